@@ -1,0 +1,228 @@
+"""The configuration: every stage's settings in one record, and what each stage of each scene and method gets of it.
+
+Defaults, ranges and comments stand in `drivesplat.settings` alone; config.yaml and config.schema.json are generated
+from them (`python -m drivesplat.config_document`). Importing this module is cheap: the Snakefile does.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from drivesplat.errors import ConfigError
+from drivesplat.settings import Settings, validated
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.evaluate import EvaluateJob, LpipsSettings
+from drivesplat.settings.extract import ExtractSettings, SceneSource
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
+from drivesplat.settings.masks import MaskJob, MaskSettings
+from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.render import RenderSettings
+from drivesplat.settings.train import PartName, SkyKind, TrainJob, TrainSettings
+from drivesplat.storage import canonical_json
+
+MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
+NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
+DATASET_OVERRIDES = (
+    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "masks", "sky", "train", "render",
+)  # fmt: skip
+METHOD_OVERRIDES = ("sky", "train")
+
+
+class DatasetSettings(Settings):
+    reader: Literal["nuscenes"] = "nuscenes"
+    """The format."""
+    dataroot: str = "~/data/nuscenes/v1.0-mini"
+    """The folder that holds the folder of tables (or that folder itself, or its grandparent)."""
+    version: str = "v1.0-mini"
+    """The folder of tables: v1.0-mini, v1.0-trainval, ..."""
+    scenes: tuple[str, ...] = MINI_SCENES
+    """Scene numbers, quoted: bare YAML would read an octal number."""
+    frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
+    """Per scene a range of key frames [first, last + 1) to use, which are then counted from 0. Others are used whole."""
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    """Settings of this file that differ for this dataset, as a tree: {images: {width: 800}}."""
+
+    @field_validator("scenes", mode="before")
+    @classmethod
+    def _scenes_are_quoted(cls, value: Any) -> Any:
+        for scene in value if isinstance(value, (list, tuple)) else ():
+            if not isinstance(scene, str):
+                octal = f'"{scene:04o}" or ' if isinstance(scene, int) else ""
+                raise ValueError(
+                    f'scene numbers are strings: put {octal}"{scene:0>4}" in quotes, since bare YAML reads 0061 as octal 49'
+                )
+        return value
+
+    @model_validator(mode="after")
+    def _frames_are_ranges(self) -> "DatasetSettings":
+        for scene, (first, last) in self.frames.items():
+            if scene not in self.scenes:
+                raise ValueError(f"frames names scene {scene!r}, which is not in scenes")
+            if not 0 <= first < last:
+                raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
+        return self
+
+
+class MethodSettings(Settings):
+    parts: tuple[PartName, ...] = Field(("background",), min_length=1)
+    """What the model is made of."""
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    """Settings of this file that differ for this method, as a tree; `sky` and `train` may."""
+
+
+class Config(Settings):
+    datasets: dict[str, DatasetSettings] = Field(default_factory=lambda: {"nuscenes": DatasetSettings()}, min_length=1)
+    """Recorded drives, each under a name of your choice."""
+    methods: dict[str, MethodSettings] = Field(default_factory=lambda: {"vanilla": MethodSettings()}, min_length=1)
+    """Methods to train and compare, each under a name of your choice; a result folder each."""
+    cameras: tuple[str, ...] = Field(("CAM_FRONT",), min_length=1)
+    """Cameras to train on."""
+    eval_camera: str = "CAM_FRONT"
+    """The camera whose held-out images are measured; one of cameras."""
+    sweeps: bool = False
+    """Train on the 12 Hz images between key frames, too."""
+    images: ImageSettings = ImageSettings()
+    holdout: HoldoutSettings = HoldoutSettings()
+    extract: ExtractSettings = ExtractSettings()
+    lidar_seed: LidarSeedSettings = LidarSeedSettings()
+    masks: MaskSettings = MaskSettings()
+    sky: SkyKind = "cubemap"
+    """Behind the Gaussians: 'cubemap' (learned, by direction), 'mask' (one learned colour, Gaussians kept out of sky
+    pixels) or 'none' (black). On nuScenes the cube map does best: without one Gaussians fill the sky and fall into view."""
+    train: TrainSettings = TrainSettings()
+    render: RenderSettings = RenderSettings()
+    lpips: LpipsSettings = LpipsSettings()
+    device: DeviceSettings = DeviceSettings()
+    random_seed: int = Field(0, ge=0, lt=2**31)
+    """Seeds every random choice."""
+    results_dir: str = Field("results", min_length=1)
+    """The folder of all output; keep experiments apart by giving each its own."""
+
+    @model_validator(mode="after")
+    def _names_fit_together(self) -> "Config":
+        owners: dict[str, str] = {}
+        for name, dataset in self.datasets.items():
+            for scene in dataset.scenes:
+                _require_name(scene, "scene")
+                if owners.setdefault(scene, name) != name:
+                    raise ValueError(
+                        f"scene {scene!r} is in two datasets, {owners[scene]} and {name}; rename or drop one"
+                    )
+            if len(set(dataset.scenes)) != len(dataset.scenes):
+                raise ValueError(f"datasets.{name}.scenes names a scene twice")
+        for name in self.methods:
+            _require_name(name, "method")
+        if self.eval_camera not in self.cameras:
+            raise ValueError(f"eval_camera {self.eval_camera} is not among cameras ({', '.join(self.cameras)})")
+        return self
+
+    @property
+    def scenes(self) -> list[str]:
+        """All configured scenes, in order."""
+        return [scene for dataset in self.datasets.values() for scene in dataset.scenes]
+
+    def dataset_of(self, scene: str) -> str:
+        """The name of the dataset a scene belongs to. Raises ConfigError listing the scenes there are."""
+        for name, dataset in self.datasets.items():
+            if scene in dataset.scenes:
+                return name
+        raise ConfigError(
+            f"scene {scene!r} is not in the config; there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
+        )
+
+
+def _require_name(name: str, kind: str) -> None:
+    import re
+
+    if not re.match(NAME, name) or name in ("logs", "benchmarks"):
+        raise ValueError(f"{kind} {name!r} cannot name a folder: use letters, digits, '_', '-' and '.'")
+
+
+def load(values: Mapping[str, Any]) -> Config:
+    """The validated config, overrides included. Raises ConfigError: one line, the key, its value, what is allowed."""
+    config = validated(Config, dict(values), "")
+    for name, dataset in config.datasets.items():
+        _require_known(dataset.overrides, DATASET_OVERRIDES, f"datasets.{name}.overrides")
+        _overridden(config, dataset.overrides, f"datasets.{name}.overrides")
+    for name, method in config.methods.items():
+        _require_known(method.overrides, METHOD_OVERRIDES, f"methods.{name}.overrides")
+        _overridden(config, method.overrides, f"methods.{name}.overrides")
+    return config
+
+
+def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
+    """The config as it holds for one scene, and one method where given. Raises ConfigError for an unknown scene."""
+    dataset = config.dataset_of(scene)
+    config = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
+    return _overridden(config, config.methods[method].overrides, f"methods.{method}.overrides") if method else config
+
+
+def _overridden(config: Config, overrides: Mapping[str, Any], where: str) -> Config:
+    if not overrides:
+        return config
+    return validated(Config, merged(config.model_dump(), overrides), f"(with {where}) ")
+
+
+def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with `overrides` laid over it, mappings merged key by key."""
+    result = dict(base)
+    for key, value in overrides.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
+        result[key] = merged(result[key], value) if both else value
+    return result
+
+
+def _require_known(overrides: Mapping[str, Any], allowed: tuple[str, ...], where: str) -> None:
+    for key in overrides:
+        if key not in allowed:
+            raise ConfigError(f"'{where}.{key}' cannot be set there; what can: {', '.join(allowed)}")
+
+
+SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
+METHOD_STAGES = ("train", "evaluate")
+
+
+def stage_settings(config: Config, stage: str, scene: str, method: str | None = None) -> str:
+    """The canonical JSON of everything a stage of a scene (and method) may know: the one param Snakemake compares."""
+    return canonical_json(_record(for_scene(config, scene, method), stage, scene, method).model_dump(mode="json"))
+
+
+def _record(config: Config, stage: str, scene: str, method: str | None) -> Settings:
+    name = config.dataset_of(scene)
+    dataset = config.datasets[name]
+    if stage == "extract":
+        return SceneSource(
+            dataset=name,
+            reader=dataset.reader,
+            version=dataset.version,
+            scene=scene,
+            frames=dataset.frames.get(scene),
+            cameras=config.cameras,
+            sweeps=config.sweeps,
+            on_missing=config.extract.on_missing,
+        )
+    if stage == "lidar_seed":
+        return SeedJob(
+            lidar_seed=config.lidar_seed, holdout=config.holdout, images=config.images, random_seed=config.random_seed
+        )
+    if stage == "parser":
+        return ParserJob(holdout=config.holdout, images=config.images)
+    if stage == "masks":
+        return MaskJob(masks=config.masks, images=config.images)
+    if stage == "train":
+        parts = config.methods[method].parts
+        return TrainJob(parts=parts, sky=config.sky, train=config.train, random_seed=config.random_seed)
+    if stage == "evaluate":
+        return EvaluateJob(
+            eval_camera=config.eval_camera,
+            cameras=config.cameras,
+            sweeps=config.sweeps,
+            holdout=config.holdout,
+            lpips=config.lpips.enabled,
+        )
+    if stage == "scene_metrics":
+        return Settings()
+    raise ValueError(f"no stage is called {stage!r}")

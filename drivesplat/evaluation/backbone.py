@@ -1,0 +1,54 @@
+"""The stage `lpips_backbone`: AlexNet's weights, fetched once or found where a user put them."""
+
+import hashlib
+import logging
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+from drivesplat.settings.evaluate import LpipsSettings
+from drivesplat.storage import atomic_write, sha256_file
+
+log = logging.getLogger(__name__)
+
+MAX_BYTES = 1_000_000_000
+CHUNK = 1 << 20
+
+
+def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
+    """Makes sure of the backbone at `path`. Returns a record: `file`, `sha256`, and `unavailable` (None, or why in a line).
+
+    Never raises for a missing network or a wrong file: LPIPS is then null with that reason. A file that does not match the
+    checksum is reported and left alone where a user put it, and not kept where it was fetched.
+    """
+    reason = None if path.is_file() else _fetch(settings, path)
+    digest = sha256_file(path) if path.is_file() else None
+    if digest is not None and not digest.startswith(settings.sha256):
+        reason = f"{path} has SHA-256 {digest[:16]}…, lpips.sha256 says {settings.sha256}: replace the file"
+    if reason:
+        log.warning("LPIPS will be null: %s", reason)
+    return {"file": str(path), "sha256": digest, "unavailable": reason}
+
+
+def _fetch(settings: LpipsSettings, path: Path) -> str | None:
+    """Downloads the backbone; None, or in a line why that failed."""
+    advice = f"put the file at {path} yourself, then run again"
+    digest, size = hashlib.sha256(), 0
+    try:
+        with urllib.request.urlopen(settings.url, timeout=settings.timeout_s) as response, atomic_write(path) as file:
+            while chunk := response.read(CHUNK):
+                size += len(chunk)
+                if size > MAX_BYTES:
+                    raise ValueError(f"it is larger than {MAX_BYTES:,} bytes")
+                digest.update(chunk)
+                file.write(chunk)
+            expected = response.headers.get("Content-Length")
+            if expected is not None and size != int(expected):
+                raise ValueError(f"it ended after {size:,} of {int(expected):,} bytes")
+            if not digest.hexdigest().startswith(settings.sha256):
+                raise ValueError(f"its SHA-256 is {digest.hexdigest()[:16]}…, not {settings.sha256}")
+    except (urllib.error.URLError, OSError, ValueError) as error:
+        reason = getattr(error, "reason", None) or error
+        return f"the AlexNet backbone could not be fetched from {settings.url} ({reason}); {advice}"
+    return None

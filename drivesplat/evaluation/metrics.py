@@ -1,0 +1,104 @@
+"""PSNR, SSIM and LPIPS pooled over regions, as the measuring protocol defines them.
+
+Maps are computed per frame and accumulated per region, so memory does not grow with the number of frames.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from skimage.metrics import structural_similarity
+
+from drivesplat.regions import REGIONS, region_mask
+
+LEAST_REGION_PIXELS = 1000
+"""A region with fewer pixels in a group is null."""
+LEAST_FRAME_PIXELS = 100
+"""A frame with fewer pixels of a region does not count in its frame mean."""
+
+LpipsMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def psnr(squared_error: float) -> float | None:
+    """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]; None where it is 0."""
+    return -10.0 * math.log10(squared_error) if squared_error > 0 else None
+
+
+def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The structural similarity (h, w), mean over channels, of two images (h, w, 3) in [0, 1]: 11 Gaussian taps, sigma 1.5."""
+    _, full = structural_similarity(
+        image,
+        truth,
+        data_range=1.0,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    return full.mean(axis=2)
+
+
+@dataclass
+class _Sums:
+    pixels: int = 0
+    squared_error: float = 0.0
+    ssim: float = 0.0
+    lpips: float = 0.0
+    frame_psnrs: list[float] = field(default_factory=list)
+
+
+class RegionMetrics:
+    """Metrics of one group of frames: `add` each frame, then `summary`."""
+
+    def __init__(self, lpips_map: LpipsMap | None):
+        self._lpips_map = lpips_map
+        self._sums = {region: _Sums() for region in REGIONS}
+
+    def add(self, image: np.ndarray, truth: np.ndarray, labels: np.ndarray) -> None:
+        """A rendered and a recorded image (h, w, 3) in [0, 1], and the frame's label image (h, w)."""
+        image, truth = image.clip(0.0, 1.0).astype(np.float64), truth.astype(np.float64)
+        squared_error = ((image - truth) ** 2).mean(axis=2)
+        similarity = ssim_map(image, truth)
+        perceptual = self._lpips_map(image, truth) if self._lpips_map else np.zeros_like(similarity)
+        for region, sums in self._sums.items():
+            mask = region_mask(labels, region)
+            pixels = int(mask.sum())
+            if pixels == 0:
+                continue
+            frame_error = float(squared_error[mask].sum())
+            sums.pixels += pixels
+            sums.squared_error += frame_error
+            sums.ssim += float(similarity[mask].sum())
+            sums.lpips += float(perceptual[mask].sum())
+            frame_psnr = psnr(frame_error / pixels)
+            if pixels >= LEAST_FRAME_PIXELS and frame_psnr is not None:
+                sums.frame_psnrs.append(frame_psnr)
+
+    def summary(self) -> dict[str, Any]:
+        """`gap_db` and a record per region; None where a region has too few pixels."""
+        regions = {region: self._record(sums) for region, sums in self._sums.items()}
+        return {"gap_db": gap_db(regions), **regions}
+
+    def _record(self, sums: _Sums) -> dict[str, Any] | None:
+        if sums.pixels < LEAST_REGION_PIXELS:
+            return None
+        pooled = psnr(sums.squared_error / sums.pixels)
+        return {
+            "psnr": pooled,
+            **({"identical": True} if pooled is None else {}),
+            "psnr_frame_mean": float(np.mean(sums.frame_psnrs)) if sums.frame_psnrs else None,
+            "ssim": sums.ssim / sums.pixels,
+            "lpips": sums.lpips / sums.pixels if self._lpips_map else None,
+            "pixels": sums.pixels,
+        }
+
+
+def gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
+    """Static minus moving-vehicle PSNR; vehicle where nothing moves; None where there is neither."""
+    static, moving = regions["static"], regions["moving_vehicle"] or regions["vehicle"]
+    if static is None or moving is None or static["psnr"] is None or moving["psnr"] is None:
+        return None
+    return static["psnr"] - moving["psnr"]

@@ -1,0 +1,87 @@
+"""The seam between Snakemake's scripts and the library: settings in, errors out in one line, threads as granted."""
+
+import json
+import logging
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from drivesplat.errors import DriveSplatError
+from drivesplat.provenance import provenance
+from drivesplat.settings import Settings
+from drivesplat.settings.device import DeviceSettings
+
+S = TypeVar("S", bound=Settings)
+
+
+class Job:
+    """What a rule's script may know: its files, its settings and its digest of code; never the whole config."""
+
+    def __init__(self, snakemake: Any):
+        self.input = snakemake.input
+        self.output = snakemake.output
+        self.wildcards = snakemake.wildcards
+        self.threads: int = snakemake.threads
+        self._rule: str = snakemake.rule
+        self._params = snakemake.params
+        self._resources = snakemake.resources
+
+    @property
+    def stage(self) -> str:
+        """The name under which results remember this stage; a method's stages carry its name."""
+        method = getattr(self.wildcards, "method", None)
+        return f"{method}/{self._rule}" if method else self._rule
+
+    @property
+    def name(self) -> str:
+        """Stage and scene, for messages."""
+        return " ".join([self.stage, *([self.wildcards.scene] if hasattr(self.wildcards, "scene") else [])])
+
+    def settings(self, model: type[S]) -> S:
+        """The rule's settings as the record it expects."""
+        return model.model_validate_json(self._params.settings)
+
+    def device(self) -> DeviceSettings:
+        """Where to run; not one of the settings, since it decides no result."""
+        return DeviceSettings.model_validate_json(self._resources.device)
+
+    def param(self, name: str) -> Any:
+        """A further parameter of the rule, given as JSON."""
+        return json.loads(self._params.get(name))
+
+    def provenance(self, *upstream: dict[str, Any], inputs: dict[str, str] | None = None) -> dict[str, Any]:
+        """The provenance of this rule's result, made from results with the provenances `upstream`."""
+        return provenance(self.stage, json.loads(self._params.settings), self._params.code, upstream, inputs or {})
+
+
+@contextmanager
+def job(snakemake: Any) -> Iterator[Job]:
+    """A rule's script as a context: logs into the rule's log, and ends a failure in one line on the console.
+
+    A DriveSplatError is told as its sentence; anything else is a bug, told with the place of its traceback in the log.
+    """
+    log_path = Path(snakemake.log[0])
+    log_path.parent.mkdir(parents=True, exist_ok=True)
+    handler = logging.FileHandler(log_path, mode="w", encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    console = logging.StreamHandler(sys.stderr)
+    console.setLevel(logging.WARNING)
+    console.setFormatter(logging.Formatter("drivesplat: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
+    logging.captureWarnings(True)
+    current = Job(snakemake)
+    try:
+        yield current
+    except DriveSplatError as error:
+        logging.getLogger(__name__).error("%s: %s", current.name, error)
+        sys.exit(1)
+    except Exception as error:
+        handler.stream.write(traceback.format_exc())
+        message = "%s: %s: %s (a bug; the traceback is in %s)"
+        logging.getLogger(__name__).error(message, current.name, type(error).__name__, error, log_path)
+        sys.exit(1)
+    finally:
+        logging.shutdown()

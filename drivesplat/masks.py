@@ -1,0 +1,120 @@
+"""The stage `masks`: what is static, moving or sky in every image, as PNGs that a person can look at.
+
+masks/masks.json                          what was made, from what
+masks/regions/{camera}/{timestamp}.png    labels of `drivesplat.regions.LABELS`
+masks/sky/{camera}/{timestamp}.png        255 where the sky is
+"""
+
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from drivesplat.errors import DatasetError
+from drivesplat.images import continuous_intrinsics, read_image, read_mask, target_size
+from drivesplat.regions import LABELS, label_image
+from drivesplat.rigid import apply
+from drivesplat.scene import Frame, Scene
+from drivesplat.seeding.sweeps import read_sweep
+from drivesplat.settings.masks import MaskJob
+from drivesplat.sky_mask import sky_mask
+from drivesplat.storage import atomic_write, read_json, unreadable
+
+log = logging.getLogger(__name__)
+
+
+def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
+    """Writes the masks of every image below `folder`; returns the record for masks.json.
+
+    Raises DatasetError naming the file where a user's mask is missing or unreadable.
+    """
+    sweeps = [sweep for sweep in scene.sweeps if Path(sweep.path).is_file()]
+    timestamps = np.array([sweep.timestamp for sweep in sweeps])
+
+    def one(frame: Frame) -> float:
+        size = target_size(frame, job.images)
+        near = np.argmin(np.abs(timestamps - frame.timestamp)) if sweeps else None
+        close = near is not None and abs(timestamps[near] - frame.timestamp) < scene.key_frame_interval
+        lidar = apply(sweeps[near].sensor_to_world, read_sweep(sweeps[near])) if close else None
+        sky = _sky(frame, job, size, lidar)
+        _write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
+        _write_png(folder / mask_name("regions", frame.camera, frame.timestamp), _regions(scene, frame, job, size))
+        return float(sky.mean())
+
+    with ThreadPoolExecutor() as pool:
+        sky_shares = list(pool.map(one, scene.frames))
+    return {
+        "labels": LABELS,
+        "images": len(scene.frames),
+        "regions": "masks" if job.masks.regions_folder else "boxes",
+        "sky": "masks" if job.masks.sky_folder else "heuristic",
+        "sky_share": float(np.mean(sky_shares)),
+    }
+
+
+def mask_name(kind: str, camera: str, timestamp: int) -> str:
+    """The path of a mask below the masks folder; `kind` is 'regions' or 'sky'."""
+    return f"{kind}/{camera}/{timestamp}.png"
+
+
+def read_masks_record(folder: Path) -> dict[str, Any]:
+    record = read_json(folder / "masks.json", rule="masks")
+    if not isinstance(record, dict) or "regions" not in record:
+        raise unreadable(folder / "masks.json", "masks", "not a record of masks")
+    return record
+
+
+def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    """The sky (h, w) bool of an image at `size` (width, height). Raises ResultError where the mask is missing or unreadable."""
+    return _made_mask(folder, "sky", camera, timestamp, size) > 127
+
+
+def read_labels(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    """The label image (h, w) of an image at `size` (width, height). Raises ResultError where it is missing or unreadable."""
+    return _made_mask(folder, "regions", camera, timestamp, size)
+
+
+def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    path = folder / mask_name(kind, camera, timestamp)
+    try:
+        return read_mask(path, size)
+    except DatasetError as error:
+        raise unreadable(path, "masks", str(error)) from error
+
+
+def _sky(frame: Frame, job: MaskJob, size: tuple[int, int], lidar: np.ndarray | None) -> np.ndarray:
+    if job.masks.sky_folder:
+        return _users_mask(job.masks.sky_folder, frame, size) > 127
+    return sky_mask(
+        read_image(frame.image_path, size), continuous_intrinsics(frame, size), frame.camera_to_world, lidar
+    )
+
+
+def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) -> np.ndarray:
+    if job.masks.regions_folder:
+        labels = _users_mask(job.masks.regions_folder, frame, size).copy()
+        if labels.max() > max(LABELS.values()):
+            raise DatasetError(
+                f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; they end at {max(LABELS.values())}"
+            )
+    else:
+        labels = label_image(scene, frame, size)
+    polygon = job.masks.own_car_polygons.get(frame.camera)
+    if polygon:
+        import cv2
+
+        corners = np.round(np.array(polygon) * size).astype(np.int32)
+        cv2.fillPoly(labels, [corners], LABELS["own_car"])
+    return labels
+
+
+def _users_mask(folder: str, frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    return read_mask(Path(folder).expanduser() / frame.camera / f"{Path(frame.image_path).stem}.png", size)
+
+
+def _write_png(path: Path, labels: np.ndarray) -> None:
+    with atomic_write(path) as file:
+        Image.fromarray(labels).save(file, format="PNG")

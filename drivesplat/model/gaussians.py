@@ -1,0 +1,29 @@
+"""Gaussians in world coordinates, ready for the rasterizer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """n Gaussians: `means` metres, `quats` w, x, y, z, `scales` metres, `opacities` in [0, 1], `sh` coefficients (RGB)."""
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    scales: Float[Tensor, "n 3"]
+    opacities: Float[Tensor, " n"]
+    sh: Float[Tensor, "n k 3"]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
+    """Several sets as one, in order; a single set is returned as it is."""
+    if len(sets) == 1:
+        return sets[0]
+    return Gaussians(**{f.name: torch.cat([getattr(s, f.name) for s in sets]) for f in fields(Gaussians)})

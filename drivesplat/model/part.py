@@ -1,0 +1,46 @@
+"""What a method is made of: parts that place Gaussians, and a sky behind them.
+
+Each part owns its parameters, their learning rates and its densification. A method is a list of parts.
+"""
+
+from abc import ABC, abstractmethod
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from drivesplat.model.gaussians import Gaussians
+
+
+class Part(nn.Module, ABC):
+    """A set of Gaussians: the world's static background, a moving actor, ...
+
+    `params` holds what is optimised, under gsplat's names where a gsplat strategy densifies it.
+    """
+
+    name: str
+    params: nn.ParameterDict
+
+    @abstractmethod
+    def at(self, time: float) -> Gaussians:
+        """Its Gaussians in world coordinates at a time in seconds since the first key frame."""
+
+    @abstractmethod
+    def learning_rates(self) -> dict[str, float]:
+        """The initial learning rate of every entry of `params`."""
+
+    def __len__(self) -> int:
+        return len(self.params["means"])
+
+
+class Sky(nn.Module, ABC):
+    """What is seen where no Gaussian is: a colour by direction."""
+
+    params: nn.ParameterDict
+
+    @abstractmethod
+    def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        """RGB in [0, 1] seen along unit world directions."""
+
+    @abstractmethod
+    def learning_rates(self) -> dict[str, float]:
+        """The learning rate of every entry of `params`."""

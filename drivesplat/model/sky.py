@@ -1,0 +1,84 @@
+"""Skies: a learned cube map, or one learned colour.
+
+The cube map's texels are the vertices of a grid on the cube: texels on an edge or corner are shared by the faces that
+meet there, so that the colour is continuous over seams by construction.
+"""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from drivesplat.model.part import Sky
+
+
+class ConstantSky(Sky):
+    """One learned colour everywhere, started at `color` (3,) in [0, 1]."""
+
+    def __init__(self, color: Float[Tensor, "3"], learning_rate: float):
+        super().__init__()
+        self.params = nn.ParameterDict({"color": nn.Parameter(_logit(color))})
+        self._learning_rate = learning_rate
+
+    def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        return torch.sigmoid(self.params["color"]).expand_as(rays)
+
+    def learning_rates(self) -> dict[str, float]:
+        return {"color": self._learning_rate}
+
+
+class CubemapSky(Sky):
+    """A learned cube map of `resolution` texels along an edge, started at `color` (3,) in [0, 1]."""
+
+    def __init__(self, resolution: int, color: Float[Tensor, "3"], learning_rate: float):
+        super().__init__()
+        index, count = shared_vertices(resolution)
+        self.register_buffer("index", index, persistent=False)
+        self.params = nn.ParameterDict({"texels": nn.Parameter(_logit(color).repeat(count, 1))})
+        self._learning_rate = learning_rate
+
+    def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        faces = self.params["texels"][self.index]
+        sampled = F.grid_sample(
+            faces.permute(3, 0, 1, 2)[None],
+            face_coordinates(rays)[None, None],
+            align_corners=True,
+            padding_mode="border",
+        )
+        return torch.sigmoid(sampled[0, :, 0].permute(1, 2, 0))
+
+    def learning_rates(self) -> dict[str, float]:
+        return {"texels": self._learning_rate}
+
+
+def face_coordinates(rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Where directions meet the cube, as grid_sample's x, y (on the face) and z (which face), all in [-1, 1].
+
+    Faces 0 to 5 are +x, -x, +y, -y, +z, -z. On a face with axis i, x and y are the coordinates of axes i + 1 and i + 2.
+    """
+    axis = rays.abs().argmax(dim=-1, keepdim=True)
+    along = rays.gather(-1, axis)
+    u = rays.gather(-1, (axis + 1) % 3) / along.abs()
+    v = rays.gather(-1, (axis + 2) % 3) / along.abs()
+    face = 2 * axis + (along < 0)
+    return torch.cat([u, v, face * (2.0 / 5.0) - 1.0], dim=-1)
+
+
+def shared_vertices(resolution: int) -> tuple[Int[Tensor, "6 r r"], int]:
+    """For every face texel (face, v, u) the index of its cube-surface vertex, and how many vertices there are."""
+    line = torch.arange(resolution)
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    faces = []
+    for face in range(6):
+        axis, end = face // 2, 0 if face % 2 else resolution - 1
+        corner = torch.zeros(resolution, resolution, 3, dtype=torch.long)
+        corner[..., axis] = end
+        corner[..., (axis + 1) % 3] = u
+        corner[..., (axis + 2) % 3] = v
+        faces.append((corner[..., 0] * resolution + corner[..., 1]) * resolution + corner[..., 2])
+    keys, index = torch.unique(torch.stack(faces), return_inverse=True)
+    return index, len(keys)
+
+
+def _logit(color: Tensor) -> Tensor:
+    return torch.logit(color.clamp(0.02, 0.98))

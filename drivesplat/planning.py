@@ -1,0 +1,141 @@
+"""What the Snakefile needs to know before anything runs: settings and code digests for its rules, and early refusals.
+
+Everything here is cheap to import and to compute; it runs once in the main process and once in every job.
+"""
+
+import fcntl
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from drivesplat.config import METHOD_STAGES, SCENE_STAGES, Config, for_scene, load, stage_settings
+from drivesplat.errors import ConfigError, DriveSplatError
+from drivesplat.readers import layout
+from drivesplat.rerun import code_digest
+from drivesplat.storage import canonical_json
+
+SCRIPTS = "workflow_scripts"
+BACKBONE = "resources/lpips/alexnet.pth"
+"""Where LPIPS's AlexNet backbone is kept; users without network put it there themselves."""
+
+
+class Plan:
+    """The validated config as the rules ask for it; `basedir` is the Snakefile's folder."""
+
+    def __init__(self, values: Mapping[str, Any], basedir: str):
+        self.config: Config = load(values)
+        self._scripts = Path(basedir) / SCRIPTS
+        self._held_lock: Any = None
+
+    def settings(self, stage: str) -> Callable[[Any], str]:
+        """The function of wildcards that gives a stage's settings as canonical JSON."""
+
+        def settings_of(wildcards: Any) -> str:
+            return stage_settings(self.config, stage, wildcards.scene, getattr(wildcards, "method", None))
+
+        return settings_of
+
+    def code(self, stage: str) -> str:
+        """The digest of all code a stage runs."""
+        return code_digest(self._scripts / f"{stage}.py")
+
+    def tables(self, wildcards: Any) -> list[str]:
+        """The dataset files that decide a scene's scene.json."""
+        dataset = self.config.datasets[self.config.dataset_of(wildcards.scene)]
+        files = layout(dataset.reader)
+        return [
+            str(file) for file in files.table_files(files.find_root(dataset.dataroot, dataset.version), dataset.version)
+        ]
+
+    def points_file(self, wildcards: Any) -> list[str]:
+        """The user's extra seed points, where given."""
+        path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
+        return [str(Path(path).expanduser())] if path else []
+
+    def lpips_record(self, _: Any) -> list[str]:
+        """The record of LPIPS's backbone, where LPIPS is wanted."""
+        return ["resources/lpips/backbone.json"] if self.config.lpips.enabled else []
+
+    def backbone_file(self, _: Any) -> list[str]:
+        """The backbone itself, where it is there already: its arrival reruns what lacked it."""
+        return [BACKBONE] if Path(BACKBONE).is_file() else []
+
+    def device(self) -> str:
+        """Where jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
+        return canonical_json(self.config.device.model_dump(mode="json"))
+
+    def known(self, names: Any) -> str:
+        """A wildcard constraint that admits these names only."""
+        return "|".join(re.escape(name) for name in names)
+
+    def report_scenes(self, targets: list[str]) -> list[str]:
+        """The scenes of a report: all, but where the report alone is asked for those that have been measured."""
+        reports = {"gap_report", *(f"{self.config.results_dir}/gap_report.{kind}" for kind in ("csv", "json"))}
+        if not targets or not set(targets) <= reports:
+            return self.config.scenes
+        return [s for s in self.config.scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
+
+    def expected_stages(self) -> str:
+        """For every scene the settings and code its metrics.json should come from, as JSON, to tell stale results."""
+        codes = {stage: self.code(stage) for stage in (*SCENE_STAGES, *METHOD_STAGES)}
+        return canonical_json({scene: self._stages(scene, codes) for scene in self.config.scenes})
+
+    def _stages(self, scene: str, codes: Mapping[str, str]) -> dict[str, Any]:
+        import json
+
+        stages = {stage: (stage, None) for stage in SCENE_STAGES}
+        stages |= {f"{method}/{stage}": (stage, method) for method in self.config.methods for stage in METHOD_STAGES}
+        return {
+            name: {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": codes[stage]}
+            for name, (stage, method) in stages.items()
+        }
+
+    def refuse_unknown(self, targets: list[str]) -> None:
+        """Raises ConfigError, listing what there is, where a target names a scene or method that the config does not."""
+        for target in targets:
+            if not target.startswith(f"{self.config.results_dir}/"):
+                continue
+            scene, *rest = target.removeprefix(f"{self.config.results_dir}/").split("/")
+            if not rest:
+                continue
+            self.config.dataset_of(scene)
+            if len(rest) > 1 and rest[0] not in (*self.config.methods, "masks"):
+                raise ConfigError(
+                    f"method {rest[0]!r} is not in the config; there are: {', '.join(self.config.methods)}"
+                )
+
+    def refuse_absent_data(self, targets: list[str]) -> None:
+        """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""
+        for scene in self._scenes_of(targets):
+            self.tables(_Scene(scene))
+
+    def _scenes_of(self, targets: list[str]) -> list[str]:
+        results = f"{self.config.results_dir}/"
+        named = [target.removeprefix(results).split("/")[0] for target in targets if target.startswith(results)]
+        if (
+            not targets
+            or any(not target.startswith(results) for target in targets)
+            or set(named) - set(self.config.scenes)
+        ):
+            return self.report_scenes(targets)
+        return named
+
+    def hold_results(self) -> None:
+        """Keeps a second run out of the results folder until this process ends, however it ends. Raises DriveSplatError."""
+        folder = Path(self.config.results_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
+        try:
+            fcntl.flock(self._held_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise DriveSplatError(
+                f"another run is working in {folder}/; wait for it, or give this one its own folder (results_dir)"
+            ) from None
+
+
+class _Scene:
+    """A stand-in for a rule's wildcards."""
+
+    def __init__(self, scene: str):
+        self.scene = scene

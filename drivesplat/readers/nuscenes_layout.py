@@ -1,0 +1,44 @@
+"""Where the files of nuScenes are."""
+
+from pathlib import Path
+
+from drivesplat.errors import DatasetError
+
+TABLES = (
+    "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
+    "sample_data", "scene", "sensor", "visibility",
+)  # fmt: skip
+HOW_TO_GET_IT = "download it from https://www.nuscenes.org/nuscenes (free registration), unpack it there, or set datasets.<name>.dataroot in config.yaml"
+
+
+def find_root(dataroot: str, version: str) -> Path:
+    """The folder that holds the tables' folder `version`: `dataroot` itself, its parent, or its folder of that name.
+
+    Raises DatasetError: what was looked for, where, and how to get it.
+    """
+    given = Path(dataroot).expanduser()
+    for root in (given, given.parent, given / version):
+        if (
+            root.is_dir()
+            and (root / version / "scene.json").is_file()
+            and (root != given.parent or given.name == version)
+        ):
+            return root
+    if not given.is_dir():
+        raise DatasetError(f"nuScenes {version} not found: there is no folder {given}; {HOW_TO_GET_IT}")
+    others = sorted(p.parent.name for p in given.glob("v1.0-*/scene.json"))
+    found = (
+        f"it holds {', '.join(others)}: set datasets.<name>.version"
+        if others
+        else f"it holds no nuScenes tables; {HOW_TO_GET_IT}"
+    )
+    raise DatasetError(f"nuScenes {version} not found: looked for {version}/scene.json in {given}; {found}")
+
+
+def table_files(root: Path, version: str) -> list[Path]:
+    """The files that decide what `read` returns. Raises DatasetError naming the tables that are missing."""
+    files = [root / version / f"{name}.json" for name in TABLES]
+    absent = [file.name for file in files if not file.is_file()]
+    if absent:
+        raise DatasetError(f"nuScenes {version} in {root} is incomplete: {', '.join(absent)} missing; {HOW_TO_GET_IT}")
+    return files

@@ -1,0 +1,86 @@
+"""What makes a rerun exact: a digest of the code a stage runs, blind to comments, docstrings, layout and file times.
+
+Snakemake compares a rule's `params`; this digest and the stage's canonical settings are two of them (rules/common.smk).
+"""
+
+import ast
+import hashlib
+from functools import cache
+from importlib.util import resolve_name
+from pathlib import Path
+
+PACKAGE = "drivesplat"
+PACKAGE_FOLDER = Path(__file__).parent
+
+
+def code_digest(script: str | Path) -> str:
+    """A hash of the meaning of a script and of every module of this package it imports, directly or through others.
+
+    The meaning is the syntax tree without bare strings (docstrings, field comments). Imports inside functions count.
+    """
+    path = Path(script)
+    modules, waiting = {}, _imports(path, package="")
+    while waiting:
+        name = waiting.pop()
+        if name not in modules:
+            file = _file_of(name)
+            modules[name] = _meaning(file)
+            waiting |= _imports(file, package=name if file.name == "__init__.py" else name.rpartition(".")[0])
+    content = [_meaning(path), *(f"{name}\n{modules[name]}" for name in sorted(modules))]
+    return hashlib.sha256("\n\n".join(content).encode()).hexdigest()
+
+
+@cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+@cache
+def _meaning(path: Path) -> str:
+    return ast.unparse(_WithoutBareStrings().visit(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+class _WithoutBareStrings(ast.NodeTransformer):
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        super().generic_visit(node)
+        if isinstance(getattr(node, "body", None), list):
+            node.body = [s for s in node.body if not _is_bare_string(s)] or [ast.Pass()]
+        return node
+
+
+def _is_bare_string(statement: ast.AST) -> bool:
+    return (
+        isinstance(statement, ast.Expr)
+        and isinstance(statement.value, ast.Constant)
+        and isinstance(statement.value.value, str)
+    )
+
+
+def _imports(path: Path, package: str) -> set[str]:
+    """The modules of this package that a file imports, packages on the way to them included."""
+    names: set[str] = set()
+    for node in ast.walk(_tree(path)):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module
+            names.update([base, *(f"{base}.{alias.name}" for alias in node.names)])
+        elif isinstance(node, ast.Constant) and _names_a_module(node.value):
+            names.add(node.value)
+    parts = (name.split(".") for name in names if name.split(".")[0] == PACKAGE)
+    candidates = {".".join(p[: i + 1]) for p in parts for i in range(len(p))}
+    return {name for name in candidates if _file_of(name) is not None}
+
+
+def _names_a_module(value: object) -> bool:
+    """Whether a string constant spells a module of this package: modules imported by name."""
+    return isinstance(value, str) and value.startswith(f"{PACKAGE}.") and _file_of(value) is not None
+
+
+@cache
+def _file_of(module: str) -> Path | None:
+    base = PACKAGE_FOLDER.joinpath(*module.split(".")[1:])
+    for file in (base / "__init__.py", base.with_suffix(".py")):
+        if file.is_file() and file.stem.isidentifier():
+            return file
+    return None

@@ -1,0 +1,34 @@
+"""Rigid transforms as 4x4 matrices, float64, applied to column vectors."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """The 4x4 transform of a rotation matrix (3, 3) and a translation (3,)."""
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = translation
+    return transform
+
+
+def inverse(transform: np.ndarray) -> np.ndarray:
+    """The inverse of rigid transforms (..., 4, 4)."""
+    rotation_t = np.swapaxes(transform[..., :3, :3], -1, -2)
+    result = np.zeros_like(transform)
+    result[..., :3, :3] = rotation_t
+    result[..., :3, 3] = -(rotation_t @ transform[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def apply(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """`points` (n, 3) moved by `transform` (4, 4)."""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def interpolate(start: np.ndarray, end: np.ndarray, fraction: float) -> np.ndarray:
+    """The pose (4, 4) at `fraction` between two poses: linear position, slerp rotation. Outside [0, 1] the motion continues."""
+    turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
+    rotation = start[:3, :3] @ Rotation.from_rotvec(fraction * turn).as_matrix()
+    return rigid(rotation, (1.0 - fraction) * start[:3, 3] + fraction * end[:3, 3])

@@ -1,0 +1,154 @@
+"""The record that flows through the workflow: one drive, whatever dataset it came from.
+
+Frames of reference. World: metres, z up, the axes of the dataset's global frame, its origin moved to the first ego
+position (`Scene.origin`, kept in float64). Camera: OpenCV (x right, y down, z forward). Intrinsics: OpenCV (integer
+coordinates at pixel centres), in pixels of the recorded image. Object: x forward, y left, z up, at the box centre.
+Ego: nuScenes (x forward, y left, z up, on the ground under the rear axle). Timestamps: microseconds.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.storage import read_json, unreadable, write_json
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image. `intrinsics` (3, 3); `camera_to_world`, `ego_to_world` (4, 4) at the image's own timestamp."""
+
+    camera: str
+    timestamp: int
+    image_path: str
+    width: int
+    height: int
+    intrinsics: np.ndarray
+    camera_to_world: np.ndarray
+    ego_to_world: np.ndarray
+    is_key_frame: bool
+    sample_index: int
+    token: str
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One LiDAR revolution. `sensor_to_world` (4, 4) at the sweep's timestamp; `path` may be missing on disk."""
+
+    path: str
+    timestamp: int
+    sensor_to_world: np.ndarray
+    is_key_frame: bool
+    sample_index: int
+    token: str
+
+
+@dataclass(frozen=True)
+class Track:
+    """One annotated object over time.
+
+    `size` (3,) is length, width, height in metres. Per annotation: `timestamps` (n,), `sample_indices` (n,), increasing;
+    `object_to_world` (n, 4, 4); `visibility` (n,): 1 (0-40 %) to 4 (80-100 %), 0 where the dataset does not say.
+    """
+
+    id: str
+    category: str
+    size: np.ndarray
+    timestamps: np.ndarray
+    sample_indices: np.ndarray
+    object_to_world: np.ndarray
+    visibility: np.ndarray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A recorded drive.
+
+    `key_frame_timestamps` (n,): key frame i is `sample_index` i. `origin` (3,): global = world + origin. `poses` names
+    where the poses come from ('nuscenes', 'refined'); `key_frame_range` the dataset's key frames [first, last + 1) that
+    were read, None for all.
+    """
+
+    name: str
+    dataset: str
+    version: str
+    description: str
+    origin: np.ndarray
+    key_frame_timestamps: np.ndarray
+    frames: tuple[Frame, ...]
+    sweeps: tuple[Sweep, ...]
+    tracks: tuple[Track, ...]
+    poses: str
+    key_frame_range: list[int] | None = None
+    missing_images: int = 0
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def key_frame_interval(self) -> float:
+        """The median time between key frames, in microseconds (nuScenes: 500,000)."""
+        if len(self.key_frame_timestamps) < 2:
+            return 500_000.0
+        return float(np.median(np.diff(self.key_frame_timestamps)))
+
+    def nearest_key_frame(self, timestamp: int) -> int:
+        """The index of the key frame nearest to `timestamp` (microseconds)."""
+        return int(np.argmin(np.abs(self.key_frame_timestamps - timestamp)))
+
+
+_ARRAYS = {
+    "intrinsics": np.float64,
+    "camera_to_world": np.float64,
+    "ego_to_world": np.float64,
+    "sensor_to_world": np.float64,
+    "object_to_world": np.float64,
+    "origin": np.float64,
+    "size": np.float64,
+    "timestamps": np.int64,
+    "sample_indices": np.int64,
+    "visibility": np.int64,
+    "key_frame_timestamps": np.int64,
+}
+_RECORDS: dict[str, type] = {"frames": Frame, "sweeps": Sweep, "tracks": Track}
+
+
+def write_scene(path: str | Path, scene: Scene) -> None:
+    """Writes `scene.json`."""
+    write_json(path, {"schema": SCHEMA, **_to_plain(scene)})
+
+
+def read_scene(path: str | Path) -> Scene:
+    """Reads `scene.json`. Raises ResultError where the file is not one, naming it and the rule that makes it."""
+    content = read_json(path, rule="extract")
+    try:
+        if content.pop("schema") != SCHEMA:
+            raise ValueError("it has another schema")
+        return _from_plain(Scene, content)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise unreadable(path, "extract", f"not a scene record ({error})") from error
+
+
+def _to_plain(record: Any) -> dict[str, Any]:
+    plain = {}
+    for name, value in vars(record).items():
+        if isinstance(value, np.ndarray):
+            plain[name] = value.tolist()
+        elif name in _RECORDS:
+            plain[name] = [_to_plain(item) for item in value]
+        else:
+            plain[name] = value
+    return plain
+
+
+def _from_plain(kind: type, plain: dict[str, Any]) -> Any:
+    values = {}
+    for name, value in plain.items():
+        if name in _ARRAYS:
+            values[name] = np.array(value, dtype=_ARRAYS[name])
+        elif name in _RECORDS:
+            values[name] = tuple(_from_plain(_RECORDS[name], item) for item in value)
+        else:
+            values[name] = value
+    return kind(**values)

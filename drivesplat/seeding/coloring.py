@@ -1,0 +1,70 @@
+"""Colours for points from the images that see them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivesplat.images import project
+
+
+@dataclass(frozen=True)
+class ColorView:
+    """An image that may colour points: `pixels` (h, w, 3) uint8, `intrinsics` continuous (3, 3), `usable` (h, w) bool."""
+
+    pixels: np.ndarray
+    intrinsics: np.ndarray
+    world_to_camera: np.ndarray
+    timestamp: int
+    usable: np.ndarray
+
+
+CELL = 4
+"""Edge in pixels of the cells of the depth buffer that decides occlusion: LiDAR is sparser than the image."""
+OCCLUSION = 1.05
+"""A point is hidden where something in its cell is nearer by this factor and half a metre."""
+
+
+def color_by_visibility(
+    points: np.ndarray, times: np.ndarray, views: Iterable[ColorView]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Each point's colour in the view nearest to it in time among those that see it unoccluded.
+
+    `points` (n, 3) world; `times` (n,) microseconds. Returns colours (n, 3) uint8 and the number of views that see each
+    point (n,): where it is 0 the colour is meaningless.
+    """
+    colors = np.zeros((len(points), 3), dtype=np.uint8)
+    best = np.full(len(points), np.inf)
+    seen = np.zeros(len(points), dtype=np.int64)
+    for view in views:
+        index, rows, columns = visible(points, view.world_to_camera, view.intrinsics, view.pixels.shape[:2])
+        usable = view.usable[rows, columns]
+        index, rows, columns = index[usable], rows[usable], columns[usable]
+        seen[index] += 1
+        distance = np.abs(times[index] - view.timestamp)
+        better = distance < best[index]
+        index, rows, columns = index[better], rows[better], columns[better]
+        best[index] = distance[better]
+        colors[index] = view.pixels[rows, columns]
+    return colors, seen
+
+
+def visible(
+    points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (m,), pixel rows (m,) and columns (m,) of the points (n, 3) that an image of `shape` (h, w) sees.
+
+    A point is hidden where another of the points, in the same cell of CELL pixels, stands clearly before it.
+    """
+    pixels, depth = project(points, world_to_camera, intrinsics)
+    height, width = shape
+    inside = (
+        (depth > 0.5) & (pixels[:, 0] >= 0) & (pixels[:, 0] < width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < height)
+    )
+    index = np.flatnonzero(inside)
+    columns, rows = pixels[index].astype(np.int64).T
+    cells = (rows // CELL) * (width // CELL + 1) + columns // CELL
+    nearest = np.full((height // CELL + 1) * (width // CELL + 1), np.inf)
+    np.minimum.at(nearest, cells, depth[index])
+    front = depth[index] <= nearest[cells] * OCCLUSION + 0.5
+    return index[front], rows[front], columns[front]

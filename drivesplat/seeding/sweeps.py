@@ -1,0 +1,68 @@
+"""LiDAR sweeps in world coordinates, without the own car and without what moves."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.rigid import apply, inverse
+from drivesplat.scene import Scene, Sweep
+from drivesplat.tracks import Box, box_at, moves_at_all
+
+log = logging.getLogger(__name__)
+
+_RECORD = 5
+"""nuScenes' .pcd.bin: x, y, z (metres, sensor frame), intensity, ring; five float32 a return."""
+
+
+def read_sweep(sweep: Sweep) -> np.ndarray:
+    """The returns (n, 3) of a sweep in its sensor's frame, metres, non-finite ones left out.
+
+    Raises DatasetError naming the sample_data token and the path where the file is missing, truncated or empty.
+    """
+    path = Path(sweep.path)
+    where = f"key frame {sweep.sample_index}, sample_data {sweep.token}: LiDAR file {path}"
+    if not path.is_file():
+        raise DatasetError(f"{where} is missing; restore it, or set lidar_seed.on_missing: warn to go on without it")
+    size = path.stat().st_size
+    if size == 0 or size % (4 * _RECORD):
+        raise DatasetError(
+            f"{where} is corrupt ({size} bytes are no whole number of returns); restore it, or set lidar_seed.on_missing: warn"
+        )
+    points = np.fromfile(path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
+    return points[np.isfinite(points).all(axis=1)].astype(np.float64)
+
+
+def without_own_car(points: np.ndarray, radius: float) -> np.ndarray:
+    """Sensor-frame returns (n, 3) farther than `radius` metres (horizontally) from the sensor."""
+    return points[np.hypot(points[:, 0], points[:, 1]) > radius]
+
+
+def moving_boxes(scene: Scene, timestamp: int) -> list[Box]:
+    """The boxes, at `timestamp`, of every track that ever moves in the scene: they leave no static points behind."""
+    boxes = (box_at(track, timestamp, scene.key_frame_interval) for track in scene.tracks if moves_at_all(track))
+    return [box for box in boxes if box is not None]
+
+
+def outside_boxes(points: np.ndarray, boxes: list[Box], margin: float) -> np.ndarray:
+    """Which world points (n, 3) lie outside all boxes grown by `margin` metres on every side: (n,) bool."""
+    outside = np.ones(len(points), dtype=bool)
+    for box in boxes:
+        near = np.flatnonzero(
+            np.linalg.norm(points - box.object_to_world[:3, 3], axis=1) < np.linalg.norm(box.size) / 2 + 2 * margin
+        )
+        in_box = apply(inverse(box.object_to_world), points[near])
+        outside[near[(np.abs(in_box) < box.size / 2 + margin).all(axis=1)]] = False
+    return outside
+
+
+def thin(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Indices (m,) of one point for every occupied voxel of edge `voxel` metres, in order; all for voxel 0."""
+    if voxel == 0 or len(points) == 0:
+        return np.arange(len(points))
+    cells = np.floor(points / voxel).astype(np.int64)
+    cells -= cells.min(axis=0)
+    spans = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
+    return np.sort(np.unique(keys, return_index=True)[1])

@@ -1,0 +1,38 @@
+"""The base of every settings record, and its errors in one line each.
+
+A stage's settings live beside the stage. Field comments are attribute docstrings, so that a reworded comment is no
+change of the code (see `drivesplat.rerun`).
+"""
+
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from drivesplat.errors import ConfigError
+
+S = TypeVar("S", bound="Settings")
+
+
+class Settings(BaseModel):
+    """Immutable settings: unknown keys are refused, field docstrings are the documentation."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, protected_namespaces=())
+
+
+def validated(model: type[S], values: dict[str, Any], where: str) -> S:
+    """`model` made from `values`.
+
+    Raises ConfigError: one line that names each offending key, with `where` before it, its value and what is allowed.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_sentence(item, where) for item in error.errors())) from None
+
+
+def _sentence(item: dict[str, Any], where: str) -> str:
+    key = where + ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return f"unknown key '{key}' (value {item['input']!r}): check its spelling against config.yaml"
+    message = item["msg"].removeprefix("Value error, ")
+    return f"'{key}' is {item['input']!r}: {message[:1].lower()}{message[1:]}"

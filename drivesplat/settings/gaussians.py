@@ -1,0 +1,28 @@
+"""How Gaussians start and learn."""
+
+from pydantic import Field
+
+from drivesplat.settings import Settings
+
+
+class GaussianSettings(Settings):
+    """How Gaussians start and how fast they learn; learning rates are gsplat's example's."""
+
+    sh_degree: int = Field(3, ge=0, le=3)
+    """Highest degree of the spherical harmonics that hold the colours."""
+    init_opacity: float = Field(0.5, gt=0, lt=1)
+    """Opacity of seed Gaussians."""
+    init_scale: float = Field(1.0, gt=0, le=10)
+    """Size of a seed Gaussian in units of the mean distance to its three neighbours."""
+    lr_means: float = Field(1.6e-4, gt=0)
+    """Learning rate of positions, times the scene's scale; decays exponentially to a hundredth."""
+    lr_scales: float = Field(5e-3, gt=0)
+    """Learning rate of log scales."""
+    lr_quats: float = Field(1e-3, gt=0)
+    """Learning rate of rotations."""
+    lr_opacities: float = Field(5e-2, gt=0)
+    """Learning rate of opacity logits."""
+    lr_sh0: float = Field(2.5e-3, gt=0)
+    """Learning rate of the colours' constant term."""
+    lr_shN: float = Field(1.25e-4, gt=0)
+    """Learning rate of the colours' view-dependent terms."""

@@ -1,0 +1,22 @@
+"""What is held out; the measuring protocol fixes the meaning."""
+
+from pydantic import Field, model_validator
+
+from drivesplat.settings import Settings
+
+
+class HoldoutSettings(Settings):
+    every_nth: int = Field(8, ge=0)
+    """Hold out the key frames i with i % every_nth == offset: group 'interpolation'. 0 = none."""
+    offset: int = Field(4, ge=0)
+    """See every_nth. 0 would hold out the first key frame, which nothing surrounds."""
+    last_block: int = Field(4, ge=0)
+    """Hold out the last so many key frames: group 'extrapolation'. 0 = none."""
+
+    @model_validator(mode="after")
+    def _offset_within_period(self) -> "HoldoutSettings":
+        if self.every_nth and self.offset >= self.every_nth:
+            raise ValueError(
+                f"offset must be under every_nth ({self.every_nth}), or no key frame would ever be held out"
+            )
+        return self

@@ -1,0 +1,92 @@
+"""The settings of a training."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from drivesplat.settings import Settings
+from drivesplat.settings.gaussians import GaussianSettings
+
+PartName = Literal["background"]
+SkyKind = Literal["none", "mask", "cubemap"]
+
+
+class McmcSettings(Settings):
+    """strategy: mcmc. 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024), gsplat's MCMCStrategy."""
+
+    noise_lr: float = Field(5e5, ge=0)
+    """Strength of the exploration noise on positions."""
+    min_opacity: float = Field(0.005, gt=0, lt=1)
+    """Gaussians below it are dead and are relocated."""
+    refine_every: int = Field(100, ge=1)
+    """Iterations between relocations."""
+
+
+class DefaultSettings(Settings):
+    """strategy: default. Densification by screen-space gradient (Kerbl et al. 2023), gsplat's DefaultStrategy."""
+
+    grow_grad2d: float = Field(2e-4, gt=0)
+    """Gaussians whose mean screen-space gradient exceeds it are split or duplicated."""
+    prune_opacity: float = Field(0.005, gt=0, lt=1)
+    """Gaussians below it are removed."""
+    absgrad: bool = False
+    """Use absolute gradients (needs a larger grow_grad2d, 8e-4 in gsplat's example; GPU only)."""
+    refine_every: int = Field(100, ge=1)
+    """Iterations between densifications."""
+    reset_every: int = Field(3000, ge=1)
+    """Iterations between resets of all opacities."""
+
+
+class FloaterSettings(Settings):
+    radius: float = Field(1.0, ge=0, le=10)
+    """Gaussians whose centre is nearer than this (metres) to the path of a training camera are faded out: the recording car drove there, so it is empty. 0 = off."""
+    every: int = Field(100, ge=1)
+    """Iterations between prunings."""
+
+
+class TrainSettings(Settings):
+    iterations: int = Field(30_000, ge=1, le=1_000_000)
+    """Optimisation steps, one image each."""
+    strategy: Literal["mcmc", "default"] = "mcmc"
+    """Densification: 'mcmc' or 'default'."""
+    cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
+    """Most Gaussians. Memory grows with it: about 1 GB per million, and as much again while rendering."""
+    gaussians: GaussianSettings = GaussianSettings()
+    mcmc: McmcSettings = McmcSettings()
+    default: DefaultSettings = DefaultSettings()
+    floaters: FloaterSettings = FloaterSettings()
+    refine_start: float = Field(0.0167, ge=0, le=1)
+    """Densification starts after this fraction of the iterations."""
+    refine_stop: float = Field(0.833, ge=0, le=1)
+    """Densification stops after this fraction of the iterations."""
+    sh_every: float = Field(0.0333, ge=0, le=1)
+    """The spherical harmonics gain a degree every so large a fraction of the iterations."""
+    ssim_weight: float = Field(0.2, ge=0, le=1)
+    """The colour loss is (1 - w) L1 + w (1 - SSIM)."""
+    opacity_reg: float = Field(0.01, ge=0)
+    """Weight of the mean opacity in the loss: what is not needed fades."""
+    scale_reg: float = Field(0.01, ge=0)
+    """Weight of the mean scale (metres) in the loss: what is large must earn it."""
+    sky_alpha_weight: float = Field(0.05, ge=0)
+    """Weight of -log(1 - alpha) on sky pixels (sky: mask or cubemap): no Gaussian in the sky."""
+    sky_resolution: int = Field(128, ge=2, le=2048)
+    """Texels along an edge of the sky's cube map."""
+    lr_sky: float = Field(1e-2, gt=0)
+    """Learning rate of the sky's colours (logits)."""
+    antialiased: bool = False
+    """Mip-Splatting's 2D filter instead of 3DGS's dilation."""
+    checkpoint_every: int = Field(5_000, ge=1)
+    """Iterations between resume checkpoints."""
+    log_every: int = Field(100, ge=1)
+    """Iterations between TensorBoard scalars, and between checks that all losses and gradients are finite."""
+    image_every: int = Field(5_000, ge=1)
+    """Iterations between TensorBoard images."""
+
+
+class TrainJob(Settings):
+    """Everything that decides the content of one checkpoint, its inputs aside."""
+
+    parts: tuple[PartName, ...]
+    sky: SkyKind
+    train: TrainSettings
+    random_seed: int

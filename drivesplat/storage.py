@@ -1,0 +1,144 @@
+"""Files that are either whole or absent: atomic writes, and readers that accept plain data only.
+
+Every writer writes beside its target, flushes to disk and renames. Every reader turns a truncated, foreign or unsafe
+file into a ResultError that names the file and the rule that rebuilds it.
+"""
+
+import hashlib
+import io
+import json
+import os
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from drivesplat.errors import ResultError
+
+_PLAIN_GLOBALS = {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy.core.numeric", "_frombuffer"),
+    ("numpy._core.numeric", "_frombuffer"),
+}
+
+
+def unreadable(path: str | Path, rule: str, why: str) -> ResultError:
+    """The one sentence for a file that cannot be used."""
+    return ResultError(f"{path}: {why}; delete it and rerun: the rule '{rule}' rebuilds it")
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
+    """A binary file that appears at `path` only once its content is complete and on disk.
+
+    Raises ResultError, naming `path`, where the disk is full or the folder cannot be written.
+    """
+    path = Path(path)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(aside, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+        _fsync_folder(path.parent)
+    except OSError as error:
+        raise ResultError(
+            f"{path}: cannot be written ({error.strerror or error}); free space or fix its permissions"
+        ) from error
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _fsync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def canonical_json(value: Any) -> str:
+    """The one spelling of `value`: sorted keys, no white space, no NaN."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def sha256_text(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def sha256_file(path: str | Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    text = json.dumps(value, indent=1, allow_nan=False)
+    with atomic_write(path) as file:
+        file.write(text.encode() + b"\n")
+
+
+def read_json(path: str | Path, rule: str) -> Any:
+    """The content of a JSON result. Raises ResultError naming `path` and `rule` where it is not whole."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            return json.load(file)
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise unreadable(path, rule, f"not a readable JSON file ({error})") from error
+
+
+def write_plain_pickle(path: str | Path, value: Any) -> None:
+    """Pickles plain containers and numpy arrays; refuses anything else with a TypeError."""
+    _require_plain(value)
+    with atomic_write(path) as file:
+        pickle.dump(value, file, protocol=4)
+
+
+def read_plain_pickle(path: str | Path, rule: str) -> Any:
+    """Reads what `write_plain_pickle` wrote.
+
+    Nothing in the file is executed: any global beyond numpy's own array constructors is refused before it is imported.
+    Raises ResultError naming `path` and `rule`.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise unreadable(path, rule, f"cannot be read ({error.strerror})") from error
+    try:
+        value = _PlainUnpickler(io.BytesIO(content)).load()
+        _require_plain(value)
+        return value
+    except Exception as error:  # a pickle can fail in any way: every one means "not our file"
+        raise unreadable(path, rule, f"not a pickle of plain data and arrays ({error})") from error
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Callable:
+        if (module, name) not in _PLAIN_GLOBALS:
+            raise pickle.UnpicklingError(f"it refers to {module}.{name}")
+        core = (
+            "numpy.core" if np.__version__.startswith("1.") else "numpy._core"
+        )  # numpy 1 and 2 name the same module differently
+        return super().find_class(module.replace("numpy._core", "numpy.core").replace("numpy.core", core), name)
+
+
+def _require_plain(value: Any) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _require_plain(key)
+            _require_plain(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            _require_plain(item)
+    elif isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError("an array of Python objects is not plain data")
+    elif not (value is None or isinstance(value, (bool, int, float, str, bytes))) or isinstance(value, np.generic):
+        raise TypeError(f"{type(value).__name__} is not plain data")

@@ -1,0 +1,86 @@
+"""Where an annotated object is at a time between its annotations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivesplat.rigid import interpolate
+from drivesplat.scene import Scene, Track
+
+MOVING_VEHICLE = 1.0
+"""Horizontal speed in m/s above which a vehicle counts as moving."""
+MOVING_HUMAN = 0.3
+"""Horizontal speed in m/s above which a person counts as moving."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A track at one time: `object_to_world` (4, 4), `size` (3,) length, width, height in metres, `speed` in m/s (horizontal)."""
+
+    track_id: str
+    category: str
+    size: np.ndarray
+    object_to_world: np.ndarray
+    speed: float
+    visibility: int
+
+    @property
+    def corners(self) -> np.ndarray:
+        """The eight corners (8, 3) in world coordinates; index bits 2, 1, 0 are the signs of x, y, z."""
+        signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        return (signs * self.size) @ self.object_to_world[:3, :3].T + self.object_to_world[:3, 3]
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves now, by the measuring protocol's threshold for its class (nothing else moves)."""
+        if self.category.startswith("vehicle."):
+            return self.speed > MOVING_VEHICLE
+        if self.category.startswith("human."):
+            return self.speed > MOVING_HUMAN
+        return False
+
+
+def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
+    """The box of `track` at `timestamp` (microseconds), or None where it is absent.
+
+    Between consecutive key frames that both hold the track the position is linear and the rotation slerps. Up to half an
+    `interval` (microseconds, the scene's key-frame interval) beyond an end, the end segment's motion continues; a single box
+    holds still. Where the annotation has a gap, the track ends before it and begins anew after it.
+    """
+    for first, last in _runs(track.sample_indices):
+        times = track.timestamps[first : last + 1]
+        reach = interval / 2.0
+        if not times[0] - reach <= timestamp <= times[-1] + reach:
+            continue
+        nearest = first + int(np.argmin(np.abs(times - timestamp)))
+        visibility = int(track.visibility[nearest])
+        if first == last:
+            return Box(track.id, track.category, track.size, track.object_to_world[first], 0.0, visibility)
+        segment = first + int(np.clip(np.searchsorted(times, timestamp, side="right") - 1, 0, last - first - 1))
+        start, end = track.object_to_world[segment], track.object_to_world[segment + 1]
+        duration = float(track.timestamps[segment + 1] - track.timestamps[segment])
+        pose = interpolate(start, end, (timestamp - track.timestamps[segment]) / duration)
+        speed = float(np.linalg.norm((end - start)[:2, 3])) / duration * 1e6
+        return Box(track.id, track.category, track.size, pose, speed, visibility)
+    return None
+
+
+def boxes_at(scene: Scene, timestamp: int) -> list[Box]:
+    """All boxes that are there at `timestamp` (microseconds)."""
+    boxes = (box_at(track, timestamp, scene.key_frame_interval) for track in scene.tracks)
+    return [box for box in boxes if box is not None]
+
+
+def moves_at_all(track: Track) -> bool:
+    """Whether a vehicle or person ever moves in this scene, by the same thresholds."""
+    times = track.timestamps
+    for first, last in _runs(track.sample_indices):
+        if any(box_at(track, int(time), 0.0).moves for time in times[first:last]):
+            return True
+    return False
+
+
+def _runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
+    """First and last position of every run of consecutive key frames."""
+    breaks = np.flatnonzero(np.diff(sample_indices) != 1)
+    return list(zip([0, *(breaks + 1)], [*breaks, len(sample_indices) - 1], strict=True))

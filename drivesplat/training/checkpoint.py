@@ -1,0 +1,125 @@
+"""Checkpoints: tensors and plain data only, whole or absent, resumed only by the training that wrote them."""
+
+import fcntl
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from drivesplat.errors import ResultError, TrainingError
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.storage import atomic_write, unreadable
+from drivesplat.training.densify import Densifier
+from drivesplat.training.optimizers import ModelOptimizers
+
+log = logging.getLogger(__name__)
+
+
+def save(path: Path, content: dict[str, Any]) -> None:
+    """Writes tensors and plain data, atomically."""
+    with atomic_write(path) as file:
+        torch.save(content, file)
+
+
+def load(path: Path, rule: str) -> dict[str, Any]:
+    """Reads what `save` wrote; nothing in the file is executed.
+
+    Raises ResultError naming the file and `rule` where it is truncated, foreign, or holds anything but tensors and plain data.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # zip, pickle and torch each fail in their own way
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise unreadable(path, rule, f"not a checkpoint of this workflow ({reason})") from error
+    if not isinstance(content, dict):
+        raise unreadable(path, rule, "not a checkpoint of this workflow (it holds no record)")
+    return content
+
+
+@contextmanager
+def sole_trainer(folder: Path) -> Iterator[None]:
+    """Keeps a second trainer out of `folder`; the kernel frees the lock when this process ends, however it ends.
+
+    Raises TrainingError naming the process that holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "lock", "a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.seek(0)
+            holder = file.read().strip() or "unknown"
+            raise TrainingError(
+                f"process {holder} is still training in {folder}; wait for it or end it (kill {holder}), then run again"
+            ) from None
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield
+
+
+def state_of(
+    model: SplatModel, optimizers: ModelOptimizers, densifiers: list[Densifier], device: torch.device
+) -> dict[str, Any]:
+    """All that decides how the training goes on."""
+    return {
+        "model": {key: value.detach() for key, value in model.state_dict().items()},
+        "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.all()},
+        "densifiers": [densifier.state for densifier in densifiers],
+        "random": torch.get_rng_state(),
+        "random_cuda": torch.cuda.get_rng_state(device) if device.type == "cuda" else None,
+    }
+
+
+def restore_model(model: SplatModel, state: dict[str, torch.Tensor]) -> None:
+    """Puts saved parameters into a model, whatever its number of Gaussians was."""
+    for name, value in state.items():
+        owner_name, _, key = name.rpartition(".")
+        owner = model.get_submodule(owner_name)
+        old = owner[key]
+        owner[key] = torch.nn.Parameter(value.to(old.device), requires_grad=old.requires_grad)
+
+
+def restore(
+    state: dict[str, Any],
+    model: SplatModel,
+    optimizers: ModelOptimizers,
+    densifiers: list[Densifier],
+    device: torch.device,
+) -> None:
+    """The inverse of `state_of`, in place."""
+    restore_model(model, state["model"])
+    parameters = [*((part.params, group) for part, group in zip(model.parts, optimizers.parts, strict=True))]
+    if model.sky is not None:
+        parameters.append((model.sky.params, optimizers.sky))
+    for params, group in parameters:
+        for key, optimizer in group.items():
+            optimizer.param_groups[0]["params"] = [params[key]]
+    for name, optimizer in optimizers.all():
+        optimizer.load_state_dict(state["optimizers"][name])
+    for densifier, saved in zip(densifiers, state["densifiers"], strict=True):
+        densifier.state = {
+            key: value.to(device) if isinstance(value, torch.Tensor) else value for key, value in saved.items()
+        }
+    torch.set_rng_state(state["random"])
+    if device.type == "cuda" and state["random_cuda"] is not None:
+        torch.cuda.set_rng_state(state["random_cuda"], device)
+
+
+def resumable(path: Path, fingerprint: str) -> dict[str, Any] | None:
+    """The resume state at `path` if this training wrote it; None, with a message, where there is none or it is another's."""
+    if not path.exists():
+        return None
+    try:
+        content = load(path, rule="train")
+    except ResultError as error:
+        log.warning("%s: training starts at 0", error)
+        return None
+    if content.get("fingerprint") != fingerprint:
+        log.warning("%s belongs to other settings, code or inputs: training starts at 0", path)
+        return None
+    return content

@@ -1,0 +1,65 @@
+"""What a training tells while it runs: TensorBoard, a progress bar, and a halt where numbers stop being numbers."""
+
+import sys
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from drivesplat.errors import TrainingError
+from drivesplat.model.splat_model import Picture
+from drivesplat.training.views import TrainingView
+
+
+class FiniteGuard:
+    """Remembers, on the device and without waiting for it, the first iteration at which each term was not finite."""
+
+    def __init__(self, device: torch.device):
+        self._device = device
+        self._first: dict[str, Tensor] = {}
+
+    def watch(self, step: int, terms: dict[str, Tensor]) -> None:
+        for name, value in terms.items():
+            first = self._first.get(name)
+            if first is None:
+                first = self._first[name] = torch.full((), -1, dtype=torch.long, device=self._device)
+            bad = ~torch.isfinite(value.detach()) & (first < 0)
+            first.masked_fill_(bad, step)
+
+    def check(self, checkpoint: str) -> None:
+        """Raises TrainingError naming the earliest iteration and its terms where one was not finite."""
+        found = sorted((int(first), name) for name, first in self._first.items() if int(first) >= 0)
+        if found:
+            step = found[0][0]
+            names = ", ".join(name for at, name in found if at == step)
+            raise TrainingError(
+                f"iteration {step + 1}: {names} is not finite; the last good checkpoint is kept ({checkpoint}); "
+                "lower the learning rates (train.gaussians.lr_*) or raise train.mcmc.min_opacity"
+            )
+
+
+class Monitor:
+    """Scalars and images into a TensorBoard folder, a progress bar where a terminal looks."""
+
+    def __init__(self, folder: Path, iterations: int, start: int, label: str):
+        self._writer = SummaryWriter(str(folder), purge_step=start or None)
+        self._bar = tqdm(
+            total=iterations, initial=start, desc=label, unit="it", disable=not sys.stderr.isatty(), mininterval=1.0
+        )
+
+    def scalars(self, step: int, values: dict[str, float], advanced: int) -> None:
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+        self._bar.update(advanced)
+        self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
+
+    def image(self, step: int, view: TrainingView, picture: Picture) -> None:
+        """Recorded and rendered side by side."""
+        pair = torch.cat([view.target(), picture.image.detach().clamp(0.0, 1.0)], dim=1)
+        self._writer.add_image("recorded_and_rendered", pair.cpu(), step, dataformats="HWC")
+
+    def close(self) -> None:
+        self._bar.close()
+        self._writer.close()

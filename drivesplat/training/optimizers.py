@@ -1,0 +1,54 @@
+"""Adam for every parameter of a model, one optimizer each, as gsplat's strategies need it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.training.densify import Optimizers
+
+MEANS_DECAY = 0.01
+"""Positions learn at the end at this fraction of their initial rate."""
+
+
+@dataclass
+class ModelOptimizers:
+    """`parts[i]` belongs to part i of the model, `sky` to its sky."""
+
+    parts: list[Optimizers]
+    sky: Optimizers
+
+    def all(self) -> list[tuple[str, torch.optim.Optimizer]]:
+        return [
+            *((f"{i}.{k}", o) for i, group in enumerate(self.parts) for k, o in group.items()),
+            *((f"sky.{k}", o) for k, o in self.sky.items()),
+        ]
+
+    def step(self) -> None:
+        for _, optimizer in self.all():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+
+def make_optimizers(model: SplatModel) -> ModelOptimizers:
+    return ModelOptimizers(
+        parts=[_adams(part.params, part.learning_rates()) for part in model.parts],
+        sky=_adams(model.sky.params, model.sky.learning_rates()) if model.sky is not None else {},
+    )
+
+
+def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
+    fused = next(iter(params.values())).is_cuda
+    return {
+        name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15, fused=fused)
+        for name, rate in rates.items()
+        if params[name].requires_grad
+    }
+
+
+def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, iterations: int) -> None:
+    """Sets the learning rates of `step`: positions decay exponentially, the rest stay."""
+    for part, group in zip(model.parts, optimizers.parts, strict=True):
+        if "means" in group:
+            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * MEANS_DECAY ** (step / iterations)

@@ -1,0 +1,186 @@
+"""The stage `train`: Gaussians fitted to the training images of a scene."""
+
+import logging
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from drivesplat.device import device_name, out_of_memory
+from drivesplat.errors import TrainingError
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training import checkpoint
+from drivesplat.training.densify import Densifier
+from drivesplat.training.floaters import camera_path, fade_floaters
+from drivesplat.training.losses import loss_terms
+from drivesplat.training.monitor import FiniteGuard, Monitor
+from drivesplat.training.optimizers import ModelOptimizers, make_optimizers, schedule
+from drivesplat.training.views import TrainingView, order
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Where a training keeps what outlives it: `resume` (a folder no rule declares), `tensorboard`; `fingerprint` of settings, code and inputs."""
+
+    resume: Path
+    tensorboard: Path
+    fingerprint: str
+    label: str
+
+    @property
+    def state(self) -> Path:
+        return self.resume / "state.pt"
+
+
+@dataclass
+class Trainer:
+    """A training between two iterations."""
+
+    model: SplatModel
+    views: list[TrainingView]
+    settings: TrainSettings
+    seed: int
+    device: torch.device
+    optimizers: ModelOptimizers
+    densifiers: list[Densifier]
+    guard: FiniteGuard
+    step: int = 0
+
+    @classmethod
+    def begin(
+        cls,
+        model: SplatModel,
+        views: list[TrainingView],
+        settings: TrainSettings,
+        seed: int,
+        scene_scale: float,
+        device: torch.device,
+    ) -> "Trainer":
+        torch.manual_seed(seed)
+        densifiers = [Densifier(part, settings, scene_scale) for part in model.parts]
+        return cls(model, views, settings, seed, device, make_optimizers(model), densifiers, FiniteGuard(device))
+
+    def advance(self) -> tuple[dict[str, torch.Tensor], Any, TrainingView]:
+        """One iteration: render a view, compare, step, densify. Returns its loss terms, picture and view."""
+        view = self.views[order(len(self.views), self.step, self.seed)]
+        schedule(self.model, self.optimizers, self.step, self.settings.iterations)
+        picture = self.model.render(view.view, self.sh_degree(), absgrad=self.densifiers[0].absgrad)
+        terms = loss_terms(picture, view, self.model, self.settings)
+        for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
+            densifier.before_backward(self.step, optimizers, picture.info)
+        torch.stack(list(terms.values())).sum().backward()
+        self.guard.watch(
+            self.step, {**{f"loss {name}": value for name, value in terms.items()}, **self._gradient_norms()}
+        )
+        self.optimizers.step()
+        for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
+            densifier.after_step(self.step, optimizers, picture.info)
+        self.step += 1
+        return terms, picture, view
+
+    def sh_degree(self) -> int:
+        every = max(1, int(self.settings.sh_every * self.settings.iterations))
+        return min(self.step // every, self.settings.gaussians.sh_degree)
+
+    def _gradient_norms(self) -> dict[str, torch.Tensor]:
+        named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
+        norms = torch._foreach_norm([gradient for _, gradient in named])
+        return {f"gradient of {name.rpartition('.')[2]}": norm for (name, _), norm in zip(named, norms, strict=True)}
+
+
+@dataclass(frozen=True)
+class TrainingSummary:
+    """What `train.json` says of a finished training. `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too."""
+
+    iterations: int
+    seconds: float
+    gaussians: int
+    peak_gpu_memory_gb: float | None
+    device: str
+    random_seed: int
+    resumed_at: list[int]
+
+
+def train(
+    model: SplatModel, views: list[TrainingView], settings: TrainSettings, seed: int, scene_scale: float, device: torch.device, workspace: Workspace
+) -> TrainingSummary:  # fmt: skip
+    """Fits `model` in place, resuming where an earlier run of the same training was ended.
+
+    Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's memory is
+    exhausted. The last good checkpoint survives both.
+    """
+    model.to(device)
+    trainer = Trainer.begin(model, views, settings, seed, scene_scale, device)
+    saved = checkpoint.resumable(workspace.state, workspace.fingerprint)
+    seconds, resumed_at = 0.0, []
+    if saved is not None:
+        checkpoint.restore(saved["state"], model, trainer.optimizers, trainer.densifiers, device)
+        trainer.step, seconds, resumed_at = saved["step"], saved["seconds"], [*saved["resumed_at"], saved["step"]]
+        log.info("resuming at iteration %d of %d", trainer.step, settings.iterations)
+    else:
+        shutil.rmtree(workspace.tensorboard, ignore_errors=True)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    monitor = Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label)
+    began = time.monotonic()
+
+    def save() -> None:
+        trainer.guard.check(str(workspace.state))
+        so_far = seconds + time.monotonic() - began
+        content = {
+            "fingerprint": workspace.fingerprint,
+            "step": trainer.step,
+            "seconds": so_far,
+            "resumed_at": resumed_at,
+        }
+        checkpoint.save(
+            workspace.state,
+            {**content, "state": checkpoint.state_of(model, trainer.optimizers, trainer.densifiers, device)},
+        )
+
+    try:
+        _iterate(trainer, monitor, str(workspace.state), save)
+    except torch.cuda.OutOfMemoryError:
+        raise out_of_memory(len(model)) from None
+    finally:
+        monitor.close()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    peak = torch.cuda.max_memory_allocated(device) / 1e9 if device.type == "cuda" else None
+    return TrainingSummary(
+        trainer.step, seconds + time.monotonic() - began, len(model), peak, device_name(device), seed, resumed_at
+    )
+
+
+def _iterate(trainer: Trainer, monitor: Monitor, checkpoint_path: str, save: Callable[[], None]) -> None:
+    settings = trainer.settings
+    starts, ends = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
+    while trainer.step < settings.iterations:
+        terms, picture, view = trainer.advance()
+        if settings.floaters.radius and trainer.step % settings.floaters.every == 0:
+            for part in trainer.model.parts:
+                fade_floaters(part, starts, ends, settings.floaters.radius)
+        if trainer.step % settings.log_every == 0:
+            trainer.guard.check(checkpoint_path)
+            if len(trainer.model) == 0:
+                raise TrainingError(
+                    f"iteration {trainer.step}: no Gaussian is left; lower train.opacity_reg or the pruning thresholds"
+                )
+            monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
+        if trainer.step % settings.image_every == 0:
+            monitor.image(trainer.step, view, picture)
+        if trainer.step % settings.checkpoint_every == 0 and trainer.step < settings.iterations:
+            save()
+    trainer.guard.check(checkpoint_path)
+
+
+def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
+    losses = {f"loss/{name}": float(value.detach()) for name, value in terms.items()}
+    return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model))}

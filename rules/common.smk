@@ -1,0 +1,46 @@
+# The config, validated; refusals before any job; the one way by which rules get settings and code digests.
+#
+# A rule's `params` are its settings (canonical JSON of its own subtree, defaults filled in) and the digest of its code.
+# Snakemake compares nothing else of them, so key order, comments and other stages' settings never rerun anything.
+import os
+import sys
+
+from snakemake.cli import get_argument_parser
+from snakemake.utils import validate
+
+sys.path.insert(0, workflow.basedir)
+os.environ["PYTHONPATH"] = os.pathsep.join([workflow.basedir, *filter(None, [os.environ.get("PYTHONPATH")])])
+
+from drivesplat.errors import DriveSplatError
+from drivesplat.planning import Plan
+
+asked = get_argument_parser().parse_known_args()[0]
+
+try:
+    plan = Plan(config, workflow.basedir)
+    if workflow.is_main_process and not asked.lint:
+        plan.refuse_unknown(asked.targets)
+        plan.refuse_absent_data(asked.targets)
+except DriveSplatError as error:
+    sys.exit(f"drivesplat: {error}")
+
+validate(config, os.path.join(workflow.basedir, "config.schema.json"), set_default=False)
+
+
+pathvars:
+    results=plan.config.results_dir,
+    logs=f"{plan.config.results_dir}/logs",
+    benchmarks=f"{plan.config.results_dir}/benchmarks",
+
+
+wildcard_constraints:
+    scene=plan.known(plan.config.scenes),
+    method=plan.known(plan.config.methods),
+
+
+onstart:
+    if workflow.is_main_process:
+        try:
+            plan.hold_results()
+        except DriveSplatError as error:
+            sys.exit(f"drivesplat: {error}")

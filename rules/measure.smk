@@ -1,0 +1,78 @@
+# What a trained method is worth on the images it has not seen.
+#
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, parser.pkl, masks/.
+# OUTPUTS: <results>/{scene}/{method}/eval.json, <results>/{scene}/metrics.json; resources/lpips/backbone.json.
+
+
+rule lpips_backbone:
+    """
+    Fetches LPIPS's AlexNet backbone once, or takes the file that lies there; where neither works LPIPS is null with
+    the reason, and the run goes on.
+    """
+    input:
+        file=plan.backbone_file,
+    output:
+        record="<resources>/lpips/backbone.json",
+    params:
+        settings=plan.config.lpips.model_dump_json(),
+        code=plan.code("lpips_backbone"),
+    log:
+        "<logs>/lpips_backbone.log",
+    benchmark:
+        "<benchmarks>/lpips_backbone.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    script:
+        "../workflow_scripts/lpips_backbone.py"
+
+
+rule evaluate:
+    """
+    Renders the held-out images of the evaluated camera and measures PSNR, SSIM and LPIPS over static and moving pixels.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        summary="<results>/{scene}/{method}/train.json",
+        parser="<results>/{scene}/parser.pkl",
+        masks="<results>/{scene}/masks/masks.json",
+        lpips=plan.lpips_record,
+    output:
+        metrics="<results>/{scene}/{method}/eval.json",
+    params:
+        settings=plan.settings("evaluate"),
+        code=plan.code("evaluate"),
+    log:
+        "<logs>/{scene}/{method}/evaluate.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/evaluate.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 4
+    resources:
+        gpu=1,
+        device=plan.device(),
+        mem_mb=8000,
+        runtime=30,
+    script:
+        "../workflow_scripts/evaluate.py"
+
+
+rule scene_metrics:
+    """
+    Puts all methods of a scene side by side.
+    """
+    input:
+        evals=expand("<results>/{{scene}}/{method}/eval.json", method=plan.config.methods),
+    output:
+        metrics="<results>/{scene}/metrics.json",
+    params:
+        settings=plan.settings("scene_metrics"),
+        code=plan.code("scene_metrics"),
+    log:
+        "<logs>/{scene}/metrics.log",
+    benchmark:
+        "<benchmarks>/{scene}/metrics.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    script:
+        "../workflow_scripts/scene_metrics.py"

@@ -1,0 +1,104 @@
+# From a dataset's tables to what a training needs.
+#
+# REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
+# OUTPUTS: <results>/{scene}/scene.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it).
+
+
+rule extract:
+    """
+    Reads the dataset's tables once and checks them: cameras, LiDAR sweeps and object tracks in one world frame,
+    every image with the ego pose of its own timestamp.
+    """
+    input:
+        tables=plan.tables,
+    output:
+        scene="<results>/{scene}/scene.json",
+    params:
+        settings=plan.settings("extract"),
+        code=plan.code("extract"),
+    log:
+        "<logs>/{scene}/extract.log",
+    benchmark:
+        "<benchmarks>/{scene}/extract.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=8000,
+        runtime=30,
+    script:
+        "../workflow_scripts/extract.py"
+
+
+rule lidar_seed:
+    """
+    Starts the Gaussians where LiDAR of the training key frames found something that stands still, coloured from
+    training images, with random far points along pixels that LiDAR does not reach.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+        points_file=plan.points_file,
+    output:
+        seed="<results>/{scene}/seed.ply",
+    params:
+        settings=plan.settings("lidar_seed"),
+        code=plan.code("lidar_seed"),
+    log:
+        "<logs>/{scene}/lidar_seed.log",
+    benchmark:
+        "<benchmarks>/{scene}/lidar_seed.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=8000,
+        runtime=30,
+    script:
+        "../workflow_scripts/lidar_seed.py"
+
+
+rule parser:
+    """
+    Packs cameras, splits and seed into the dict that users of gsplat's example trainer will recognise.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+        seed="<results>/{scene}/seed.ply",
+    output:
+        parser="<results>/{scene}/parser.pkl",
+    params:
+        settings=plan.settings("parser"),
+        code=plan.code("parser"),
+    log:
+        "<logs>/{scene}/parser.log",
+    benchmark:
+        "<benchmarks>/{scene}/parser.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=10,
+    script:
+        "../workflow_scripts/parser.py"
+
+
+rule masks:
+    """
+    Labels every pixel of every image: static, parked, moving, left out (from the annotated boxes), and sky.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+    output:
+        masks="<results>/{scene}/masks/masks.json",
+    params:
+        settings=plan.settings("masks"),
+        code=plan.code("masks"),
+    log:
+        "<logs>/{scene}/masks.log",
+    benchmark:
+        "<benchmarks>/{scene}/masks.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    script:
+        "../workflow_scripts/masks.py"

@@ -1,0 +1,34 @@
+# The training of one method on one scene.
+#
+# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json.
+# OUTPUTS: <results>/{scene}/{method}/checkpoint.pt and train.json; tensorboard/ beside them. While it runs,
+# resume/ holds what a killed training goes on from; no rule declares it, so that Snakemake leaves it alone.
+
+
+rule train:
+    """
+    Fits Gaussians to the training images; resumes where a run of the same settings, code and inputs was ended.
+    """
+    input:
+        parser="<results>/{scene}/parser.pkl",
+        masks="<results>/{scene}/masks/masks.json",
+    output:
+        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        summary="<results>/{scene}/{method}/train.json",
+    params:
+        settings=plan.settings("train"),
+        code=plan.code("train"),
+    log:
+        "<logs>/{scene}/{method}/train.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/train.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 8
+    resources:
+        gpu=1,
+        device=plan.device(),
+        mem_mb=16000,
+        runtime=240,
+    script:
+        "../workflow_scripts/train.py"

@@ -1,0 +1,16 @@
+"""Tables into scene.json."""
+
+import dataclasses
+from pathlib import Path
+
+from drivesplat.extract import extract_scene
+from drivesplat.job import job
+from drivesplat.provenance import digests_of
+from drivesplat.scene import write_scene
+from drivesplat.settings.extract import SceneSource
+
+with job(snakemake) as current:
+    tables = current.input.tables
+    scene = extract_scene(current.settings(SceneSource), Path(tables[0]).parents[1])
+    provenance = current.provenance(inputs={"tables": digests_of(tables)})
+    write_scene(current.output.scene, dataclasses.replace(scene, provenance=provenance))

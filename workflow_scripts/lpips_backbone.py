@@ -1,0 +1,12 @@
+"""LPIPS's backbone into resources/lpips, and a record of it."""
+
+from pathlib import Path
+
+from drivesplat.evaluation.backbone import provide_backbone
+from drivesplat.job import job
+from drivesplat.planning import BACKBONE
+from drivesplat.settings.evaluate import LpipsSettings
+from drivesplat.storage import write_json
+
+with job(snakemake) as current:
+    write_json(current.output.record, provide_backbone(current.settings(LpipsSettings), Path(BACKBONE)))
