@@ -41,7 +41,10 @@ class DatasetSettings(Settings):
     scenes: tuple[str, ...] = MINI_SCENES
     """Scene numbers, quoted: bare YAML would read an octal number."""
     frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
-    """Per scene a range of key frames [first, last + 1) to use, which are then counted from 0. Others are used whole."""
+    """Per scene a range of key frames [first, last + 1) to use, which are then counted from 0.
+
+    Others are used whole.
+    """
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings of this file that differ for this dataset, as a tree: {images: {width: 800}}."""
 
@@ -52,7 +55,8 @@ class DatasetSettings(Settings):
             if not isinstance(scene, str):
                 octal = f'"{scene:04o}" or ' if isinstance(scene, int) else ""
                 raise ValueError(
-                    f'scene numbers are strings: put {octal}"{scene:0>4}" in quotes, since bare YAML reads 0061 as octal 49'
+                    f'scene numbers are strings: put {octal}"{scene:0>4}" in quotes, '
+                    "since bare YAML reads 0061 as octal 49"
                 )
         return value
 
@@ -91,7 +95,7 @@ class Config(Settings):
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
     """Behind the Gaussians: 'cubemap' (learned, by direction), 'mask' (one learned colour, Gaussians kept out of sky
-    pixels) or 'none' (black). On nuScenes the cube map does best: without one Gaussians fill the sky and fall into view."""
+    pixels) or 'none' (black). The cube map does best on nuScenes: without one, Gaussians fill the sky."""
     train: TrainSettings = TrainSettings()
     render: RenderSettings = RenderSettings()
     lpips: LpipsSettings = LpipsSettings()
@@ -130,7 +134,8 @@ class Config(Settings):
             if scene in dataset.scenes:
                 return name
         raise ConfigError(
-            f"scene {scene!r} is not in the config; there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
+            f"scene {scene!r} is not in the config; "
+            f"there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
         )
 
 

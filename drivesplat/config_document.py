@@ -36,7 +36,10 @@ def config_schema() -> str:
     schema = {"$schema": DIALECT, **Config.model_json_schema(mode="validation")}
     device = schema["properties"]["device"]
     kinds = schema["$defs"]["DeviceSettings"]["properties"]["kind"]["enum"]
-    schema["properties"]["device"] = {"anyOf": [{"$ref": device["$ref"]}, {"enum": kinds}], "default": device["default"]}
+    schema["properties"]["device"] = {
+        "anyOf": [{"$ref": device["$ref"]}, {"enum": kinds}],
+        "default": device["default"],
+    }
     return json.dumps(schema, indent=1) + "\n"
 
 

@@ -10,8 +10,8 @@ from drivesplat.settings.device import DeviceSettings
 def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) -> Any:
     """The torch device to train or render on; `min_free_gb` stands in for the setting of that name where given.
 
-    Raises DeviceError, saying what to do, where there is no usable GPU (unless `cpu` was written), gsplat is not importable or
-    cannot run on it, or too little memory is free.
+    Raises DeviceError, saying what to do, where there is no usable GPU (unless `cpu` was written), gsplat is not
+    importable or cannot run on it, or too little memory is free.
     """
     import torch
 
@@ -24,7 +24,8 @@ def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) ->
             else "sees no GPU (driver missing or too old?)"
         )
         raise DeviceError(
-            f"no usable GPU: torch {torch.__version__} {build}; fix that, or write device: cpu (very slow on real scenes)"
+            f"no usable GPU: torch {torch.__version__} {build}; "
+            "fix that, or write device: cpu (very slow on real scenes)"
         )
     free_gb = torch.cuda.mem_get_info()[0] / 1e9
     name = torch.cuda.get_device_name()
@@ -43,11 +44,13 @@ def _require_gsplat() -> None:
         from gsplat.cuda._backend import _C
     except Exception as error:  # its just-in-time build can fail in any way
         raise DeviceError(
-            f"gsplat cannot be loaded ({type(error).__name__}: {error}); reinstall it for this torch and CUDA, or write device: cpu"
+            f"gsplat cannot be loaded ({type(error).__name__}: {error}); "
+            "reinstall it for this torch and CUDA, or write device: cpu"
         ) from error
     if _C is None:
         raise DeviceError(
-            "gsplat is not compiled and there is no CUDA toolkit (nvcc) to compile it with; install the toolkit that matches torch, or write device: cpu"
+            "gsplat is not compiled and there is no CUDA toolkit (nvcc) to compile it with; "
+            "install the toolkit that matches torch, or write device: cpu"
         )
 
 
@@ -67,5 +70,6 @@ def out_of_memory(gaussians: int) -> DeviceError:
     peak = torch.cuda.max_memory_allocated() / 1e9 if torch.cuda.is_available() else 0.0
     gc.collect()
     return DeviceError(
-        f"out of GPU memory with {gaussians:,} Gaussians (peak {peak:.1f} GB): lower train.cap_max, then images.width, then the number of cameras or sweeps"
+        f"out of GPU memory with {gaussians:,} Gaussians (peak {peak:.1f} GB): lower train.cap_max, then "
+        "images.width, then the number of cameras or sweeps"
     )

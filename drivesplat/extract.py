@@ -33,13 +33,17 @@ def extract_scene(source: SceneSource, root: Path) -> Scene:
     kept = tuple(frame for frame, fault in zip(scene.frames, faults, strict=True) if not fault)
     if not kept:
         raise DatasetError(
-            f"scene {source.scene}: none of its {len(scene.frames)} images can be read (first: {scene.frames[0].image_path})"
+            f"scene {source.scene}: none of its {len(scene.frames)} images can be read (first: "
+            f"{scene.frames[0].image_path})"
         )
     return dataclasses.replace(scene, dataset=source.dataset, frames=kept, missing_images=len(scene.frames) - len(kept))
 
 
 def image_fault(frame: Frame) -> str | None:
-    """What is wrong with a frame's image file, or None. Decodes it, at reduced size, since a truncated JPEG opens well."""
+    """What is wrong with a frame's image file, or None.
+
+    Decodes it, at reduced size, since a truncated JPEG opens well.
+    """
     path = Path(frame.image_path)
     if not path.is_file():
         return f"image {path} is missing"

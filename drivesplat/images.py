@@ -46,7 +46,10 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """A label image (h, w) uint8, brought to `size` (width, height) by nearest neighbour. Raises DatasetError naming the path."""
+    """A label image (h, w) uint8, brought to `size` (width, height) by nearest neighbour.
+
+    Raises DatasetError naming the path.
+    """
     try:
         with Image.open(path) as image:
             labels = np.asarray(image if image.mode in ("L", "P") else image.convert("L"))

@@ -1,8 +1,8 @@
 """The stage `masks`: what is static, moving or sky in every image, as PNGs that a person can look at.
 
-masks/masks.json                          what was made, from what
-masks/regions/{camera}/{timestamp}.png    labels of `drivesplat.regions.LABELS`
-masks/sky/{camera}/{timestamp}.png        255 where the sky is
+- masks/masks.json: what was made, from what
+- masks/regions/{camera}/{timestamp}.png: labels of `drivesplat.regions.LABELS`
+- masks/sky/{camera}/{timestamp}.png: 255 where the sky is
 """
 
 import logging
@@ -68,12 +68,18 @@ def read_masks_record(folder: Path) -> dict[str, Any]:
 
 
 def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
-    """The sky (h, w) bool of an image at `size` (width, height). Raises ResultError where the mask is missing or unreadable."""
+    """The sky (h, w) bool of an image at `size` (width, height).
+
+    Raises ResultError where the mask is missing or unreadable.
+    """
     return _made_mask(folder, "sky", camera, timestamp, size) > 127
 
 
 def read_labels(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
-    """The label image (h, w) of an image at `size` (width, height). Raises ResultError where it is missing or unreadable."""
+    """The label image (h, w) of an image at `size` (width, height).
+
+    Raises ResultError where it is missing or unreadable.
+    """
     return _made_mask(folder, "regions", camera, timestamp, size)
 
 
@@ -98,7 +104,8 @@ def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) ->
         labels = _users_mask(job.masks.regions_folder, frame, size).copy()
         if labels.max() > max(LABELS.values()):
             raise DatasetError(
-                f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; they end at {max(LABELS.values())}"
+                f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; "
+                f"they end at {max(LABELS.values())}"
             )
     else:
         labels = label_image(scene, frame, size)

@@ -1,7 +1,7 @@
 """The stage `parser`: what a trainer needs of a scene, in one pickle of plain containers and arrays.
 
-The dict has the keys that users of gsplat's example trainer will recognise. Frames: world (metres, z up), OpenCV cameras;
-`Ks` in the continuous pixel convention at `image_sizes`, the size at which images are trained and measured.
+The dict has the keys that users of gsplat's example trainer will recognise. Frames: world (metres, z up), OpenCV
+cameras; `Ks` in the continuous pixel convention at `image_sizes`, the size at which images are trained and measured.
 """
 
 from pathlib import Path
@@ -18,17 +18,19 @@ from drivesplat.settings.parser import ParserJob
 from drivesplat.storage import read_plain_pickle, unreadable
 
 _KEYS = {
-    "Ks", "camtoworlds", "image_paths", "image_names", "image_sizes", "camera_names", "camera_indices", "timestamps", "sample_indices",
-    "is_key_frame", "points", "points_rgb", "scene_scale", "splits", "held_out_frames", "scene",
+    "Ks", "camtoworlds", "image_paths", "image_names", "image_sizes", "camera_names", "camera_indices", "timestamps",
+    "sample_indices", "is_key_frame", "points", "points_rgb", "scene_scale", "splits",
+    "held_out_frames", "scene", "seed",
 }  # fmt: skip
 
 
 def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any]:
     """The training record of a scene with N images and P seed points.
 
-    `Ks` (N, 3, 3), `camtoworlds` (N, 4, 4), `image_sizes` (N, 2) width and height, `camera_indices` (N,) into `camera_names`,
-    `timestamps` (N,) microseconds, `points` (P, 3), `points_rgb` (P, 3) uint8, `scene_scale` metres (the farthest training
-    camera from their mean), `splits`: indices of images by group. Raises DatasetError where no training image is left.
+    `Ks` (N, 3, 3), `camtoworlds` (N, 4, 4), `image_sizes` (N, 2) width and height, `camera_indices` (N,) of cameras,
+    `timestamps` (N,) microseconds, `points` (P, 3), `points_rgb` (P, 3) uint8, `scene_scale` metres (the farthest
+    training camera from their mean), `splits`: indices of images by group. Raises DatasetError where no training image
+    is left.
     """
     frames = scene.frames
     sizes = [target_size(frame, job.images) for frame in frames]
@@ -39,7 +41,8 @@ def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any
     }
     if len(splits["train"]) == 0:
         raise DatasetError(
-            f"scene {scene.name}: no training image is left; hold out fewer key frames (holdout.every_nth, holdout.last_block)"
+            f"scene {scene.name}: no training image is left; "
+            "hold out fewer key frames (holdout.every_nth, holdout.last_block)"
         )
     camera_to_world = np.stack([frame.camera_to_world for frame in frames])
     centers = camera_to_world[splits["train"], :3, 3]

@@ -92,7 +92,7 @@ class Plan:
         }
 
     def refuse_unknown(self, targets: list[str]) -> None:
-        """Raises ConfigError, listing what there is, where a target names a scene or method that the config does not."""
+        """Raises ConfigError, listing what there is, where a target names a scene or method the config does not."""
         for target in targets:
             if not target.startswith(f"{self.config.results_dir}/"):
                 continue
@@ -122,7 +122,10 @@ class Plan:
         return named
 
     def hold_results(self) -> None:
-        """Keeps a second run out of the results folder until this process ends, however it ends. Raises DriveSplatError."""
+        """Keeps a second run out of the results folder until this process ends, however it ends.
+
+        Raises DriveSplatError.
+        """
         folder = Path(self.config.results_dir)
         folder.mkdir(parents=True, exist_ok=True)
         self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)

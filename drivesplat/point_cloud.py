@@ -50,7 +50,10 @@ def read_ply(path: str | Path, rule: str) -> PointCloud:
 
 
 def read_positions(path: str | Path) -> np.ndarray:
-    """The vertex positions (n, 3) float64 of any PLY file. Raises OSError, PlyParseError, KeyError or ValueError where it is none."""
+    """The vertex positions (n, 3) float64 of any PLY file.
+
+    Raises OSError, PlyParseError, KeyError or ValueError where it is none.
+    """
     return _columns(PlyData.read(str(path))["vertex"], ("x", "y", "z"), "f8")
 
 

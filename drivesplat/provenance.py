@@ -1,4 +1,4 @@
-"""Where a result comes from: the settings, code and inputs of every stage behind it, carried along from stage to stage."""
+"""Where a result comes from: settings, code and inputs of every stage behind it, carried from stage to stage."""
 
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
@@ -16,8 +16,8 @@ def provenance(
 ) -> dict[str, Any]:
     """The provenance of a result of `stage`, given those of the results it was made from.
 
-    `inputs` are digests of files that no stage made (tables, a user's points file), by name. Raises ResultError where two
-    results behind it were made by the same stage in different ways.
+    `inputs` are digests of files that no stage made (tables, a user's points file), by name. Raises ResultError where
+    two results behind it were made by the same stage in different ways.
     """
     merged = combine(upstream)
     merged["stages"][stage] = {"settings": settings, "code": code}

@@ -17,9 +17,9 @@ REGIONS = ("static", "vehicle", "moving_vehicle")
 def gap_report(paths: list[str], expected: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The content of gap_report.json from the metrics.json files of measured scenes.
 
-    `expected` gives for every configured scene the settings and code its metrics should come from: a result made otherwise,
-    or measured under another protocol than the first, is left out and named under `left_out`. `missing` names the
-    configured scenes without a result.
+    `expected` gives for every configured scene the settings and code its metrics should come from: a result made
+    otherwise, or measured under another protocol than the first, is left out and named under `left_out`. `missing`
+    names the configured scenes without a result.
     """
     rows: list[dict[str, Any]] = []
     left_out: list[dict[str, str]] = []

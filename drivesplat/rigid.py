@@ -28,7 +28,10 @@ def apply(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def interpolate(start: np.ndarray, end: np.ndarray, fraction: float) -> np.ndarray:
-    """The pose (4, 4) at `fraction` between two poses: linear position, slerp rotation. Outside [0, 1] the motion continues."""
+    """The pose (4, 4) at `fraction` between two poses: linear position, slerp rotation.
+
+    Outside [0, 1] the motion continues.
+    """
     turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
     rotation = start[:3, :3] @ Rotation.from_rotvec(fraction * turn).as_matrix()
     return rigid(rotation, (1.0 - fraction) * start[:3, 3] + fraction * end[:3, 3])

@@ -50,8 +50,9 @@ class Sweep:
 class Track:
     """One annotated object over time.
 
-    `size` (3,) is length, width, height in metres. Per annotation: `timestamps` (n,), `sample_indices` (n,), increasing;
-    `object_to_world` (n, 4, 4); `visibility` (n,): 1 (0-40 %) to 4 (80-100 %), 0 where the dataset does not say.
+    `size` (3,) is length, width, height in metres. Per annotation: `timestamps` (n,), `sample_indices` (n,),
+    increasing; `object_to_world` (n, 4, 4); `visibility` (n,): 1 (0-40 %) to 4 (80-100 %), 0 where the dataset does not
+    say.
     """
 
     id: str

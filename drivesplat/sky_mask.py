@@ -1,4 +1,4 @@
-"""Where the sky is in an image: above the horizon, bright or blue, smooth, joined to the top edge, and without LiDAR returns."""
+"""Where the sky is: above the horizon, bright or blue, smooth, joined to the top edge, without LiDAR returns."""
 
 import cv2
 import numpy as np

@@ -47,7 +47,7 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(aside, path)
+        aside.replace(path)
         _fsync_folder(path.parent)
     except OSError as error:
         raise ResultError(

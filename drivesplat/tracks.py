@@ -15,7 +15,7 @@ MOVING_HUMAN = 0.3
 
 @dataclass(frozen=True)
 class Box:
-    """A track at one time: `object_to_world` (4, 4), `size` (3,) length, width, height in metres, `speed` in m/s (horizontal)."""
+    """A track at one time: `size` (3,) length, width, height in metres, `speed` horizontal in m/s."""
 
     track_id: str
     category: str
@@ -43,9 +43,9 @@ class Box:
 def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
     """The box of `track` at `timestamp` (microseconds), or None where it is absent.
 
-    Between consecutive key frames that both hold the track the position is linear and the rotation slerps. Up to half an
-    `interval` (microseconds, the scene's key-frame interval) beyond an end, the end segment's motion continues; a single box
-    holds still. Where the annotation has a gap, the track ends before it and begins anew after it.
+    Between consecutive key frames that both hold the track the position is linear and the rotation slerps. Up to half
+    an `interval` (microseconds, the scene's key-frame interval) beyond an end, the end segment's motion continues; a
+    single box holds still. Where the annotation has a gap, the track ends before it and begins anew after it.
     """
     for first, last in _runs(track.sample_indices):
         times = track.timestamps[first : last + 1]

@@ -17,10 +17,11 @@ CHUNK = 1 << 20
 
 
 def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
-    """Makes sure of the backbone at `path`. Returns a record: `file`, `sha256`, and `unavailable` (None, or why in a line).
+    """Makes sure of the backbone at `path`. Returns a record: `file`, `sha256`, and `unavailable` (None, or why in a
+    line).
 
-    Never raises for a missing network or a wrong file: LPIPS is then null with that reason. A file that does not match the
-    checksum is reported and left alone where a user put it, and not kept where it was fetched.
+    Never raises for a missing network or a wrong file: LPIPS is then null with that reason. A file that does not match
+    the checksum is reported and left alone where a user put it, and not kept where it was fetched.
     """
     reason = None if path.is_file() else _fetch(settings, path)
     digest = sha256_file(path) if path.is_file() else None

@@ -35,8 +35,8 @@ def evaluate_method(
 ) -> dict[str, Any]:
     """The content of one method's eval.json, provenance aside.
 
-    `checkpoint`, `summary` and `parser` are the contents of checkpoint.pt, train.json and parser.pkl; `lpips_record` that of
-    LPIPS's backbone, None where LPIPS is not wanted.
+    `checkpoint`, `summary` and `parser` are the contents of checkpoint.pt, train.json and parser.pkl; `lpips_record`
+    that of LPIPS's backbone, None where LPIPS is not wanted.
     """
     device = choose_device(device_settings, min_free_gb=0.0)
     model, train_job = trained_model(checkpoint)
@@ -86,7 +86,10 @@ def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: Evaluate
 
 
 def findings(group: dict[str, Any]) -> dict[str, bool | None]:
-    """Whether the scene shows what is expected of a static model; findings, never gates. None where a region is null."""
+    """Whether the scene shows what is expected of a static model;
+
+    findings, never gates. None where a region is null.
+    """
 
     def of(region: str) -> float | None:
         return group[region]["psnr"] if group[region] else None
@@ -114,7 +117,8 @@ def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int
 
 
 def evaluate_groups(
-    model: SplatModel, parser: dict[str, Any], masks: Path, camera: str, sh_degree: int, lpips_map: LpipsMap | None, device: torch.device
+    model: SplatModel, parser: dict[str, Any], masks: Path, camera: str, sh_degree: int, lpips_map: LpipsMap | None,
+    device: torch.device
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """The metrics of every held-out group, by region. `masks` is the folder of the stage `masks`."""
     groups = {}

@@ -28,7 +28,8 @@ def unavailable_or_map(record: dict[str, Any] | None, device: torch.device) -> t
 def lpips_map(backbone: Path, device: torch.device) -> LpipsMap:
     """The function of two images (h, w, 3) in [0, 1] that gives their LPIPS (h, w).
 
-    Raises ResultError where the backbone's file is missing or no AlexNet; it is read as tensors, nothing in it is executed.
+    Raises ResultError where the backbone's file is missing or no AlexNet; it is read as tensors, nothing in it is
+    executed.
     """
     with warnings.catch_warnings():  # lpips calls torchvision and torch.load in ways they have deprecated
         warnings.simplefilter("ignore")

@@ -27,7 +27,7 @@ def psnr(squared_error: float) -> float | None:
 
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """The structural similarity (h, w), mean over channels, of two images (h, w, 3) in [0, 1]: 11 Gaussian taps, sigma 1.5."""
+    """The structural similarity (h, w) of two images (h, w, 3) in [0, 1], mean over channels: 11 taps, sigma 1.5."""
     _, full = structural_similarity(
         image,
         truth,

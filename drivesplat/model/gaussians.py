@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Gaussians:
-    """n Gaussians: `means` metres, `quats` w, x, y, z, `scales` metres, `opacities` in [0, 1], `sh` coefficients (RGB)."""
+    """n Gaussians: `means` and `scales` metres, `quats` w, x, y, z, `opacities` in [0, 1], `sh` RGB coefficients."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]

@@ -16,7 +16,7 @@ from drivesplat.rasterize import rasterize
 
 @dataclass(frozen=True)
 class View:
-    """A camera at a time: `K` (3, 3) continuous pixels, `camera_to_world` (4, 4), `time` in seconds since the first key frame."""
+    """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image."""
 
     K: Float[Tensor, "3 3"]
     camera_to_world: Float[Tensor, "4 4"]
@@ -40,7 +40,7 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view shows: `image` (h, w, 3) with the sky behind, `alpha` (h, w) of the Gaussians, `depth` (h, w) metres or None."""
+    """What a view shows: `image` with the sky behind, `alpha` of the Gaussians, `depth` in metres or None."""
 
     image: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
@@ -63,7 +63,10 @@ class SplatModel(nn.Module):
     def render(
         self, view: View, sh_degree: int, *, absgrad: bool = False, with_depth: bool = False, rays: Tensor | None = None
     ) -> Picture:
-        """The view, with spherical harmonics up to `sh_degree`; `rays` (h, w, 3) saves computing `view.rays()` again."""
+        """The view, with spherical harmonics up to `sh_degree`;
+
+        `rays` (h, w, 3) saves computing `view.rays()` again.
+        """
         gaussians = concatenate([part.at(view.time) for part in self.parts])
         rendering = rasterize(
             gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh,

@@ -15,7 +15,8 @@ class Rendering:
     """What C cameras see: `image` (C, h, w, channels), `alpha` (C, h, w, 1), `depth` (C, h, w, 1) in metres or None.
 
     `image` is premultiplied: nothing is composited behind it. `depth` is the expected depth along the camera axis.
-    `info` holds what gsplat's densification strategies read (`means2d`, `radii`, `width`, `height`, `n_cameras`, `gaussian_ids`).
+    `info` holds what gsplat's densification strategies read (`means2d`, `radii`, `width`, `height`, `n_cameras`,
+    `gaussian_ids`).
     """
 
     image: Float[Tensor, "c h w channels"]
@@ -43,10 +44,10 @@ def rasterize(
 ) -> Rendering:
     """Renders n Gaussians in C pinhole cameras.
 
-    `means` in world metres; `quats` w, x, y, z (normalised inside); `scales` metres; `opacities` in [0, 1]; `colors` are SH
-    coefficients up to `sh_degree`, or final values where that is None. `viewmats` take world to camera (OpenCV); `Ks` use the
-    continuous pixel convention. The projection is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et
-    al. 2023); `antialiased` scales opacities by the 2D filter's loss (Yu et al. 2024).
+    `means` in world metres; `quats` w, x, y, z (normalised inside); `scales` metres; `opacities` in [0, 1]; `colors`
+    are SH coefficients up to `sh_degree`, or final values where that is None. `viewmats` take world to camera (OpenCV);
+    `Ks` use the continuous pixel convention. The projection is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian
+    Splatting (Kerbl et al. 2023); `antialiased` scales opacities by the 2D filter's loss (Yu et al. 2024).
 
     `backend`: one of BACKENDS; None takes gsplat on a GPU and the reference on the CPU.
     """

@@ -9,8 +9,8 @@ from drivesplat.rasterize.door import Rendering
 
 
 def rasterize_gsplat(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int,
-    *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
 ) -> Rendering:  # fmt: skip
     """See `drivesplat.rasterize.rasterize`. Needs a GPU."""
     image, alpha, info = rasterization(

@@ -1,7 +1,8 @@
 """The readable rasterizer in plain torch: what the others are held to, and what small scenes train with on a CPU.
 
 Projection and spherical harmonics are gsplat's own torch implementations; compositing follows Kerbl et al. 2023, with
-gsplat's cut-offs: alpha at most 0.999, contributions under 1/255 dropped, a ray ends before its transmittance reaches 1e-4.
+gsplat's cut-offs: alpha at most 0.999, contributions under 1/255 dropped, a ray ends before its transmittance reaches
+1e-4.
 """
 
 from typing import Any
@@ -19,10 +20,13 @@ TILE = 16
 
 
 def rasterize_reference(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int,
-    *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
 ) -> Rendering:  # fmt: skip
-    """See `drivesplat.rasterize.rasterize`. Works in float32 and float64; autograd gives every gradient but `absgrad`."""
+    """See `drivesplat.rasterize.rasterize`.
+
+    Works in float32 and float64; autograd gives every gradient but `absgrad`.
+    """
     if absgrad:
         raise ValueError("the reference rasterizer has no absolute gradients: set train.absgrad: false")
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_covar=True, compute_preci=False)

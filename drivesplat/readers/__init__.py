@@ -1,7 +1,7 @@
 """Datasets into `Scene` records.
 
-A dataset is two modules here: `{name}_layout` knows its files (`find_root`, `table_files`) and is cheap to import, `{name}`
-reads them (`read`). Nothing downstream opens a dataset's tables again.
+A dataset is two modules here: `{name}_layout` knows its files (`find_root`, `table_files`) and is cheap to import,
+`{name}` reads them (`read`). Nothing downstream opens a dataset's tables again.
 """
 
 from importlib import import_module

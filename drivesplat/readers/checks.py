@@ -25,7 +25,10 @@ def checked_pose(translation: Sequence[float], rotation_wxyz: Sequence[float], r
 
 
 def checked_intrinsics(matrix: Sequence[Sequence[float]], token: str) -> np.ndarray:
-    """A pinhole K (3, 3). Raises DatasetError naming the calibrated sensor's token where it is singular or malformed."""
+    """A pinhole K (3, 3).
+
+    Raises DatasetError naming the calibrated sensor's token where it is singular or malformed.
+    """
     k = np.array(matrix, dtype=np.float64)
     proper = k.shape == (3, 3) and np.isfinite(k).all() and k[0, 0] > 0 and k[1, 1] > 0 and np.allclose(k[2], [0, 0, 1])
     if not proper:
@@ -41,7 +44,10 @@ def checked_size(width: int, height: int, token: str) -> tuple[int, int]:
 
 
 def require_increasing(timestamps: Sequence[int], tokens: Sequence[str], table: str) -> np.ndarray:
-    """The timestamps (n,) int64 in microseconds. Raises DatasetError naming the first record that is not later than its predecessor."""
+    """The timestamps (n,) int64 in microseconds.
+
+    Raises DatasetError naming the first record that is not later than its predecessor.
+    """
     times = np.array(timestamps, dtype=np.int64)
     wrong = np.flatnonzero(np.diff(times) <= 0)
     if len(wrong):

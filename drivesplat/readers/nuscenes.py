@@ -23,7 +23,7 @@ def read(
 ) -> Scene:
     """The scene called `name` ("0103").
 
-    `sweeps` adds the images and LiDAR sweeps between key frames. `frames` = (first, last + 1) keeps a range of key frames,
+    `sweeps` adds the images and LiDAR sweeps between key frames. `frames` = (first, last + 1) keeps some key frames,
     which are then counted from 0. Image files are not opened. Raises DatasetError naming the offending token.
     """
     tables = _load(root, version)

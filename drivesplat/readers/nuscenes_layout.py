@@ -8,7 +8,10 @@ TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
     "sample_data", "scene", "sensor", "visibility",
 )  # fmt: skip
-HOW_TO_GET_IT = "download it from https://www.nuscenes.org/nuscenes (free registration), unpack it there, or set datasets.<name>.dataroot in config.yaml"
+HOW_TO_GET_IT = (
+    "download it from https://www.nuscenes.org/nuscenes (free registration), unpack it there, "
+    "or set datasets.<name>.dataroot in config.yaml"
+)
 
 
 def find_root(dataroot: str, version: str) -> Path:

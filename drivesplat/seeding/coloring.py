@@ -10,7 +10,7 @@ from drivesplat.images import project
 
 @dataclass(frozen=True)
 class ColorView:
-    """An image that may colour points: `pixels` (h, w, 3) uint8, `intrinsics` continuous (3, 3), `usable` (h, w) bool."""
+    """An image that may colour points: `pixels` (h, w, 3) uint8, `usable` (h, w) bool, `intrinsics` continuous."""
 
     pixels: np.ndarray
     intrinsics: np.ndarray

@@ -17,7 +17,8 @@ def far_points(
     depths: tuple[float, float],
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`count` random points (at most) in the view's frustum, through pixels that `covered` (n, 3) world points leave empty.
+    """`count` random points (at most) in the view's frustum, through pixels that `covered` (n, 3) world points leave
+    empty.
 
     Depth is log-uniform between `depths` (metres); a point that would lie under the ground plane at height `ground_z`
     is moved up its ray onto it. Returns positions (m, 3) and the colours (m, 3) of their pixels.

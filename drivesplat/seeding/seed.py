@@ -1,8 +1,9 @@
 """The stage `lidar_seed`: where the Gaussians start.
 
-LiDAR of the training key frames in world coordinates, without the own car and without what moves, thinned, coloured from
-training images; then points of a file, if given; then far points along pixels that none of these cover. Held-out images
-and sweeps contribute nothing, neither position (of LiDAR) nor colour, and a point that no training image sees is left out.
+LiDAR of the training key frames in world coordinates, without the own car and without what moves, thinned, coloured
+from training images; then points of a file, if given; then far points along pixels that none of these cover. Held-out
+images and sweeps contribute nothing, neither position (of LiDAR) nor colour, and a point that no training image sees is
+left out.
 """
 
 import logging
@@ -54,14 +55,16 @@ def seed_points(scene: Scene, job: SeedJob) -> PointCloud:
     }
     if len(positions) + len(far) == 0:
         raise DatasetError(
-            f"scene {scene.name}: no seed points: no LiDAR return is seen by a training image and lidar_seed.far_points is 0"
+            f"scene {scene.name}: no seed points: "
+            "no LiDAR return is seen by a training image and lidar_seed.far_points is 0"
         )
     log.info("%d seed points: %s", len(positions) + len(far), note)
     return PointCloud(np.concatenate([positions, far]).astype(np.float32), np.concatenate([colors, far_colors]), note)
 
 
 def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, int]:
-    """Static LiDAR points (n, 3) of the training key frames in world coordinates, their times (n,), and the sweeps missing.
+    """Static LiDAR points (n, 3) of the training key frames in world coordinates, their times (n,), and the sweeps
+    missing.
 
     Raises DatasetError where the scene has no LiDAR at all and on_missing is 'stop'.
     """

@@ -28,7 +28,8 @@ def read_sweep(sweep: Sweep) -> np.ndarray:
     size = path.stat().st_size
     if size == 0 or size % (4 * _RECORD):
         raise DatasetError(
-            f"{where} is corrupt ({size} bytes are no whole number of returns); restore it, or set lidar_seed.on_missing: warn"
+            f"{where} is corrupt ({size} bytes are no whole number of returns); "
+            "restore it, or set lidar_seed.on_missing: warn"
         )
     points = np.fromfile(path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
     return points[np.isfinite(points).all(axis=1)].astype(np.float64)

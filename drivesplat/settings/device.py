@@ -11,7 +11,8 @@ class DeviceSettings(Settings):
     """Where the work runs. Not part of any result's settings: moving to another machine reruns nothing."""
 
     kind: Literal["auto", "cuda", "cpu"] = "auto"
-    """'auto' takes the GPU and refuses real scenes without one; 'cuda' insists on it; 'cpu' is for the patient. `device: cpu` is short for `device: {kind: cpu}`."""
+    """'auto' takes the GPU and refuses real scenes without one; 'cuda' insists on it; 'cpu' is for the patient.
+    `device: cpu` is short for `device: {kind: cpu}`."""
     min_free_gb: float = Field(8.0, ge=0, le=1000)
     """A training does not start with less free GPU memory than this (GB)."""
 

@@ -8,11 +8,13 @@ from drivesplat.settings.images import ImageSettings
 
 class MaskSettings(Settings):
     regions_folder: str | None = None
-    """Your own label images (labels as in drivesplat/regions.py), named {camera}/{image name}.png. null = from the annotated boxes."""
+    """Your own label images (labels as in drivesplat/regions.py), named {camera}/{image name}.png. null = from the
+    annotated boxes."""
     sky_folder: str | None = None
     """Your own sky masks (255 = sky), named {camera}/{image name}.png. null = a heuristic."""
     own_car_polygons: dict[str, tuple[tuple[float, float], ...]] = Field(default_factory=dict)
-    """Per camera the outline of the own car's body, as x, y in fractions of the image's width and height: left out of every region."""
+    """Per camera the outline of the own car's body, as x, y in fractions of the image's width and height: left out of
+    every region."""
 
 
 class MaskJob(Settings):

@@ -12,7 +12,8 @@ SkyKind = Literal["none", "mask", "cubemap"]
 
 
 class McmcSettings(Settings):
-    """strategy: mcmc. 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024), gsplat's MCMCStrategy."""
+    """strategy: mcmc. 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024), gsplat's
+    MCMCStrategy."""
 
     noise_lr: float = Field(5e5, ge=0)
     """Strength of the exploration noise on positions."""
@@ -39,7 +40,8 @@ class DefaultSettings(Settings):
 
 class FloaterSettings(Settings):
     radius: float = Field(1.0, ge=0, le=10)
-    """Gaussians whose centre is nearer than this (metres) to the path of a training camera are faded out: the recording car drove there, so it is empty. 0 = off."""
+    """Gaussians whose centre is nearer than this (metres) to the path of a training camera are faded out: the
+    recording car drove there, so it is empty. 0 = off."""
     every: int = Field(100, ge=1)
     """Iterations between prunings."""
 

@@ -28,7 +28,8 @@ def save(path: Path, content: dict[str, Any]) -> None:
 def load(path: Path, rule: str) -> dict[str, Any]:
     """Reads what `save` wrote; nothing in the file is executed.
 
-    Raises ResultError naming the file and `rule` where it is truncated, foreign, or holds anything but tensors and plain data.
+    Raises ResultError naming the file and `rule` where it is truncated, foreign, or holds anything but tensors and
+    plain data.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -111,7 +112,10 @@ def restore(
 
 
 def resumable(path: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The resume state at `path` if this training wrote it; None, with a message, where there is none or it is another's."""
+    """The resume state at `path` if this training wrote it;
+
+    None, with a message, where there is none or it is another's.
+    """
     if not path.exists():
         return None
     try:

@@ -36,7 +36,10 @@ class Densifier:
             self._strategy.step_pre_backward(self._part.params, optimizers, self.state, step, info)
 
     def after_step(self, step: int, optimizers: Optimizers, info: dict[str, Any]) -> None:
-        """Grows, prunes and moves Gaussians after the optimizers have stepped. Draws from torch's global generator, as gsplat does."""
+        """Grows, prunes and moves Gaussians after the optimizers have stepped.
+
+        Draws from torch's global generator, as gsplat does.
+        """
         params = self._part.params
         with nullcontext() if params["means"].is_cuda else torch_twins():
             if isinstance(self._strategy, DefaultStrategy):
@@ -47,7 +50,7 @@ class Densifier:
 
 
 class CappedDefaultStrategy(DefaultStrategy):
-    """gsplat's DefaultStrategy that never exceeds `cap_max` Gaussians: where more want to grow, those with the largest gradients do."""
+    """gsplat's DefaultStrategy with at most `cap_max` Gaussians: where more want to grow, the largest gradients do."""
 
     cap_max: int = 1_500_000
 
@@ -101,7 +104,8 @@ def relocation(
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
     """Opacity and scale with which `ratios` (n,) copies at one place look like the one Gaussian that was there.
 
-    Equation 9 of Kheradmand et al. 2024; `binoms[i, k]` is the binomial coefficient. The twin of gsplat's compute_relocation.
+    Equation 9 of Kheradmand et al. 2024; `binoms[i, k]` is the binomial coefficient. The twin of gsplat's
+    compute_relocation.
     """
     n_max = len(binoms)
     ratios = ratios.clamp(1, n_max).long()

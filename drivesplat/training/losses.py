@@ -34,12 +34,15 @@ def loss_terms(
 
 
 def sky_alpha_loss(alpha: Float[Tensor, "h w"], sky: Tensor) -> Float[Tensor, ""]:
-    """-log(1 - alpha) averaged over the image, counting sky pixels only: the half of the cross entropy that empties the sky."""
+    """Mean over the image of -log(1 - alpha) on sky pixels: the half of the cross entropy that empties the sky."""
     return (-torch.log((1.0 - alpha).clamp(min=1e-4)) * sky).mean()
 
 
 def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Mean structural similarity (Wang et al. 2004) as 3DGS trains with: 11 Gaussian taps, sigma 1.5, data range 1, zero-padded."""
+    """Mean structural similarity (Wang et al.
+
+    2004) as 3DGS trains with: 11 Gaussian taps, sigma 1.5, data range 1, zero-padded.
+    """
     taps = torch.arange(SSIM_TAPS, device=image.device, dtype=image.dtype) - SSIM_TAPS // 2
     kernel = torch.softmax(-(taps**2) / (2 * SSIM_SIGMA**2), dim=0)
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)

@@ -12,27 +12,33 @@ from drivesplat.errors import TrainingError
 from drivesplat.model.splat_model import Picture
 from drivesplat.training.views import TrainingView
 
+NEVER = 2**62
+
 
 class FiniteGuard:
-    """Remembers, on the device and without waiting for it, the first iteration at which each term was not finite."""
+    """Remembers, without waiting for the device, the first iteration at which each watched value was not finite."""
 
     def __init__(self, device: torch.device):
         self._device = device
-        self._first: dict[str, Tensor] = {}
+        self._first: dict[tuple[str, ...], Tensor] = {}
 
-    def watch(self, step: int, terms: dict[str, Tensor]) -> None:
-        for name, value in terms.items():
-            first = self._first.get(name)
-            if first is None:
-                first = self._first[name] = torch.full((), -1, dtype=torch.long, device=self._device)
-            bad = ~torch.isfinite(value.detach()) & (first < 0)
-            first.masked_fill_(bad, step)
+    def watch(self, step: int, values: dict[str, Tensor]) -> None:
+        """Looks at the scalars `values`, by name, of an iteration."""
+        names = tuple(values)
+        if names not in self._first:
+            self._first[names] = torch.full((len(names),), NEVER, device=self._device)
+        finite = torch.isfinite(torch.stack([value.detach() for value in values.values()]))
+        self._first[names] = torch.minimum(self._first[names], torch.where(finite, NEVER, step))
 
     def check(self, checkpoint: str) -> None:
         """Raises TrainingError naming the earliest iteration and its terms where one was not finite."""
-        found = sorted((int(first), name) for name, first in self._first.items() if int(first) >= 0)
-        if found:
-            step = found[0][0]
+        found = [
+            (step, name)
+            for names, first in self._first.items()
+            for step, name in zip(first.tolist(), names, strict=True)
+        ]
+        step = min((step for step, _ in found), default=NEVER)
+        if step < NEVER:
             names = ", ".join(name for at, name in found if at == step)
             raise TrainingError(
                 f"iteration {step + 1}: {names} is not finite; the last good checkpoint is kept ({checkpoint}); "

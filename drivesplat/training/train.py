@@ -27,7 +27,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where a training keeps what outlives it: `resume` (a folder no rule declares), `tensorboard`; `fingerprint` of settings, code and inputs."""
+    """Where a training keeps what outlives it.
+
+    `resume` is a folder no rule declares; `fingerprint` is that of settings, code and inputs.
+    """
 
     resume: Path
     tensorboard: Path
@@ -97,7 +100,10 @@ class Trainer:
 
 @dataclass(frozen=True)
 class TrainingSummary:
-    """What `train.json` says of a finished training. `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too."""
+    """What `train.json` says of a finished training.
+
+    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too.
+    """
 
     iterations: int
     seconds: float
@@ -109,12 +115,13 @@ class TrainingSummary:
 
 
 def train(
-    model: SplatModel, views: list[TrainingView], settings: TrainSettings, seed: int, scene_scale: float, device: torch.device, workspace: Workspace
+    model: SplatModel, views: list[TrainingView], settings: TrainSettings, seed: int, scene_scale: float, device:
+    torch.device, workspace: Workspace
 ) -> TrainingSummary:  # fmt: skip
     """Fits `model` in place, resuming where an earlier run of the same training was ended.
 
-    Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's memory is
-    exhausted. The last good checkpoint survives both.
+    Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
+    memory is exhausted. The last good checkpoint survives both.
     """
     model.to(device)
     trainer = Trainer.begin(model, views, settings, seed, scene_scale, device)

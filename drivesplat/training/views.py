@@ -14,7 +14,7 @@ from drivesplat.model.splat_model import View
 
 @dataclass(frozen=True)
 class TrainingView:
-    """A camera and what it recorded: `pixels` (h, w, 3) uint8, `sky` (h, w) True where the sky is, or None where unknown."""
+    """A camera and what it recorded; `sky` is True where the sky is, None where that is unknown."""
 
     view: View
     pixels: UInt8[Tensor, "h w 3"]
