@@ -12,6 +12,14 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
 
+def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
+    """The most Gaussians a parser record's training images can hold: `cap_max`, or fewer where they have few pixels."""
+    if not settings.pixels_per_gaussian:
+        return settings.cap_max
+    pixels = int(parser["image_sizes"][parser["splits"]["train"]].prod(axis=1).sum())
+    return max(1, min(settings.cap_max, int(pixels / settings.pixels_per_gaussian)))
+
+
 def build_model(
     parser: dict[str, Any], parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings, sky_color: np.ndarray
 ) -> SplatModel:

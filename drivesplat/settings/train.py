@@ -53,6 +53,9 @@ class TrainSettings(Settings):
     """Densification: 'mcmc' or 'default'."""
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
     """Most Gaussians. Memory grows with it: about 1 GB per million, and as much again while rendering."""
+    pixels_per_gaussian: float = Field(20.0, ge=0)
+    """At most one Gaussian per so many training pixels (0 = no such limit): one of SH degree 3 has 59 parameters, 20
+    pixels have 60 values. More Gaussians than that fit what no other view shows."""
     gaussians: GaussianSettings = GaussianSettings()
     mcmc: McmcSettings = McmcSettings()
     default: DefaultSettings = DefaultSettings()

@@ -10,7 +10,7 @@ import numpy as np
 
 from drivesplat.device import choose_device
 from drivesplat.masks import read_sky_mask
-from drivesplat.model.build import build_model, rebuild_model
+from drivesplat.model.build import build_model, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
@@ -47,12 +47,13 @@ def run_training(
         device = choose_device(device_settings)
         sky_masks = sky_masks_of(parser, files.masks) if job.sky != "none" else None
         views = load_views(parser, sky_masks, device)
-        model = build_model(parser, job.parts, job.sky, job.train, mean_sky_color(views))
+        settings = job.train.model_copy(update={"cap_max": gaussian_cap(parser, job.train)})
+        model = build_model(parser, job.parts, job.sky, settings, mean_sky_color(views))
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
         workspace = Workspace(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
-        summary = train(model, views, job.train, job.random_seed, parser["scene_scale"], device, workspace)
+        summary = train(model, views, settings, job.random_seed, parser["scene_scale"], device, workspace)
         content = {
             "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
             "job": job.model_dump_json(),

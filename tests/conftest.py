@@ -1,0 +1,43 @@
+"""Shape checks switched on for the whole library, and the tiny world."""
+
+import os
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook("drivesplat", "beartype.beartype")
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="session")
+def tiny_root(tmp_path_factory) -> Path:
+    """A tiny drive in nuScenes format: scene 0001, read only."""
+    from tiny_world import World, write_world
+
+    return write_world(tmp_path_factory.mktemp("tiny"), World())
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tiny_root):
+    """The tiny drive as a Scene, with the images between key frames."""
+    from drivesplat.extract import extract_scene
+    from drivesplat.settings.extract import SceneSource
+
+    return extract_scene(
+        SceneSource(
+            dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None,
+            cameras=("CAM_FRONT",), sweeps=True, on_missing="stop",
+        ),
+        tiny_root,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def real_scene_root() -> Path:
+    """The folder of a real nuScenes scene-0061; skips where there is none."""
+    root = Path(os.environ.get("NUSCENES_SCENE0061", REPOSITORY.parent / "shared/data/nuscenes-scene0061"))
+    if not (root / "v1.0-mini").is_dir():
+        pytest.skip(f"no real nuScenes scene at {root}: set NUSCENES_SCENE0061 to one")
+    return root
