@@ -4,9 +4,12 @@ Everything here is cheap to import and to compute; it runs once in the main proc
 """
 
 import fcntl
+import json
+import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from drivesplat.config import METHOD_STAGES, SCENE_STAGES, Config, for_scene, load, stage_settings
@@ -18,6 +21,12 @@ from drivesplat.storage import canonical_json
 SCRIPTS = "workflow_scripts"
 BACKBONE = "resources/lpips/alexnet.pth"
 """Where LPIPS's AlexNet backbone is kept; users without network put it there themselves."""
+
+
+def let_scripts_import(folder: str) -> None:
+    """Makes the package at `folder` importable for the scripts of all rules, in whatever environment they run."""
+    inherited = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([folder, *([inherited] if inherited else [])])
 
 
 class Plan:
@@ -82,8 +91,6 @@ class Plan:
         return canonical_json({scene: self._stages(scene, codes) for scene in self.config.scenes})
 
     def _stages(self, scene: str, codes: Mapping[str, str]) -> dict[str, Any]:
-        import json
-
         stages = {stage: (stage, None) for stage in SCENE_STAGES}
         stages |= {f"{method}/{stage}": (stage, method) for method in self.config.methods for stage in METHOD_STAGES}
         return {
@@ -108,7 +115,7 @@ class Plan:
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""
         for scene in self._scenes_of(targets):
-            self.tables(_Scene(scene))
+            self.tables(SimpleNamespace(scene=scene))
 
     def _scenes_of(self, targets: list[str]) -> list[str]:
         results = f"{self.config.results_dir}/"
@@ -135,10 +142,3 @@ class Plan:
             raise DriveSplatError(
                 f"another run is working in {folder}/; wait for it, or give this one its own folder (results_dir)"
             ) from None
-
-
-class _Scene:
-    """A stand-in for a rule's wildcards."""
-
-    def __init__(self, scene: str):
-        self.scene = scene

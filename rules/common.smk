@@ -9,11 +9,11 @@ from snakemake.cli import get_argument_parser
 from snakemake.utils import validate
 
 sys.path.insert(0, workflow.basedir)
-os.environ["PYTHONPATH"] = os.pathsep.join([workflow.basedir, *filter(None, [os.environ.get("PYTHONPATH")])])
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.planning import Plan
+from drivesplat.planning import Plan, let_scripts_import
 
+let_scripts_import(workflow.basedir)
 asked = get_argument_parser().parse_known_args()[0]
 
 try:

@@ -13,15 +13,15 @@ rule lpips_backbone:
         file=plan.backbone_file,
     output:
         record="<resources>/lpips/backbone.json",
-    params:
-        settings=plan.config.lpips.model_dump_json(),
-        code=plan.code("lpips_backbone"),
     log:
         "<logs>/lpips_backbone.log",
     benchmark:
         "<benchmarks>/lpips_backbone.tsv"
     conda:
         "../envs/drivesplat.yaml"
+    params:
+        settings=plan.config.lpips.model_dump_json(),
+        code=plan.code("lpips_backbone"),
     script:
         "../workflow_scripts/lpips_backbone.py"
 
@@ -38,9 +38,6 @@ rule evaluate:
         lpips=plan.lpips_record,
     output:
         metrics="<results>/{scene}/{method}/eval.json",
-    params:
-        settings=plan.settings("evaluate"),
-        code=plan.code("evaluate"),
     log:
         "<logs>/{scene}/{method}/evaluate.log",
     benchmark:
@@ -53,6 +50,9 @@ rule evaluate:
         device=plan.device(),
         mem_mb=8000,
         runtime=30,
+    params:
+        settings=plan.settings("evaluate"),
+        code=plan.code("evaluate"),
     script:
         "../workflow_scripts/evaluate.py"
 
@@ -65,14 +65,14 @@ rule scene_metrics:
         evals=expand("<results>/{{scene}}/{method}/eval.json", method=plan.config.methods),
     output:
         metrics="<results>/{scene}/metrics.json",
-    params:
-        settings=plan.settings("scene_metrics"),
-        code=plan.code("scene_metrics"),
     log:
         "<logs>/{scene}/metrics.log",
     benchmark:
         "<benchmarks>/{scene}/metrics.tsv"
     conda:
         "../envs/drivesplat.yaml"
+    params:
+        settings=plan.settings("scene_metrics"),
+        code=plan.code("scene_metrics"),
     script:
         "../workflow_scripts/scene_metrics.py"

@@ -13,14 +13,14 @@ rule gap_report:
     output:
         table="<results>/gap_report.csv",
         report="<results>/gap_report.json",
-    params:
-        expected=plan.expected_stages(),
-        code=plan.code("gap_report"),
     log:
         "<logs>/gap_report.log",
     benchmark:
         "<benchmarks>/gap_report.tsv"
     conda:
         "../envs/drivesplat.yaml"
+    params:
+        expected=plan.expected_stages(),
+        code=plan.code("gap_report"),
     script:
         "../workflow_scripts/gap_report.py"

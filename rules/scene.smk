@@ -13,9 +13,6 @@ rule extract:
         tables=plan.tables,
     output:
         scene="<results>/{scene}/scene.json",
-    params:
-        settings=plan.settings("extract"),
-        code=plan.code("extract"),
     log:
         "<logs>/{scene}/extract.log",
     benchmark:
@@ -25,6 +22,9 @@ rule extract:
     resources:
         mem_mb=8000,
         runtime=30,
+    params:
+        settings=plan.settings("extract"),
+        code=plan.code("extract"),
     script:
         "../workflow_scripts/extract.py"
 
@@ -39,9 +39,6 @@ rule lidar_seed:
         points_file=plan.points_file,
     output:
         seed="<results>/{scene}/seed.ply",
-    params:
-        settings=plan.settings("lidar_seed"),
-        code=plan.code("lidar_seed"),
     log:
         "<logs>/{scene}/lidar_seed.log",
     benchmark:
@@ -51,6 +48,9 @@ rule lidar_seed:
     resources:
         mem_mb=8000,
         runtime=30,
+    params:
+        settings=plan.settings("lidar_seed"),
+        code=plan.code("lidar_seed"),
     script:
         "../workflow_scripts/lidar_seed.py"
 
@@ -64,9 +64,6 @@ rule parser:
         seed="<results>/{scene}/seed.ply",
     output:
         parser="<results>/{scene}/parser.pkl",
-    params:
-        settings=plan.settings("parser"),
-        code=plan.code("parser"),
     log:
         "<logs>/{scene}/parser.log",
     benchmark:
@@ -76,6 +73,9 @@ rule parser:
     resources:
         mem_mb=4000,
         runtime=10,
+    params:
+        settings=plan.settings("parser"),
+        code=plan.code("parser"),
     script:
         "../workflow_scripts/parser.py"
 
@@ -88,9 +88,6 @@ rule masks:
         scene="<results>/{scene}/scene.json",
     output:
         masks="<results>/{scene}/masks/masks.json",
-    params:
-        settings=plan.settings("masks"),
-        code=plan.code("masks"),
     log:
         "<logs>/{scene}/masks.log",
     benchmark:
@@ -100,5 +97,8 @@ rule masks:
     resources:
         mem_mb=4000,
         runtime=30,
+    params:
+        settings=plan.settings("masks"),
+        code=plan.code("masks"),
     script:
         "../workflow_scripts/masks.py"

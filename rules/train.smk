@@ -15,9 +15,6 @@ rule train:
     output:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
         summary="<results>/{scene}/{method}/train.json",
-    params:
-        settings=plan.settings("train"),
-        code=plan.code("train"),
     log:
         "<logs>/{scene}/{method}/train.log",
     benchmark:
@@ -30,5 +27,8 @@ rule train:
         device=plan.device(),
         mem_mb=16000,
         runtime=240,
+    params:
+        settings=plan.settings("train"),
+        code=plan.code("train"),
     script:
         "../workflow_scripts/train.py"
