@@ -1,8 +1,8 @@
 """A tiny street in nuScenes format: small images, few key frames, exact geometry.
 
-A textured ground, a wall along the road, a parked van, a car driving ahead, a pedestrian; a front camera that fires 35 ms
-before the LiDAR, image sweeps between key frames, a LiDAR of a few beams. Everything is cast ray by ray in numpy from the
-same boxes that stand in the annotations, so that a test can compute what it expects.
+A textured ground, a wall along the road, a parked truck, a car driving ahead, a pedestrian; a front camera that fires
+35 ms before the LiDAR, image sweeps between key frames, a LiDAR of a few beams. Everything is cast ray by ray in numpy
+from the same boxes that stand in the annotations, so that a test can compute what it expects.
 """
 
 import json
@@ -44,7 +44,7 @@ class Thing:
 
 def default_things() -> list[Thing]:
     return [
-        Thing("vehicle.car", (4.0, 2.0, 1.6), (9.0, 0.0, 0.8), velocity=(5.0, 0.0), color=(230, 230, 235)),
+        Thing("vehicle.car", (4.0, 2.0, 1.6), (8.5, 0.0, 0.8), velocity=(4.2, 0.0), color=(230, 230, 235)),
         Thing("vehicle.truck", (6.0, 2.4, 2.6), (16.0, -4.5, 1.3), color=(60, 90, 180)),
         Thing("human.pedestrian.adult", (0.8, 0.8, 1.8), (12.0, 4.0, 0.9), velocity=(1.2, 0.0), color=(210, 60, 60)),
         Thing("movable_object.trafficcone", (0.5, 0.5, 0.9), (11.0, 3.0, 0.45), color=(250, 120, 20)),
@@ -97,8 +97,12 @@ _TABLES = (
 
 
 def _static_tables(tables: dict[str, list[dict]], world: World) -> None:
-    tables["log"].append({"token": "log", "logfile": "tiny", "vehicle": "n000", "date_captured": "", "location": "tiny"})
-    tables["map"].append({"token": "map", "category": "semantic_prior", "filename": "maps/map.png", "log_tokens": ["log"]})
+    tables["log"].append(
+        {"token": "log", "logfile": "tiny", "vehicle": "n000", "date_captured": "", "location": "tiny"}
+    )
+    tables["map"].append(
+        {"token": "map", "category": "semantic_prior", "filename": "maps/map.png", "log_tokens": ["log"]}
+    )
     levels = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
     tables["visibility"] += [{"token": token, "level": level, "description": ""} for token, level in levels.items()]
     for category in dict.fromkeys(thing.category for thing in world.things):
@@ -132,8 +136,10 @@ def _write_scene(root: Path, tables: dict[str, list[dict]], world: World, scene:
             "first_sample_token": samples[0], "last_sample_token": samples[-1], "description": "tiny",
         }
     )  # fmt: skip
-    for i, token in enumerate(samples):
-        tables["sample"].append({**_linked(samples, i), "timestamp": START_US + i * KEY_FRAME_US, "scene_token": f"scene {scene}"})
+    for i in range(len(samples)):
+        tables["sample"].append(
+            {**_linked(samples, i), "timestamp": START_US + i * KEY_FRAME_US, "scene_token": f"scene {scene}"}
+        )
     _write_sensor(root, tables, world, scene, "CAM_FRONT", CAMERA_DELAY_US, world.sweeps_between)
     _write_sensor(root, tables, world, scene, "LIDAR_TOP", 0, 0)
     for number, thing in enumerate(world.things):
@@ -164,12 +170,18 @@ def _write_sensor(root: Path, tables: dict, world: World, scene: str, channel: s
             filename = f"{folder}/{scene}__{i:04}.pcd.bin"
             cast_lidar(world, seconds).tofile(root / filename)
         tables["ego_pose"].append(
-            {"token": token, "timestamp": START_US + offset_us, "rotation": [1.0, 0.0, 0.0, 0.0], "translation": (ORIGIN + world.ego_at(seconds)).tolist()}
+            {
+                "token": token,
+                "timestamp": START_US + offset_us,
+                "rotation": [1.0, 0.0, 0.0, 0.0],
+                "translation": (ORIGIN + world.ego_at(seconds)).tolist(),
+            }
         )
         tables["sample_data"].append(
             {
                 **_linked(tokens, i), "sample_token": f"{scene} sample {index}", "ego_pose_token": token,
-                "calibrated_sensor_token": f"calibrated {channel}", "timestamp": START_US + offset_us, "fileformat": filename.rsplit(".")[-1],
+                "calibrated_sensor_token": f"calibrated {channel}", "timestamp": START_US + offset_us,
+                "fileformat": filename.rsplit(".")[-1],
                 "is_key_frame": key, "height": world.height if channel == "CAM_FRONT" else 0,
                 "width": world.width if channel == "CAM_FRONT" else 0, "filename": filename,
             }
@@ -193,7 +205,8 @@ def _annotate(tables: dict, world: World, scene: str, thing: Thing, number: int)
             {
                 **_linked(tokens, position), "sample_token": f"{scene} sample {i}", "instance_token": instance,
                 "visibility_token": thing.visibility, "attribute_tokens": [], "size": [width, length, height],
-                "translation": (ORIGIN + thing.at(i * KEY_FRAME_US * 1e-6)).tolist(), "num_lidar_pts": 10, "num_radar_pts": 0,
+                "translation": (ORIGIN + thing.at(i * KEY_FRAME_US * 1e-6)).tolist(),
+                "num_lidar_pts": 10, "num_radar_pts": 0,
                 "rotation": [np.cos(thing.heading / 2), 0.0, 0.0, np.sin(thing.heading / 2)],
             }
         )  # fmt: skip
@@ -211,7 +224,9 @@ def cast_image(world: World, seconds: float) -> np.ndarray:
 def cast_lidar(world: World, seconds: float) -> np.ndarray:
     """Returns (n, 5) float32 in the sensor's frame, as nuScenes stores them."""
     azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 1.5)), np.radians(np.linspace(-28, 10, 24)))
-    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    rays = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
+    )
     rays = rays.reshape(-1, 3)
     distance, _ = cast(world, world.ego_at(seconds) + LIDAR_AT, rays, seconds)
     hit = distance < 70.0
@@ -222,7 +237,7 @@ def cast_lidar(world: World, seconds: float) -> np.ndarray:
 
 
 def cast(world: World, origin: np.ndarray, rays: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (n,) in units of each ray's length, and colour (n, 3), of what rays from a point of the drive hit first."""
+    """Distance (n,) in units of each ray's length, and colour (n, 3), of what rays from a point hit first."""
     distance = np.full(len(rays), np.inf)
     color = np.zeros((len(rays), 3))
     with np.errstate(divide="ignore", invalid="ignore"):

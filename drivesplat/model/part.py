@@ -36,6 +36,8 @@ class Sky(nn.Module, ABC):
     """What is seen where no Gaussian is: a colour by direction."""
 
     params: nn.ParameterDict
+    keeps_gaussians_out: bool
+    """Whether Gaussians are to stay out of sky pixels, since this sky alone is to be seen there."""
 
     @abstractmethod
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

@@ -15,6 +15,8 @@ from drivesplat.model.part import Sky
 class ConstantSky(Sky):
     """One learned colour everywhere, started at `color` (3,) in [0, 1]."""
 
+    keeps_gaussians_out = True
+
     def __init__(self, color: Float[Tensor, "3"], learning_rate: float):
         super().__init__()
         self.params = nn.ParameterDict({"color": nn.Parameter(_logit(color))})
@@ -29,6 +31,8 @@ class ConstantSky(Sky):
 
 class CubemapSky(Sky):
     """A learned cube map of `resolution` texels along an edge, started at `color` (3,) in [0, 1]."""
+
+    keeps_gaussians_out = False
 
     def __init__(self, resolution: int, color: Float[Tensor, "3"], learning_rate: float):
         super().__init__()

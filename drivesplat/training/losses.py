@@ -28,7 +28,7 @@ def loss_terms(
         )
     if settings.scale_reg:
         terms["scale_reg"] = settings.scale_reg * torch.cat([torch.exp(p.params["scales"]) for p in model.parts]).mean()
-    if model.sky is not None and view.sky is not None and settings.sky_alpha_weight:
+    if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(picture.alpha, view.sky)
     return terms
 

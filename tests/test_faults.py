@@ -1,0 +1,205 @@
+"""What goes wrong, and what the user may count on: each fault through Snakemake itself, in one line."""
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from tiny_world import World
+from workflow_copy import TINY_TRAINING, WorkflowCopy
+
+pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
+
+
+def told(done: subprocess.CompletedProcess) -> str:
+    """The one line that a failed run says, checked to be one line and no traceback."""
+    assert done.returncode != 0, done.stdout
+    assert "Traceback" not in done.stdout, done.stdout
+    lines = {line for line in done.stdout.splitlines() if line.startswith("drivesplat: ")}
+    assert len(lines) == 1, done.stdout
+    return lines.pop()
+
+
+@pytest.fixture
+def copy(tmp_path) -> WorkflowCopy:
+    return WorkflowCopy.make(tmp_path / "workflow")
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"trian": {"iterations": 3}}, ["trian", "spelling"]),
+        ({"train": {"iteration": 3}}, ["train.iteration", "3"]),
+        ({"train": {"iterations": -5}}, ["train.iterations", "-5", "greater than or equal to 1"]),
+        ({"sky": "blue"}, ["sky", "'blue'", "'none', 'mask' or 'cubemap'"]),
+        ({"holdout": {"every_nth": 4, "offset": 4}}, ["holdout", "offset", "every_nth (4)"]),
+    ],
+)
+def test_a_mistyped_key_or_value_stops_before_any_job(copy, config, words):
+    copy.config |= config
+    copy.write_config()
+    line = told(copy.run())
+    assert all(word in line for word in words), line
+    assert not (copy.folder / "results").exists()
+
+
+def test_an_unknown_scene_stops_before_any_job_and_lists_those_there_are(copy):
+    line = told(copy.run("results/9999/metrics.json"))
+    assert "9999" in line and "0001" in line
+    assert not (copy.folder / "results").exists()
+
+
+def test_an_unquoted_scene_number_is_told_to_be_quoted(copy):
+    copy.write_config("datasets: {nuscenes: {dataroot: data, scenes: [0061]}}\n")
+    line = told(copy.run())
+    assert "quotes" in line and '"0061"' in line
+
+
+def test_an_unknown_method_lists_those_there_are(copy):
+    line = told(copy.run("results/0001/vanila/train.json"))
+    assert "vanila" in line and "vanilla" in line
+
+
+@pytest.mark.parametrize(
+    ("dataset", "words"),
+    [
+        ({"dataroot": "elsewhere"}, ["v1.0-mini", "elsewhere", "nuscenes.org", "dataroot"]),
+        ({"dataroot": "empty"}, ["v1.0-mini", "empty", "nuscenes.org"]),
+        ({"dataroot": "data", "version": "v1.0-trainval"}, ["v1.0-trainval", "data", "v1.0-mini", "version"]),
+    ],
+)
+def test_a_missing_dataset_is_told_in_one_message(copy, dataset, words):
+    (copy.folder / "empty").mkdir()
+    copy.config["datasets"] = {"nuscenes": {"scenes": ["0001"], **dataset}}
+    copy.write_config()
+    line = told(copy.run("results/0001/metrics.json"))
+    assert all(word in line for word in words), line
+
+
+def test_missing_tables_are_named(copy):
+    (copy.folder / "data/v1.0-mini/ego_pose.json").unlink()
+    assert "ego_pose.json" in told(copy.run("results/0001/scene.json"))
+
+
+def edit_table(copy: WorkflowCopy, table: str, change) -> None:
+    path = copy.folder / f"data/v1.0-mini/{table}.json"
+    rows = json.loads(path.read_text())
+    change(rows)
+    path.write_text(json.dumps(rows))
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "token"),
+    [
+        ("ego_pose", lambda rows: rows[3].update(translation=[float("nan"), 0, 0]), "0001 CAM_FRONT 3"),
+        ("ego_pose", lambda rows: rows[2].update(rotation=[2.0, 0, 0, 0]), "0001 CAM_FRONT 2"),
+        ("calibrated_sensor", lambda rows: rows[0].update(camera_intrinsic=[[0] * 3] * 3), "calibrated CAM_FRONT"),
+        ("sample", lambda rows: rows[4].update(timestamp=rows[3]["timestamp"]), "0001 sample 4"),
+    ],
+)
+def test_malformed_tables_are_rejected_with_the_token(copy, table, change, token):
+    edit_table(copy, table, change)
+    copy.config["sweeps"] = True
+    copy.write_config()
+    assert token in told(copy.run("results/0001/scene.json"))
+    assert not (copy.folder / "results/0001/scene.json").exists()
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda p: p.unlink(), lambda p: p.write_bytes(p.read_bytes()[:700])], ids=["missing", "truncated"]
+)
+def test_a_bad_image_is_named_with_its_sample(copy, damage):
+    path = copy.folder / "data/samples/CAM_FRONT/0001__0004.jpg"
+    damage(path)
+    line = told(copy.run("results/0001/scene.json"))
+    assert "0001__0004.jpg" in line and "0001 CAM_FRONT 4" in line
+    assert not (copy.folder / "results/0001/scene.json").exists()
+
+
+def test_missing_lidar_stops_and_names_it_or_is_counted_where_told_to_go_on(copy):
+    (copy.folder / "data/samples/LIDAR_TOP/0001__0002.pcd.bin").unlink()
+    line = told(copy.run("results/0001/parser.pkl"))
+    assert "0001__0002.pcd.bin" in line and "lidar_seed.on_missing: warn" in line
+    copy.config["lidar_seed"] = {**copy.config["lidar_seed"], "on_missing": "warn"}
+    copy.write_config()
+    done = copy.run("results/0001/metrics.json")
+    assert done.returncode == 0, done.stdout
+    assert copy.read("results/0001/metrics.json")["protocol"]["lidar_missing"] == 1
+
+
+def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
+    copy.config["device"] = "auto"
+    copy.write_config()
+    line = told(copy.run("results/0001/vanilla/train.json"))
+    assert "no usable GPU" in line and "device: cpu" in line
+    assert not (copy.folder / "results/0001/vanilla/checkpoint.pt").exists()
+
+
+def test_a_scene_without_vehicles_gets_nulls(tmp_path):
+    copy = WorkflowCopy.make(tmp_path / "workflow", World(things=[]), train=TINY_TRAINING | {"iterations": 20})
+    done = copy.run("results/0001/metrics.json")
+    assert done.returncode == 0, done.stdout
+    result = copy.read("results/0001/metrics.json")["methods"]["vanilla"]["extrapolation"]
+    assert result["vehicle"] is None and result["moving_vehicle"] is None and result["gap_db"] is None
+    assert result["static"]["psnr"] == result["all"]["psnr"]
+    assert "NaN" not in (copy.folder / "results/0001/metrics.json").read_text()
+
+
+def test_a_second_run_in_one_folder_is_refused(copy):
+    results = copy.folder / "results"
+    results.mkdir()
+    with open(results / ".lock", "w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        line = told(copy.run("results/0001/scene.json"))
+    assert "another run" in line
+    assert copy.run("results/0001/scene.json").returncode == 0
+
+
+def training_process(copy: WorkflowCopy) -> int | None:
+    """The process id of the running train.py of this copy."""
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                arguments = (entry / "cmdline").read_bytes().split(b"\0")
+                where = str((entry / "cwd").readlink())
+            except OSError:
+                continue
+            if (
+                where == str(copy.folder)
+                and any(a.endswith(b".train.py") for a in arguments)
+                and b"python" in arguments[0]
+            ):
+                return int(entry.name)
+    return None
+
+
+def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
+    training = TINY_TRAINING | {"iterations": 240, "checkpoint_every": 10}
+    whole = WorkflowCopy.make(tmp_path / "whole", train=training)
+    killed = WorkflowCopy.make(tmp_path / "killed", train=training)
+    assert whole.run("results/0001/metrics.json").returncode == 0
+    state = killed.folder / "results/0001/vanilla/resume/state.pt"
+    running = subprocess.Popen(
+        killed.command("--cores", "2", "--", "results/0001/metrics.json"), cwd=killed.folder,
+        env={**os.environ, "CUDA_VISIBLE_DEVICES": ""}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    deadline = time.monotonic() + 120
+    while not state.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    trainer = training_process(killed)
+    assert state.exists() and trainer is not None
+    os.kill(trainer, signal.SIGKILL)
+    assert running.wait(timeout=120) != 0
+    left = {path.name for path in (killed.folder / "results/0001/vanilla").iterdir()}
+    assert not {"checkpoint.pt", "train.json"} & left
+    done = killed.run("results/0001/metrics.json")
+    assert done.returncode == 0, done.stdout
+    summary = killed.read("results/0001/vanilla/train.json")
+    assert summary["iterations"] == 240 and len(summary["resumed_at"]) == 1 and summary["resumed_at"][0] >= 10
+    a, b = (c.read("results/0001/metrics.json")["methods"]["vanilla"]["extrapolation"] for c in (whole, killed))
+    for region in ("all", "static", "moving_vehicle"):
+        assert abs(a[region]["psnr"] - b[region]["psnr"]) < 0.1

@@ -1,0 +1,147 @@
+"""What is held out: the table of the measuring protocol, checked image by image."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from drivesplat.holdout import frame_groups, held_out_key_frames, sweep_groups
+from drivesplat.scene import Frame, Scene, Sweep
+from drivesplat.settings.holdout import HoldoutSettings
+
+INTERVAL = 500_000
+
+
+def drive(key_frames: int, cameras=("CAM_FRONT", "CAM_BACK"), between: int = 5) -> Scene:
+    """A drive whose cameras fire at their own delays after the key frame, `between` images between key frames."""
+    frames, sweeps = [], []
+    for c, camera in enumerate(cameras):
+        for step in range((key_frames - 1) * (between + 1) + 1):
+            index, part = divmod(step, between + 1)
+            time = index * INTERVAL + part * INTERVAL // (between + 1) + 7_000 * c
+            nearest = index if part <= (between + 1) / 2 else index + 1
+            frames.append(
+                Frame(camera, time, "", 16, 9, np.eye(3), np.eye(4), np.eye(4), part == 0, nearest, f"{camera} {step}")
+            )
+    for step in range((key_frames - 1) * 10 + 1):
+        index, part = divmod(step, 10)
+        sweeps.append(Sweep("", step * INTERVAL // 10, np.eye(4), part == 0, index, f"sweep {step}"))
+    times = np.arange(key_frames) * INTERVAL
+    return Scene("0001", "", "", "", np.zeros(3), times, tuple(frames), tuple(sweeps), (), "nuscenes")
+
+
+def held_out(count: int, **settings) -> tuple[list[int], list[int]]:
+    groups = held_out_key_frames(count, HoldoutSettings(**settings))
+    assert groups.keys() == {"interpolation", "extrapolation"}
+    return groups["interpolation"], groups["extrapolation"]
+
+
+def test_the_defaults_on_39_key_frames_are_those_of_the_protocol():
+    assert held_out(39) == ([4, 12, 20, 28], [35, 36, 37, 38])
+
+
+@pytest.mark.parametrize(
+    ("count", "settings", "interpolation", "extrapolation"),
+    [
+        (40, {}, [4, 12, 20, 28], [36, 37, 38, 39]),
+        (39, {"every_nth": 0}, [], [35, 36, 37, 38]),
+        (39, {"last_block": 0}, [4, 12, 20, 28, 36], []),
+        (39, {"every_nth": 0, "last_block": 0}, [], []),
+        (10, {"every_nth": 4, "offset": 0, "last_block": 1}, [0, 4, 8], [9]),
+        (10, {"every_nth": 1, "offset": 0, "last_block": 3}, [0, 1, 2, 3, 4, 5, 6], [7, 8, 9]),
+        (3, {}, [], [0, 1, 2]),
+        (1, {"last_block": 0}, [], []),
+        (5, {"last_block": 0}, [4], []),
+    ],
+)
+def test_every_nth_and_the_last_block_are_held_out(count, settings, interpolation, extrapolation):
+    assert held_out(count, **settings) == (interpolation, extrapolation)
+
+
+@pytest.mark.parametrize("last_block", range(12))
+def test_a_frame_in_both_groups_belongs_to_the_block(last_block):
+    interpolation, extrapolation = held_out(12, every_nth=2, offset=1, last_block=last_block)
+    assert extrapolation == list(range(12 - last_block, 12))
+    assert interpolation == [i for i in (1, 3, 5, 7, 9, 11) if i < 12 - last_block]
+
+
+@pytest.mark.parametrize(("every_nth", "offset"), [(8, 8), (8, 9), (1, 1), (4, 4)])
+def test_an_offset_that_would_never_hold_out_anything_is_refused(every_nth, offset):
+    with pytest.raises(ValidationError, match="offset must be under every_nth"):
+        HoldoutSettings(every_nth=every_nth, offset=offset)
+
+
+def test_without_every_nth_the_offset_does_not_matter():
+    assert HoldoutSettings(every_nth=0, offset=9).offset == 9
+
+
+@pytest.mark.parametrize("field", ["every_nth", "offset", "last_block"])
+def test_negative_numbers_are_refused(field):
+    with pytest.raises(ValidationError):
+        HoldoutSettings(**{field: -1})
+
+
+HOLDOUT = HoldoutSettings(every_nth=4, offset=2, last_block=2)
+"""Of 10 key frames: 2, 6 by interpolation; 8, 9 by extrapolation."""
+HELD_OUT = {2: "interpolation", 6: "interpolation", 8: "extrapolation", 9: "extrapolation"}
+
+
+def test_all_cameras_images_of_a_held_out_timestamp_are_held_out():
+    scene = drive(10)
+    groups = {
+        (frame.camera, frame.sample_index): group
+        for frame, group in zip(scene.frames, frame_groups(scene, HOLDOUT), strict=True)
+        if frame.is_key_frame
+    }
+    assert groups == {(c, i): HELD_OUT.get(i, "train") for c in ("CAM_FRONT", "CAM_BACK") for i in range(10)}
+
+
+def test_images_between_key_frames_are_excluded_where_nearer_than_half_an_interval_to_a_held_out_one():
+    scene = drive(10)
+    between = [(f, g) for f, g in zip(scene.frames, frame_groups(scene, HOLDOUT), strict=True) if not f.is_key_frame]
+    assert {group for _, group in between} == {"train", "excluded"}
+    for frame, group in between:
+        near = any(abs(frame.timestamp - i * INTERVAL) < INTERVAL / 2 for i in HELD_OUT)
+        assert group == ("excluded" if near else "train"), frame.token
+
+
+def test_an_image_exactly_half_way_to_a_held_out_key_frame_may_be_trained_on():
+    scene = drive(4, cameras=("CAM_FRONT",), between=1)
+    groups = frame_groups(scene, HoldoutSettings(every_nth=0, last_block=1))
+    assert [f.timestamp for f in scene.frames] == [i * INTERVAL // 2 for i in range(7)]
+    assert groups == ["train"] * 6 + ["extrapolation"]
+
+
+def test_lidar_sweeps_are_held_out_like_images():
+    scene = drive(10)
+    for sweep, group in zip(scene.sweeps, sweep_groups(scene, HOLDOUT), strict=True):
+        if sweep.is_key_frame:
+            assert group == HELD_OUT.get(sweep.sample_index, "train")
+        else:
+            near = any(abs(sweep.timestamp - i * INTERVAL) < INTERVAL / 2 for i in HELD_OUT)
+            assert group == ("excluded" if near else "train"), sweep.token
+
+
+def test_a_missing_image_shifts_no_other_images_group():
+    scene = drive(10)
+    whole = dict(zip((f.token for f in scene.frames), frame_groups(scene, HOLDOUT), strict=True))
+    thinned = dataclasses.replace(scene, frames=scene.frames[3:20] + scene.frames[23:])
+    assert frame_groups(thinned, HOLDOUT) == [whole[f.token] for f in thinned.frames]
+
+
+def test_nothing_held_out_trains_on_everything():
+    scene = drive(5)
+    none = HoldoutSettings(every_nth=0, last_block=0)
+    assert set(frame_groups(scene, none)) == set(sweep_groups(scene, none)) == {"train"}
+
+
+def test_the_tiny_drives_image_sweep_215_ms_after_a_held_out_key_frame_is_excluded(tiny_scene):
+    """Its camera fires 35 ms before the key frame; its image sweeps lie half an interval after the camera's images."""
+    groups = frame_groups(tiny_scene, HoldoutSettings(every_nth=4, offset=1, last_block=0))
+    expected = ["train"] * 19
+    for key_frame in (1, 5, 9):
+        expected[2 * key_frame] = "interpolation"
+        if key_frame < 9:
+            expected[2 * key_frame + 1] = "excluded"
+    assert groups == expected

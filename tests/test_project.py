@@ -1,0 +1,54 @@
+"""The project as a whole: pins in one place, planning that stays quick, presets that load."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drivesplat.config import load, merged
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+def pins(lines: list[str]) -> dict[str, str]:
+    return dict(line.strip().split("==") for line in lines if "==" in line and not line.strip().startswith("#"))
+
+
+def test_environments_pin_what_the_constraints_pin():
+    constraints = pins((REPOSITORY / "constraints.txt").read_text().splitlines())
+    for path in (REPOSITORY / "envs").glob("*.yaml"):
+        packages = next(d["pip"] for d in yaml.safe_load(path.read_text())["dependencies"] if isinstance(d, dict))
+        environment = pins(packages)
+        assert environment and all(constraints[name] == version for name, version in environment.items()), path.name
+        tools = {"pytest", "pytest-xdist", "ruff", "snakefmt", "snakemake-executor-plugin-slurm"}
+        assert constraints.keys() - environment.keys() == tools, path.name
+
+
+def test_every_requirement_is_pinned():
+    required = {
+        line.strip() for line in (REPOSITORY / "requirements.txt").read_text().splitlines() if line and line[0] != "#"
+    }
+    assert required == pins((REPOSITORY / "constraints.txt").read_text().splitlines()).keys()
+
+
+def test_planning_imports_nothing_heavy():
+    code = "import sys, drivesplat.planning as _; print(' '.join(sys.modules))"
+    modules = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    ).stdout
+    heavy = {"torch", "gsplat", "nuscenes", "scipy", "pandas", "skimage", "cv2", "matplotlib", "lpips"}
+    assert not heavy & set(modules.split())
+
+
+@pytest.mark.parametrize("preset", sorted(path.name for path in (REPOSITORY / "presets").glob("*.yaml")))
+def test_presets_are_valid_over_the_defaults(preset):
+    defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
+    config = load(merged(defaults, yaml.safe_load((REPOSITORY / "presets" / preset).read_text())))
+    assert config.scenes
+
+
+def test_scripts_are_thin():
+    for script in (REPOSITORY / "workflow_scripts").glob("*.py"):
+        assert len([line for line in script.read_text().splitlines() if line.strip()]) <= 25, script.name

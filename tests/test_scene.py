@@ -1,0 +1,115 @@
+"""scene.json: a scene returns to the last bit, a bad file is named with its rule, and times find their key frames."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from drivesplat.errors import ResultError
+from drivesplat.scene import Frame, Scene, Sweep, Track, read_scene, write_scene
+
+
+def pose(seed: int) -> np.ndarray:
+    """Numbers without a short decimal spelling."""
+    return np.random.default_rng(seed).normal(0.0, 1e3, (4, 4))
+
+
+def some_scene(times: tuple[int, ...] = (1_532_402_927_647_951, 1_532_402_928_147_950)) -> Scene:
+    first, last = times[0], times[-1]
+    intrinsics = np.array([[1266.417203046554, 0.0, 816.2670197447984], [0.0, 1266.4, 491.507], [0.0, 0.0, 1.0]])
+    frame = Frame("CAM_FRONT", first - 35_000, "/data/ä.jpg", 1600, 900, intrinsics, pose(1), pose(2), True, 0, "a")
+    between = dataclasses.replace(frame, timestamp=first + 10, is_key_frame=False, token="b")
+    sweep = Sweep("/data/a.pcd.bin", first, pose(3), True, 0, "c")
+    track = Track(
+        "instance", "vehicle.car", np.array([4.1, 1.9, 1.7]), np.array([first, last]), np.array([0, 1]),
+        np.stack([pose(4), pose(5)]), np.array([4, 0]),
+    )  # fmt: skip
+    return Scene(
+        "0061", "nuscenes", "v1.0-mini", "Parked truck, ä", np.array([411.3039349319818, 1180.8903791765097, 0.1]),
+        np.array(times), (frame, between), (sweep,), (track,), "refined", [0, 2], 3, {"stages": {"extract": {}}},
+    )  # fmt: skip
+
+
+def assert_same_record(a, b) -> None:
+    assert type(a) is type(b)
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes(), field.name
+        elif isinstance(x, tuple):
+            assert isinstance(y, tuple) and len(x) == len(y), field.name
+            for item, other in zip(x, y, strict=True):
+                assert_same_record(item, other)
+        else:
+            assert x == y and type(x) is type(y), field.name
+
+
+def test_a_scene_returns_to_the_last_bit(tmp_path):
+    scene = some_scene()
+    write_scene(tmp_path / "scene.json", scene)
+    assert_same_record(read_scene(tmp_path / "scene.json"), scene)
+
+
+def test_the_tiny_drive_returns_to_the_last_bit(tmp_path, tiny_scene):
+    write_scene(tmp_path / "scene.json", tiny_scene)
+    assert_same_record(read_scene(tmp_path / "scene.json"), tiny_scene)
+
+
+def test_a_scene_without_frame_range_sweeps_or_tracks_returns(tmp_path):
+    scene = dataclasses.replace(some_scene(), sweeps=(), tracks=(), key_frame_range=None)
+    write_scene(tmp_path / "scene.json", scene)
+    assert_same_record(read_scene(tmp_path / "scene.json"), scene)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.99])
+def test_a_truncated_scene_is_refused_naming_file_and_rule(tmp_path, share):
+    write_scene(tmp_path / "scene.json", some_scene())
+    whole = (tmp_path / "scene.json").read_bytes()
+    (tmp_path / "scene.json").write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ResultError, match=r"scene\.json.*'extract'"):
+        read_scene(tmp_path / "scene.json")
+
+
+def without(key):
+    return lambda content: {name: value for name, value in content.items() if name != key}
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda content: {**content, "schema": 2},
+        without("schema"),
+        without("frames"),
+        without("origin"),
+        lambda content: {**content, "another": 1},
+        lambda content: {**content, "frames": [1]},
+        lambda content: {**content, "frames": [without("token")(content["frames"][0])]},
+        lambda content: {**content, "tracks": None},
+        lambda content: {**content, "origin": ["x", "y", "z"]},
+        lambda content: [content],
+        lambda content: "scene",
+        lambda content: None,
+    ],
+)
+def test_json_that_is_no_scene_of_this_schema_is_refused_naming_file_and_rule(tmp_path, edit):
+    write_scene(tmp_path / "scene.json", some_scene())
+    content = edit(json.loads((tmp_path / "scene.json").read_text()))
+    (tmp_path / "scene.json").write_text(json.dumps(content))
+    with pytest.raises(ResultError, match=r"scene\.json.*'extract'"):
+        read_scene(tmp_path / "scene.json")
+
+
+@pytest.mark.parametrize(
+    ("time", "nearest"), [(-5, 0), (0, 0), (49, 0), (51, 1), (100, 1), (179, 1), (181, 2), (9999, 2)]
+)
+def test_the_nearest_key_frame_is_nearest_in_time(time, nearest):
+    assert some_scene((0, 100, 260)).nearest_key_frame(time) == nearest
+
+
+@pytest.mark.parametrize(
+    ("times", "interval"),
+    [((0, 500_000, 1_000_000, 1_700_000), 500_000.0), ((7, 100), 93.0), ((7,), 500_000.0)],
+)
+def test_the_interval_is_the_median_time_between_key_frames(times, interval):
+    assert some_scene(times).key_frame_interval == interval

@@ -1,0 +1,172 @@
+"""Skies: a cube map without seams, and one colour."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from drivesplat.model.sky import ConstantSky, CubemapSky, face_coordinates, shared_vertices
+
+AXES = {0: (1, 0, 0), 1: (-1, 0, 0), 2: (0, 1, 0), 3: (0, -1, 0), 4: (0, 0, 1), 5: (0, 0, -1)}
+"""The outward normal of every face."""
+
+
+def random_rays(seed: int, count: int) -> torch.Tensor:
+    """Unit directions all over the sphere, as an image of one row."""
+    rays = np.random.default_rng(seed).normal(size=(1, count, 3))
+    return torch.from_numpy(rays / np.linalg.norm(rays, axis=-1, keepdims=True)).float()
+
+
+def random_sky(resolution: int, seed: int = 0) -> CubemapSky:
+    sky = CubemapSky(resolution, torch.full((3,), 0.5), 1e-2)
+    with torch.no_grad():
+        sky.params["texels"].normal_(generator=torch.Generator().manual_seed(seed))
+    return sky
+
+
+def surface_points(resolution: int) -> torch.Tensor:
+    """Where the texels (face, v, u) lie on the cube [-1, 1]^3, from the documented layout of the faces: (6, r, r, 3)."""
+    line = torch.linspace(-1.0, 1.0, resolution)
+    points = torch.zeros(6, resolution, resolution, 3)
+    for face, normal in AXES.items():
+        axis = face // 2
+        points[face, ..., axis] = normal[axis]
+        points[face, ..., (axis + 1) % 3] = line[None, :]
+        points[face, ..., (axis + 2) % 3] = line[:, None]
+    return points
+
+
+@pytest.mark.parametrize("resolution", [2, 3, 5, 16])
+def test_texels_are_the_vertices_of_a_grid_on_the_cube(resolution):
+    index, count = shared_vertices(resolution)
+    assert count == 6 * resolution**2 - 12 * resolution + 8
+    assert torch.equal(index.unique(), torch.arange(count))
+
+
+@pytest.mark.parametrize("resolution", [2, 3, 5])
+def test_faces_share_a_texel_exactly_where_they_meet(resolution):
+    index, _ = shared_vertices(resolution)
+    same_place = (
+        torch.cdist(surface_points(resolution).reshape(-1, 3), surface_points(resolution).reshape(-1, 3)) < 1e-6
+    )
+    same_texel = index.reshape(-1, 1) == index.reshape(1, -1)
+    assert torch.equal(same_place, same_texel)
+
+
+@pytest.mark.parametrize("face", range(6))
+def test_a_ray_along_an_axis_meets_the_centre_of_its_face(face):
+    x, y, z = face_coordinates(torch.tensor(AXES[face], dtype=torch.float32).reshape(1, 1, 3))[0, 0]
+    assert (float(x), float(y)) == (0.0, 0.0)
+    assert (float(z) + 1.0) / 2.0 * 5.0 == pytest.approx(face, abs=1e-5)
+
+
+def test_the_length_of_a_ray_does_not_matter():
+    rays = random_rays(1, 200)
+    torch.testing.assert_close(face_coordinates(rays * 37.0), face_coordinates(rays))
+
+
+@pytest.mark.parametrize("resolution", [2, 7])
+def test_colours_lie_where_the_layout_says(resolution):
+    """Bilinear interpolation is exact for a function that is linear on the cube's surface."""
+    slope = torch.tensor([[0.9, -0.4, 0.2], [-0.7, 0.8, 0.1], [0.3, 0.5, -1.1]])
+    sky = CubemapSky(resolution, torch.full((3,), 0.5), 1e-2)
+    with torch.no_grad():
+        sky.params["texels"][sky.index] = surface_points(resolution) @ slope
+    rays = random_rays(2, 500)
+    on_cube = rays / rays.abs().amax(dim=-1, keepdim=True)
+    torch.testing.assert_close(sky.colors(rays), torch.sigmoid(on_cube @ slope), rtol=0, atol=1e-5)
+
+
+def edge_points() -> list[np.ndarray]:
+    """Points on all twelve edges and eight corners of the cube."""
+    points = [np.array(corner, dtype=float) for corner in itertools.product((-1.0, 1.0), repeat=3)]
+    for axis in range(3):
+        for first, second in itertools.product((-1.0, 1.0), repeat=2):
+            for along in (-0.83, -0.31, 0.0, 0.27, 0.6):
+                point = np.zeros(3)
+                point[axis], point[(axis + 1) % 3], point[(axis + 2) % 3] = along, first, second
+                points.append(point)
+    return points
+
+
+@pytest.mark.parametrize("resolution", [2, 8])
+def test_no_seam_shows_at_any_edge_or_corner(resolution):
+    sky = random_sky(resolution)
+    for point in edge_points():
+        aside = np.array(list(itertools.product((-1e-6, 0.0, 1e-6), repeat=3)))
+        around = torch.from_numpy(point + aside).float()[None]
+        faces = face_coordinates(around)[..., 2].unique()
+        assert len(faces) >= 2, "the rays must fall on both sides of the seam"
+        colors = sky.colors(around)[0]
+        assert float((colors.amax(dim=0) - colors.amin(dim=0)).max()) < 1e-4
+
+
+def test_a_small_turn_changes_colours_a_little_everywhere():
+    sky = random_sky(8)
+    rays = random_rays(4, 5000)
+    turn = torch.from_numpy(Rotation.from_rotvec([4e-5, -3e-5, 5e-5]).as_matrix()).float()
+    assert float((sky.colors(rays @ turn.T) - sky.colors(rays)).abs().max()) < 5e-3
+
+
+def test_the_gradient_is_that_of_finite_differences():
+    sky = random_sky(3).double()
+    rays, weights = random_rays(5, 40).double(), torch.from_numpy(np.random.default_rng(6).normal(size=(1, 40, 3)))
+    texels = sky.params["texels"]
+    (sky.colors(rays) * weights).sum().backward()
+    step = 1e-5
+    with torch.no_grad():
+        for i, c in itertools.product(range(len(texels)), range(3)):
+            values = []
+            for sign in (1.0, -1.0):
+                texels[i, c] += sign * step
+                values.append(float((sky.colors(rays) * weights).sum()))
+                texels[i, c] -= sign * step
+            assert float(texels.grad[i, c]) == pytest.approx((values[0] - values[1]) / (2 * step), abs=1e-8)
+
+
+def test_every_texel_learns_from_an_all_round_view():
+    sky = random_sky(4)
+    sky.colors(random_rays(7, 5000)).sum().backward()
+    assert (sky.params["texels"].grad > 0).all()
+
+
+@pytest.mark.parametrize("color", [(0.2, 0.5, 0.9), (0.75, 0.75, 0.75)])
+def test_a_new_cube_map_has_its_start_colour_in_all_directions(color):
+    colors = CubemapSky(5, torch.tensor(color), 1e-2).colors(random_rays(8, 1000))
+    torch.testing.assert_close(colors, torch.tensor(color).expand_as(colors), rtol=0, atol=1e-5)
+
+
+def test_a_constant_sky_is_one_learned_colour():
+    sky = ConstantSky(torch.tensor([0.2, 0.5, 0.9]), 3e-3)
+    rays = random_rays(9, 50)
+    torch.testing.assert_close(sky.colors(rays), torch.tensor([0.2, 0.5, 0.9]).expand(1, 50, 3), rtol=0, atol=1e-6)
+    sky.colors(rays).sum().backward()
+    expected = 50 * torch.tensor([0.2 * 0.8, 0.5 * 0.5, 0.9 * 0.1])
+    torch.testing.assert_close(sky.params["color"].grad, expected)
+
+
+@pytest.mark.parametrize("kind", ["constant", "cubemap"])
+@pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+def test_a_black_or_white_start_can_still_learn(kind, color):
+    start = torch.tensor(color)
+    sky = ConstantSky(start, 1e-2) if kind == "constant" else CubemapSky(2, start, 1e-2)
+    colors = sky.colors(random_rays(10, 20))
+    assert float((colors - start).abs().max()) < 0.03
+    colors.sum().backward()
+    (gradient,) = (value.grad for value in sky.params.values())
+    assert torch.isfinite(gradient).all() and float(gradient.abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize(("kind", "name"), [("constant", "color"), ("cubemap", "texels")])
+def test_learning_rates_are_given_for_every_parameter(kind, name):
+    start = torch.full((3,), 0.5)
+    sky = ConstantSky(start, 3e-3) if kind == "constant" else CubemapSky(2, start, 3e-3)
+    assert sky.learning_rates() == {name: 3e-3} and set(sky.params) == {name}
+
+
+def test_only_learned_texels_are_saved():
+    assert set(random_sky(4).state_dict()) == {"params.texels"}
+    assert math.prod(random_sky(4).state_dict()["params.texels"].shape) == 56 * 3

@@ -1,0 +1,314 @@
+"""Files are whole or absent, hold plain data only, and a bad one is named together with the rule that rebuilds it."""
+
+import builtins
+import collections
+import enum
+import errno
+import json
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from drivesplat.errors import ResultError
+from drivesplat.storage import (
+    atomic_write,
+    canonical_json,
+    read_json,
+    read_plain_pickle,
+    sha256_file,
+    sha256_text,
+    write_json,
+    write_plain_pickle,
+)
+
+
+def write(path, content: bytes) -> None:
+    with atomic_write(path) as file:
+        file.write(content)
+
+
+def files_below(folder) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def raiser(number: int):
+    def raises(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    return raises
+
+
+def test_a_written_file_holds_what_was_written_and_nothing_lies_beside_it(tmp_path):
+    write(tmp_path / "new folder" / "result.bin", b"content")
+    assert (tmp_path / "new folder" / "result.bin").read_bytes() == b"content"
+    assert files_below(tmp_path) == {"new folder/result.bin"}
+
+
+def test_nothing_stands_at_the_target_while_it_is_being_written(tmp_path):
+    target = tmp_path / "result.bin"
+    with atomic_write(target) as file:
+        file.write(b"half")
+        file.flush()
+        assert not target.exists()
+    assert target.read_bytes() == b"half"
+
+
+def test_a_crash_while_writing_leaves_the_old_file_and_no_partial_one(tmp_path):
+    write(tmp_path / "result.bin", b"old")
+    with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "result.bin") as file:
+        file.write(b"new, but only ha")
+        raise ZeroDivisionError
+    assert (tmp_path / "result.bin").read_bytes() == b"old"
+    assert files_below(tmp_path) == {"result.bin"}
+
+
+def test_a_crash_while_writing_a_new_file_leaves_none(tmp_path):
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "result.bin") as file:
+        file.write(b"half")
+        raise KeyboardInterrupt
+    assert files_below(tmp_path) == set()
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file_and_keeps_the_old_one(tmp_path, monkeypatch):
+    write(tmp_path / "result.bin", b"old")
+    monkeypatch.setattr(os, "fsync", raiser(errno.ENOSPC))
+    with pytest.raises(ResultError) as failure:
+        write(tmp_path / "result.bin", b"new")
+    assert str(tmp_path / "result.bin") in str(failure.value)
+    assert os.strerror(errno.ENOSPC) in str(failure.value)
+    assert (tmp_path / "result.bin").read_bytes() == b"old"
+    assert files_below(tmp_path) == {"result.bin"}
+
+
+def test_a_read_only_file_system_is_told_with_the_name_of_the_file(tmp_path, monkeypatch):
+    """There every change fails, that of a file which is not there included."""
+    opened = builtins.open
+
+    def open_read_only(file, mode="r", *args, **kwargs):
+        return opened(file, mode, *args, **kwargs) if "r" in mode else raiser(errno.EROFS)()
+
+    for name in ("unlink", "remove", "rename", "replace"):
+        monkeypatch.setattr(os, name, raiser(errno.EROFS))
+    monkeypatch.setattr(builtins, "open", open_read_only)
+    with pytest.raises(ResultError) as failure:
+        write(tmp_path / "result.bin", b"new")
+    assert str(tmp_path / "result.bin") in str(failure.value)
+    assert os.strerror(errno.EROFS) in str(failure.value)
+
+
+def test_a_file_where_the_folder_should_be_is_told_with_the_name_of_the_file(tmp_path):
+    (tmp_path / "results").write_text("a file, no folder")
+    with pytest.raises(ResultError, match=r"results/0061/scene\.json"):
+        write(tmp_path / "results" / "0061" / "scene.json", b"{}")
+    with pytest.raises(ResultError, match=r"results/scene\.json"):
+        write(tmp_path / "results" / "scene.json", b"{}")
+
+
+def test_canonical_json_does_not_depend_on_the_order_of_keys():
+    value = {"b": 1, "a": {"d": [1, 2.5, None], "c": "ä"}}
+    reordered = {"a": {"c": "ä", "d": [1, 2.5, None]}, "b": 1}
+    assert canonical_json(value) == canonical_json(reordered)
+    assert json.loads(canonical_json(value)) == value
+    assert canonical_json({"b": 1, "a": [True, None]}) == '{"a":[true,null],"b":1}'
+
+
+def test_canonical_json_depends_on_every_value():
+    assert canonical_json({"a": [1, 2]}) != canonical_json({"a": [2, 1]})
+    assert canonical_json({"a": 1, "b": 2}) != canonical_json({"a": 2, "b": 1})
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_no_json_holds_a_number_that_is_not_finite(tmp_path, value):
+    with pytest.raises(ValueError):
+        canonical_json({"psnr": value})
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "metrics.json", {"psnr": value})
+    assert files_below(tmp_path) == set()
+
+
+def test_digests_are_sha256(tmp_path):
+    (tmp_path / "abc").write_bytes(b"abc")
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-2, appendix B.1
+    assert sha256_text("abc") == known
+    assert sha256_file(tmp_path / "abc") == known
+
+
+def test_json_returns_as_it_was_written_to_the_last_bit(tmp_path):
+    value = {"numbers": [0.1, 1 / 3, 1e-300, 2**53 + 1], "text": "Zürich", "none": None, "nested": {"a": [True]}}
+    write_json(tmp_path / "value.json", value)
+    assert read_json(tmp_path / "value.json", rule="extract") == value
+
+
+def test_json_truncated_anywhere_is_refused_naming_file_and_rule(tmp_path):
+    write_json(tmp_path / "whole.json", {"schema": 1, "frames": [{"token": "ä"}, 2.5]})
+    whole = (tmp_path / "whole.json").read_bytes()
+    for length in range(len(whole.rstrip())):
+        (tmp_path / "cut.json").write_bytes(whole[:length])
+        with pytest.raises(ResultError, match=r"cut\.json.*'extract'"):
+            read_json(tmp_path / "cut.json", rule="extract")
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", b"\xff\xfe\x00", b"{} {}", b"not json"])
+def test_foreign_json_is_refused_naming_file_and_rule(tmp_path, content):
+    (tmp_path / "foreign.json").write_bytes(content)
+    with pytest.raises(ResultError, match=r"foreign\.json.*'parser'"):
+        read_json(tmp_path / "foreign.json", rule="parser")
+
+
+def test_a_missing_result_is_named_with_its_rule(tmp_path):
+    with pytest.raises(ResultError, match=r"absent\.json.*'extract'"):
+        read_json(tmp_path / "absent.json", rule="extract")
+    with pytest.raises(ResultError, match=r"absent\.pkl.*'parser'"):
+        read_plain_pickle(tmp_path / "absent.pkl", rule="parser")
+
+
+def assert_same(a, b) -> None:
+    assert type(a) is type(b)
+    if isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype and a.shape == b.shape
+        assert a.tobytes() == b.tobytes()
+    elif isinstance(a, dict):
+        assert list(a) == list(b)
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_same(x, y)
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"Ks": np.eye(3), "timestamps": np.array([2**60 + 1]), "points": np.zeros((0, 3), np.float32)},
+        {"splits": {"train": np.arange(3), "held_out": []}, "size": (640, 360), "none": None, "flag": True, 4: b"\0"},
+        [np.array([True, False]), np.array(["a", "bc"]), np.array(1.5), np.arange(6).reshape(2, 3).T],
+        np.array([(1, 2.0)], dtype=[("x", "i4"), ("y", "f8")]),
+    ],
+)
+def test_a_plain_pickle_returns_as_it_was_written(tmp_path, value):
+    write_plain_pickle(tmp_path / "value.pkl", value)
+    assert_same(read_plain_pickle(tmp_path / "value.pkl", rule="parser"), value)
+
+
+class Anything:
+    """A class of our own."""
+
+
+class Colour(enum.IntEnum):
+    RED = 1
+
+
+class Text(str):
+    """More than a string."""
+
+    __slots__ = ()
+
+
+Pair = collections.namedtuple("Pair", "a b")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.array([None, 1], dtype=object),
+        np.array([("a", 1)], dtype=[("x", object), ("y", "i4")]),
+        Anything(),
+        Anything,
+        len,
+        {1, 2},
+        np.float64(1.0),
+        np.int64(1),
+        np.dtype("f8"),
+        {Anything(): 1},
+        [[(Anything(),)]],
+        1j,
+        collections.OrderedDict(a=1),
+        collections.defaultdict(list),
+        Pair(1, 2),
+        Colour.RED,
+        Text("text"),
+        np.ma.masked_array([1.0, 2.0]),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_no_plain_data_is_refused_when_it_is_written(tmp_path, value):
+    """Whatever the reader refuses the writer must refuse: a result that is written can be read again."""
+    with pytest.raises(TypeError):
+        write_plain_pickle(tmp_path / "value.pkl", {"value": value})
+    assert files_below(tmp_path) == set()
+
+
+class RunsACommand:
+    def __init__(self, marker):
+        self.command = f"touch '{marker}'"
+
+    def __reduce__(self):
+        return os.system, (self.command,)
+
+
+class Opens:
+    def __init__(self, marker):
+        self.marker = str(marker)
+
+    def __reduce__(self):
+        return builtins.open, (self.marker, "w")
+
+
+class Evaluates:
+    def __init__(self, marker):
+        self.code = f"open({str(marker)!r}, 'w').close()"
+
+    def __reduce__(self):
+        return builtins.eval, (self.code,)
+
+
+@pytest.mark.parametrize("attack", [RunsACommand, Opens, Evaluates])
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_a_pickle_that_would_run_something_is_refused_and_runs_nothing(tmp_path, attack, protocol):
+    marker = tmp_path / "executed"
+    content = pickle.dumps({"Ks": np.eye(3), "attack": attack(marker)}, protocol=protocol)
+    pickle.loads(pickle.dumps(attack(marker)))
+    assert marker.exists(), "the attack itself must work for this test to mean anything"
+    marker.unlink()
+    (tmp_path / "parser.pkl").write_bytes(content)
+    with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
+        read_plain_pickle(tmp_path / "parser.pkl", rule="parser")
+    assert not marker.exists()
+
+
+def test_an_attack_hidden_inside_an_array_of_objects_is_refused_and_runs_nothing(tmp_path):
+    marker = tmp_path / "executed"
+    array = np.empty(1, dtype=object)
+    array[0] = RunsACommand(marker)
+    (tmp_path / "parser.pkl").write_bytes(pickle.dumps(array))
+    with pytest.raises(ResultError, match="'parser'"):
+        read_plain_pickle(tmp_path / "parser.pkl", rule="parser")
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("value", [np.array([None, 1]), collections.OrderedDict(a=1), Pair(1, 2), {1, 2}, 1j])
+def test_a_pickle_of_anything_but_plain_data_is_refused_when_it_is_read(tmp_path, value):
+    (tmp_path / "parser.pkl").write_bytes(pickle.dumps({"value": value}))
+    with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
+        read_plain_pickle(tmp_path / "parser.pkl", rule="parser")
+
+
+def test_a_pickle_truncated_anywhere_is_refused_naming_file_and_rule(tmp_path):
+    write_plain_pickle(tmp_path / "whole.pkl", {"Ks": np.eye(3), "names": ["a", "b"]})
+    whole = (tmp_path / "whole.pkl").read_bytes()
+    for length in range(len(whole)):
+        (tmp_path / "cut.pkl").write_bytes(whole[:length])
+        with pytest.raises(ResultError, match=r"cut\.pkl.*'parser'"):
+            read_plain_pickle(tmp_path / "cut.pkl", rule="parser")
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nformat", b"\x89PNG\r\n\x1a\n", b"PK\x03\x04", b"\x80\xff."])
+def test_a_foreign_pickle_is_refused_naming_file_and_rule(tmp_path, content):
+    (tmp_path / "foreign.pkl").write_bytes(content)
+    with pytest.raises(ResultError, match=r"foreign\.pkl.*'parser'"):
+        read_plain_pickle(tmp_path / "foreign.pkl", rule="parser")

@@ -1,0 +1,175 @@
+"""The whole DAG on a tiny world, as users run it."""
+
+import math
+
+import pytest
+from workflow_copy import WorkflowCopy
+
+pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("workflow")]
+
+REGIONS = ("all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> WorkflowCopy:
+    """The workflow run to its end on one scene with two methods."""
+    methods = {"vanilla": {}, "plain": {"overrides": {"sky": "none", "train": {"strategy": "default"}}}}
+    copy = WorkflowCopy.make(tmp_path_factory.mktemp("finished"), methods=methods)
+    done = copy.run()
+    assert done.returncode == 0, done.stdout
+    return copy
+
+
+def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
+    metrics = finished.read("results/0001/metrics.json")
+    assert (metrics["schema"], metrics["scene"], metrics["dataset"]) == (1, "0001", "nuscenes")
+    expected = {
+        "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "eval_camera": "CAM_FRONT", "width": 96, "height": 54,
+        "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4}, "train_images": 5,
+        "held_out_frames": {"interpolation": [4], "extrapolation": [6, 7, 8, 9]}, "poses": "nuscenes",
+        "regions": "boxes", "extra_points": None, "lidar_missing": 0,
+    }  # fmt: skip
+    assert {key: metrics["protocol"][key] for key in expected} == expected
+    assert set(metrics["methods"]) == {"vanilla", "plain"}
+    assert {"settings_sha256", "code_sha256", "inputs_sha256", "versions"} <= metrics["provenance"].keys()
+
+
+def test_every_method_is_measured_in_both_groups_and_all_regions(finished):
+    for result in finished.read("results/0001/metrics.json")["methods"].values():
+        for group in ("interpolation", "extrapolation"):
+            assert set(REGIONS) | {"gap_db"} == set(result[group])
+            assert result[group]["all"]["psnr"] > 8.0
+            for region in REGIONS:
+                record = result[group][region]
+                assert record is None or (
+                    record["pixels"] >= 1000 and math.isfinite(record["psnr"]) and record["ssim"] <= 1.0
+                )
+        whole, moving = result["extrapolation"]["static"], result["extrapolation"]["moving_vehicle"]
+        assert result["extrapolation"]["gap_db"] == pytest.approx(whole["psnr"] - moving["psnr"])
+        assert (result["train_iterations"], result["peak_gpu_memory_gb"]) == (60, None)
+        assert result["lpips_unavailable"] == "lpips.enabled is false"
+
+
+def test_the_report_has_a_row_per_scene_and_method(finished):
+    report = finished.read("results/gap_report.json")
+    assert [(row["scene"], row["method"]) for row in report["rows"]] == [("0001", "vanilla"), ("0001", "plain")]
+    assert report["left_out"] == [] and report["missing"] == []
+    lines = (finished.folder / "results/gap_report.csv").read_text().splitlines()
+    assert len(lines) == 3 and lines[0].startswith("scene,dataset,method")
+
+
+def test_what_a_training_leaves_behind(finished):
+    folder = finished.folder / "results/0001/vanilla"
+    assert {"checkpoint.pt", "train.json", "eval.json", "tensorboard"} == {path.name for path in folder.iterdir()}
+    assert list((folder / "tensorboard").glob("events.*"))
+
+
+TRAINING_AND_AFTER = {"train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1}
+EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, **TRAINING_AND_AFTER}
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ({}, {}),
+        ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
+        ({"methods": {"plain": {"overrides": {"sky": "mask", "train": {"strategy": "default"}}}}},
+         {"train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1}),
+        ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, **TRAINING_AND_AFTER}),
+        ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
+         {"masks": 1, **TRAINING_AND_AFTER}),
+        ({"holdout": {"last_block": 3}}, {"lidar_seed": 1, "parser": 1, **TRAINING_AND_AFTER}),
+        ({"extract": {"on_missing": "warn"}}, EVERYTHING),
+        ({"render": {"fps": 60}}, {}),
+        ({"device": {"kind": "cpu", "min_free_gb": 1}}, {}),
+        ({"lpips": {"enabled": False, "timeout_s": 3}}, {}),
+        ({"methods": {"third": {}}}, {"train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1}),
+    ],
+)  # fmt: skip
+def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, setting, expected):
+    changed = dict(finished.config)
+    for key, value in setting.items():
+        changed[key] = {**changed[key], **value} if isinstance(changed.get(key), dict) else value
+    assert WorkflowWithConfig(finished, changed).planned() == expected
+
+
+def test_order_comments_and_written_out_defaults_rerun_nothing(finished):
+    import yaml
+
+    reversed_keys = {key: finished.config[key] for key in reversed(finished.config)}
+    reversed_keys["lidar_seed"] = {"voxel_size": 0.1, "far_points": 100, "max_points": 500}
+    text = "# a comment\n" + yaml.safe_dump(reversed_keys, sort_keys=False)
+    finished.write_config(text)
+    try:
+        assert finished.planned() == {}
+    finally:
+        finished.write_config()
+
+
+def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
+    for path in finished.folder.rglob("*"):
+        if (
+            path.is_file()
+            and ".snakemake" not in path.parts
+            and path.suffix in (".py", ".smk", ".yaml", ".json", ".ply")
+        ):
+            content = path.read_bytes()
+            path.unlink()
+            path.write_bytes(content)
+    assert finished.planned() == {}
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "expected"),
+    [
+        ("drivesplat/evaluation/metrics.py", "LEAST_FRAME_PIXELS = 100", "LEAST_FRAME_PIXELS = 90",
+         {"evaluate": 2, "scene_metrics": 1, "gap_report": 1}),
+        ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
+        ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71", {"masks": 1, **TRAINING_AND_AFTER}),
+        ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
+        ("drivesplat/training/floaters.py", "FADED = 1e-4", "FADED = 2e-4", TRAINING_AND_AFTER),
+        ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
+        ("drivesplat/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING | {"extract": 0}),
+        ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
+        ("drivesplat/report.py", "SCHEMA = 1", "SCHEMA = 2", {"gap_report": 1}),
+    ],
+)  # fmt: skip
+def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, old, new, expected):
+    path = finished.folder / file
+    before = path.read_text()
+    assert old in before
+    path.write_text(before.replace(old, new, 1))
+    try:
+        assert finished.planned() == {rule: count for rule, count in expected.items() if count}
+    finally:
+        path.write_text(before)
+
+
+def test_a_truncated_result_is_named_with_the_rule_that_rebuilds_it(finished, tmp_path):
+    import shutil
+
+    copy = WorkflowCopy(tmp_path / "copy", finished.config)
+    shutil.copytree(finished.folder, copy.folder)
+    seed = copy.folder / "results/0001/seed.ply"
+    seed.write_bytes(seed.read_bytes()[:2000])
+    done = copy.run("results/0001/metrics.json")
+    assert done.returncode != 0
+    line = next(line for line in done.stdout.splitlines() if line.startswith("drivesplat:"))
+    assert "seed.ply" in line and "lidar_seed" in line
+    assert "Traceback" not in done.stdout
+    assert not (copy.folder / "results/0001/parser.pkl").exists()
+
+
+class WorkflowWithConfig(WorkflowCopy):
+    """The same folder under another config."""
+
+    def __init__(self, other: WorkflowCopy, config: dict):
+        super().__init__(other.folder, config)
+        self._other = other
+
+    def planned(self, *targets: str) -> dict[str, int]:
+        self.write_config()
+        try:
+            return super().planned(*targets)
+        finally:
+            self._other.write_config()

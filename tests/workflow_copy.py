@@ -1,0 +1,96 @@
+"""A copy of the workflow in a folder of its own, run as users run it: as a subprocess, with a config file."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from tiny_world import World, write_world
+
+REPOSITORY = Path(__file__).parent.parent
+PARTS = (
+    "Snakefile",
+    "config.yaml",
+    "config.schema.json",
+    "drivesplat",
+    "envs",
+    "profiles",
+    "rules",
+    "workflow_scripts",
+)
+TINY_TRAINING = {
+    "iterations": 60,
+    "log_every": 10,
+    "checkpoint_every": 20,
+    "image_every": 30,
+    "gaussians": {"sh_degree": 1},
+    "sky_resolution": 8,
+}
+
+
+@dataclass
+class WorkflowCopy:
+    """The workflow at `folder`, with `config` in its mine.yaml."""
+
+    folder: Path
+    config: dict[str, Any]
+
+    @classmethod
+    def make(cls, folder: Path, world: World | None = None, **config: Any) -> "WorkflowCopy":
+        """Copies the workflow and writes a tiny world beside it; `config` is laid over the tests' settings."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for part in PARTS:
+            source = REPOSITORY / part
+            ignore = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(source, folder / part, ignore=ignore) if source.is_dir() else shutil.copy2(
+                source, folder / part
+            )
+        world = world or World()
+        write_world(folder / "data", world)
+        base = {
+            "datasets": {"nuscenes": {"dataroot": "data", "scenes": list(world.scenes)}},
+            "lidar_seed": {"max_points": 500, "far_points": 100},
+            "train": TINY_TRAINING,
+            "lpips": {"enabled": False},
+            "device": "cpu",
+        }
+        copy = cls(folder, {**base, **config})
+        copy.write_config()
+        return copy
+
+    def write_config(self, text: str | None = None) -> None:
+        (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))
+
+    def command(self, *arguments: str) -> list[str]:
+        return [sys.executable, "-m", "snakemake", "--configfile", "mine.yaml", *arguments]
+
+    def run(self, *targets: str, cores: int = 2, flags: tuple[str, ...] = ()) -> subprocess.CompletedProcess:
+        """Runs Snakemake; the result holds its output (both streams) as `stdout`."""
+        arguments = self.command("--cores", str(cores), *flags, "--", *targets)
+        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
+        return subprocess.run(
+            arguments,
+            cwd=self.folder,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=600,
+        )
+
+    def planned(self, *targets: str) -> dict[str, int]:
+        """How many jobs of each rule `snakemake -n` plans; raises where planning fails."""
+        done = self.run(*targets, flags=("-n",))
+        if done.returncode:
+            raise AssertionError(done.stdout)
+        table = done.stdout.rpartition("Job stats:")[2].partition("total")[0]
+        return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", table, re.M) if name != "all"}
+
+    def read(self, path: str) -> Any:
+        return json.loads((self.folder / path).read_text())
