@@ -1,6 +1,7 @@
 """The compute device, probed through torch alone, so that AMD's builds of torch are treated alike."""
 
-import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from drivesplat.errors import DeviceError
@@ -63,13 +64,16 @@ def device_name(device: Any) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({platform.machine()})"
 
 
-def out_of_memory(gaussians: int) -> DeviceError:
-    """The one sentence for a GPU that is full, with what lowers the need."""
+@contextmanager
+def telling_out_of_memory(gaussians: Callable[[], int]) -> Iterator[None]:
+    """Turns an exhausted GPU into a DeviceError with what lowers the need; `gaussians` counts them when it happens."""
     import torch
 
-    peak = torch.cuda.max_memory_allocated() / 1e9 if torch.cuda.is_available() else 0.0
-    gc.collect()
-    return DeviceError(
-        f"out of GPU memory with {gaussians:,} Gaussians (peak {peak:.1f} GB): lower train.cap_max, then "
-        "images.width, then the number of cameras or sweeps"
-    )
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError:
+        peak = torch.cuda.max_memory_allocated() / 1e9
+        raise DeviceError(
+            f"out of GPU memory with {gaussians():,} Gaussians (peak {peak:.1f} GB): lower train.cap_max, then "
+            "images.width, then the number of cameras or sweeps"
+        ) from None

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.device import choose_device
+from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics
@@ -42,7 +42,8 @@ def evaluate_method(
     model, train_job = trained_model(checkpoint)
     unavailable, lpips_map = unavailable_or_map(lpips_record, device)
     sh_degree = train_job.train.gaussians.sh_degree
-    groups = evaluate_groups(model.to(device), parser, masks, job.eval_camera, sh_degree, lpips_map, device)
+    with telling_out_of_memory(lambda: len(model)):
+        groups = evaluate_groups(model.to(device), parser, masks, job.eval_camera, sh_degree, lpips_map, device)
     return {
         "schema": 1,
         "scene": parser["scene"]["name"],

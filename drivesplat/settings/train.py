@@ -73,8 +73,8 @@ class TrainSettings(Settings):
     scale_reg: float = Field(0.01, ge=0)
     """Weight of the mean scale (metres) in the loss: what is large must earn it."""
     sky_alpha_weight: float = Field(0.05, ge=0)
-    """Weight of -log(1 - alpha) on sky pixels with `sky: mask`: no Gaussian in the sky. A cube map does without: it cost
-    0.5 dB of static PSNR on scene 0061, where masks and tree tops disagree."""
+    """Weight of -log(1 - alpha) on sky pixels with `sky: mask`: no Gaussian in the sky. A cube map does without:
+    it cost 0.5 dB of static PSNR on scene 0061, where masks and tree tops disagree."""
     sky_resolution: int = Field(128, ge=2, le=2048)
     """Texels along an edge of the sky's cube map."""
     lr_sky: float = Field(1e-2, gt=0)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.device import choose_device
+from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.masks import read_sky_mask
 from drivesplat.model.build import build_model, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
@@ -46,7 +46,8 @@ def run_training(
     with checkpoint.sole_trainer(files.resume):
         device = choose_device(device_settings)
         sky_masks = sky_masks_of(parser, files.masks) if job.sky != "none" else None
-        views = load_views(parser, sky_masks, device)
+        with telling_out_of_memory(lambda: 0):
+            views = load_views(parser, sky_masks, device)
         settings = job.train.model_copy(update={"cap_max": gaussian_cap(parser, job.train)})
         model = build_model(parser, job.parts, job.sky, settings, mean_sky_color(views))
         fingerprint = sha256_text(

@@ -3,14 +3,13 @@
 import logging
 import shutil
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from drivesplat.device import device_name, out_of_memory
+from drivesplat.device import device_name, telling_out_of_memory
 from drivesplat.errors import TrainingError
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
@@ -115,59 +114,91 @@ class TrainingSummary:
 
 
 def train(
-    model: SplatModel, views: list[TrainingView], settings: TrainSettings, seed: int, scene_scale: float, device:
-    torch.device, workspace: Workspace
-) -> TrainingSummary:  # fmt: skip
+    model: SplatModel,
+    views: list[TrainingView],
+    settings: TrainSettings,
+    seed: int,
+    scene_scale: float,
+    device: torch.device,
+    workspace: Workspace,
+) -> TrainingSummary:
     """Fits `model` in place, resuming where an earlier run of the same training was ended.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
-    model.to(device)
-    trainer = Trainer.begin(model, views, settings, seed, scene_scale, device)
-    saved = checkpoint.resumable(workspace.state, workspace.fingerprint)
-    seconds, resumed_at = 0.0, []
-    if saved is not None:
-        checkpoint.restore(saved["state"], model, trainer.optimizers, trainer.densifiers, device)
-        trainer.step, seconds, resumed_at = saved["step"], saved["seconds"], [*saved["resumed_at"], saved["step"]]
-        log.info("resuming at iteration %d of %d", trainer.step, settings.iterations)
-    else:
-        shutil.rmtree(workspace.tensorboard, ignore_errors=True)
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-    monitor = Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label)
-    began = time.monotonic()
+    with telling_out_of_memory(lambda: len(model)):
+        trainer = Trainer.begin(model.to(device), views, settings, seed, scene_scale, device)
+        run = Run.begin(trainer, workspace)
+        monitor = Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label)
+        try:
+            _iterate(run, monitor)
+        finally:
+            monitor.close()
+        return run.summary()
 
-    def save() -> None:
-        trainer.guard.check(str(workspace.state))
-        so_far = seconds + time.monotonic() - began
+
+@dataclass
+class Run:
+    """A training and its place on disk: what was done before this process, and what outlives it."""
+
+    trainer: Trainer
+    workspace: Workspace
+    seconds_before: float
+    resumed_at: list[int]
+    began: float
+
+    @classmethod
+    def begin(cls, trainer: Trainer, workspace: Workspace) -> "Run":
+        """Takes up the workspace's resume state if this training wrote it; otherwise starts at 0."""
+        if trainer.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(trainer.device)
+        saved = checkpoint.resumable(workspace.state, workspace.fingerprint)
+        if saved is None:
+            shutil.rmtree(workspace.tensorboard, ignore_errors=True)
+            return cls(trainer, workspace, 0.0, [], time.monotonic())
+        checkpoint.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
+        trainer.step = saved["step"]
+        log.info("resuming at iteration %d of %d", trainer.step, trainer.settings.iterations)
+        return cls(trainer, workspace, saved["seconds"], [*saved["resumed_at"], trainer.step], time.monotonic())
+
+    @property
+    def seconds(self) -> float:
+        """Training time so far, earlier processes included."""
+        return self.seconds_before + time.monotonic() - self.began
+
+    def check(self) -> None:
+        """Raises TrainingError where something was not finite, or no Gaussian is left."""
+        self.trainer.guard.check(str(self.workspace.state))
+        if len(self.trainer.model) == 0:
+            raise TrainingError(
+                f"iteration {self.trainer.step}: no Gaussian is left; "
+                "lower train.opacity_reg or the thresholds of the densification"
+            )
+
+    def save(self) -> None:
+        """Writes the resume state, unless the training has gone wrong."""
+        self.check()
+        t = self.trainer
         content = {
-            "fingerprint": workspace.fingerprint,
-            "step": trainer.step,
-            "seconds": so_far,
-            "resumed_at": resumed_at,
+            "fingerprint": self.workspace.fingerprint,
+            "step": t.step,
+            "seconds": self.seconds,
+            "resumed_at": self.resumed_at,
+            "state": checkpoint.state_of(t.model, t.optimizers, t.densifiers, t.device),
         }
-        checkpoint.save(
-            workspace.state,
-            {**content, "state": checkpoint.state_of(model, trainer.optimizers, trainer.densifiers, device)},
-        )
+        checkpoint.save(self.workspace.state, content)
 
-    try:
-        _iterate(trainer, monitor, str(workspace.state), save)
-    except torch.cuda.OutOfMemoryError:
-        raise out_of_memory(len(model)) from None
-    finally:
-        monitor.close()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    peak = torch.cuda.max_memory_allocated(device) / 1e9 if device.type == "cuda" else None
-    return TrainingSummary(
-        trainer.step, seconds + time.monotonic() - began, len(model), peak, device_name(device), seed, resumed_at
-    )
+    def summary(self) -> TrainingSummary:
+        t, on_gpu = self.trainer, self.trainer.device.type == "cuda"
+        if on_gpu:
+            torch.cuda.synchronize(t.device)
+        peak = torch.cuda.max_memory_allocated(t.device) / 1e9 if on_gpu else None
+        return TrainingSummary(t.step, self.seconds, len(t.model), peak, device_name(t.device), t.seed, self.resumed_at)
 
 
-def _iterate(trainer: Trainer, monitor: Monitor, checkpoint_path: str, save: Callable[[], None]) -> None:
-    settings = trainer.settings
+def _iterate(run: Run, monitor: Monitor) -> None:
+    trainer, settings = run.trainer, run.trainer.settings
     starts, ends = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
     while trainer.step < settings.iterations:
         terms, picture, view = trainer.advance()
@@ -175,17 +206,13 @@ def _iterate(trainer: Trainer, monitor: Monitor, checkpoint_path: str, save: Cal
             for part in trainer.model.parts:
                 fade_floaters(part, starts, ends, settings.floaters.radius)
         if trainer.step % settings.log_every == 0:
-            trainer.guard.check(checkpoint_path)
-            if len(trainer.model) == 0:
-                raise TrainingError(
-                    f"iteration {trainer.step}: no Gaussian is left; lower train.opacity_reg or the pruning thresholds"
-                )
+            run.check()
             monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
         if trainer.step % settings.image_every == 0:
             monitor.image(trainer.step, view, picture)
         if trainer.step % settings.checkpoint_every == 0 and trainer.step < settings.iterations:
-            save()
-    trainer.guard.check(checkpoint_path)
+            run.save()
+    run.check()
 
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
