@@ -20,9 +20,12 @@ log = logging.getLogger(__name__)
 
 
 def save(path: Path, content: dict[str, Any]) -> None:
-    """Writes tensors and plain data, atomically."""
+    """Writes tensors and plain data, atomically. Raises ResultError naming `path` where the disk is full."""
     with atomic_write(path) as file:
-        torch.save(content, file)
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:  # what torch's zip writer makes of a failed write
+            raise OSError(f"torch could not write it: {str(error).splitlines()[0]}") from error
 
 
 def load(path: Path, rule: str) -> dict[str, Any]:
