@@ -16,11 +16,10 @@ from drivesplat.config import METHOD_STAGES, SCENE_STAGES, Config, for_scene, lo
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.readers import layout
 from drivesplat.rerun import code_digest
+from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.storage import canonical_json
 
 SCRIPTS = "workflow_scripts"
-BACKBONE = "resources/lpips/alexnet.pth"
-"""Where LPIPS's AlexNet backbone is kept; users without network put it there themselves."""
 
 
 def let_scripts_import(folder: str) -> None:
@@ -64,7 +63,7 @@ class Plan:
 
     def lpips_record(self, _: Any) -> list[str]:
         """The record of LPIPS's backbone, where LPIPS is wanted."""
-        return ["resources/lpips/backbone.json"] if self.config.lpips.enabled else []
+        return [BACKBONE_RECORD] if self.config.lpips.enabled else []
 
     def backbone_file(self, _: Any) -> list[str]:
         """The backbone itself, where it is there already: its arrival reruns what lacked it."""

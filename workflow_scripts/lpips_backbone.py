@@ -4,8 +4,7 @@ from pathlib import Path
 
 from drivesplat.evaluation.backbone import provide_backbone
 from drivesplat.job import job
-from drivesplat.planning import BACKBONE
-from drivesplat.settings.evaluate import LpipsSettings
+from drivesplat.settings.evaluate import BACKBONE, LpipsSettings
 from drivesplat.storage import write_json
 
 with job(snakemake) as current:

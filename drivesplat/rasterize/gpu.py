@@ -5,7 +5,7 @@ from typing import Any
 from gsplat import rasterization
 from torch import Tensor
 
-from drivesplat.rasterize.door import Rendering
+from drivesplat.rasterize.rendering import Rendering
 
 
 def rasterize_gsplat(

@@ -5,6 +5,11 @@ from pydantic import Field
 from drivesplat.settings import Settings
 from drivesplat.settings.holdout import HoldoutSettings
 
+BACKBONE = "resources/lpips/alexnet.pth"
+"""Where LPIPS's AlexNet backbone is kept; users without network put it there themselves."""
+BACKBONE_RECORD = "resources/lpips/backbone.json"
+"""What is known of that file."""
+
 
 class LpipsSettings(Settings):
     enabled: bool = True
