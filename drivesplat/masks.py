@@ -7,6 +7,7 @@
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +32,10 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
-    sweeps = [sweep for sweep in scene.sweeps if Path(sweep.path).is_file()]
-    timestamps = np.array([sweep.timestamp for sweep in sweeps])
 
     def one(frame: Frame) -> float:
         size = target_size(frame, job.images)
-        near = np.argmin(np.abs(timestamps - frame.timestamp)) if sweeps else None
-        close = near is not None and abs(timestamps[near] - frame.timestamp) < scene.key_frame_interval
-        lidar = apply(sweeps[near].sensor_to_world, read_sweep(sweeps[near])) if close else None
-        sky = _sky(frame, job, size, lidar)
+        sky = _sky(frame, job, size, _nearest_returns(scene, frame))
         _write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
         _write_png(folder / mask_name("regions", frame.camera, frame.timestamp), _regions(scene, frame, job, size))
         return float(sky.mean())
@@ -53,6 +49,16 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
         "sky": "masks" if job.masks.sky_folder else "heuristic",
         "sky_share": float(np.mean(sky_shares)),
     }
+
+
+def _nearest_returns(scene: Scene, frame: Frame) -> np.ndarray | None:
+    """World points (n, 3) of the readable sweep nearest to a frame; None where none is within a key-frame interval."""
+    for sweep in sorted(scene.sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp)):
+        if abs(sweep.timestamp - frame.timestamp) >= scene.key_frame_interval:
+            break
+        with suppress(DatasetError):  # the stage lidar_seed is the one that complains
+            return apply(sweep.sensor_to_world, read_sweep(sweep))
+    return None
 
 
 def mask_name(kind: str, camera: str, timestamp: int) -> str:

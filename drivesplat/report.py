@@ -8,7 +8,7 @@ from typing import Any
 from drivesplat.errors import ResultError
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.provenance import differences
-from drivesplat.storage import atomic_write, read_json
+from drivesplat.storage import atomic_write, read_json, unreadable
 
 SCHEMA = 1
 REGIONS = ("static", "vehicle", "moving_vehicle")
@@ -27,15 +27,21 @@ def gap_report(paths: list[str], expected: dict[str, dict[str, Any]]) -> dict[st
     for path in paths:
         try:
             record = read_json(path, rule="scene_metrics")
-            scene, reasons = record["scene"], _mismatches(record, expected, measured)
-        except (ResultError, KeyError, TypeError) as error:
+            scene, protocol = record["scene"], record["protocol"]
+            reasons = _mismatches(record, expected, measured)
+            scene_rows = [_row(record, method) for method in record["methods"]]
+        except ResultError as error:
             left_out.append({"scene": Path(path).parent.name, "why": str(error)})
+            continue
+        except (AttributeError, KeyError, TypeError) as error:
+            why = unreadable(path, "scene_metrics", f"not the metrics of a scene ({type(error).__name__}: {error})")
+            left_out.append({"scene": Path(path).parent.name, "why": str(why)})
             continue
         if reasons:
             left_out.append({"scene": scene, "why": "; ".join(reasons)})
             continue
-        measured[scene] = record["protocol"]
-        rows += [_row(record, method) for method in record["methods"]]
+        measured[scene] = protocol
+        rows += scene_rows
     named = {*measured, *(item["scene"] for item in left_out)}
     missing = [{"scene": scene, "why": "not measured"} for scene in expected if scene not in named]
     return {"schema": SCHEMA, "rows": rows, "means": _means(rows), "left_out": left_out, "missing": missing}

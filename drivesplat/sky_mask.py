@@ -37,7 +37,8 @@ def sky_mask(
         candidate &= ~_near_returns(
             lidar, np.linalg.inv(camera_to_world), intrinsics, (height, width), max(1, round(LIDAR_REACH * scale))
         )
-    candidate = ndimage.binary_opening(candidate, iterations=max(1, round(scale)))
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    candidate = cv2.morphologyEx(candidate.astype(np.uint8), cv2.MORPH_OPEN, cross, iterations=max(1, round(scale)))
     labels, _ = ndimage.label(candidate)
     at_top = np.unique(labels[: max(1, round(2 * scale))])
     return np.isin(labels, at_top[at_top > 0])

@@ -10,7 +10,7 @@ import json
 import os
 import pickle
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -54,7 +54,8 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
             f"{path}: cannot be written ({error.strerror or error}); free space or fix its permissions"
         ) from error
     finally:
-        aside.unlink(missing_ok=True)
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
 
 
 def _fsync_folder(folder: Path) -> None:
@@ -130,15 +131,17 @@ class _PlainUnpickler(pickle.Unpickler):
 
 
 def _require_plain(value: Any) -> None:
-    if isinstance(value, dict):
+    """Raises TypeError for anything but plain containers, scalars and arrays; a subclass of one is not plain."""
+    kind = type(value)
+    if kind is dict:
         for key, item in value.items():
             _require_plain(key)
             _require_plain(item)
-    elif isinstance(value, (list, tuple)):
+    elif kind in (list, tuple):
         for item in value:
             _require_plain(item)
-    elif isinstance(value, np.ndarray):
+    elif kind is np.ndarray:
         if value.dtype.hasobject:
             raise TypeError("an array of Python objects is not plain data")
-    elif not (value is None or isinstance(value, (bool, int, float, str, bytes))) or isinstance(value, np.generic):
-        raise TypeError(f"{type(value).__name__} is not plain data")
+    elif value is not None and kind not in (bool, int, float, str, bytes):
+        raise TypeError(f"{kind.__name__} is not plain data")

@@ -82,5 +82,5 @@ def moves_at_all(track: Track) -> bool:
 
 def _runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
     """First and last position of every run of consecutive key frames."""
-    breaks = np.flatnonzero(np.diff(sample_indices) != 1)
-    return list(zip([0, *(breaks + 1)], [*breaks, len(sample_indices) - 1], strict=True))
+    breaks = np.flatnonzero(np.diff(sample_indices) != 1).tolist()
+    return list(zip([0, *(i + 1 for i in breaks)], [*breaks, len(sample_indices) - 1], strict=True))

@@ -28,7 +28,7 @@ def random_sky(resolution: int, seed: int = 0) -> CubemapSky:
 
 
 def surface_points(resolution: int) -> torch.Tensor:
-    """Where the texels (face, v, u) lie on the cube [-1, 1]^3, from the documented layout of the faces: (6, r, r, 3)."""
+    """Where texels (face, v, u) lie on the cube [-1, 1]^3 by the documented layout of the faces: (6, r, r, 3)."""
     line = torch.linspace(-1.0, 1.0, resolution)
     points = torch.zeros(6, resolution, resolution, 3)
     for face, normal in AXES.items():
@@ -100,15 +100,15 @@ def test_no_seam_shows_at_any_edge_or_corner(resolution):
         around = torch.from_numpy(point + aside).float()[None]
         faces = face_coordinates(around)[..., 2].unique()
         assert len(faces) >= 2, "the rays must fall on both sides of the seam"
-        colors = sky.colors(around)[0]
+        colors = sky.colors(around)[0].detach()
         assert float((colors.amax(dim=0) - colors.amin(dim=0)).max()) < 1e-4
 
 
 def test_a_small_turn_changes_colours_a_little_everywhere():
-    sky = random_sky(8)
+    sky = random_sky(8).requires_grad_(False)
     rays = random_rays(4, 5000)
     turn = torch.from_numpy(Rotation.from_rotvec([4e-5, -3e-5, 5e-5]).as_matrix()).float()
-    assert float((sky.colors(rays @ turn.T) - sky.colors(rays)).abs().max()) < 5e-3
+    assert float((sky.colors(rays @ turn.T) - sky.colors(rays)).abs().max()) < 2e-3
 
 
 def test_the_gradient_is_that_of_finite_differences():
@@ -154,7 +154,7 @@ def test_a_black_or_white_start_can_still_learn(kind, color):
     start = torch.tensor(color)
     sky = ConstantSky(start, 1e-2) if kind == "constant" else CubemapSky(2, start, 1e-2)
     colors = sky.colors(random_rays(10, 20))
-    assert float((colors - start).abs().max()) < 0.03
+    assert float((colors - start).detach().abs().max()) < 0.03
     colors.sum().backward()
     (gradient,) = (value.grad for value in sky.params.values())
     assert torch.isfinite(gradient).all() and float(gradient.abs().max()) > 1e-3

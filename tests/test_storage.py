@@ -55,6 +55,13 @@ def test_nothing_stands_at_the_target_while_it_is_being_written(tmp_path):
     assert target.read_bytes() == b"half"
 
 
+def test_whoever_reads_the_old_file_while_a_new_one_comes_reads_the_old_one_whole(tmp_path):
+    write(tmp_path / "result.bin", b"old")
+    with open(tmp_path / "result.bin", "rb") as reader:
+        write(tmp_path / "result.bin", b"new")
+        assert reader.read() == b"old"
+
+
 def test_a_crash_while_writing_leaves_the_old_file_and_no_partial_one(tmp_path):
     write(tmp_path / "result.bin", b"old")
     with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "result.bin") as file:

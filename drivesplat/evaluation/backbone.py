@@ -1,12 +1,13 @@
 """The stage `lpips_backbone`: AlexNet's weights, fetched once or found where a user put them."""
 
 import hashlib
+import http.client
 import logging
-import urllib.error
 import urllib.request
 from pathlib import Path
 from typing import Any
 
+from drivesplat.errors import DriveSplatError
 from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.storage import atomic_write, sha256_file
 
@@ -33,23 +34,32 @@ def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
 
 
 def _fetch(settings: LpipsSettings, path: Path) -> str | None:
-    """Downloads the backbone; None, or in a line why that failed."""
-    advice = f"put the file at {path} yourself, then run again"
-    digest, size = hashlib.sha256(), 0
+    """Downloads the backbone to `path`; None, or in a line why that failed."""
     try:
-        with urllib.request.urlopen(settings.url, timeout=settings.timeout_s) as response, atomic_write(path) as file:
-            while chunk := response.read(CHUNK):
-                size += len(chunk)
-                if size > MAX_BYTES:
-                    raise ValueError(f"it is larger than {MAX_BYTES:,} bytes")
-                digest.update(chunk)
-                file.write(chunk)
-            expected = response.headers.get("Content-Length")
-            if expected is not None and size != int(expected):
-                raise ValueError(f"it ended after {size:,} of {int(expected):,} bytes")
-            if not digest.hexdigest().startswith(settings.sha256):
-                raise ValueError(f"its SHA-256 is {digest.hexdigest()[:16]}…, not {settings.sha256}")
-    except (urllib.error.URLError, OSError, ValueError) as error:
-        reason = getattr(error, "reason", None) or error
-        return f"the AlexNet backbone could not be fetched from {settings.url} ({reason}); {advice}"
+        content = _download(settings)
+        with atomic_write(path) as file:
+            file.write(content)
+    except (OSError, ValueError, http.client.HTTPException, DriveSplatError) as error:
+        reason = " ".join(str(getattr(error, "reason", None) or error or type(error).__name__).split())
+        return (
+            f"the AlexNet backbone could not be fetched from {settings.url} ({reason}); "
+            f"put the file at {path} yourself, then run again"
+        )
     return None
+
+
+def _download(settings: LpipsSettings) -> bytes:
+    """The file at `settings.url`, whole and of the right checksum; raises OSError, ValueError or HTTPException."""
+    content = bytearray()
+    with urllib.request.urlopen(settings.url, timeout=settings.timeout_s) as response:
+        while chunk := response.read(CHUNK):
+            content += chunk
+            if len(content) > MAX_BYTES:
+                raise ValueError(f"it is larger than {MAX_BYTES:,} bytes")
+        expected = response.headers.get("Content-Length")
+    if expected is not None and len(content) != int(expected):
+        raise ValueError(f"it ended after {len(content):,} of {int(expected):,} bytes")
+    digest = hashlib.sha256(content).hexdigest()
+    if not digest.startswith(settings.sha256):
+        raise ValueError(f"its SHA-256 is {digest[:16]}…, not {settings.sha256}")
+    return bytes(content)

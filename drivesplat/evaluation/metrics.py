@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from drivesplat.errors import ResultError
 from drivesplat.regions import REGIONS, region_mask
 
 LEAST_REGION_PIXELS = 1000
@@ -58,7 +59,12 @@ class RegionMetrics:
         self._sums = {region: _Sums() for region in REGIONS}
 
     def add(self, image: np.ndarray, truth: np.ndarray, labels: np.ndarray) -> None:
-        """A rendered and a recorded image (h, w, 3) in [0, 1], and the frame's label image (h, w)."""
+        """A rendered and a recorded image (h, w, 3) in [0, 1], and the frame's label image (h, w).
+
+        Raises ResultError where the rendering is not finite.
+        """
+        if not np.isfinite(image).all():
+            raise ResultError("a held-out image was rendered as no numbers; delete its checkpoint.pt and rerun")
         image, truth = image.clip(0.0, 1.0).astype(np.float64), truth.astype(np.float64)
         squared_error = ((image - truth) ** 2).mean(axis=2)
         similarity = ssim_map(image, truth)

@@ -11,12 +11,16 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
+from drivesplat.errors import ConfigError
 from drivesplat.rasterize.rendering import Rendering
 
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
 TILE = 16
+NEAR_PLANE = 0.01
+EPS2D = 0.3
+"""Variance in square pixels that gsplat's 2D filter adds."""
 
 
 def rasterize_reference(
@@ -28,14 +32,13 @@ def rasterize_reference(
     Works in float32 and float64; autograd gives every gradient but `absgrad`.
     """
     if absgrad:
-        raise ValueError("the reference rasterizer has no absolute gradients: set train.absgrad: false")
+        raise ConfigError("absolute gradients need a GPU: set train.default.absgrad: false")
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_covar=True, compute_preci=False)
-    radii, means2d, depths, conics, compensations = _fully_fused_projection(
-        means, covars, viewmats, Ks, width, height, calc_compensations=antialiased
-    )
+    projected = [_project(means, covars, viewmat, k, width, height) for viewmat, k in zip(viewmats, Ks, strict=True)]
+    radii, means2d, depths, conics = (torch.stack(values) for values in zip(*projected, strict=True))
     opacities2d = opacities.expand(len(viewmats), -1)
     if antialiased:
-        opacities2d = opacities2d * compensations
+        opacities2d = opacities2d * _compensation(conics)
     images, alphas = [], []
     for camera in range(len(viewmats)):
         values = _view_colors(means, colors, viewmats[camera], sh_degree)
@@ -61,6 +64,25 @@ def rasterize_reference(
     if not with_depth:
         return Rendering(image, alpha, None, info)
     return Rendering(image[..., :-1], alpha, image[..., -1:] / alpha.clamp(min=1e-10), info)
+
+
+def _project(means: Tensor, covars: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, ...]:
+    """Radii (n, 2), means (n, 2), depths (n,) and conics (n, 3) of Gaussians in one image.
+
+    What is not before the camera stands in at a harmless place, out of reach of gradients, with radius 0.
+    """
+    ahead = means.detach() @ viewmat[2, :3] + viewmat[2, 3] > NEAR_PLANE
+    before_camera = viewmat[:3, :3].T @ (torch.tensor([0.0, 0.0, 1.0]).to(means) - viewmat[:3, 3])
+    safe = torch.where(ahead[:, None], means, before_camera)
+    radii, means2d, depths, conics, _ = _fully_fused_projection(safe, covars, viewmat[None], K[None], width, height)
+    return radii[0] * ahead[:, None], means2d[0], depths[0], conics[0]
+
+
+def _compensation(conics: Tensor) -> Tensor:
+    """The factor (..., n) by which the 2D filter lowers opacities, from `conics` (..., n, 3): Yu et al. 2024, eq. 7."""
+    c, b, a = (conics / (conics[..., :1] * conics[..., 2:] - conics[..., 1:2] ** 2)).unbind(-1)
+    unfiltered = (a - EPS2D) * (c - EPS2D) - b**2
+    return torch.sqrt((unfiltered / (a * c - b**2)).clamp(min=1e-12))
 
 
 def _view_colors(means: Tensor, colors: Tensor, viewmat: Tensor, sh_degree: int | None) -> Tensor:

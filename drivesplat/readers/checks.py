@@ -29,11 +29,18 @@ def checked_intrinsics(matrix: Sequence[Sequence[float]], token: str) -> np.ndar
 
     Raises DatasetError naming the calibrated sensor's token where it is singular or malformed.
     """
-    k = np.array(matrix, dtype=np.float64)
-    proper = k.shape == (3, 3) and np.isfinite(k).all() and k[0, 0] > 0 and k[1, 1] > 0 and np.allclose(k[2], [0, 0, 1])
-    if not proper:
+    try:
+        k = np.array(matrix, dtype=np.float64)
+    except ValueError:
+        k = np.empty(0)
+    if not (k.shape == (3, 3) and np.isfinite(k).all() and _is_pinhole(k)):
         raise DatasetError(f"calibrated_sensor {token}: its camera_intrinsic is singular or not a pinhole matrix")
     return k
+
+
+def _is_pinhole(k: np.ndarray) -> bool:
+    no_skew = k[0, 1] == 0 and k[1, 0] == 0
+    return bool(no_skew and k[0, 0] > 0 and k[1, 1] > 0 and np.allclose(k[2], [0, 0, 1]))
 
 
 def checked_size(width: int, height: int, token: str) -> tuple[int, int]:

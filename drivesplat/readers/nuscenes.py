@@ -31,11 +31,10 @@ def read(
     if record is None:
         there = ", ".join(s["name"].removeprefix("scene-") for s in tables.scene)
         raise DatasetError(f"scene {name} is not in nuScenes {version} at {root}; there are: {there}")
-    samples = _samples(tables, record)[slice(*(frames or (None, None)))]
-    if not samples:
-        raise DatasetError(
-            f"scene {name}: the frame range {frames} holds no key frame (it has {record['nbr_samples']})"
-        )
+    samples = _samples(tables, record)
+    if frames and frames[1] > len(samples):
+        raise DatasetError(f"scene {name}: the frame range {frames} ends beyond its {len(samples)} key frames")
+    samples = samples[slice(*(frames or (None, None)))]
     times = require_increasing([s["timestamp"] for s in samples], [s["token"] for s in samples], "sample")
     origin = _origin(tables, samples[0], cameras)
     scene = Scene(

@@ -92,7 +92,8 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
         positions.append(points)
         times.append(np.full(len(points), sweep.timestamp, dtype=np.float64))
     if missing:
-        log.warning("%d of %d LiDAR sweeps are missing; seeding without them", missing, len(scene.sweeps))
+        key_sweeps = sum(sweep.is_key_frame for sweep in scene.sweeps)
+        log.warning("%d of %d LiDAR sweeps are missing; seeding without them", missing, key_sweeps)
     merged, merged_times = np.concatenate(positions), np.concatenate(times)
     kept = thin(merged, settings.voxel_size)
     return merged[kept], merged_times[kept], missing

@@ -4,9 +4,9 @@ A stage's settings live beside the stage. Field comments are attribute docstring
 change of the code (see `drivesplat.rerun`).
 """
 
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from drivesplat.errors import ConfigError
 
@@ -16,7 +16,20 @@ S = TypeVar("S", bound="Settings")
 class Settings(BaseModel):
     """Immutable settings: unknown keys are refused, field docstrings are the documentation."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, protected_namespaces=())
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True, protected_namespaces=()
+    )
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_text_for_numbers(cls, value: Any, info: Any) -> Any:
+        kinds = cls.model_fields[info.field_name].annotation
+        wanted = {kinds, *get_args(kinds)} & {int, float, bool}
+        if wanted == {bool} and not isinstance(value, bool):
+            raise ValueError("input should be true or false")
+        if wanted and wanted != {bool} and isinstance(value, (str, bool)):
+            raise ValueError("input should be a number (YAML reads 1e-3 as text: write 1.0e-3)")
+        return value
 
 
 def validated(model: type[S], values: dict[str, Any], where: str) -> S:
@@ -31,6 +44,8 @@ def validated(model: type[S], values: dict[str, Any], where: str) -> S:
 
 
 def _sentence(item: dict[str, Any], where: str) -> str:
+    if not item["loc"]:
+        return where + item["msg"].removeprefix("Value error, ")
     key = where + ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
         return f"unknown key '{key}' (value {item['input']!r}): check its spelling against config.yaml"

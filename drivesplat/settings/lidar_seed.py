@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.extract import OnMissing
@@ -27,6 +27,13 @@ class LidarSeedSettings(Settings):
     """Random points along pixels that no other seed point covers (sky, tall buildings, missing LiDAR). 0 = none."""
     far_depths: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (3.0, 300.0)
     """Nearest and farthest depth of far points in metres (log-uniform between; never under the road)."""
+
+    @field_validator("far_depths")
+    @classmethod
+    def _nearest_first(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] >= value[1]:
+            raise ValueError("the nearest depth must be under the farthest")
+        return value
 
 
 class SeedJob(Settings):

@@ -1,16 +1,9 @@
-"""gsplat's densification strategies, one per part, behind one interface; and what the CPU needs to run them."""
+"""The densification of a model's parts: each part its own gsplat strategy and state."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from typing import Any
-from unittest.mock import patch
 
 import torch
-from gsplat import DefaultStrategy, MCMCStrategy
-from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
-from gsplat.strategy import ops
-from jaxtyping import Float
-from torch import Tensor
 
 from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
@@ -22,17 +15,18 @@ class Densifier:
     """The densification of one part: call `before_backward` and `after_step` at every iteration."""
 
     def __init__(self, part: Part, settings: TrainSettings, scene_scale: float):
+        from drivesplat.training import strategies  # gsplat; the stage says in a sentence where it is missing
+
         self._part = part
-        self._strategy = _strategy(settings)
-        self.absgrad = settings.strategy == "default" and settings.default.absgrad
-        self.state: dict[str, Any] = (
-            self._strategy.initialize_state(scene_scale=scene_scale)
-            if settings.strategy == "default"
-            else self._strategy.initialize_state()
-        )
+        self._by_gradient = settings.strategy == "default"
+        self._strategy = strategies.make_strategy(settings)
+        self._on_cpu = strategies.torch_twins
+        self.absgrad = self._by_gradient and settings.default.absgrad
+        scale = {"scene_scale": scene_scale} if self._by_gradient else {}
+        self.state: dict[str, Any] = self._strategy.initialize_state(**scale)
 
     def before_backward(self, step: int, optimizers: Optimizers, info: dict[str, Any]) -> None:
-        if isinstance(self._strategy, DefaultStrategy):
+        if self._by_gradient:
             self._strategy.step_pre_backward(self._part.params, optimizers, self.state, step, info)
 
     def after_step(self, step: int, optimizers: Optimizers, info: dict[str, Any]) -> None:
@@ -41,78 +35,6 @@ class Densifier:
         Draws from torch's global generator, as gsplat does.
         """
         params = self._part.params
-        with nullcontext() if params["means"].is_cuda else torch_twins():
-            if isinstance(self._strategy, DefaultStrategy):
-                self._strategy.step_post_backward(params, optimizers, self.state, step, info, packed=False)
-            else:
-                rate = optimizers["means"].param_groups[0]["lr"]
-                self._strategy.step_post_backward(params, optimizers, self.state, step, info, lr=rate)
-
-
-class CappedDefaultStrategy(DefaultStrategy):
-    """gsplat's DefaultStrategy with at most `cap_max` Gaussians: where more want to grow, the largest gradients do."""
-
-    cap_max: int = 1_500_000
-
-    @torch.no_grad()
-    def _grow_gs(self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
-        gradients = state["grad2d"] / state["count"].clamp_min(1)
-        room = max(0, self.cap_max - len(gradients))
-        wanting = torch.nonzero(gradients > self.grow_grad2d)[:, 0]
-        if len(wanting) > room:
-            weakest_first = wanting[torch.argsort(gradients[wanting])]
-            state["grad2d"][weakest_first[: len(wanting) - room]] = 0.0
-        return super()._grow_gs(params, optimizers, state, step)
-
-
-def _strategy(settings: TrainSettings) -> DefaultStrategy | MCMCStrategy:
-    start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
-    if settings.strategy == "mcmc":
-        return MCMCStrategy(
-            cap_max=settings.cap_max,
-            noise_lr=settings.mcmc.noise_lr,
-            min_opacity=settings.mcmc.min_opacity,
-            refine_start_iter=start,
-            refine_stop_iter=stop,
-            refine_every=settings.mcmc.refine_every,
-        )
-    strategy = CappedDefaultStrategy(
-        grow_grad2d=settings.default.grow_grad2d,
-        prune_opa=settings.default.prune_opacity,
-        absgrad=settings.default.absgrad,
-        refine_start_iter=start,
-        refine_stop_iter=stop,
-        refine_every=settings.default.refine_every,
-        reset_every=settings.default.reset_every,
-    )
-    strategy.cap_max = settings.cap_max
-    return strategy
-
-
-@contextmanager
-def torch_twins() -> Iterator[None]:
-    """For its duration gsplat's strategies use torch twins of the two CUDA kernels they call."""
-    with (
-        patch.object(ops, "compute_relocation", relocation),
-        patch.object(ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
-    ):
-        yield
-
-
-def relocation(
-    opacities: Float[Tensor, " n"], scales: Float[Tensor, "n 3"], ratios: Tensor, binoms: Float[Tensor, "n_max n_max"]
-) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """Opacity and scale with which `ratios` (n,) copies at one place look like the one Gaussian that was there.
-
-    Equation 9 of Kheradmand et al. 2024; `binoms[i, k]` is the binomial coefficient. The twin of gsplat's
-    compute_relocation.
-    """
-    n_max = len(binoms)
-    ratios = ratios.clamp(1, n_max).long()
-    new_opacities = 1.0 - (1.0 - opacities) ** (1.0 / ratios)
-    k = torch.arange(n_max, device=opacities.device, dtype=torch.float64)  # the terms alternate and reach 1e14
-    series = (-1.0) ** k / torch.sqrt(k + 1.0) * new_opacities[:, None].double() ** (k + 1)
-    # sum over i < ratio of sum over k <= i of binom(i, k) * series_k; binom(i, k) = 0 beyond k = i
-    coefficients = torch.cumsum(binoms.double(), dim=0)[ratios - 1]
-    shrink = opacities / (coefficients * series).sum(dim=1).to(opacities.dtype)
-    return new_opacities, shrink[:, None] * scales
+        extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}
+        with nullcontext() if params["means"].is_cuda else self._on_cpu():
+            self._strategy.step_post_backward(params, optimizers, self.state, step, info, **extra)

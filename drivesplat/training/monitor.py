@@ -50,7 +50,7 @@ class Monitor:
     """Scalars and images into a TensorBoard folder, a progress bar where a terminal looks."""
 
     def __init__(self, folder: Path, iterations: int, start: int, label: str):
-        self._writer = SummaryWriter(str(folder), purge_step=start or None)
+        self._writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
         self._bar = tqdm(
             total=iterations, initial=start, desc=label, unit="it", disable=not sys.stderr.isatty(), mininterval=1.0
         )

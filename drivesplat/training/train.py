@@ -169,12 +169,22 @@ class Run:
 
     def check(self) -> None:
         """Raises TrainingError where something was not finite, or no Gaussian is left."""
-        self.trainer.guard.check(str(self.workspace.state))
         if len(self.trainer.model) == 0:
-            raise TrainingError(
-                f"iteration {self.trainer.step}: no Gaussian is left; "
-                "lower train.opacity_reg or the thresholds of the densification"
-            )
+            raise self._none_left()
+        self.trainer.guard.check(str(self.workspace.state))
+
+    def explain(self) -> None:
+        """After an iteration failed: raises TrainingError where the cause is numbers or Gaussians that are gone."""
+        self.check()
+        dead = self.trainer.settings.mcmc.min_opacity
+        if all(not part.at(0.0).opacities.gt(dead).any() for part in self.trainer.model.parts):
+            raise self._none_left()
+
+    def _none_left(self) -> TrainingError:
+        return TrainingError(
+            f"iteration {self.trainer.step + 1}: no Gaussian is left; "
+            "lower train.opacity_reg or the thresholds of the densification"
+        )
 
     def save(self) -> None:
         """Writes the resume state, unless the training has gone wrong."""
@@ -201,7 +211,12 @@ def _iterate(run: Run, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     starts, ends = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
     while trainer.step < settings.iterations:
-        terms, picture, view = trainer.advance()
+        try:
+            terms, picture, view = trainer.advance()
+        except RuntimeError as error:
+            if not isinstance(error, torch.cuda.OutOfMemoryError):
+                run.explain()
+            raise
         if settings.floaters.radius and trainer.step % settings.floaters.every == 0:
             for part in trainer.model.parts:
                 fade_floaters(part, starts, ends, settings.floaters.radius)

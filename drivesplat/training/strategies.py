@@ -1,0 +1,96 @@
+"""gsplat's densification strategies as this workflow runs them: capped, resetting, and on the CPU."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from gsplat import DefaultStrategy, MCMCStrategy
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+from gsplat.strategy import ops
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.densify import Optimizers
+
+
+class CappedDefaultStrategy(DefaultStrategy):
+    """gsplat's DefaultStrategy with at most `cap_max` Gaussians: where more want to grow, the largest gradients do.
+
+    It resets opacities every `reset_every` iterations, as 3DGS does; gsplat 1.5.3 never comes to it, since
+    its condition `step % reset_every == 0 & step > 0` reads as `... == (0 & step) > 0`.
+    """
+
+    cap_max: int = 1_500_000
+
+    def step_post_backward(
+        self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
+    ) -> None:
+        super().step_post_backward(params, optimizers, state, step, info, packed=False)
+        if 0 < step < self.refine_stop_iter and step % self.reset_every == 0:
+            ops.reset_opa(params=params, optimizers=optimizers, state=state, value=2.0 * self.prune_opa)
+
+    @torch.no_grad()
+    def _grow_gs(self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
+        gradients = state["grad2d"] / state["count"].clamp_min(1)
+        room = max(0, self.cap_max - len(gradients))
+        wanting = torch.nonzero(gradients > self.grow_grad2d)[:, 0]
+        if len(wanting) > room:
+            weakest_first = wanting[torch.argsort(gradients[wanting])]
+            state["grad2d"][weakest_first[: len(wanting) - room]] = 0.0
+        return super()._grow_gs(params, optimizers, state, step)
+
+
+def make_strategy(settings: TrainSettings) -> DefaultStrategy | MCMCStrategy:
+    start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
+    if settings.strategy == "mcmc":
+        return MCMCStrategy(
+            cap_max=settings.cap_max,
+            noise_lr=settings.mcmc.noise_lr,
+            min_opacity=settings.mcmc.min_opacity,
+            refine_start_iter=start,
+            refine_stop_iter=stop,
+            refine_every=settings.mcmc.refine_every,
+        )
+    strategy = CappedDefaultStrategy(
+        grow_grad2d=settings.default.grow_grad2d,
+        prune_opa=settings.default.prune_opacity,
+        absgrad=settings.default.absgrad,
+        refine_start_iter=start,
+        refine_stop_iter=stop,
+        refine_every=settings.default.refine_every,
+        reset_every=settings.default.reset_every,
+    )
+    strategy.cap_max = settings.cap_max
+    return strategy
+
+
+@contextmanager
+def torch_twins() -> Iterator[None]:
+    """For its duration gsplat's strategies use torch twins of the two CUDA kernels they call."""
+    with (
+        patch.object(ops, "compute_relocation", relocation),
+        patch.object(ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
+    ):
+        yield
+
+
+def relocation(
+    opacities: Float[Tensor, " n"], scales: Float[Tensor, "n 3"], ratios: Tensor, binoms: Float[Tensor, "n_max n_max"]
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Opacity and scale with which `ratios` (n,) copies at one place look like the one Gaussian that was there.
+
+    Equation 9 of Kheradmand et al. 2024; `binoms[i, k]` is the binomial coefficient. The twin of gsplat's
+    compute_relocation.
+    """
+    n_max = len(binoms)
+    ratios = ratios.clamp(1, n_max).long()
+    new_opacities = 1.0 - (1.0 - opacities) ** (1.0 / ratios)
+    k = torch.arange(n_max, device=opacities.device, dtype=torch.float64)  # the terms alternate and reach 1e14
+    series = (-1.0) ** k / torch.sqrt(k + 1.0) * new_opacities[:, None].double() ** (k + 1)
+    # sum over i < ratio of sum over k <= i of binom(i, k) * series_k; binom(i, k) = 0 beyond k = i
+    coefficients = torch.cumsum(binoms.double(), dim=0)[ratios - 1]
+    shrink = opacities / (coefficients * series).sum(dim=1).to(opacities.dtype)
+    return new_opacities, shrink[:, None] * scales

@@ -1,0 +1,262 @@
+"""Densification on the CPU: the relocation formula, both strategies, and the cap."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gsplat import MCMCStrategy
+from gsplat.strategy import ops
+
+from drivesplat.model.background import Background
+from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
+from drivesplat.training.densify import Densifier, Optimizers
+from drivesplat.training.optimizers import make_optimizers
+from drivesplat.training.strategies import relocation, torch_twins
+
+BINOMS = MCMCStrategy().initialize_state()["binoms"]
+N_MAX = len(BINOMS)
+
+
+def relocated(opacity: float, ratio: int, scale: float = 1.0) -> tuple[float, float]:
+    """`relocation` of one isotropic Gaussian."""
+    opacities, scales = relocation(torch.tensor([opacity]), torch.full((1, 3), scale), torch.tensor([ratio]), BINOMS)
+    assert scales[0, 0] == scales[0, 1] == scales[0, 2]
+    return float(opacities[0]), float(scales[0, 0])
+
+
+def equation_9(opacity: float, ratio: int) -> float:
+    """By how much the scale shrinks: Kheradmand et al. 2024, equation 9, term by term."""
+    new = 1.0 - (1.0 - opacity) ** (1.0 / ratio)
+    terms = [
+        math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
+        for i in range(1, ratio + 1)
+        for k in range(i)
+    ]
+    return opacity / math.fsum(terms)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 7, 20, N_MAX])
+@pytest.mark.parametrize("opacity", [0.02, 0.3, 0.9, 0.999])
+def test_copies_at_one_place_are_together_as_opaque_as_the_original(opacity, ratio):
+    new_opacity, _ = relocated(opacity, ratio)
+    assert 1.0 - (1.0 - new_opacity) ** ratio == pytest.approx(opacity, rel=5e-4)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 7, 20, N_MAX])
+@pytest.mark.parametrize("opacity", [0.02, 0.3, 0.9, 0.999])
+def test_copies_are_scaled_by_equation_9(opacity, ratio):
+    _, new_scale = relocated(opacity, ratio, scale=2.5)
+    assert new_scale == pytest.approx(2.5 * equation_9(opacity, ratio), rel=5e-4)
+
+
+def test_one_copy_is_the_original():
+    opacities, scales = torch.tensor([0.1, 0.5, 0.98]), torch.tensor([[1.0, 2.0, 3.0]] * 3)
+    new_opacities, new_scales = relocation(opacities, scales, torch.ones(3, dtype=torch.long), BINOMS)
+    torch.testing.assert_close(new_opacities, opacities)
+    torch.testing.assert_close(new_scales, scales)
+
+
+@pytest.mark.parametrize(("ratio", "taken_for"), [(0, 1), (N_MAX + 1, N_MAX), (10_000, N_MAX)])
+def test_ratios_beyond_the_table_are_held_at_its_ends(ratio, taken_for):
+    assert relocated(0.7, ratio) == relocated(0.7, taken_for)
+
+
+def test_every_gaussian_is_relocated_by_its_own_ratio():
+    opacities, ratios = torch.linspace(0.05, 0.95, 12), torch.arange(1, 13)
+    scales = torch.rand(12, 3, generator=torch.Generator().manual_seed(0)) + 0.1
+    _, new_scales = relocation(opacities, scales, ratios, BINOMS)
+    factors = [equation_9(float(o), int(n)) for o, n in zip(opacities, ratios, strict=True)]
+    torch.testing.assert_close(new_scales, scales * torch.tensor(factors)[:, None], rtol=1e-4, atol=0)
+
+
+def test_gsplats_own_functions_are_back_after_the_twins():
+    before = ops.compute_relocation, ops.quat_scale_to_covar_preci
+    with pytest.raises(ZeroDivisionError), torch_twins():
+        assert ops.compute_relocation is relocation
+        raise ZeroDivisionError
+    assert (ops.compute_relocation, ops.quat_scale_to_covar_preci) == before
+
+
+def a_model(count: int = 100, size: float = 0.05) -> SplatModel:
+    """Small Gaussians spread before the camera of `a_view`."""
+    rng = np.random.default_rng(0)
+    positions, colors = rng.uniform([-2, -1.5, 3], [2, 1.5, 5], (count, 3)), rng.uniform(0, 1, (count, 3))
+    part = Background.from_points(positions, colors, GaussianSettings(sh_degree=1), 1.0)
+    part.params["scales"].data.fill_(math.log(size))
+    return SplatModel([part], None)
+
+
+def a_view() -> View:
+    intrinsics = torch.tensor([[24.0, 0.0, 16.0], [0.0, 24.0, 12.0], [0.0, 0.0, 1.0]])
+    return View(intrinsics, torch.eye(4), 32, 24, 0.0)
+
+
+def settings_of(strategy: str, **changes: Any) -> TrainSettings:
+    """Densification at every second iteration of a thousand."""
+    common = {"iterations": 1000, "strategy": strategy, "refine_start": 0.0, "refine_stop": 1.0}
+    return TrainSettings(**{
+        **common,
+        "mcmc": McmcSettings(refine_every=2, noise_lr=0.0),
+        "default": DefaultSettings(refine_every=2, prune_opacity=1e-3),
+        **changes,
+    })  # fmt: skip
+
+
+def train_step(model: SplatModel, densifier: Densifier, step: int, optimizers: Optimizers) -> None:
+    """An iteration towards a random image, as the trainer makes it."""
+    target = torch.from_numpy(np.random.default_rng(1).uniform(0, 1, (24, 32, 3))).float()
+    picture = model.render(a_view(), 1)
+    densifier.before_backward(step, optimizers, picture.info)
+    (picture.image - target).abs().mean().backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+    densifier.after_step(step, optimizers, picture.info)
+
+
+def densified(strategy: str, steps: int, count: int = 100, size: float = 0.05, **changes: Any) -> list[int]:
+    """The number of Gaussians after every iteration."""
+    torch.manual_seed(0)
+    model, settings = a_model(count, size), settings_of(strategy, **changes)
+    densifier, (optimizers,) = Densifier(model.parts[0], settings, 1.0), make_optimizers(model).parts
+    counts = []
+    for step in range(steps):
+        train_step(model, densifier, step, optimizers)
+        counts.append(len(model))
+        assert {len(value) for value in model.parts[0].params.values()} == {counts[-1]}
+        assert all(
+            optimizers[name].param_groups[0]["params"][0] is value for name, value in model.parts[0].params.items()
+        )
+    return counts
+
+
+def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
+    counts = densified("mcmc", 12, cap_max=118)
+    assert counts == [100, 100, 105, 105, 110, 110, 115, 115, 118, 118, 118, 118]
+
+
+def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
+    model, settings = a_model(), settings_of("mcmc", cap_max=100)
+    part = model.parts[0]
+    densifier, (optimizers,) = Densifier(part, settings, 1.0), make_optimizers(model).parts
+    with torch.no_grad():
+        part.params["opacities"][:30] = -9.0
+    living = part.params["means"].detach()[30:].clone()
+    torch.manual_seed(0)
+    densifier.after_step(2, optimizers, {})
+    assert len(model) == 100
+    moved = part.params["means"].detach()[:30]
+    assert ((moved[:, None] - living).abs().amax(dim=2).amin(dim=1) == 0).all()
+    assert (part.at(0.0).opacities > 0.005).all()
+
+
+def test_relocation_hardly_changes_what_is_seen():
+    """Copies of a Gaussian look like the one that was there, which the formula is made for."""
+    model, settings = a_model(size=0.12), settings_of("mcmc", cap_max=105)
+    densifier, (optimizers,) = Densifier(model.parts[0], settings, 1.0), make_optimizers(model).parts
+    with torch.no_grad():
+        before = model.render(a_view(), 0).image
+        torch.manual_seed(0)
+        densifier.after_step(2, optimizers, {})
+        after = model.render(a_view(), 0).image
+    assert len(model) == 105
+    change = (after - before).abs()
+    assert float(change.max()) < 0.05 and float(change.mean()) < 0.002
+
+
+def test_mcmc_noise_moves_faint_gaussians_more_than_opaque_ones():
+    model, settings = a_model(size=0.2), settings_of("mcmc", cap_max=100, mcmc=McmcSettings(noise_lr=5e5))
+    part = model.parts[0]
+    with torch.no_grad():
+        part.params["opacities"][:50], part.params["opacities"][50:] = -5.2, 6.0
+    before = part.params["means"].detach().clone()
+    densifier, (optimizers,) = Densifier(part, settings, 1.0), make_optimizers(model).parts
+    torch.manual_seed(0)
+    densifier.after_step(1, optimizers, {})
+    moved = (part.params["means"].detach() - before).norm(dim=1)
+    assert float(moved[:50].mean()) > 1e-2 and float(moved[50:].max()) < 1e-6
+
+
+def test_the_default_strategy_grows_where_the_image_pulls():
+    counts = densified("default", 5, default=DefaultSettings(refine_every=2, grow_grad2d=1e-7, prune_opacity=1e-3))
+    assert counts[0] == counts[1] == 100
+    assert counts[2] > 150
+
+
+def test_the_default_strategy_grows_nothing_under_its_threshold():
+    counts = densified("default", 5, default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=1e-3))
+    assert counts == [100] * 5
+
+
+@pytest.mark.parametrize("size", [pytest.param(0.005, id="duplicated"), pytest.param(0.05, id="split")])
+@pytest.mark.parametrize("cap_max", [100, 117, 250])
+def test_the_default_strategy_never_exceeds_the_cap(cap_max, size):
+    greedy = DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3)
+    counts = densified("default", 9, size=size, cap_max=cap_max, default=greedy)
+    assert max(counts) <= cap_max
+    assert counts[-1] > 0.95 * cap_max, "it fills the cap, since all want to grow"
+
+
+def test_at_the_cap_the_default_strategy_prefers_the_largest_gradients():
+    model = a_model(size=0.005)
+    part, settings = model.parts[0], settings_of("default", cap_max=110)
+    densifier, (optimizers,) = Densifier(part, settings, 1.0), make_optimizers(model).parts
+    strength = torch.from_numpy(np.random.default_rng(2).permutation(100)).float() + 1.0
+    centers = torch.zeros(1, 100, 2, requires_grad=True)
+    centers.grad = torch.stack([strength, torch.zeros(100)], dim=1)[None]
+    info = {
+        "means2d": centers, "radii": torch.ones(1, 100, 2, dtype=torch.int32), "width": 32, "height": 24,
+        "n_cameras": 1, "gaussian_ids": None,
+    }  # fmt: skip
+    before = part.params["means"].detach().clone()
+    densifier.after_step(2, optimizers, info)
+    assert len(part) == 110
+    copies = torch.cdist(part.params["means"].detach()[100:], before).argmin(dim=1)
+    assert set(copies.tolist()) == set(strength.topk(10).indices.tolist())
+
+
+def test_the_default_strategy_removes_what_is_too_faint():
+    model = a_model()
+    with torch.no_grad():
+        model.parts[0].params["opacities"][:25] = math.log(0.004 / 0.996)
+    settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=0.005))
+    densifier, (optimizers,) = Densifier(model.parts[0], settings, 1.0), make_optimizers(model).parts
+    for optimizer in optimizers.values():
+        optimizer.param_groups[0]["lr"] = 0.0
+    for step in (1, 2):
+        train_step(model, densifier, step, optimizers)
+    assert len(model) == 75
+
+
+def test_the_default_strategy_resets_opacities_every_so_many_iterations():
+    model = a_model()
+    default = DefaultSettings(refine_every=1000, reset_every=3, prune_opacity=0.005)
+    densifier = Densifier(model.parts[0], settings_of("default", default=default), 1.0)
+    (optimizers,) = make_optimizers(model).parts
+    brightest = []
+    for step in range(1, 4):
+        train_step(model, densifier, step, optimizers)
+        brightest.append(float(model.parts[0].at(0.0).opacities.detach().max()))
+    assert min(brightest[:2]) > 0.3
+    assert brightest[2] == pytest.approx(0.01, rel=1e-3), "twice prune_opacity, as in 3DGS"
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+@pytest.mark.parametrize(("start", "stop"), [(0.5, 1.0), (0.0, 0.002)])
+def test_nothing_is_densified_outside_its_span_of_iterations(strategy, start, stop):
+    counts = densified(
+        strategy, 8, refine_start=start, refine_stop=stop,
+        default=DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3),
+    )  # fmt: skip
+    assert counts == [100] * 8
+
+
+def test_absolute_gradients_are_asked_for_by_the_default_strategy_alone():
+    part = a_model().parts[0]
+    for strategy, wanted in (("mcmc", False), ("default", True)):
+        assert Densifier(part, settings_of(strategy, default=DefaultSettings(absgrad=True)), 1.0).absgrad is wanted
+    assert Densifier(part, settings_of("default"), 1.0).absgrad is False

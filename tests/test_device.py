@@ -1,0 +1,226 @@
+"""Where the work runs: what is refused before training, and in which words."""
+
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from drivesplat.cards import visible_cards
+from drivesplat.device import choose_device, device_name, telling_out_of_memory
+from drivesplat.errors import DeviceError
+from drivesplat.settings.device import DeviceSettings
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def no_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+@pytest.fixture
+def a_gpu(monkeypatch):
+    """A card of 24 GB of which 10 are free, and a gsplat compiled for it."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (10_000_000_000, 24_000_000_000))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "NVIDIA RTX 4090")
+    install_gsplat(monkeypatch, object())
+
+
+def install_gsplat(monkeypatch, compiled: object) -> None:
+    """Stands in for the module that loads gsplat's kernels; an exception as `compiled` is raised by its import."""
+    backend = ModuleType("gsplat.cuda._backend")
+
+    def missing(name: str) -> object:
+        raise compiled
+
+    if isinstance(compiled, Exception):
+        backend.__getattr__ = missing
+    else:
+        backend._C = compiled
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
+
+
+def refusal(kind: str = "auto", **settings: float) -> str:
+    """The sentence with which a device is refused."""
+    with pytest.raises(DeviceError) as error:
+        choose_device(DeviceSettings(kind=kind, **settings))
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["auto", "cuda"])
+def test_without_a_gpu_nothing_falls_back_to_the_cpu_silently(no_gpu, kind):
+    message = refusal(kind)
+    assert "no usable GPU" in message and "device: cpu" in message
+
+
+@pytest.mark.parametrize(
+    ("cuda", "hip", "said"),
+    [(None, None, "built without GPU support"), ("13.0", None, "sees no GPU"), (None, "6.4", "sees no GPU")],
+)
+def test_without_a_gpu_it_says_whether_torch_or_the_driver_is_at_fault(no_gpu, monkeypatch, cuda, hip, said):
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    monkeypatch.setattr(torch.version, "hip", hip)
+    message = refusal()
+    assert said in message and torch.__version__ in message
+
+
+def test_who_writes_cpu_gets_it(no_gpu):
+    assert choose_device(DeviceSettings(kind="cpu")) == torch.device("cpu")
+    assert choose_device(DeviceSettings.model_validate("cpu")) == torch.device("cpu")
+
+
+def test_who_writes_cpu_gets_it_even_with_a_gpu(a_gpu):
+    assert choose_device(DeviceSettings(kind="cpu", min_free_gb=1000)) == torch.device("cpu")
+
+
+@pytest.mark.parametrize("kind", ["auto", "cuda"])
+def test_a_usable_gpu_is_taken(a_gpu, kind):
+    assert choose_device(DeviceSettings(kind=kind)) == torch.device("cuda")
+
+
+def test_too_little_free_memory_is_refused_with_both_numbers(a_gpu):
+    message = refusal(min_free_gb=12.5)
+    assert "RTX 4090" in message
+    assert "10.0 GB" in message and "12.5" in message
+    assert "device.min_free_gb" in message and "train.cap_max" in message
+
+
+@pytest.mark.parametrize(("asked", "enough"), [(10.0, True), (10.1, False), (0.0, True)])
+def test_free_memory_is_compared_with_what_is_asked(a_gpu, asked, enough):
+    if enough:
+        assert choose_device(DeviceSettings(min_free_gb=asked)) == torch.device("cuda")
+    else:
+        refusal(min_free_gb=asked)
+
+
+def test_a_stage_that_needs_less_memory_than_a_training_may_say_so(a_gpu):
+    assert choose_device(DeviceSettings(min_free_gb=500), min_free_gb=0.0) == torch.device("cuda")
+
+
+def test_gsplat_that_cannot_be_imported_is_named_with_what_to_do(a_gpu, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
+    message = refusal()
+    assert "gsplat cannot be loaded" in message and "reinstall" in message and "device: cpu" in message
+
+
+@pytest.mark.parametrize("error", [IndexError("list index out of range"), RuntimeError("Error building\nextension")])
+def test_gsplat_that_fails_to_build_is_named_with_its_error(a_gpu, monkeypatch, error):
+    install_gsplat(monkeypatch, error)
+    message = refusal()
+    assert type(error).__name__ in message and str(error).split()[-1] in message
+
+
+def test_cuda_without_nvcc_is_named_with_what_to_do(a_gpu, monkeypatch):
+    install_gsplat(monkeypatch, None)
+    message = refusal()
+    assert "nvcc" in message and "toolkit" in message and "device: cpu" in message
+
+
+def test_without_gsplat_the_training_stage_still_comes_to_its_one_sentence():
+    """What the script of the rule `train` does on a machine where gsplat is not installed."""
+    script = (
+        "import sys; sys.modules['gsplat'] = None\n"
+        "import torch; torch.cuda.is_available = lambda: True\n"
+        "torch.cuda.mem_get_info = lambda *_: (10**11, 10**11); torch.cuda.get_device_name = lambda *_: 'card'\n"
+        "import drivesplat.training.run\n"
+        "from drivesplat.device import choose_device\n"
+        "from drivesplat.settings.device import DeviceSettings\n"
+        "from drivesplat.errors import DeviceError\n"
+        "try: choose_device(DeviceSettings())\n"
+        "except DeviceError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "gsplat cannot be loaded" in done.stdout
+
+
+def test_the_cpu_is_named_with_its_kind():
+    assert device_name(torch.device("cpu")).startswith("cpu (")
+
+
+def test_out_of_memory_is_told_with_what_lowers_the_need():
+    count = 1
+    with pytest.raises(DeviceError) as error, telling_out_of_memory(lambda: count):
+        count = 1_234_567
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+    message = str(error.value)
+    assert "1,234,567 Gaussians" in message and "peak" in message and "train.cap_max" in message
+    assert "\n" not in message
+
+
+def test_other_errors_are_not_taken_for_out_of_memory():
+    with pytest.raises(ZeroDivisionError), telling_out_of_memory(lambda: 1):
+        raise ZeroDivisionError
+
+
+CARD_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
+
+
+@pytest.fixture
+def four_cards(monkeypatch):
+    """A machine with four NVIDIA cards, nothing hidden."""
+    for variable in CARD_VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
+    devices = [Path(f"/dev/nvidia{i}") for i in range(4)] + [Path("/dev/nvidiactl"), Path("/dev/nvidia-uvm")]
+    with_cards = {Path("/dev"): devices, Path("/sys/class/kfd/kfd/topology/nodes"): []}
+    real = Path.glob
+    monkeypatch.setattr(
+        Path, "glob", lambda self, *a, **k: iter(with_cards[self]) if self in with_cards else real(self, *a, **k)
+    )
+
+
+def test_all_cards_count_where_none_is_hidden(four_cards):
+    assert visible_cards() == 4
+
+
+@pytest.mark.parametrize("variable", CARD_VARIABLES)
+@pytest.mark.parametrize(
+    ("value", "cards"),
+    [
+        ("0", 1),
+        ("2,3", 2),
+        ("0,1,2", 3),
+        ("GPU-5a3c,GPU-77de", 2),
+        ("MIG-1f0e", 1),
+        ("-1", 1),
+        (" 0 , 1 ", 2),
+    ],
+)
+def test_hidden_cards_do_not_count_and_there_is_always_one(four_cards, monkeypatch, variable, value, cards):
+    monkeypatch.setenv(variable, value)
+    assert visible_cards() == cards
+
+
+def test_an_empty_list_hides_all_nvidia_cards(four_cards, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert visible_cards() == 1
+
+
+def test_a_machine_without_cards_schedules_one_gpu_job_at_a_time(four_cards, monkeypatch):
+    monkeypatch.setattr(Path, "glob", lambda *_: iter(()))
+    assert visible_cards() == 1
+
+
+def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path):
+    for node, gpu_id in enumerate(("0", "0", "51234", "8121")):
+        (tmp_path / str(node)).mkdir()
+        (tmp_path / str(node) / "gpu_id").write_text(f"{gpu_id}\n")
+    found = {
+        Path("/dev"): [],
+        Path("/sys/class/kfd/kfd/topology/nodes"): [tmp_path / str(node) / "gpu_id" for node in range(4)],
+    }
+    monkeypatch.setattr(Path, "glob", lambda self, *_: iter(found[self]))
+    assert visible_cards() == 2
+
+
+def test_counting_cards_does_not_import_torch():
+    """Planning takes about a second; torch takes longer."""
+    script = (
+        "import sys; from drivesplat.cards import visible_cards; visible_cards(); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, check=True)

@@ -1,0 +1,88 @@
+"""Gaussians where the cameras drove are faded, and no others."""
+
+import numpy as np
+import pytest
+import torch
+
+from drivesplat.model.background import Background
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import DefaultSettings, McmcSettings
+from drivesplat.training.floaters import LARGEST_STEP, camera_path, fade_floaters, near_path
+
+
+def distance_to_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
+    """By dense sampling of the segment."""
+    samples = start + np.linspace(0.0, 1.0, 2001)[:, None] * (end - start)
+    return float(np.linalg.norm(samples - point, axis=1).min())
+
+
+@pytest.mark.parametrize("radius", [0.6, 1.0, 2.5])
+def test_near_is_nearer_than_the_radius_to_any_segment(radius):
+    rng = np.random.default_rng(0)
+    points, starts, ends = rng.uniform(-4, 4, (60, 3)), rng.uniform(-3, 3, (5, 3)), rng.uniform(-3, 3, (5, 3))
+    ends[2] = starts[2]
+    distances = np.array([min(distance_to_segment(p, a, b) for a, b in zip(starts, ends, strict=True)) for p in points])
+    assert np.abs(distances - radius).min() > 1e-3, "no point may lie where sampling cannot tell"
+    near = near_path(*(torch.from_numpy(x).float() for x in (points, starts, ends)), radius)
+    np.testing.assert_array_equal(near.numpy(), distances < radius)
+    assert near.any() and not near.all()
+
+
+@pytest.mark.parametrize(
+    ("point", "near"),
+    [((5.0, 0.9, 0.0), True), ((5.0, 1.1, 0.0), False), ((-0.9, 0.0, 0.0), True), ((10.8, 0.8, 0.0), False)],
+)
+def test_near_a_segment_is_a_capsule(point, near):
+    start, end = torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([[10.0, 0.0, 0.0]])
+    assert bool(near_path(torch.tensor([point]), start, end, 1.0)) is near
+
+
+def test_a_path_joins_consecutive_positions():
+    centers = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    between = torch.tensor([[2.5, 0.2, 0.0], [7.5, 0.2, 0.0]])
+    assert near_path(between, *camera_path(centers), 0.5).all()
+
+
+def test_a_path_does_not_join_positions_far_apart():
+    centers = torch.tensor([[0.0, 0.0, 0.0], [LARGEST_STEP + 1.0, 0.0, 0.0], [LARGEST_STEP + 3.0, 0.0, 0.0]])
+    points = torch.tensor([[8.0, 0.0, 0.0], [LARGEST_STEP + 2.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    assert near_path(points, *camera_path(centers), 0.5).tolist() == [False, True, True]
+
+
+def test_a_lone_position_is_a_path():
+    starts, ends = camera_path(torch.tensor([[1.0, 2.0, 3.0]]))
+    assert near_path(torch.tensor([[1.2, 2.0, 3.0], [2.2, 2.0, 3.0]]), starts, ends, 0.5).tolist() == [True, False]
+
+
+def test_only_floaters_near_the_path_fade_and_the_rest_stays():
+    positions = np.array([[0.0, 0.3, 0.0], [2.0, 0.0, 0.5], [2.0, 3.0, 0.0], [9.0, 0.0, 0.0]])
+    part = Background.from_points(positions, np.full((4, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
+    before = {name: value.detach().clone() for name, value in part.params.items()}
+    fade_floaters(part, *camera_path(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])), 1.0)
+    opacities = part.at(0.0).opacities.detach()
+    assert (opacities[:2] < 1e-3).all()
+    torch.testing.assert_close(opacities[2:], torch.tensor([0.6, 0.6]))
+    for name in before.keys() - {"opacities"}:
+        assert torch.equal(part.params[name], before[name])
+
+
+def test_a_faded_gaussian_is_under_what_the_strategies_take_for_dead():
+    part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
+    fade_floaters(part, *camera_path(torch.zeros(1, 3)), 1.0)
+    opacity = float(part.at(0.0).opacities.detach())
+    assert opacity < min(McmcSettings().min_opacity, DefaultSettings().prune_opacity)
+
+
+def test_fading_never_brightens():
+    part = Background.from_points(np.zeros((2, 3)), np.full((2, 3), 0.5), GaussianSettings(), 1.0)
+    with torch.no_grad():
+        part.params["opacities"].copy_(torch.tensor([-30.0, 2.0]))
+    fade_floaters(part, *camera_path(torch.zeros(1, 3)), 1.0)
+    assert float(part.params["opacities"].detach()[0]) == -30.0
+
+
+def test_a_faded_parameter_can_still_learn():
+    part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
+    before = part.params["opacities"]
+    fade_floaters(part, *camera_path(torch.zeros(1, 3)), 1.0)
+    assert part.params["opacities"] is before and before.requires_grad and before.is_leaf

@@ -1,0 +1,254 @@
+"""What needs a GPU: gsplat against the reference, trainings on the card, and a card that is full."""
+
+import math
+import re
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gsplat import MCMCStrategy
+from gsplat.relocation import compute_relocation
+from scipy.spatial.transform import Rotation
+from test_training import (
+    EndedError,
+    EndingViews,
+    in_subprocess,
+    mean_psnr,
+    recorded_views,
+    settings_of,
+    trained,
+    untrained,
+)
+
+from drivesplat.device import choose_device
+from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
+from drivesplat.model.background import Background
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.rasterize import rasterize
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
+from drivesplat.training.strategies import relocation
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU that torch can use"),
+]
+
+GPU = torch.device("cuda")
+WIDTH, HEIGHT = 96, 64
+INPUTS = ("means", "quats", "scales", "opacities", "colors")
+
+
+def random_scene(count: int = 3000, cameras: int = 2) -> dict[str, torch.Tensor]:
+    """Gaussians before, beside and behind two cameras, with colours of degree 3; float64 on the CPU."""
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(-1.0, 12.0, count)
+    viewmats = np.tile(np.eye(4), (cameras, 1, 1))
+    viewmats[:, :3, :3] = Rotation.from_euler("xyz", rng.uniform(-0.2, 0.2, (cameras, 3))).as_matrix()
+    viewmats[:, :3, 3] = rng.uniform(-0.5, 0.5, (cameras, 3))
+    arrays = {
+        "means": np.stack([rng.uniform(-9, 9, count), rng.uniform(-6, 6, count), depth], axis=1),
+        "quats": rng.normal(size=(count, 4)),
+        "scales": np.exp(rng.uniform(-4.0, -1.0, (count, 3))),
+        "opacities": rng.uniform(0.01, 1.0, count),
+        "colors": rng.normal(size=(count, 16, 3)) * 0.3,
+        "viewmats": viewmats,
+        "Ks": np.tile([[70.0, 0.0, 46.0], [0.0, 75.0, 33.0], [0.0, 0.0, 1.0]], (cameras, 1, 1)),
+    }
+    return {name: torch.from_numpy(values) for name, values in arrays.items()}
+
+
+def seen_and_gradients(backend: str, dtype: torch.dtype, antialiased: bool) -> dict[str, torch.Tensor]:
+    """Image, alpha and depth of the random scene, and the gradients of a random weighting of all three."""
+    scene = {name: value.to(GPU, dtype) for name, value in random_scene().items()}
+    for name in INPUTS:
+        scene[name].requires_grad_()
+    rendering = rasterize(
+        **scene, width=WIDTH, height=HEIGHT, sh_degree=3, antialiased=antialiased, with_depth=True, backend=backend
+    )
+    seen = {"image": rendering.image, "alpha": rendering.alpha, "depth": rendering.depth}
+    generator = torch.Generator().manual_seed(1)
+    weights = {name: torch.rand(value.shape, generator=generator, dtype=torch.float64) for name, value in seen.items()}
+    torch.stack([(value * weights[name].to(value)).sum() for name, value in seen.items()]).sum().backward()
+    gradients = {f"gradient of {name}": scene[name].grad for name in INPUTS}
+    return {name: value.detach().double() for name, value in {**seen, **gradients}.items()}
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_agrees_with_the_reference(antialiased):
+    expected = seen_and_gradients("reference", torch.float64, antialiased)
+    found = seen_and_gradients("gsplat", torch.float32, antialiased)
+    assert 0.05 < float(expected["alpha"].mean()) < 0.95
+    wrong = {}
+    for name, truth in expected.items():
+        error = (found[name] - truth).abs().flatten() / truth.abs().max()
+        typical, worst = float(torch.quantile(error, 0.999)), float(error.max())
+        if not (typical <= 1e-3 and worst <= 1e-2):
+            wrong[name] = (typical, worst)
+    assert not wrong, f"99.9th percentile and maximum of the error, over the tensor's maximum: {wrong}"
+
+
+def test_gpu_tensors_are_rendered_by_gsplat():
+    scene = {name: value.to(GPU, torch.float32) for name, value in random_scene(100).items()}
+    info = rasterize(**scene, width=WIDTH, height=HEIGHT, sh_degree=3).info
+    assert "isect_ids" in info, "what only gsplat's kernels make"
+    assert {"means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"} <= info.keys()
+
+
+def test_nothing_in_view_is_zeros_and_finite_gradients():
+    scene = {name: value.to(GPU, torch.float32) for name, value in random_scene(50).items()}
+    scene["means"][:, 2] = -5.0
+    for name in INPUTS:
+        scene[name].requires_grad_()
+    rendering = rasterize(**scene, width=WIDTH, height=HEIGHT, sh_degree=3, with_depth=True)
+    assert all((seen == 0).all() for seen in (rendering.image, rendering.alpha, rendering.depth))
+    (rendering.image.sum() + rendering.depth.sum()).backward()
+    assert all(torch.isfinite(scene[name].grad).all() for name in INPUTS)
+
+
+def test_relocation_is_gsplats():
+    generator = torch.Generator().manual_seed(0)
+    ratios = torch.arange(1, 21).repeat(50)
+    opacities = torch.rand(len(ratios), generator=generator) * 0.97 + 0.02
+    scales = torch.rand(len(ratios), 3, generator=generator) + 0.05
+    binoms = MCMCStrategy().initialize_state()["binoms"]
+    expected = compute_relocation(opacities.to(GPU), scales.to(GPU), ratios.to(GPU), binoms.to(GPU))
+    found = relocation(opacities, scales, ratios, binoms)
+    for ours, gsplats in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, gsplats.cpu(), rtol=1e-3, atol=1e-6)
+
+
+def gpu_settings(strategy: str, **changes: Any) -> TrainSettings:
+    """200 iterations with a checkpoint in the middle."""
+    return settings_of(strategy, **{"iterations": 200, "checkpoint_every": 80, "cap_max": 140, **changes})
+
+
+def gpu_views() -> list:
+    return recorded_views(width=64, height=48, device=GPU)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> dict[str, float]:
+    """By strategy, the PSNR of a training that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    models = {s: trained(folder / s, gpu_settings(s), gpu_views(), device=GPU)[0] for s in ("mcmc", "default")}
+    return {strategy: mean_psnr(model, gpu_views()) for strategy, model in models.items()}
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_training_comes_nearer_to_its_images(uninterrupted, strategy):
+    before = mean_psnr(untrained(gpu_settings(strategy)).to(GPU), gpu_views())
+    assert uninterrupted[strategy] > before + 3.0
+
+
+def test_absolute_gradients_densify_too(tmp_path):
+    settings = gpu_settings("default", default=DefaultSettings(absgrad=True, grow_grad2d=1e-3, refine_every=5))
+    _, summary = trained(tmp_path, settings, gpu_views(), device=GPU)
+    assert 90 < summary.gaussians <= 140
+
+
+def test_a_summary_tells_the_card_and_its_peak_memory(tmp_path):
+    _, summary = trained(tmp_path, gpu_settings("mcmc", iterations=5), gpu_views(), device=GPU)
+    assert summary.device == torch.cuda.get_device_name()
+    assert 0.0 < summary.peak_gpu_memory_gb <= torch.cuda.max_memory_allocated() / 1e9
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_resumed_training_ends_as_an_uninterrupted_one(uninterrupted, strategy, tmp_path):
+    settings = gpu_settings(strategy)
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings, EndingViews(gpu_views(), 120), device=GPU)
+    model, summary = trained(tmp_path, settings, gpu_views(), device=GPU)
+    assert summary.resumed_at == [80] and summary.iterations == 200
+    assert mean_psnr(model, gpu_views()) == pytest.approx(uninterrupted[strategy], abs=0.3)
+
+
+def train_until_killed(folder: str) -> None:
+    """For a subprocess: a training on the GPU that ends itself as `kill -9` would."""
+    trained(Path(folder), gpu_settings("mcmc"), EndingViews(gpu_views(), 120, kill=True), device=GPU)
+
+
+def test_a_killed_training_ends_as_an_uninterrupted_one(uninterrupted, tmp_path):
+    process = in_subprocess(train_until_killed, str(tmp_path))
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == -signal.SIGKILL, errors
+    model, summary = trained(tmp_path, gpu_settings("mcmc"), gpu_views(), device=GPU)
+    assert summary.resumed_at == [80] and summary.iterations == 200
+    assert mean_psnr(model, gpu_views()) == pytest.approx(uninterrupted["mcmc"], abs=0.3)
+
+
+def print_what_stops(folder: str, strategy: str, fault: str) -> None:
+    """For a subprocess: prints the sentence in which a training that goes wrong ends.
+
+    Where the library does not foresee it, a kernel's assertion takes the whole process's use of the GPU with it.
+    """
+    gaussians = GaussianSettings(sh_degree=1, lr_sh0=1e30) if fault == "not finite" else GaussianSettings(sh_degree=1)
+    settings = gpu_settings(strategy, gaussians=gaussians, refine_start=0.0, log_every=50, checkpoint_every=1000)
+    model = untrained(settings)
+    if fault == "none left":
+        with torch.no_grad():
+            model.parts[0].params["opacities"].fill_(-30.0)
+    try:
+        trained(Path(folder), settings, gpu_views(), device=GPU, model=model)
+    except TrainingError as error:
+        print(error)
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+@pytest.mark.parametrize(
+    ("fault", "said"), [("not finite", r"^iteration 2: .*ssim.* not finite"), ("none left", r"no Gaussian is left")]
+)
+def test_a_training_that_goes_wrong_ends_in_a_sentence(tmp_path, strategy, fault, said):
+    process = in_subprocess(print_what_stops, str(tmp_path), strategy, fault)
+    output, errors = process.communicate(timeout=120)
+    assert re.search(said, output), output + errors[-3000:]
+
+
+def print_out_of_memory(folder: str, gaussians: str, gigabytes: str) -> None:
+    """For a subprocess: a training on a card that seems to have only so much memory."""
+    count = int(gaussians)
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([6.0, 3.0, 3.0]) + torch.tensor([-3.0, -1.5, 3.0])
+    params = {
+        "means": means, "scales": torch.full((count, 3), math.log(0.02)), "quats": torch.rand(count, 4),
+        "opacities": torch.zeros(count), "sh0": torch.zeros(count, 1, 3), "shN": torch.zeros(count, 15, 3),
+    }  # fmt: skip
+    settings = gpu_settings("mcmc", cap_max=2 * count, mcmc=McmcSettings(), gaussians=GaussianSettings())
+    model = SplatModel([Background(params, settings.gaussians, 1.0)], None)
+    views = gpu_views()
+    torch.cuda.set_per_process_memory_fraction(float(gigabytes) * 1e9 / torch.cuda.mem_get_info()[1])
+    try:
+        trained(Path(folder), settings, views, device=GPU, model=model)
+    except DriveSplatError as error:
+        print(type(error).__name__, error)
+
+
+@pytest.mark.parametrize(
+    ("gaussians", "gigabytes"),
+    [pytest.param(400_000, 0.35, id="while training"), pytest.param(400_000, 0.05, id="before the first iteration")],
+)
+def test_a_full_card_is_told_with_its_gaussians_and_what_lowers_the_need(tmp_path, gaussians, gigabytes):
+    process = in_subprocess(print_out_of_memory, str(tmp_path), str(gaussians), str(gigabytes))
+    output, errors = process.communicate(timeout=120)
+    assert output.startswith("DeviceError "), output + errors[-3000:]
+    assert f"{gaussians:,} Gaussians" in output
+    assert re.search(r"peak \d+\.\d GB", output) and "train.cap_max" in output
+
+
+def test_too_little_free_memory_is_refused_naming_both_numbers():
+    free, total = (size / 1e9 for size in torch.cuda.mem_get_info())
+    asked = min(1000.0, math.ceil(total) + 1.0)
+    with pytest.raises(DeviceError) as error:
+        choose_device(DeviceSettings(min_free_gb=asked))
+    message = str(error.value)
+    named = float(re.search(r"has ([\d.]+) GB of free memory", message).group(1))
+    assert named == pytest.approx(free, abs=0.05 * total)
+    assert f"asks for {asked:g}" in message
+
+
+def test_a_card_that_suffices_is_taken():
+    assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU

@@ -1,0 +1,326 @@
+"""LPIPS from a backbone file, and the fetching of that file, which never stops a run."""
+
+import hashlib
+import socket
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import lpips
+import numpy as np
+import pytest
+import torch
+import torchvision
+
+from drivesplat.errors import ResultError
+from drivesplat.evaluation.backbone import provide_backbone
+from drivesplat.evaluation.lpips_map import lpips_map, unavailable_or_map
+from drivesplat.evaluation.metrics import LpipsMap
+from drivesplat.settings.evaluate import LpipsSettings
+
+CPU = torch.device("cpu")
+CONTENT = bytes(range(256)) * 300
+DIGEST = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def alexnet() -> dict[str, torch.Tensor]:
+    """Random weights under torchvision's names; the large classifier is stood in for by a small one."""
+    torch.manual_seed(0)
+    with torch.device("meta"):
+        shapes = torchvision.models.alexnet(weights=None).state_dict()
+    weights = {name: torch.randn(value.shape) * 0.05 for name, value in shapes.items() if name.startswith("features.")}
+    return {**weights, "classifier.1.weight": torch.zeros(2, 2)}
+
+
+@pytest.fixture(scope="module")
+def backbone(alexnet, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("lpips") / "alexnet.pth"
+    torch.save(alexnet, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def distance(backbone) -> LpipsMap:
+    return lpips_map(backbone, CPU)
+
+
+def images(seed: int, height: int = 70, width: int = 90) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(0, 1, (height, width, 3))
+    return np.clip(truth + 0.2 * rng.normal(size=truth.shape), 0, 1), truth
+
+
+def test_identical_images_have_no_distance(distance):
+    _, truth = images(0)
+    found = distance(truth, truth)
+    assert found.shape == (70, 90)
+    assert (found == 0).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(70, 90), (65, 64)])
+def test_unlike_images_have_a_distance_at_every_pixel(distance, height, width):
+    found = distance(*images(1, height, width))
+    assert found.shape == (height, width)
+    assert (found > 0).all() and np.isfinite(found).all()
+
+
+def test_the_map_is_that_of_lpips_with_these_weights(distance, alexnet):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        reference = lpips.LPIPS(net="alex", spatial=True, pnet_rand=True, verbose=False)
+    convolutions = [layer for layer in reference.net.modules() if isinstance(layer, torch.nn.Conv2d)]
+    for layer, number in zip(convolutions, (0, 3, 6, 8, 10), strict=True):
+        layer.weight.data = alexnet[f"features.{number}.weight"]
+        layer.bias.data = alexnet[f"features.{number}.bias"]
+    image, truth = images(2)
+    with torch.no_grad():
+        expected = reference.eval()(
+            *(torch.from_numpy(x).float().permute(2, 0, 1)[None] * 2 - 1 for x in (image, truth))
+        )
+    np.testing.assert_allclose(distance(image, truth), expected[0, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_the_random_start_of_the_network_leaves_no_trace(distance, backbone):
+    image, truth = images(3)
+    np.testing.assert_array_equal(lpips_map(backbone, CPU)(image, truth), distance(image, truth))
+
+
+class Malicious:
+    """A pickle of it makes a file when it is loaded."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def broken_backbone(kind: str, path: Path, alexnet: dict[str, torch.Tensor]) -> None:
+    match kind:
+        case "missing":
+            return
+        case "empty":
+            path.write_bytes(b"")
+        case "a web page":
+            path.write_text("<html>404</html>")
+        case "truncated":
+            torch.save(alexnet, path)
+            path.write_bytes(path.read_bytes()[:100_000])
+        case "another network":
+            torch.save(torch.nn.Linear(3, 3).state_dict(), path)
+        case "other shapes":
+            torch.save({name: torch.zeros(1) for name in alexnet}, path)
+        case "a list":
+            torch.save([1, 2, 3], path)
+        case "malicious":
+            torch.save({**alexnet, "extra": Malicious(path.parent / "executed")}, path)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["missing", "empty", "a web page", "truncated", "another network", "other shapes", "a list", "malicious"],
+)
+def test_what_is_no_alexnet_is_a_reason_in_one_line_and_nothing_of_it_runs(kind, tmp_path, alexnet):
+    path = tmp_path / "alexnet.pth"
+    broken_backbone(kind, path, alexnet)
+    reason, made = unavailable_or_map({"file": str(path), "sha256": "", "unavailable": None}, CPU)
+    assert made is None
+    assert str(path) in reason and "\n" not in reason
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_wrong_backbone_is_an_error_that_names_the_rule_to_run(tmp_path):
+    with pytest.raises(ResultError, match=r"alexnet\.pth.*lpips_backbone"):
+        lpips_map(tmp_path / "alexnet.pth", CPU)
+
+
+def test_a_good_backbone_is_a_map_and_no_reason(backbone):
+    reason, made = unavailable_or_map({"file": str(backbone), "sha256": "", "unavailable": None}, CPU)
+    assert reason is None
+    assert made(*images(4)).shape == (70, 90)
+
+
+@pytest.mark.parametrize(
+    ("record", "reason"),
+    [
+        pytest.param(None, "lpips.enabled is false", id="not wanted"),
+        pytest.param({"file": "x", "sha256": None, "unavailable": "no network"}, "no network", id="not fetched"),
+    ],
+)
+def test_without_a_backbone_there_is_the_reason_alone(record, reason):
+    assert unavailable_or_map(record, CPU) == (reason, None)
+
+
+Answer = Callable[[BaseHTTPRequestHandler], None]
+
+
+@contextmanager
+def served(answer: Answer) -> Iterator[str]:
+    """The address of a local server that answers every GET so."""
+    ended = threading.Event()
+
+    class Handler(BaseHTTPRequestHandler):
+        ENDED = ended
+
+        def do_GET(self):
+            answer(self)
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}/alexnet.pth"
+    finally:
+        ended.set()
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def sends(body: bytes, length: int | None = None) -> Answer:
+    """An answer that announces `length` bytes (default: as many as there are; -1: no announcement)."""
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        if length != -1:
+            handler.send_header("Content-Length", str(len(body) if length is None else length))
+        handler.end_headers()
+        handler.wfile.write(body)
+
+    return answer
+
+
+def not_found(handler: BaseHTTPRequestHandler) -> None:
+    handler.send_error(404)
+
+
+def says_nothing(handler: BaseHTTPRequestHandler) -> None:
+    handler.ENDED.wait(5.0)
+
+
+def stops_halfway(handler: BaseHTTPRequestHandler) -> None:
+    sends(CONTENT[:1000], len(CONTENT))(handler)
+    handler.wfile.flush()
+    handler.ENDED.wait(5.0)
+
+
+def resets_halfway(handler: BaseHTTPRequestHandler) -> None:
+    sends(CONTENT[:1000], len(CONTENT))(handler)
+    handler.wfile.flush()
+    handler.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+    handler.connection.close()
+
+
+def talks_no_http(handler: BaseHTTPRequestHandler) -> None:
+    handler.wfile.write(b"220 mail.example.org ESMTP\r\n")
+
+
+def breaks_off_a_chunk(handler: BaseHTTPRequestHandler) -> None:
+    handler.protocol_version = "HTTP/1.1"
+    handler.send_response(200)
+    handler.send_header("Transfer-Encoding", "chunked")
+    handler.end_headers()
+    handler.wfile.write(b"1000\r\n" + CONTENT[:10])
+    handler.close_connection = True
+
+
+def closed_port() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"http://127.0.0.1:{probe.getsockname()[1]}/alexnet.pth"
+
+
+def settings_of(url: str, sha256: str = DIGEST, timeout_s: float = 5.0) -> LpipsSettings:
+    return LpipsSettings(url=url, sha256=sha256, timeout_s=timeout_s)
+
+
+@pytest.mark.parametrize("digits", [8, 12, 64])
+@pytest.mark.parametrize("length", [None, -1])
+def test_a_good_file_is_fetched_and_kept(tmp_path, digits, length):
+    path = tmp_path / "lpips" / "alexnet.pth"
+    with served(sends(CONTENT, length)) as url:
+        record = provide_backbone(settings_of(url, DIGEST[:digits]), path)
+    assert record == {"file": str(path), "sha256": DIGEST, "unavailable": None}
+    assert path.read_bytes() == CONTENT
+    assert list(path.parent.iterdir()) == [path]
+
+
+def refused(record: dict, path: Path) -> str:
+    """The reason of a record whose file was not kept, after checks that hold for all of them."""
+    assert record["sha256"] is None
+    assert not path.exists() and not any(path.parent.glob("*")), "nothing is kept, not even a part"
+    reason = record["unavailable"]
+    assert reason and "\n" not in reason
+    assert f"put the file at {path}" in reason
+    return reason
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        pytest.param(sends(b"not what was promised"), "SHA-256", id="wrong checksum"),
+        pytest.param(sends(CONTENT[:1000], len(CONTENT)), "1,000 of 76,800 bytes", id="truncated"),
+        pytest.param(not_found, "Not Found", id="404"),
+        pytest.param(talks_no_http, "", id="no HTTP"),
+        pytest.param(breaks_off_a_chunk, "", id="a chunk broken off"),
+        pytest.param(resets_halfway, "", id="connection reset"),
+    ],
+)
+def test_a_bad_answer_is_a_reason_and_nothing_is_kept(tmp_path, answer, why):
+    path = tmp_path / "alexnet.pth"
+    with served(answer) as url:
+        record = provide_backbone(settings_of(url), path)
+    reason = refused(record, path)
+    assert why in reason and url in reason
+
+
+@pytest.mark.parametrize("answer", [says_nothing, stops_halfway])
+def test_a_silent_server_is_not_waited_for(tmp_path, answer):
+    path = tmp_path / "alexnet.pth"
+    began = time.monotonic()
+    with served(answer) as url:
+        record = provide_backbone(settings_of(url, timeout_s=0.5), path)
+        assert time.monotonic() - began < 3.0
+    assert "timed out" in refused(record, path)
+
+
+def test_no_server_is_a_reason(tmp_path):
+    path = tmp_path / "alexnet.pth"
+    assert "refused" in refused(provide_backbone(settings_of(closed_port()), path), path)
+
+
+@pytest.mark.parametrize("url", ["nowhere", "http://", "http://127.0.0.1:none/x", "file:///nowhere/alexnet.pth"])
+def test_an_address_that_is_none_is_a_reason(tmp_path, url):
+    path = tmp_path / "alexnet.pth"
+    assert refused(provide_backbone(settings_of(url), path), path)
+
+
+def test_a_file_that_a_user_put_there_is_used_without_the_network(tmp_path):
+    path = tmp_path / "alexnet.pth"
+    path.write_bytes(CONTENT)
+    record = provide_backbone(settings_of(closed_port(), DIGEST[:8]), path)
+    assert record == {"file": str(path), "sha256": DIGEST, "unavailable": None}
+
+
+def test_a_wrong_file_that_a_user_put_there_is_named_and_left_alone(tmp_path):
+    path = tmp_path / "alexnet.pth"
+    path.write_bytes(b"something else")
+    record = provide_backbone(settings_of(closed_port()), path)
+    assert str(path) in record["unavailable"] and "SHA-256" in record["unavailable"]
+    assert "\n" not in record["unavailable"]
+    assert path.read_bytes() == b"something else"
+
+
+def test_a_file_can_be_put_there_after_a_failed_fetch(tmp_path):
+    path = tmp_path / "alexnet.pth"
+    assert provide_backbone(settings_of(closed_port()), path)["unavailable"]
+    path.write_bytes(CONTENT)
+    assert provide_backbone(settings_of(closed_port()), path)["unavailable"] is None

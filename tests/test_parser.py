@@ -1,0 +1,144 @@
+"""parser.pkl: what a trainer needs, under the names that users of gsplat's example trainer know."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drivesplat.errors import DatasetError, ResultError
+from drivesplat.holdout import frame_groups
+from drivesplat.parser import parser_dict, read_parser
+from drivesplat.point_cloud import PointCloud
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.parser import ParserJob
+from drivesplat.storage import write_plain_pickle
+
+HOLDOUT = HoldoutSettings(every_nth=4, offset=2, last_block=2)
+
+
+def job(width=None, holdout=HOLDOUT) -> ParserJob:
+    return ParserJob(holdout=holdout, images=ImageSettings(width=width))
+
+
+@pytest.fixture(scope="module")
+def seed() -> PointCloud:
+    random = np.random.default_rng(0)
+    note = {"lidar": 40, "points_file": 0, "far": 10, "lidar_missing": 3, "extra_points": None, "provenance": {"a": 1}}
+    return PointCloud(
+        random.normal(size=(50, 3)).astype(np.float32), random.integers(0, 256, (50, 3)).astype(np.uint8), note
+    )
+
+
+def test_the_record_has_the_keys_and_shapes_of_gsplats_example_trainer(tiny_scene, seed):
+    record = parser_dict(tiny_scene, seed, job())
+    images, points = 19, 50
+    shapes = {
+        "Ks": (images, 3, 3), "camtoworlds": (images, 4, 4), "image_sizes": (images, 2), "camera_indices": (images,),
+        "timestamps": (images,), "sample_indices": (images,), "is_key_frame": (images,), "points": (points, 3),
+        "points_rgb": (points, 3),
+    }  # fmt: skip
+    assert {key: record[key].shape for key in shapes} == shapes
+    assert record["points_rgb"].dtype == np.uint8
+    assert len(record["image_paths"]) == len(record["image_names"]) == images
+    assert record["camera_names"] == ["CAM_FRONT"]
+    assert isinstance(record["scene_scale"], float)
+
+
+def test_images_keep_their_order_paths_times_and_poses(tiny_scene, seed):
+    record = parser_dict(tiny_scene, seed, job())
+    for i, frame in enumerate(tiny_scene.frames):
+        assert record["image_paths"][i] == frame.image_path
+        assert record["image_names"][i] == frame.image_path.rsplit("/", 1)[1]
+        assert record["timestamps"][i] == frame.timestamp
+        assert record["sample_indices"][i] == frame.sample_index
+        assert record["is_key_frame"][i] == frame.is_key_frame
+        np.testing.assert_array_equal(record["camtoworlds"][i], frame.camera_to_world)
+    np.testing.assert_array_equal(record["points"], seed.positions)
+    np.testing.assert_array_equal(record["points_rgb"], seed.colors)
+
+
+def test_cameras_are_counted_in_order_of_appearance(tiny_scene, seed):
+    back = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames]
+    scene = dataclasses.replace(tiny_scene, frames=(*back, *tiny_scene.frames))
+    record = parser_dict(scene, seed, job())
+    assert record["camera_names"] == ["CAM_BACK", "CAM_FRONT"]
+    np.testing.assert_array_equal(record["camera_indices"], [0] * 19 + [1] * 19)
+
+
+def test_splits_are_disjoint_and_cover_every_image(tiny_scene, seed):
+    record = parser_dict(tiny_scene, seed, job())
+    assert record["splits"].keys() == {"train", "interpolation", "extrapolation", "excluded"}
+    together = np.concatenate(list(record["splits"].values()))
+    np.testing.assert_array_equal(np.sort(together), np.arange(19))
+    groups = frame_groups(tiny_scene, HOLDOUT)
+    for group, images in record["splits"].items():
+        assert all(groups[i] == group for i in images)
+    assert [record["sample_indices"][i] for i in record["splits"]["interpolation"]] == [2, 6]
+    assert [record["sample_indices"][i] for i in record["splits"]["extrapolation"]] == [8, 9]
+    assert record["held_out_frames"] == {"interpolation": [2, 6], "extrapolation": [8, 9]}
+
+
+@pytest.mark.parametrize(("width", "size"), [(None, (96, 54)), (48, (48, 27)), (64, (64, 36)), (192, (192, 108))])
+def test_intrinsics_are_those_of_the_size_that_is_trained_at(tiny_scene, seed, width, size):
+    """Continuous convention: the image's centre is at half its width and height, whatever the size."""
+    record = parser_dict(tiny_scene, seed, job(width))
+    np.testing.assert_array_equal(record["image_sizes"], [size] * 19)
+    focal = 0.62 * size[0]
+    expected = [[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(record["Ks"], [expected] * 19)
+
+
+def test_the_scale_is_the_farthest_training_camera_from_their_mean(tiny_scene, seed):
+    """The tiny drive's camera moves along x at a steady speed; a scene is at least a metre large."""
+    record = parser_dict(tiny_scene, seed, job())
+    train = record["camtoworlds"][record["splits"]["train"], 0, 3]
+    assert record["scene_scale"] == pytest.approx(np.abs(train - train.mean()).max())
+    still = [dataclasses.replace(frame, camera_to_world=np.eye(4)) for frame in tiny_scene.frames]
+    assert parser_dict(dataclasses.replace(tiny_scene, frames=tuple(still)), seed, job())["scene_scale"] == 1.0
+
+
+def test_held_out_cameras_do_not_widen_the_scale(tiny_scene, seed):
+    whole = parser_dict(tiny_scene, seed, job())["scene_scale"]
+    frames = list(tiny_scene.frames)
+    far = frames[-1].camera_to_world.copy()
+    far[0, 3] += 1000.0
+    frames[-1] = dataclasses.replace(frames[-1], camera_to_world=far)
+    assert parser_dict(dataclasses.replace(tiny_scene, frames=tuple(frames)), seed, job())["scene_scale"] == whole
+
+
+def test_what_the_protocol_says_of_scene_and_seed_is_carried_along(tiny_scene, seed):
+    scene = dataclasses.replace(tiny_scene, missing_images=2, key_frame_range=[0, 10], poses="refined")
+    record = parser_dict(scene, seed, job())
+    assert record["scene"] == {
+        "name": "0001", "dataset": "tiny", "version": "v1.0-mini", "poses": "refined", "key_frame_range": [0, 10],
+        "missing_images": 2,
+    }  # fmt: skip
+    assert record["seed"] == {"lidar": 40, "points_file": 0, "far": 10, "lidar_missing": 3, "extra_points": None}
+
+
+@pytest.mark.parametrize(
+    "holdout",
+    [HoldoutSettings(every_nth=1, offset=0), HoldoutSettings(last_block=10), HoldoutSettings(last_block=99)],
+)
+def test_a_scene_without_training_images_is_refused_with_the_settings_that_hold_them_out(tiny_scene, seed, holdout):
+    key_frames = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
+    scene = dataclasses.replace(tiny_scene, frames=key_frames)
+    with pytest.raises(DatasetError, match=r"0001.*holdout\.every_nth.*holdout\.last_block"):
+        parser_dict(scene, seed, job(holdout=holdout))
+
+
+def test_the_record_is_plain_data_that_returns_from_its_file(tiny_scene, seed, tmp_path):
+    record = {**parser_dict(tiny_scene, seed, job()), "provenance": {}}
+    write_plain_pickle(tmp_path / "parser.pkl", record)
+    again = read_parser(tmp_path / "parser.pkl")
+    assert again.keys() == record.keys()
+    np.testing.assert_array_equal(again["Ks"], record["Ks"])
+    np.testing.assert_array_equal(again["splits"]["train"], record["splits"]["train"])
+
+
+@pytest.mark.parametrize("content", [{}, {"Ks": np.eye(3)}, [1], None])
+def test_a_pickle_that_is_no_parser_record_is_refused_naming_file_and_rule(tmp_path, content):
+    write_plain_pickle(tmp_path / "parser.pkl", content)
+    with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
+        read_parser(tmp_path / "parser.pkl")

@@ -1,0 +1,318 @@
+"""The report across scenes: rows and means of what is current and comparable; the rest is named, never mixed in."""
+
+import copy
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivesplat.report import console_table, gap_report, write_csv
+
+PROTOCOL = {
+    "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "eval_camera": "CAM_FRONT", "width": 640, "height": 360,
+    "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4},
+    "held_out_frames": {"interpolation": [4], "extrapolation": [35, 36]}, "train_images": 31, "poses": "nuscenes",
+    "regions": "boxes", "extra_points": None, "lidar_missing": 0,
+}  # fmt: skip
+
+
+def stages(methods=("vanilla",), width=640, iterations=30000, code="c") -> dict[str, Any]:
+    """The stages behind a result, as provenance holds them."""
+    made = {
+        "extract": {"settings": {"sweeps": False}, "code": "e"},
+        "parser": {"settings": {"images": {"width": width}}, "code": "p"},
+    }
+    for method in methods:
+        made[f"{method}/train"] = {"settings": {"train": {"iterations": iterations}}, "code": code}
+    return made
+
+
+def region(psnr: float | None, lpips: float | None = None) -> dict[str, Any]:
+    identical = {"identical": True} if psnr is None else {}
+    return {"psnr": psnr, **identical, "psnr_frame_mean": psnr, "ssim": 0.8, "lpips": lpips, "pixels": 5000}
+
+
+def group(static: float, moving: float | None = None, parked: float | None = None, lpips: float | None = None) -> dict:
+    """The figures of a group: a moving and a parked vehicle, or neither."""
+    there = [psnr for psnr in (moving, parked) if psnr is not None]
+    vehicle = sum(there) / len(there) if there else None
+    behind = moving if moving is not None else vehicle
+    return {
+        "gap_db": None if behind is None else static - behind,
+        "all": region(static - 1.0, lpips),
+        "static": region(static, lpips),
+        "vehicle": None if vehicle is None else region(vehicle, lpips),
+        "car": None,
+        "moving_vehicle": None if moving is None else region(moving, lpips),
+        "parked_vehicle": None if parked is None else region(parked, lpips),
+        "moving_human": None,
+    }
+
+
+def method(interpolation: dict, extrapolation: dict, gaussians=1000, seconds=60.0) -> dict[str, Any]:
+    return {
+        "interpolation": interpolation, "extrapolation": extrapolation, "gaussians": gaussians,
+        "train_seconds": seconds, "train_iterations": 30000, "peak_gpu_memory_gb": None, "device": "cpu",
+        "random_seed": 0, "findings": {},
+    }  # fmt: skip
+
+
+def metrics(scene: str, methods: dict[str, dict], made=None, **protocol) -> dict[str, Any]:
+    return {
+        "schema": 1, "scene": scene, "dataset": "nuscenes", "protocol": {**PROTOCOL, **protocol}, "methods": methods,
+        "provenance": {"stages": made or stages(tuple(methods)), "inputs": {}},
+    }  # fmt: skip
+
+
+VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
+VANILLA_B = method(group(26.0, None, 22.0, lpips=0.1), group(23.0), gaussians=3000, seconds=80.0)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a metrics.json where the workflow does, and returns its path."""
+
+    def write_metrics(record: dict | str, scene: str | None = None) -> str:
+        path = tmp_path / (scene or record["scene"]) / "metrics.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(record if isinstance(record, str) else json.dumps(record))
+        return str(path)
+
+    return write_metrics
+
+
+def expecting(*scenes: str, methods=("vanilla",)) -> dict[str, Any]:
+    return {scene: stages(methods) for scene in scenes}
+
+
+def test_a_row_holds_both_groups_figures_of_a_scene_and_method(write):
+    report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061"))
+    assert report["rows"] == [
+        {
+            "scene": "0061", "dataset": "nuscenes", "method": "vanilla",
+            "interpolation_static": 24.0, "interpolation_vehicle": 19.0, "interpolation_moving_vehicle": 17.0,
+            "interpolation_gap_db": 7.0, "interpolation_lpips": 0.3,
+            "extrapolation_static": 22.0, "extrapolation_vehicle": 14.0, "extrapolation_moving_vehicle": 14.0,
+            "extrapolation_gap_db": 8.0, "extrapolation_lpips": None,
+            "gaussians": 1000, "train_seconds": 60.0,
+        }
+    ]  # fmt: skip
+    assert report["left_out"] == report["missing"] == []
+    assert report["schema"] == 1
+
+
+def test_a_region_that_is_null_is_null_in_its_row(write):
+    (row,) = gap_report([write(metrics("0103", {"vanilla": VANILLA_B}))], expecting("0103"))["rows"]
+    assert (row["interpolation_vehicle"], row["interpolation_moving_vehicle"]) == (22.0, None)
+    assert row["extrapolation_vehicle"] is row["extrapolation_moving_vehicle"] is row["extrapolation_gap_db"] is None
+
+
+def test_a_group_without_a_single_image_is_null_in_its_row(write):
+    nothing = {**dict.fromkeys(group(1.0)), "gap_db": None}
+    record = metrics("0061", {"vanilla": method(nothing, group(22.0, 14.0))})
+    (row,) = gap_report([write(record)], expecting("0061"))["rows"]
+    assert row["interpolation_static"] is row["interpolation_gap_db"] is row["interpolation_lpips"] is None
+    assert row["extrapolation_static"] == 22.0
+
+
+def test_identical_images_are_null_and_not_infinite(write):
+    same = {**group(24.0, 17.0), "static": region(None), "gap_db": None}
+    (row,) = gap_report([write(metrics("0061", {"vanilla": method(same, same)}))], expecting("0061"))["rows"]
+    assert row["interpolation_static"] is None
+
+
+def test_every_scene_and_method_has_a_row_in_order(write):
+    both = {"vanilla": VANILLA_A, "street": VANILLA_B}
+    paths = [write(metrics("0103", both)), write(metrics("0061", both))]
+    report = gap_report(paths, expecting("0061", "0103", methods=("vanilla", "street")))
+    assert [(row["scene"], row["method"]) for row in report["rows"]] == [
+        ("0103", "vanilla"), ("0103", "street"), ("0061", "vanilla"), ("0061", "street"),
+    ]  # fmt: skip
+
+
+def test_means_are_over_scenes_by_method_and_ignore_null(write):
+    paths = [
+        write(metrics("0061", {"vanilla": VANILLA_A, "street": VANILLA_B})),
+        write(metrics("0103", {"vanilla": VANILLA_B, "street": VANILLA_B})),
+    ]
+    means = gap_report(paths, expecting("0061", "0103", methods=("vanilla", "street")))["means"]
+    assert [mean["method"] for mean in means] == ["vanilla", "street"]
+    vanilla, street = means
+    assert vanilla["interpolation_static"] == 25.0
+    assert vanilla["interpolation_moving_vehicle"] == 17.0, "of the one scene where something moves"
+    assert vanilla["interpolation_gap_db"] == pytest.approx((7.0 + 4.0) / 2)
+    assert vanilla["extrapolation_vehicle"] == 14.0
+    assert vanilla["interpolation_lpips"] == pytest.approx(0.2)
+    assert vanilla["extrapolation_lpips"] is None
+    assert (vanilla["gaussians"], vanilla["train_seconds"]) == (2000, 70.0)
+    assert street["extrapolation_moving_vehicle"] is None
+
+
+def left_out(report: dict[str, Any], scene: str) -> str:
+    (why,) = [item["why"] for item in report["left_out"] if item["scene"] == scene]
+    assert "\n" not in why
+    return why
+
+
+def test_a_result_of_other_settings_is_left_out_and_named_with_the_difference(write):
+    stale = metrics("0103", {"vanilla": VANILLA_B}, stages(iterations=7000))
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A})), write(stale)]
+    report = gap_report(paths, expecting("0061", "0103"))
+    assert [row["scene"] for row in report["rows"]] == ["0061"]
+    assert report["means"][0]["interpolation_static"] == 24.0, "what is left out counts in no mean"
+    assert all(word in left_out(report, "0103") for word in ("vanilla/train", "train.iterations", "7000", "30000"))
+    assert report["missing"] == []
+
+
+def test_a_result_of_other_code_is_left_out_and_named_with_the_stage(write):
+    report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}, stages(code="old")))], expecting("0061"))
+    assert report["rows"] == []
+    assert "vanilla/train: other code" in left_out(report, "0061")
+
+
+def test_a_result_without_a_configured_method_is_left_out_and_says_so(write):
+    report = gap_report(
+        [write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061", methods=("vanilla", "street"))
+    )
+    assert report["rows"] == []
+    assert "street/train" in left_out(report, "0061")
+
+
+def test_a_result_of_a_scene_that_is_not_configured_is_left_out(write):
+    report = gap_report([write(metrics("0103", {"vanilla": VANILLA_A}))], expecting("0061"))
+    assert report["rows"] == []
+    assert "config" in left_out(report, "0103")
+    assert [item["scene"] for item in report["missing"]] == ["0061"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("width", 320),
+        ("height", 200),
+        ("cameras", ["CAM_FRONT", "CAM_BACK"]),
+        ("eval_camera", "CAM_BACK"),
+        ("sweeps", True),
+        ("holdout", {"every_nth": 8, "offset": 4, "last_block": 0}),
+        ("poses", "refined"),
+        ("regions", "masks"),
+    ],
+)
+def test_a_result_of_another_protocol_is_left_out_and_named_with_the_difference(write, key, value):
+    paths = [
+        write(metrics("0061", {"vanilla": VANILLA_A})),
+        write(metrics("0103", {"vanilla": VANILLA_A}, **{key: value})),
+        write(metrics("0553", {"vanilla": VANILLA_A})),
+    ]
+    report = gap_report(paths, expecting("0061", "0103", "0553"))
+    assert [row["scene"] for row in report["rows"]] == ["0061", "0553"]
+    assert key in left_out(report, "0103") and "0061" in left_out(report, "0103")
+
+
+def test_what_differs_from_scene_to_scene_by_nature_is_no_other_protocol(write):
+    held_out = {"interpolation": [4, 12], "extrapolation": [36, 37]}
+    other = metrics("0103", {"vanilla": VANILLA_A}, held_out_frames=held_out, train_images=30, lidar_missing=2)
+    report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A})), write(other)], expecting("0061", "0103"))
+    assert len(report["rows"]) == 2 and report["left_out"] == []
+
+
+def test_a_stale_result_sets_no_protocol_for_the_others(write):
+    stale = metrics("0061", {"vanilla": VANILLA_A}, stages(iterations=7000), width=320)
+    paths = [write(stale), write(metrics("0103", {"vanilla": VANILLA_A}))]
+    report = gap_report(paths, expecting("0061", "0103"))
+    assert [row["scene"] for row in report["rows"]] == ["0103"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_result_is_left_out_and_named_with_file_and_rule(write, share):
+    text = json.dumps(metrics("0103", {"vanilla": VANILLA_A}))
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A})), write(text[: int(share * len(text))], "0103")]
+    report = gap_report(paths, expecting("0061", "0103"))
+    assert [row["scene"] for row in report["rows"]] == ["0061"]
+    assert "0103/metrics.json" in left_out(report, "0103") and "'scene_metrics'" in left_out(report, "0103")
+    assert report["missing"] == []
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        {},
+        [],
+        "text",
+        {"scene": "0103"},
+        {**metrics("0103", {"vanilla": VANILLA_A}), "provenance": {}},
+        {**metrics("0103", {"vanilla": VANILLA_A}), "protocol": {}},
+        {key: value for key, value in metrics("0103", {"vanilla": VANILLA_A}).items() if key != "methods"},
+        metrics("0103", {"vanilla": {}}),
+    ],
+    ids=range(8),
+)
+def test_a_foreign_result_is_left_out_and_named_with_file_and_rule(write, foreign):
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A})), write(json.dumps(foreign), "0103")]
+    report = gap_report(paths, expecting("0061", "0103"))
+    assert [row["scene"] for row in report["rows"]] == ["0061"]
+    assert "0103/metrics.json" in left_out(report, "0103") and "'scene_metrics'" in left_out(report, "0103")
+
+
+def test_configured_scenes_without_a_result_are_listed(write):
+    report = gap_report([write(metrics("0103", {"vanilla": VANILLA_A}))], expecting("0061", "0103", "0553"))
+    assert [item["scene"] for item in report["missing"]] == ["0061", "0553"]
+    assert all(item["why"] for item in report["missing"])
+
+
+def test_a_report_of_nothing_still_comes_out(tmp_path):
+    report = gap_report([], expecting("0061"))
+    assert report["rows"] == report["means"] == [] and [item["scene"] for item in report["missing"]] == ["0061"]
+    write_csv(tmp_path / "gap_report.csv", report)
+    assert len((tmp_path / "gap_report.csv").read_text().splitlines()) == 1
+    assert "0061" in console_table(report)
+
+
+@pytest.fixture
+def report(write) -> dict[str, Any]:
+    """Two measured scenes, one stale, one missing."""
+    paths = [
+        write(metrics("0061", {"vanilla": VANILLA_A})),
+        write(metrics("0103", {"vanilla": VANILLA_B})),
+        write(metrics("0553", {"vanilla": VANILLA_B}, stages(iterations=7000))),
+    ]
+    return gap_report(paths, expecting("0061", "0103", "0553", "0655"))
+
+
+def test_a_report_is_json_without_nan(report):
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
+    before = copy.deepcopy(report)
+    write_csv(tmp_path / "gap_report.csv", report)
+    with open(Path(tmp_path / "gap_report.csv"), newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    figures = ("static", "vehicle", "moving_vehicle", "gap_db", "lpips")
+    assert list(rows[0]) == [
+        "scene", "dataset", "method",
+        *(f"interpolation_{name}" for name in figures), *(f"extrapolation_{name}" for name in figures),
+        "gaussians", "train_seconds",
+    ]  # fmt: skip
+    assert [row["scene"] for row in rows] == ["0061", "0103"]
+    assert float(rows[0]["interpolation_gap_db"]) == 7.0
+    assert rows[1]["extrapolation_vehicle"] == rows[0]["extrapolation_lpips"] == ""
+    assert report == before
+
+
+def test_the_console_table_can_be_read(report):
+    lines = console_table(report).splitlines()
+    header = next(i for i, line in enumerate(lines) if "scene" in line and "method" in line)
+    table = lines[header : header + 4]
+    assert len({len(line) for line in table}) == 1, "columns line up"
+    assert max(map(len, table)) <= 120
+    first, second, mean = (line.split() for line in table[1:])
+    assert first == ["0061", "vanilla", "24.00", "19.00", "17.00", "7.00", "22.00", "14.00", "14.00", "8.00"]
+    assert second == ["0103", "vanilla", "26.00", "22.00", "-", "4.00", "23.00", "-", "-", "-"]
+    assert mean[:3] == ["mean", "vanilla", "25.00"]
+    assert any("interp" in word for word in table[0].split()) and any("extrap" in word for word in table[0].split())
+    notes = "\n".join(lines[header + 4 :])
+    assert "0553" in notes and "train.iterations" in notes and "0655" in notes
+    assert "None" not in "\n".join(table)

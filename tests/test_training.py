@@ -1,0 +1,639 @@
+"""A training from its first iteration to its files: what it learns, and what it survives."""
+
+import errno
+import json
+import logging
+import math
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from drivesplat.errors import DeviceError, DriveSplatError, ResultError, TrainingError
+from drivesplat.model.background import Background
+from drivesplat.model.sky import ConstantSky
+from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.rasterize import rasterize
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import DefaultSettings, FloaterSettings, McmcSettings, TrainJob, TrainSettings
+from drivesplat.training import checkpoint
+from drivesplat.training.monitor import FiniteGuard
+from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.run import TrainingFiles, mean_sky_color, read_checkpoint, run_training, trained_model
+from drivesplat.training.train import Trainer, TrainingSummary, Workspace, train
+from drivesplat.training.views import TrainingView, load_views, order, view_of
+
+REPOSITORY = Path(__file__).parent.parent
+CPU = torch.device("cpu")
+WIDTH, HEIGHT = 32, 24
+ITERATIONS, CHECKPOINT_AT, ENDED_AT = 60, 30, 43
+
+
+def recorded_views(count: int = 5, width: int = WIDTH, height: int = HEIGHT, device: torch.device = CPU) -> list:
+    """What `count` cameras in a row see of a cloud of random Gaussians."""
+    rng = np.random.default_rng(0)
+    n = 80
+    cloud = [
+        rng.uniform([-3, -1.5, 3], [3, 1.5, 6], (n, 3)), rng.normal(size=(n, 4)), rng.uniform(0.1, 0.5, (n, 3)),
+        rng.uniform(0.3, 1.0, n), rng.uniform(0, 1, (n, 3)),
+    ]  # fmt: skip
+    tensors = [torch.from_numpy(values).float() for values in cloud]
+    views = []
+    for i in range(count):
+        camera_to_world = torch.eye(4)
+        camera_to_world[0, 3] = 2.0 * i / max(1, count - 1) - 1.0
+        intrinsics = torch.tensor([[0.7 * width, 0.0, width / 2], [0.0, 0.7 * width, height / 2], [0.0, 0.0, 1.0]])
+        view = View(intrinsics, camera_to_world, width, height, time=0.5 * i)
+        image = rasterize(*tensors, view.viewmat[None], view.K[None], width, height, backend="reference").image[0]
+        moved = View(view.K.to(device), camera_to_world.to(device), width, height, view.time)
+        views.append(TrainingView(moved, (image.clamp(0, 1) * 255).to(torch.uint8).to(device), None))
+    return views
+
+
+def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    return rng.uniform([-3, -1.5, 3], [3, 1.5, 6], (count, 3)), rng.uniform(0.3, 0.7, (count, 3))
+
+
+def untrained(settings: TrainSettings, sky: bool = False) -> SplatModel:
+    part = Background.from_points(*seed_points(), settings.gaussians, 1.0)
+    return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
+
+
+def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:
+    """A training of 60 iterations in which everything happens that happens in one of 30,000."""
+    common = {
+        "iterations": ITERATIONS, "strategy": strategy, "cap_max": 110, "checkpoint_every": CHECKPOINT_AT,
+        "log_every": 10, "image_every": 30,
+        "gaussians": GaussianSettings(sh_degree=1, lr_means=2e-3, lr_sh0=2e-2, lr_scales=1e-2),
+        "mcmc": McmcSettings(refine_every=5, noise_lr=1e3),
+        "default": DefaultSettings(refine_every=5, grow_grad2d=1e-3),
+        "floaters": FloaterSettings(every=7),
+    }  # fmt: skip
+    return TrainSettings(**{**common, **changes})
+
+
+def workspace_of(folder: Path, fingerprint: str) -> Workspace:
+    return Workspace(folder / "resume", folder / "tensorboard", fingerprint, "train")
+
+
+def trained(
+    folder: Path,
+    settings: TrainSettings,
+    views: list | None = None,
+    seed: int = 0,
+    device: torch.device = CPU,
+    model: SplatModel | None = None,
+    fingerprint: str = "of this training",
+) -> tuple[SplatModel, TrainingSummary]:
+    """The model after `train`, and its summary."""
+    model = untrained(settings) if model is None else model
+    views = recorded_views(device=device) if views is None else views
+    return model, train(model, views, settings, seed, 1.0, device, workspace_of(folder, fingerprint))
+
+
+@torch.no_grad()
+def mean_psnr(model: SplatModel, views: list[TrainingView]) -> float:
+    errors = [float((model.render(v.view, 1).image.clamp(0, 1) - v.target()).square().mean()) for v in views]
+    return float(np.mean([-10.0 * math.log10(error) for error in errors]))
+
+
+class EndedError(Exception):
+    """Stands for whatever ends a training that could have gone on."""
+
+
+class EndingViews(list):
+    """Training images of which the `at`-th look ends the training."""
+
+    def __init__(self, views: list[TrainingView], at: int, kill: bool = False):
+        super().__init__(views)
+        self._looks_left, self._kill = at, kill
+
+    def __getitem__(self, index: int) -> TrainingView:
+        self._looks_left -= 1
+        if self._looks_left < 0 and self._kill:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self._looks_left < 0:
+            raise EndedError
+        return super().__getitem__(index)
+
+
+def train_until_killed(folder: str) -> None:
+    """For a subprocess: a training that ends itself as `kill -9` would."""
+    torch.set_num_threads(1)
+    trained(Path(folder), settings_of(), EndingViews(recorded_views(), ENDED_AT, kill=True))
+
+
+def hold_the_lock(folder: str) -> None:
+    """For a subprocess: a trainer that works until it is killed."""
+    with checkpoint.sole_trainer(Path(folder)):
+        print("held", flush=True)
+        signal.pause()
+
+
+def in_subprocess(function: Callable[..., None], *arguments: str) -> subprocess.Popen:
+    """A process that calls a function of a test module."""
+    paths = [str(REPOSITORY), str(REPOSITORY / "tests")]
+    script = (
+        f"import sys; sys.path[:0] = {paths}; import {function.__module__} as m; m.{function.__name__}(*{arguments})"
+    )
+    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Tests run side by side: with a thread per core each, they would mostly wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> dict[str, tuple[SplatModel, TrainingSummary]]:
+    """By strategy, a training that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    return {s: trained(folder / s, settings_of(s)) for s in ("mcmc", "default")}
+
+
+def same_parameters(a: SplatModel, b: SplatModel) -> bool:
+    first, second = a.state_dict(), b.state_dict()
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+# ---- what it learns
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_training_comes_nearer_to_its_images(uninterrupted, strategy):
+    views = recorded_views()
+    model, summary = uninterrupted[strategy]
+    assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 3.0
+    assert summary.iterations == ITERATIONS and summary.resumed_at == []
+    assert 90 < summary.gaussians == len(model) <= 110
+    assert summary.peak_gpu_memory_gb is None and summary.device.startswith("cpu")
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_one_seed_gives_one_result_on_the_cpu(uninterrupted, strategy, tmp_path):
+    again, _ = trained(tmp_path, settings_of(strategy))
+    assert same_parameters(again, uninterrupted[strategy][0])
+
+
+def test_another_seed_gives_another_result(uninterrupted, tmp_path):
+    other, summary = trained(tmp_path, settings_of(), seed=1)
+    assert summary.random_seed == 1
+    assert not torch.equal(other.parts[0].params["means"], uninterrupted["mcmc"][0].parts[0].params["means"])
+
+
+def test_a_sky_learns_too(tmp_path):
+    settings = settings_of(iterations=20)
+    model = untrained(settings, sky=True)
+    views = [TrainingView(v.view, torch.zeros_like(v.pixels), None) for v in recorded_views()]
+    trained(tmp_path, settings, views, model=model)
+    assert (torch.sigmoid(model.sky.params["color"]) < 0.48).all()
+
+
+@pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (50, 0.1), (100, 0.01)])
+def test_positions_learn_ever_more_slowly(step, factor):
+    model = untrained(settings_of())
+    optimizers = make_optimizers(model)
+    before = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
+    schedule(model, optimizers, step, 100)
+    after = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
+    assert after.pop("0.means") == pytest.approx(2e-3 * factor)
+    assert after == {name: rate for name, rate in before.items() if name != "0.means"}
+
+
+@pytest.mark.parametrize(("step", "degree"), [(0, 0), (9, 0), (10, 1), (25, 2), (35, 3), (99, 3)])
+def test_spherical_harmonics_gain_a_degree_at_a_time(step, degree):
+    settings = settings_of(iterations=100, sh_every=0.1, gaussians=GaussianSettings(sh_degree=3))
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, 1.0, CPU)
+    trainer.step = step
+    assert trainer.sh_degree() == degree
+
+
+# ---- the images
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_every_epoch_sees_every_view_once_in_an_order_of_its_own(count):
+    epochs = [[order(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
+    assert all(sorted(epoch) == list(range(count)) for epoch in epochs)
+    assert count == 1 or len({tuple(epoch) for epoch in epochs}) > 1
+    assert epochs == [[order(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
+
+
+def test_the_order_of_views_hangs_on_the_seed():
+    assert [order(20, i, seed=1) for i in range(20)] != [order(20, i, seed=2) for i in range(20)]
+
+
+def parser_record(folder: Path, views: list[TrainingView]) -> dict[str, Any]:
+    """What the stage `parser` would say of recorded views; the third is held out."""
+    n = len(views)
+    paths = [str(folder / f"{i}.png") for i in range(n)]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, view in zip(paths, views, strict=True):
+        Image.fromarray(view.pixels.numpy()).save(path)
+    points, colors = seed_points()
+    return {
+        "Ks": np.stack([v.view.K.double().numpy() for v in views]),
+        "camtoworlds": np.stack([v.view.camera_to_world.double().numpy() for v in views]),
+        "image_paths": paths,
+        "image_sizes": np.array([[WIDTH, HEIGHT]] * n, dtype=np.int64),
+        "camera_names": ["CAM_FRONT"],
+        "camera_indices": np.zeros(n, dtype=np.int64),
+        "timestamps": 1_532_402_927_000_000 + 500_000 * np.arange(n),
+        "points": points.astype(np.float32),
+        "points_rgb": (colors * 255).astype(np.uint8),
+        "scene_scale": 1.0,
+        "splits": {"train": np.array([i for i in range(n) if i != 2]), "interpolation": np.array([2])},
+    }  # fmt: skip
+
+
+def test_views_are_the_training_images_and_no_others(tmp_path):
+    recorded = recorded_views()
+    loaded = load_views(parser_record(tmp_path, recorded), None, CPU)
+    assert len(loaded) == 4
+    for view, expected in zip(loaded, [recorded[i] for i in (0, 1, 3, 4)], strict=True):
+        assert torch.equal(view.pixels, expected.pixels) and view.sky is None
+        torch.testing.assert_close(view.view.camera_to_world, expected.view.camera_to_world)
+        assert view.view.time == pytest.approx(expected.view.time)
+        assert view.target().dtype == torch.float32 and float(view.target().max()) <= 1.0
+
+
+def test_the_time_of_a_view_counts_from_the_first_image(tmp_path):
+    record = parser_record(tmp_path, recorded_views())
+    assert [view_of(record, i, CPU).time for i in range(5)] == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])
+
+
+def test_the_sky_starts_at_the_mean_colour_of_its_pixels():
+    views = recorded_views(2)
+    masks = [torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) for _ in views]
+    masks[0][:3] = True
+    masks[1][0, :5] = True
+    seen = [TrainingView(v.view, v.pixels, mask) for v, mask in zip(views, masks, strict=True)]
+    pixels = np.concatenate([v.pixels.numpy()[mask.numpy()] for v, mask in zip(views, masks, strict=True)])
+    np.testing.assert_allclose(mean_sky_color(seen), pixels.mean(axis=0) / 255.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_without_sky_pixels_the_sky_starts_grey(known):
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) if known else None
+    (color,) = set(mean_sky_color([TrainingView(v.view, v.pixels, mask) for v in recorded_views(2)]))
+    assert 0.0 < color < 1.0
+
+
+# ---- what it survives
+
+
+def test_a_training_killed_halfway_resumes_and_ends_as_an_uninterrupted_one(uninterrupted, tmp_path):
+    process = in_subprocess(train_until_killed, str(tmp_path))
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL, errors
+    assert [path.name for path in (tmp_path / "resume").iterdir()] == ["state.pt"]
+
+    resumed, summary = trained(tmp_path, settings_of())
+    whole, whole_summary = uninterrupted["mcmc"]
+    views = recorded_views()
+    assert summary.iterations == whole_summary.iterations == ITERATIONS
+    assert summary.resumed_at == [CHECKPOINT_AT]
+    assert summary.gaussians == whole_summary.gaussians
+    assert mean_psnr(resumed, views) == pytest.approx(mean_psnr(whole, views), abs=0.1)
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_resumed_training_is_the_same_training_on_the_cpu(uninterrupted, strategy, tmp_path):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(strategy), EndingViews(recorded_views(), ENDED_AT))
+    resumed, summary = trained(tmp_path, settings_of(strategy))
+    assert summary.resumed_at == [CHECKPOINT_AT]
+    assert same_parameters(resumed, uninterrupted[strategy][0])
+
+
+def test_a_training_ended_twice_resumes_twice_and_counts_all_its_time(uninterrupted, tmp_path):
+    settings = settings_of(checkpoint_every=20)
+    for looks in (25, 25):
+        with pytest.raises(EndedError):
+            trained(tmp_path, settings, EndingViews(recorded_views(), looks))
+    before = checkpoint.load(tmp_path / "resume/state.pt", "train")["seconds"]
+    resumed, summary = trained(tmp_path, settings)
+    assert summary.resumed_at == [20, 40]
+    assert summary.seconds > before > 0.0
+    assert same_parameters(resumed, uninterrupted["mcmc"][0])
+
+
+def test_a_training_ended_before_its_first_checkpoint_starts_at_0(uninterrupted, tmp_path):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(), EndingViews(recorded_views(), CHECKPOINT_AT - 1))
+    again, summary = trained(tmp_path, settings_of())
+    assert summary.resumed_at == []
+    assert same_parameters(again, uninterrupted["mcmc"][0])
+
+
+def test_the_resume_state_of_another_training_is_ignored_with_a_message(uninterrupted, tmp_path, caplog):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(), EndingViews(recorded_views(), ENDED_AT), seed=9, fingerprint="of another")
+    with caplog.at_level(logging.WARNING):
+        model, summary = trained(tmp_path, settings_of())
+    assert "other settings, code or inputs" in caplog.text and "starts at 0" in caplog.text
+    assert summary.resumed_at == [] and summary.iterations == ITERATIONS
+    assert same_parameters(model, uninterrupted["mcmc"][0])
+
+
+class Malicious:
+    """A pickle of it makes a file when it is loaded."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def spoil(path: Path, kind: str) -> None:
+    """Puts something at `path` that no training of this workflow wrote whole."""
+    good = {"fingerprint": "of this training", "model": {"means": torch.zeros(50_000)}}
+    match kind:
+        case "truncated":
+            torch.save(good, path)
+            path.write_bytes(path.read_bytes()[:100_000])
+        case "empty":
+            path.write_bytes(b"")
+        case "text":
+            path.write_text("PSNR 42 dB")
+        case "a tensor":
+            torch.save(torch.zeros(3), path)
+        case "malicious":
+            torch.save({**good, "extra": Malicious(path.parent / "executed")}, path)
+        case "a malicious pickle":
+            path.write_bytes(pickle.dumps({**good, "model": Malicious(path.parent / "executed")}, protocol=2))
+        case "a whole module":
+            torch.save({**good, "model": torch.nn.Linear(2, 2)}, path)
+
+
+FOREIGN = ["truncated", "empty", "text", "a tensor", "malicious", "a malicious pickle", "a whole module"]
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_a_spoilt_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(kind, tmp_path, caplog):
+    path = tmp_path / "state.pt"
+    spoil(path, kind)
+    with caplog.at_level(logging.WARNING):
+        assert checkpoint.resumable(path, "of this training") is None
+    assert str(path) in caplog.text and "starts at 0" in caplog.text
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("kind", [*FOREIGN, "missing", "another record"])
+def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    spoil(path, kind)
+    if kind == "another record":
+        torch.save({"fingerprint": "", "step": 3}, path)
+    with pytest.raises(ResultError) as error:
+        read_checkpoint(path)
+    assert str(path) in str(error.value) and "'train'" in str(error.value) and "\n" not in str(error.value)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_without_a_resume_state_nothing_is_said(tmp_path, caplog):
+    assert checkpoint.resumable(tmp_path / "state.pt", "any") is None
+    assert caplog.text == ""
+
+
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, monkeypatch, failure):
+    path = tmp_path / "state.pt"
+    checkpoint.save(path, {"step": 1, "means": torch.ones(3)})
+
+    def half(content: Any, file: Any) -> None:
+        file.write(b"PK half a checkpoint")
+        raise failure
+
+    monkeypatch.setattr(torch, "save", half)
+    with pytest.raises(ResultError if isinstance(failure, OSError) else KeyboardInterrupt):
+        checkpoint.save(path, {"step": 2})
+    assert checkpoint.load(path, "train")["step"] == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_told_with_the_files_name_and_keeps_the_earlier_checkpoint(tmp_path):
+    """A limit on the size of files stands for the full disk: torch's writer fails in the same way."""
+    path = tmp_path / "state.pt"
+    checkpoint.save(path, {"step": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
+    try:
+        with pytest.raises(ResultError, match=r"state\.pt.*cannot be written"):
+            checkpoint.save(path, {"step": 2, "means": torch.zeros(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert checkpoint.load(path, "train")["step"] == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_second_trainer_is_refused_naming_the_first_and_a_killed_one_frees_the_folder(tmp_path):
+    holder = in_subprocess(hold_the_lock, str(tmp_path / "resume"))
+    try:
+        assert holder.stdout.readline() == "held\n", holder.stderr.read()
+        assert_refused(tmp_path / "resume", holder.pid)
+    finally:
+        holder.kill()
+        holder.communicate()
+    with checkpoint.sole_trainer(tmp_path / "resume"):
+        assert_refused(tmp_path / "resume", os.getpid())
+
+
+def assert_refused(folder: Path, process: int) -> None:
+    refusal = rf"process {process} is still training in .*{folder.name}"
+    with pytest.raises(TrainingError, match=refusal), checkpoint.sole_trainer(folder):
+        pass
+
+
+def test_a_trainer_that_fails_frees_the_folder(tmp_path):
+    with pytest.raises(EndedError), checkpoint.sole_trainer(tmp_path):
+        raise EndedError
+    with checkpoint.sole_trainer(tmp_path):
+        pass
+
+
+# ---- numbers that are none
+
+
+def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoint(tmp_path):
+    """Colours leap to 1e29 in the first step, so that the second iteration's squares overflow."""
+    settings = settings_of(
+        checkpoint_every=1,
+        log_every=10,
+        gaussians=GaussianSettings(sh_degree=1, lr_sh0=1e30),
+        opacity_reg=0,
+        scale_reg=0,
+    )
+    with pytest.raises(TrainingError) as error:
+        trained(tmp_path, settings)
+    message = str(error.value)
+    assert message.startswith("iteration 2: ") and "loss ssim" in message
+    assert "opacity_reg" not in message and "scale_reg" not in message
+    assert str(tmp_path / "resume/state.pt") in message
+    assert checkpoint.load(tmp_path / "resume/state.pt", "train")["step"] == 1
+
+
+@pytest.mark.parametrize("log_every", [1, 50])
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_it_is_a_training_error_however_rarely_it_is_looked_for(tmp_path, strategy, log_every):
+    """Densification comes between the loss that is no number and the check."""
+    settings = settings_of(
+        strategy,
+        checkpoint_every=1000,
+        log_every=log_every,
+        refine_start=0.0,
+        gaussians=GaussianSettings(sh_degree=1, lr_sh0=1e30),
+    )
+    with pytest.raises(TrainingError, match=r"^iteration 2: .*not finite"):
+        trained(tmp_path, settings)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_the_guard_names_the_first_iteration_and_its_terms_alone(value):
+    guard = FiniteGuard(CPU)
+    fine, bad = torch.tensor(1.0), torch.tensor(value)
+    guard.watch(0, {"loss l1": fine, "loss ssim": fine, "gradient of means": fine})
+    guard.check("state.pt")
+    guard.watch(6, {"loss l1": fine, "loss ssim": bad, "gradient of means": bad})
+    guard.watch(7, {"loss l1": bad, "loss ssim": bad, "gradient of means": bad})
+    with pytest.raises(TrainingError) as error:
+        guard.check("state.pt")
+    message = str(error.value)
+    assert "iteration 7: loss ssim, gradient of means is not finite" in message
+    assert "loss l1" not in message and "state.pt" in message
+
+
+def test_the_guard_keeps_apart_iterations_that_watch_different_terms():
+    guard = FiniteGuard(CPU)
+    guard.watch(3, {"loss l1": torch.tensor(1.0), "loss sky_alpha": torch.tensor(math.nan)})
+    guard.watch(2, {"loss l1": torch.tensor(math.nan)})
+    with pytest.raises(TrainingError, match="iteration 3: loss l1 is not finite"):
+        guard.check("state.pt")
+
+
+@pytest.mark.parametrize("log_every", [1, 50])
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_training_without_gaussians_left_says_so(tmp_path, strategy, log_every):
+    settings = settings_of(strategy, log_every=log_every, refine_start=0.0, checkpoint_every=1000)
+    model = untrained(settings)
+    with torch.no_grad():
+        model.parts[0].params["opacities"].fill_(-30.0)
+    with pytest.raises(TrainingError, match="no Gaussian is left"):
+        trained(tmp_path, settings, model=model)
+
+
+def test_views_that_show_no_gaussian_are_no_error(tmp_path):
+    settings = settings_of(iterations=10)
+    model = untrained(settings)
+    with torch.no_grad():
+        model.parts[0].params["means"][:, 2] *= -1.0
+    _, summary = trained(tmp_path, settings, model=model)
+    assert summary.iterations == 10
+
+
+def test_absolute_gradients_on_the_cpu_are_refused_by_their_setting(tmp_path):
+    settings = settings_of("default", default=DefaultSettings(absgrad=True))
+    with pytest.raises(DriveSplatError, match=r"train\.default\.absgrad"):
+        trained(tmp_path, settings)
+
+
+# ---- what it tells
+
+
+def test_tensorboard_holds_every_loss_and_pictures(tmp_path):
+    trained(tmp_path, settings_of())
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    wanted = {"loss/total", "loss/l1", "loss/ssim", "loss/opacity_reg", "loss/scale_reg", "gaussians"}
+    assert set(board.Tags()["scalars"]) == wanted
+    losses = {name: [event.value for event in board.Scalars(name)] for name in wanted}
+    assert [event.step for event in board.Scalars("loss/total")] == [10, 20, 30, 40, 50, 60]
+    assert losses["loss/total"][-1] < losses["loss/total"][0]
+    parts = [losses[name] for name in wanted - {"loss/total", "gaussians"}]
+    np.testing.assert_allclose(losses["loss/total"], np.sum(parts, axis=0), rtol=1e-5)
+    assert [event.step for event in board.Images("recorded_and_rendered")] == [30, 60]
+    assert {(event.width, event.height) for event in board.Images("recorded_and_rendered")} == {(2 * WIDTH, HEIGHT)}
+
+
+def test_tensorboard_of_a_resumed_training_tells_every_iteration_once(tmp_path):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(), EndingViews(recorded_views(), ENDED_AT))
+    trained(tmp_path, settings_of())
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert [event.step for event in board.Scalars("loss/total")] == [10, 20, 30, 40, 50, 60]
+
+
+# ---- its files
+
+PROVENANCE = {"settings_sha256": "a", "code_sha256": "b", "inputs_sha256": "c", "stages": {}, "inputs": {}}
+
+
+def job_of(**changes: Any) -> TrainJob:
+    settings = settings_of(**{"iterations": 20, "checkpoint_every": 10, "pixels_per_gaussian": 0, **changes})
+    return TrainJob(parts=("background",), sky="none", train=settings, random_seed=3)
+
+
+def files_in(folder: Path) -> TrainingFiles:
+    return TrainingFiles(folder / "checkpoint.pt", folder / "train.json", folder / "masks")
+
+
+def run(folder: Path, job: TrainJob, device: str = "cpu") -> TrainingFiles:
+    files = files_in(folder / "vanilla")
+    record = parser_record(folder / "images", recorded_views())
+    run_training(record, job, DeviceSettings(kind=device), files, PROVENANCE, "train")
+    return files
+
+
+def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
+    files = run(tmp_path, job_of())
+    assert {path.name for path in files.checkpoint.parent.iterdir()} == {"checkpoint.pt", "train.json", "tensorboard"}
+    summary = json.loads(files.summary.read_text())
+    content = read_checkpoint(files.checkpoint)
+    model, job = trained_model(content)
+    assert content["provenance"] == summary["provenance"] == PROVENANCE
+    assert job == job_of()
+    assert summary["gaussians"] == len(model) and summary["iterations"] == 20 and summary["random_seed"] == 3
+    assert summary["peak_gpu_memory_gb"] is None and summary["resumed_at"] == []
+    views = recorded_views()
+    assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
+
+
+def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):
+    pixels = 4 * WIDTH * HEIGHT
+    files = run(tmp_path, job_of(pixels_per_gaussian=pixels / 95, cap_max=1000, iterations=40, refine_start=0.0))
+    assert json.loads(files.summary.read_text())["gaussians"] == 95
+
+
+def test_a_failed_training_leaves_no_result_but_its_resume_state(tmp_path):
+    job = job_of(gaussians=GaussianSettings(sh_degree=1, lr_sh0=1e30), checkpoint_every=1)
+    with pytest.raises(TrainingError):
+        run(tmp_path, job)
+    assert {path.name for path in (tmp_path / "vanilla").iterdir()} == {"resume", "tensorboard"}
+    assert (tmp_path / "vanilla/resume/state.pt").is_file()
+
+
+def test_without_a_gpu_a_training_is_refused_before_it_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(DeviceError, match="device: cpu"):
+        run(tmp_path, job_of(), device="auto")
+    files = files_in(tmp_path / "vanilla")
+    assert not files.checkpoint.exists() and not files.summary.exists()
