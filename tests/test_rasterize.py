@@ -384,10 +384,11 @@ def test_an_unknown_backend_is_named_with_those_there_are():
         rasterize(**{f.name: getattr(scene, f.name) for f in fields(scene)}, backend="vulkan")
 
 
-def test_float32_is_rendered_in_float32():
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_float32_is_rendered_in_float32(antialiased):
     scene = random_scene(seed=14, n=40, width=24, height=20)
-    image = scene.render().image
-    single = scene.float().render().image
+    image = scene.render(antialiased=antialiased).image
+    single = scene.float().render(antialiased=antialiased).image
     assert single.dtype == torch.float32
     error = (single - image).abs()
     assert float(error.quantile(0.99)) < 1e-5 and float(error.max()) < 1e-2

@@ -21,9 +21,14 @@ class Densifier:
         self._by_gradient = settings.strategy == "default"
         self._strategy = strategies.make_strategy(settings)
         self._on_cpu = strategies.torch_twins
+        self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
         self.absgrad = self._by_gradient and settings.default.absgrad
         scale = {"scene_scale": scene_scale} if self._by_gradient else {}
         self.state: dict[str, Any] = self._strategy.initialize_state(**scale)
+
+    def due(self, step: int) -> bool:
+        """Whether Gaussians may be added, moved or removed after `step`."""
+        return step % self._every == 0
 
     def before_backward(self, step: int, optimizers: Optimizers, info: dict[str, Any]) -> None:
         if self._by_gradient:

@@ -5,13 +5,12 @@ import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from drivesplat.device import device_name, telling_out_of_memory
 from drivesplat.errors import TrainingError
-from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.densify import Densifier
@@ -69,8 +68,8 @@ class Trainer:
         densifiers = [Densifier(part, settings, scene_scale) for part in model.parts]
         return cls(model, views, settings, seed, device, make_optimizers(model), densifiers, FiniteGuard(device))
 
-    def advance(self) -> tuple[dict[str, torch.Tensor], Any, TrainingView]:
-        """One iteration: render a view, compare, step, densify. Returns its loss terms, picture and view."""
+    def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
+        """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
         view = self.views[order(len(self.views), self.step, self.seed)]
         schedule(self.model, self.optimizers, self.step, self.settings.iterations)
         picture = self.model.render(view.view, self.sh_degree(), absgrad=self.densifiers[0].absgrad)
@@ -82,10 +81,17 @@ class Trainer:
             self.step, {**{f"loss {name}": value for name, value in terms.items()}, **self._gradient_norms()}
         )
         self.optimizers.step()
+        return terms, picture, view
+
+    def densifies(self) -> bool:
+        """Whether this iteration may add, move or remove Gaussians."""
+        return any(densifier.due(self.step) for densifier in self.densifiers)
+
+    def densify(self, picture: Picture) -> None:
+        """The second half: each part grows, prunes and moves its Gaussians."""
         for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
             densifier.after_step(self.step, optimizers, picture.info)
         self.step += 1
-        return terms, picture, view
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
@@ -168,23 +174,14 @@ class Run:
         return self.seconds_before + time.monotonic() - self.began
 
     def check(self) -> None:
-        """Raises TrainingError where something was not finite, or no Gaussian is left."""
-        if len(self.trainer.model) == 0:
-            raise self._none_left()
+        """Raises TrainingError where something was not finite, or no visible Gaussian is left."""
         self.trainer.guard.check(str(self.workspace.state))
-
-    def explain(self) -> None:
-        """After an iteration failed: raises TrainingError where the cause is numbers or Gaussians that are gone."""
-        self.check()
         dead = self.trainer.settings.mcmc.min_opacity
-        if all(not part.at(0.0).opacities.gt(dead).any() for part in self.trainer.model.parts):
-            raise self._none_left()
-
-    def _none_left(self) -> TrainingError:
-        return TrainingError(
-            f"iteration {self.trainer.step + 1}: no Gaussian is left; "
-            "lower train.opacity_reg or the thresholds of the densification"
-        )
+        if not any(torch.sigmoid(part.params["opacities"]).gt(dead).any() for part in self.trainer.model.parts):
+            raise TrainingError(
+                f"iteration {self.trainer.step + 1}: no Gaussian is left; "
+                "lower train.opacity_reg or the thresholds of the densification"
+            )
 
     def save(self) -> None:
         """Writes the resume state, unless the training has gone wrong."""
@@ -211,12 +208,12 @@ def _iterate(run: Run, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     starts, ends = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
     while trainer.step < settings.iterations:
-        try:
-            terms, picture, view = trainer.advance()
-        except RuntimeError as error:
-            if not isinstance(error, torch.cuda.OutOfMemoryError):
-                run.explain()
-            raise
+        terms, picture, view = trainer.fit_one()
+        if trainer.densifies():
+            run.check()  # a strategy fed with what is no number ends in an assertion on the GPU, beyond rescue
+        trainer.densify(picture)
+        if len(trainer.model) == 0:
+            run.check()
         if settings.floaters.radius and trainer.step % settings.floaters.every == 0:
             for part in trainer.model.parts:
                 fade_floaters(part, starts, ends, settings.floaters.radius)

@@ -46,7 +46,7 @@ def load_views(
     for index in parser["splits"]["train"]:
         path = parser["image_paths"][index]
         width, height = (int(v) for v in parser["image_sizes"][index])
-        pixels = torch.from_numpy(np.ascontiguousarray(read_image(path, (width, height)))).to(device)
+        pixels = torch.from_numpy(read_image(path, (width, height)).copy()).to(device)
         sky = torch.from_numpy(sky_masks[path]).to(device) if sky_masks else None
         views.append(TrainingView(view_of(parser, int(index), device), pixels, sky))
     return views
