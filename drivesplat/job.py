@@ -1,4 +1,4 @@
-"""The seam between Snakemake's scripts and the library: settings in, errors out in one line, threads as granted."""
+"""The seam between Snakemake's scripts and the library: settings in, errors out in one line."""
 
 import json
 import logging

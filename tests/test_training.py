@@ -541,7 +541,7 @@ def test_a_training_without_gaussians_left_says_so(tmp_path, strategy, log_every
 
 
 def test_a_reset_of_all_opacities_is_no_loss_of_gaussians(tmp_path):
-    faintest = DefaultSettings(refine_every=5, reset_every=10, prune_opacity=1e-3, grow_grad2d=1e3)
+    faintest = DefaultSettings(refine_every=1000, reset_every=10, prune_opacity=1e-3, grow_grad2d=1e3)
     settings = settings_of("default", iterations=25, log_every=1, refine_start=0.0, refine_stop=1.0, default=faintest)
     _, summary = trained(tmp_path, settings)
     assert summary.gaussians == 90

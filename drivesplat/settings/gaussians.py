@@ -13,7 +13,7 @@ class GaussianSettings(Settings):
     init_opacity: float = Field(0.5, gt=0, lt=1)
     """Opacity of seed Gaussians."""
     init_scale: float = Field(1.0, gt=0, le=10)
-    """Size of a seed Gaussian in units of the mean distance to its three neighbours."""
+    """Size of a seed Gaussian in units of the root mean square distance to its three neighbours."""
     lr_means: float = Field(1.6e-4, gt=0)
     """Learning rate of positions, times the scene's scale; decays exponentially to a hundredth."""
     lr_scales: float = Field(5e-3, gt=0)

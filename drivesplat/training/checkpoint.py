@@ -50,8 +50,12 @@ def sole_trainer(folder: Path) -> Iterator[None]:
 
     Raises TrainingError naming the process that holds it.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "lock", "a+", encoding="utf-8") as file:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = open(folder / "lock", "a+", encoding="utf-8")  # noqa: SIM115 (closed by the with below)
+    except OSError as error:
+        raise ResultError(f"{folder}: cannot be written ({error.strerror}); fix its permissions") from error
+    with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

@@ -21,6 +21,7 @@ class Densifier:
         self._by_gradient = settings.strategy == "default"
         self._strategy = strategies.make_strategy(settings)
         self._on_cpu = strategies.torch_twins
+        self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
         self.absgrad = self._by_gradient and settings.default.absgrad
         scale = {"scene_scale": scene_scale} if self._by_gradient else {}
@@ -29,6 +30,11 @@ class Densifier:
     def due(self, step: int) -> bool:
         """Whether Gaussians may be added, moved or removed after `step`."""
         return step % self._every == 0
+
+    def any_alive(self) -> bool:
+        """Whether a Gaussian is left; one that MCMC would relocate for its opacity is not."""
+        opacities = self._part.params["opacities"]
+        return bool(torch.sigmoid(opacities).gt(self._dead).any())
 
     def before_backward(self, step: int, optimizers: Optimizers, info: dict[str, Any]) -> None:
         if self._by_gradient:

@@ -174,10 +174,9 @@ class Run:
         return self.seconds_before + time.monotonic() - self.began
 
     def check(self) -> None:
-        """Raises TrainingError where something was not finite, or no visible Gaussian is left."""
+        """Raises TrainingError where something was not finite, or no Gaussian is left."""
         self.trainer.guard.check(str(self.workspace.state))
-        dead = self.trainer.settings.mcmc.min_opacity
-        if not any(torch.sigmoid(part.params["opacities"]).gt(dead).any() for part in self.trainer.model.parts):
+        if not any(densifier.any_alive() for densifier in self.trainer.densifiers):
             raise TrainingError(
                 f"iteration {self.trainer.step + 1}: no Gaussian is left; "
                 "lower train.opacity_reg or the thresholds of the densification"
