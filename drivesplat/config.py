@@ -4,6 +4,7 @@ Defaults, ranges and comments stand in `drivesplat.settings` alone; config.yaml 
 from them (`python -m drivesplat.config_document`). Importing this module is cheap: the Snakefile does.
 """
 
+import re
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -29,6 +30,8 @@ DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "masks", "sky", "train", "render",
 )  # fmt: skip
 METHOD_OVERRIDES = ("sky", "train")
+SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
+METHOD_STAGES = ("train", "evaluate")
 
 
 class DatasetSettings(Settings):
@@ -140,8 +143,6 @@ class Config(Settings):
 
 
 def _require_name(name: str, kind: str) -> None:
-    import re
-
     if not re.match(NAME, name) or name in ("logs", "benchmarks"):
         raise ValueError(f"{kind} {name!r} cannot name a folder: use letters, digits, '_', '-' and '.'")
 
@@ -184,10 +185,6 @@ def _require_known(overrides: Mapping[str, Any], allowed: tuple[str, ...], where
     for key in overrides:
         if key not in allowed:
             raise ConfigError(f"'{where}.{key}' cannot be set there; what can: {', '.join(allowed)}")
-
-
-SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
-METHOD_STAGES = ("train", "evaluate")
 
 
 def stage_settings(config: Config, stage: str, scene: str, method: str | None = None) -> str:

@@ -1,21 +1,21 @@
 """The compute device, probed through torch alone, so that AMD's builds of torch are treated alike."""
 
+import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+
+import torch
 
 from drivesplat.errors import DeviceError
 from drivesplat.settings.device import DeviceSettings
 
 
-def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) -> Any:
+def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) -> torch.device:
     """The torch device to train or render on; `min_free_gb` stands in for the setting of that name where given.
 
     Raises DeviceError, saying what to do, where there is no usable GPU (unless `cpu` was written), gsplat is not
     importable or cannot run on it, or too little memory is free.
     """
-    import torch
-
     if settings.kind == "cpu":
         return torch.device("cpu")
     if not torch.cuda.is_available():
@@ -55,20 +55,14 @@ def _require_gsplat() -> None:
         )
 
 
-def device_name(device: Any) -> str:
+def device_name(device: torch.device) -> str:
     """What `train.json` calls the device."""
-    import platform
-
-    import torch
-
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({platform.machine()})"
 
 
 @contextmanager
 def telling_out_of_memory(gaussians: Callable[[], int]) -> Iterator[None]:
     """Turns an exhausted GPU into a DeviceError with what lowers the need; `gaussians` counts them when it happens."""
-    import torch
-
     try:
         yield
     except torch.cuda.OutOfMemoryError:

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -117,8 +118,6 @@ def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) ->
         labels = label_image(scene, frame, size)
     polygon = job.masks.own_car_polygons.get(frame.camera)
     if polygon:
-        import cv2
-
         corners = np.round(np.array(polygon) * size).astype(np.int32)
         cv2.fillPoly(labels, [corners], LABELS["own_car"])
     return labels

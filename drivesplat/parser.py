@@ -5,12 +5,12 @@ cameras; `Ks` in the continuous pixel convention at `image_sizes`, the size at w
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.holdout import frame_groups, held_out_key_frames
+from drivesplat.holdout import Group, frame_groups, held_out_key_frames
 from drivesplat.images import continuous_intrinsics, target_size
 from drivesplat.point_cloud import PointCloud
 from drivesplat.scene import Scene
@@ -36,9 +36,7 @@ def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any
     sizes = [target_size(frame, job.images) for frame in frames]
     cameras = list(dict.fromkeys(frame.camera for frame in frames))
     groups = np.array(frame_groups(scene, job.holdout))
-    splits = {
-        group: np.flatnonzero(groups == group) for group in ("train", "interpolation", "extrapolation", "excluded")
-    }
+    splits = {group: np.flatnonzero(groups == group) for group in get_args(Group)}
     if len(splits["train"]) == 0:
         raise DatasetError(
             f"scene {scene.name}: no training image is left; "
@@ -72,6 +70,12 @@ def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any
         },
         "seed": {key: value for key, value in seed.note.items() if key != "provenance"},
     }
+
+
+def image_size(parser: dict[str, Any], index: int | np.integer) -> tuple[int, int]:
+    """Width and height in pixels at which image `index` of a parser record is trained and measured."""
+    width, height = parser["image_sizes"][index].tolist()
+    return width, height
 
 
 def read_parser(path: str | Path) -> dict[str, Any]:

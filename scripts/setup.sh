@@ -14,7 +14,8 @@ usable() { "$1" -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.ver
 python=
 for candidate in "${PYTHON:-}" python3.11 python3.12 python3 python; do
   if [ -n "$candidate" ] && command -v "$candidate" >/dev/null 2>&1 && usable "$candidate"; then
-    python=$candidate
+    # an activated .venv must not be what makes the new one
+    python=$("$candidate" -c 'import sys; print(sys._base_executable)')
     break
   fi
 done

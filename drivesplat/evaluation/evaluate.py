@@ -14,6 +14,7 @@ from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.images import read_image
 from drivesplat.masks import read_labels
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.parser import image_size
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.training.run import trained_model
@@ -66,7 +67,7 @@ def evaluate_method(
 def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
     """What every figure must be read with."""
     measured = [i for group in HELD_OUT_GROUPS for i in held_out_images(parser, group, job.eval_camera)]
-    width, height = (int(v) for v in parser["image_sizes"][measured[0] if measured else 0])
+    width, height = image_size(parser, measured[0] if measured else 0)
     return {
         "version": parser["scene"]["version"],
         "cameras": list(job.cameras),
@@ -87,10 +88,7 @@ def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: Evaluate
 
 
 def findings(group: dict[str, Any]) -> dict[str, bool | None]:
-    """Whether the scene shows what is expected of a static model;
-
-    findings, never gates. None where a region is null.
-    """
+    """Whether the scene shows what is expected of a static model. Never a gate; None where a region is null."""
 
     def of(region: str) -> float | None:
         return group[region]["psnr"] if group[region] else None
@@ -126,7 +124,7 @@ def evaluate_groups(
     for group in HELD_OUT_GROUPS:
         metrics = RegionMetrics(lpips_map)
         for index in held_out_images(parser, group, camera):
-            size = tuple(int(v) for v in parser["image_sizes"][index])
+            size = image_size(parser, index)
             truth = read_image(parser["image_paths"][index], size) / 255.0
             labels = read_labels(masks, camera, int(parser["timestamps"][index]), size)
             metrics.add(render(model, parser, index, sh_degree, device), truth, labels)

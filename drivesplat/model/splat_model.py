@@ -63,7 +63,7 @@ class SplatModel(nn.Module):
     def render(
         self, view: View, sh_degree: int, *, absgrad: bool = False, with_depth: bool = False, rays: Tensor | None = None
     ) -> Picture:
-        """The view, with spherical harmonics up to `sh_degree`;
+        """The view, with spherical harmonics up to `sh_degree`.
 
         `rays` (h, w, 3) saves computing `view.rays()` again.
         """

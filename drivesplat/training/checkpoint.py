@@ -119,7 +119,7 @@ def restore(
 
 
 def resumable(path: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The resume state at `path` if this training wrote it;
+    """The resume state at `path` if this training wrote it.
 
     None, with a message, where there is none or it is another's.
     """

@@ -13,9 +13,9 @@ LARGEST_STEP = 15.0
 
 
 def camera_path(centers: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Starts and ends of the segments between consecutive camera positions, in time order;
+    """Starts and ends of the segments between consecutive camera positions, in time order.
 
-    a lone position is a segment of no length.
+    A lone position is a segment of no length.
     """
     starts, ends = centers[:-1], centers[1:]
     joined = (ends - starts).norm(dim=1) < LARGEST_STEP

@@ -12,6 +12,7 @@ from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.masks import read_sky_mask
 from drivesplat.model.build import build_model, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.parser import image_size
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
@@ -85,7 +86,7 @@ def sky_masks_of(parser: dict[str, Any], masks: Path) -> dict[str, np.ndarray]:
     found = {}
     for i in parser["splits"]["train"]:
         camera = parser["camera_names"][parser["camera_indices"][i]]
-        size = tuple(int(v) for v in parser["image_sizes"][i])
+        size = image_size(parser, i)
         found[parser["image_paths"][i]] = read_sky_mask(masks, camera, int(parser["timestamps"][i]), size)
     return found
 

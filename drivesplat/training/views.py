@@ -10,6 +10,7 @@ from torch import Tensor
 
 from drivesplat.images import read_image
 from drivesplat.model.splat_model import View
+from drivesplat.parser import image_size
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class TrainingView:
 
 def view_of(parser: dict[str, Any], index: int, device: torch.device) -> View:
     """Image `index` of a parser record as a camera."""
-    width, height = (int(v) for v in parser["image_sizes"][index])
+    width, height = image_size(parser, index)
     seconds = float(parser["timestamps"][index] - parser["timestamps"].min()) * 1e-6
     return View(
         K=torch.from_numpy(parser["Ks"][index]).float().to(device),
@@ -45,8 +46,7 @@ def load_views(
     views = []
     for index in parser["splits"]["train"]:
         path = parser["image_paths"][index]
-        width, height = (int(v) for v in parser["image_sizes"][index])
-        pixels = torch.from_numpy(read_image(path, (width, height)).copy()).to(device)
+        pixels = torch.from_numpy(read_image(path, image_size(parser, index)).copy()).to(device)
         sky = torch.from_numpy(sky_masks[path]).to(device) if sky_masks else None
         views.append(TrainingView(view_of(parser, int(index), device), pixels, sky))
     return views
