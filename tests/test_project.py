@@ -22,7 +22,7 @@ def test_environments_pin_what_the_constraints_pin():
         packages = next(d["pip"] for d in yaml.safe_load(path.read_text())["dependencies"] if isinstance(d, dict))
         environment = pins(packages)
         assert environment and all(constraints[name] == version for name, version in environment.items()), path.name
-        tools = {"pytest", "pytest-xdist", "ruff", "snakefmt", "snakemake-executor-plugin-slurm"}
+        tools = {"pytest", "pytest-xdist", "pytest-benchmark", "ruff", "snakefmt", "snakemake-executor-plugin-slurm"}
         assert constraints.keys() - environment.keys() == tools, path.name
 
 
