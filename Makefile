@@ -1,14 +1,25 @@
-# make setup      .venv with everything (idempotent)
+# make demo       set-up, then the whole workflow on a synthetic drive: no dataset, no GPU, minutes
+# make setup      .venv with everything, gsplat compiled where there is an NVIDIA GPU (idempotent; docs/installation.md)
+# make doctor     what works on this machine, what does not, and what to do about it
 # make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
 # make test-gpu   what needs a GPU: the rasterizers agree, trainings resume
+# make bench      what the benchmarks/ measure, against their bounds (two idle cores)
 # make config     config.yaml and config.schema.json from the settings' definitions
-.PHONY: setup test lint test-gpu config
+.PHONY: demo setup doctor test lint test-gpu bench config
 
 BIN := .venv/bin
 WORKERS ?= 2
+CORES ?= all
+
+demo: setup
+	$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json
+	@$(BIN)/python -m drivesplat.evaluation.in_words results/demo/metrics.json
 
 setup:
 	@bash scripts/setup.sh
+
+doctor:
+	@bash scripts/doctor.sh $(CONFIG)
 
 test: setup lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu"
@@ -22,6 +33,9 @@ lint: setup
 # Uses the Python at hand where there is no .venv: GPU machines often bring their own torch.
 test-gpu:
 	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -m gpu -rs -v
+
+bench: setup
+	$(BIN)/python -m pytest benchmarks -q
 
 config: setup
 	$(BIN)/python -m drivesplat.config_document

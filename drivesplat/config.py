@@ -6,6 +6,7 @@ from them (`python -m drivesplat.config_document`). Importing this module is che
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -22,13 +23,21 @@ from drivesplat.settings.masks import MaskJob, MaskSettings
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.train import PartName, SkyKind, TrainJob, TrainSettings
+from drivesplat.settings.world import WorldJob, WorldSettings
 from drivesplat.storage import canonical_json
 
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "masks", "sky", "train", "render",
+    "device",
 )  # fmt: skip
+DEMO_OVERRIDES = {
+    "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
+    "train": {"iterations": 1_000, "cap_max": 40_000},
+    "device": {"min_free_gb": 1.0},
+}
+"""What makes the demo world train in minutes on a CPU."""
 METHOD_OVERRIDES = ("sky", "train")
 SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
@@ -50,6 +59,15 @@ class DatasetSettings(Settings):
     """
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings of this file that differ for this dataset, as a tree: {images: {width: 800}}."""
+    batch: bool = True
+    """Whether its scenes belong to `snakemake` without a target and to the report."""
+    world: WorldSettings | None = None
+    """A synthetic street that is made at dataroot, with one scene. null = a recorded dataset, which is there."""
+
+    @property
+    def world_root(self) -> str:
+        """The folder where `world` is made."""
+        return str(Path(self.dataroot).expanduser())
 
     @field_validator("scenes", mode="before")
     @classmethod
@@ -62,6 +80,12 @@ class DatasetSettings(Settings):
                     "since bare YAML reads 0061 as octal 49"
                 )
         return value
+
+    @model_validator(mode="after")
+    def _a_world_has_one_scene(self) -> "DatasetSettings":
+        if self.world and len(self.scenes) != 1:
+            raise ValueError(f"a dataset with a world has one scene, this one has {len(self.scenes)}")
+        return self
 
     @model_validator(mode="after")
     def _frames_are_ranges(self) -> "DatasetSettings":
@@ -80,8 +104,15 @@ class MethodSettings(Settings):
     """Settings of this file that differ for this method, as a tree; `sky` and `train` may."""
 
 
+def _default_datasets() -> dict[str, DatasetSettings]:
+    demo = DatasetSettings(
+        dataroot="resources/demo", scenes=("demo",), batch=False, world=WorldSettings(), overrides=DEMO_OVERRIDES
+    )
+    return {"nuscenes": DatasetSettings(), "demo": demo}
+
+
 class Config(Settings):
-    datasets: dict[str, DatasetSettings] = Field(default_factory=lambda: {"nuscenes": DatasetSettings()}, min_length=1)
+    datasets: dict[str, DatasetSettings] = Field(default_factory=_default_datasets, min_length=1)
     """Recorded drives, each under a name of your choice."""
     methods: dict[str, MethodSettings] = Field(default_factory=lambda: {"vanilla": MethodSettings()}, min_length=1)
     """Methods to train and compare, each under a name of your choice; a result folder each."""
@@ -120,6 +151,9 @@ class Config(Settings):
                     )
             if len(set(dataset.scenes)) != len(dataset.scenes):
                 raise ValueError(f"datasets.{name}.scenes names a scene twice")
+        made = [dataset.world_root for dataset in self.datasets.values() if dataset.world]
+        if len(set(made)) != len(made):
+            raise ValueError("two datasets make their world in the same dataroot; give each its own")
         for name in self.methods:
             _require_name(name, "method")
         if self.eval_camera not in self.cameras:
@@ -130,6 +164,11 @@ class Config(Settings):
     def scenes(self) -> list[str]:
         """All configured scenes, in order."""
         return [scene for dataset in self.datasets.values() for scene in dataset.scenes]
+
+    @property
+    def batch_scenes(self) -> list[str]:
+        """The scenes of `snakemake` without a target, and of the report."""
+        return [scene for dataset in self.datasets.values() if dataset.batch for scene in dataset.scenes]
 
     def dataset_of(self, scene: str) -> str:
         """The name of the dataset a scene belongs to. Raises ConfigError listing the scenes there are."""
@@ -195,6 +234,8 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
 def _record(config: Config, stage: str, scene: str, method: str | None) -> Settings:
     name = config.dataset_of(scene)
     dataset = config.datasets[name]
+    if stage == "demo_world":
+        return WorldJob(scene=scene, version=dataset.version, world=dataset.world)
     if stage == "extract":
         return SceneSource(
             dataset=name,

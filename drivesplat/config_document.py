@@ -43,27 +43,32 @@ def config_schema() -> str:
     return json.dumps(schema, indent=1) + "\n"
 
 
-def _mapping(record: BaseModel, indent: int) -> str:
-    fields = type(record).model_fields
-    return "".join(_entry(name, field, getattr(record, name), indent) for name, field in fields.items())
+def _mapping(record: BaseModel, indent: int, told: set[tuple[type, str]] | None = None) -> str:
+    """The record's fields; comments that have been `told` of an earlier record of its kind are left out."""
+    told = set() if told is None else told
+    lines = []
+    for name, field in type(record).model_fields.items():
+        pad, key = " " * indent, (type(record), name)
+        comment = "" if key in told else _comment(field, pad)
+        told.add(key)
+        value = _value(getattr(record, name), indent, told)
+        lines.append(("\n" if indent == 0 else "") + f"{comment}{pad}{name}:{value}")
+    return "".join(lines)
 
 
-def _entry(name: str, field: FieldInfo, value: Any, indent: int) -> str:
-    pad = " " * indent
-    return ("\n" if indent == 0 else "") + _comment(field, pad) + f"{pad}{name}:{_value(value, indent)}"
-
-
-def _value(value: Any, indent: int) -> str:
+def _value(value: Any, indent: int, told: set[tuple[type, str]]) -> str:
     if isinstance(value, BaseModel):
-        return "\n" + _mapping(value, indent + 2)
-    if isinstance(value, dict) and any(isinstance(item, BaseModel) for item in value.values()):
+        return "\n" + _mapping(value, indent + 2, told)
+    if isinstance(value, dict) and any(isinstance(item, (BaseModel, dict)) for item in value.values()):
         pad = " " * (indent + 2)
-        return "\n" + "".join(f"{pad}{key}:{_value(item, indent + 2)}" for key, item in value.items())
+        return "\n" + "".join(f"{pad}{key}:{_value(item, indent + 2, told)}" for key, item in value.items())
     plain = list(value) if isinstance(value, tuple) else value
     return " " + _scalar(plain) + "\n"
 
 
 def _scalar(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_scalar(item)}" for key, item in value.items()) + "}"
     if isinstance(value, str):
         return value if yaml.safe_load(value) == value and not value.startswith("~") else json.dumps(value)
     return json.dumps(value)

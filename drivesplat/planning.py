@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from drivesplat.config import METHOD_STAGES, SCENE_STAGES, Config, for_scene, load, stage_settings
+from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.readers import layout
 from drivesplat.rerun import code_digest
@@ -52,9 +53,26 @@ class Plan:
         """The dataset files that decide a scene's scene.json."""
         dataset = self.config.datasets[self.config.dataset_of(wildcards.scene)]
         files = layout(dataset.reader)
+        if dataset.world:
+            return [f"{dataset.world_root}/{dataset.version}/{table}.json" for table in files.TABLES]
         return [
             str(file) for file in files.table_files(files.find_root(dataset.dataroot, dataset.version), dataset.version)
         ]
+
+    @property
+    def worlds(self) -> dict[str, str]:
+        """The scenes of synthetic worlds, by the folder of tables that each is made in."""
+        made = [dataset for dataset in self.config.datasets.values() if dataset.world]
+        return {f"{dataset.world_root}/{dataset.version}": dataset.scenes[0] for dataset in made}
+
+    @property
+    def world_tables(self) -> tuple[str, ...]:
+        """The names of the tables that a world consists of."""
+        return layout("nuscenes").TABLES
+
+    def world_settings(self, wildcards: Any) -> str:
+        """The settings of the world whose folder of tables is `wildcards.tables`."""
+        return stage_settings(self.config, "demo_world", self.worlds[wildcards.tables])
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, where given."""
@@ -69,20 +87,22 @@ class Plan:
         """The backbone itself, where it is there already: its arrival reruns what lacked it."""
         return [BACKBONE] if Path(BACKBONE).is_file() else []
 
-    def device(self) -> str:
-        """Where jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
-        return canonical_json(self.config.device.model_dump(mode="json"))
+    def device(self, wildcards: Any) -> str:
+        """Where a scene's jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
+        device = for_scene(self.config, wildcards.scene).device.model_dump(mode="json")
+        synthetic = self.config.datasets[self.config.dataset_of(wildcards.scene)].world is not None
+        return canonical_json({**device, "kind": "any"} if synthetic and device["kind"] == "auto" else device)
 
     def known(self, names: Any) -> str:
         """A wildcard constraint that admits these names only."""
-        return "|".join(re.escape(name) for name in names)
+        return "|".join(re.escape(name) for name in names) or "(?!)"
 
     def report_scenes(self, targets: list[str]) -> list[str]:
         """The scenes of a report: all, but where the report alone is asked for those that have been measured."""
         reports = {"gap_report", *(f"{self.config.results_dir}/gap_report.{kind}" for kind in ("csv", "json"))}
         if not targets or not set(targets) <= reports:
-            return self.config.scenes
-        return [s for s in self.config.scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
+            return self.config.batch_scenes
+        return [s for s in self.config.batch_scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
 
     def expected_stages(self) -> str:
         """For every scene the settings and code its metrics.json should come from, as JSON, to tell stale results."""
@@ -114,7 +134,9 @@ class Plan:
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""
         for scene in self._scenes_of(targets):
-            self.tables(SimpleNamespace(scene=scene))
+            tables = self.tables(SimpleNamespace(scene=scene))
+            if self.config.datasets[self.config.dataset_of(scene)].world:
+                refuse_foreign_data(Path(tables[0]).parents[1])
 
     def _scenes_of(self, targets: list[str]) -> list[str]:
         results = f"{self.config.results_dir}/"

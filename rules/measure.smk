@@ -47,7 +47,7 @@ rule evaluate:
     threads: 4
     resources:
         gpu=1,
-        device=plan.device(),
+        device=plan.device,
         mem_mb=8000,
         runtime=30,
     params:

@@ -24,7 +24,7 @@ rule train:
     threads: 8
     resources:
         gpu=1,
-        device=plan.device(),
+        device=plan.device,
         mem_mb=16000,
         runtime=240,
     params:

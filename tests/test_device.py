@@ -1,7 +1,11 @@
 """Where the work runs: what is refused before training, and in which words."""
 
+import importlib.machinery
+import importlib.util
+import json
 import subprocess
 import sys
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from types import ModuleType
 
@@ -11,6 +15,7 @@ import torch
 from drivesplat.cards import visible_cards
 from drivesplat.device import choose_device, device_name, telling_out_of_memory
 from drivesplat.errors import DeviceError
+from drivesplat.gsplat_build.installed import RECORD, versions
 from drivesplat.settings.device import DeviceSettings
 
 REPOSITORY = Path(__file__).parent.parent
@@ -119,6 +124,80 @@ def test_cuda_without_nvcc_is_named_with_what_to_do(a_gpu, monkeypatch):
     install_gsplat(monkeypatch, None)
     message = refusal()
     assert "nvcc" in message and "toolkit" in message and "device: cpu" in message
+
+
+@pytest.fixture
+def gsplat_package(a_gpu, monkeypatch, tmp_path):
+    """The card of `a_gpu`, of compute capability 8.9, and a gsplat that is sources alone and would compile if asked."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda *_: (8, 9))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    package = tmp_path / "gsplat"
+    (package / "cuda").mkdir(parents=True)
+    for folder in (package, package / "cuda"):
+        (folder / "__init__.py").touch()
+    (package / "cuda/_backend.py").write_text("raise SystemExit('compiles for minutes')")
+    yield package
+    for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
+        del sys.modules[name]
+
+
+def compiled_into(package: Path, archs: list[str] | None, code: str = "") -> None:
+    """Kernels in the package: those of a wheel, or where `archs` are given those of the set-up."""
+    (package / f"csrc{EXTENSION_SUFFIXES[0]}").touch()
+    (package / "csrc.py").write_text(code)  # found where the empty file cannot be loaded
+    (package / "cuda/_backend.py").write_text("from gsplat import csrc as _C")
+    if archs:
+        (package / RECORD).write_text(json.dumps({"archs": archs, "versions": versions()}))
+
+
+@pytest.fixture
+def loadable(monkeypatch):
+    """Python modules in the place of compiled ones."""
+    real = importlib.machinery.FileFinder.find_spec
+
+    def sources_first(self, name, target=None):
+        if name == "gsplat.csrc":
+            return importlib.util.spec_from_file_location(name, Path(self.path) / "csrc.py")
+        return real(self, name, target)
+
+    monkeypatch.setattr(importlib.machinery.FileFinder, "find_spec", sources_first)
+
+
+def test_a_run_does_not_start_compiling_gsplat(gsplat_package):
+    message = refusal()
+    assert "not compiled" in message and "make setup" in message and "make doctor" in message
+    assert f"{sys.executable} -m drivesplat.gsplat_build" in message and "device: cpu" in message
+
+
+def test_a_prebuilt_gsplat_is_taken_as_it_is(gsplat_package, loadable):
+    compiled_into(gsplat_package, None)
+    assert choose_device(DeviceSettings()) == torch.device("cuda")
+
+
+def test_gsplat_compiled_for_this_card_is_taken(gsplat_package, loadable):
+    compiled_into(gsplat_package, ["7.5", "8.6"])
+    assert choose_device(DeviceSettings()) == torch.device("cuda")
+
+
+def test_gsplat_compiled_for_another_card_names_both_and_the_command(gsplat_package, loadable):
+    compiled_into(gsplat_package, ["7.5"])
+    message = refusal()
+    assert "RTX 4090" in message and "8.9" in message and 'GSPLAT_ARCHS="7.5;8.9" make setup' in message
+
+
+def test_compiled_gsplat_that_does_not_load_is_not_compiled_anew(gsplat_package, loadable):
+    compiled_into(gsplat_package, None, "raise ImportError('undefined symbol: _ZN3c10')")
+    message = refusal()
+    assert "gsplat cannot be loaded" in message and "undefined symbol" in message and "make doctor" in message
+
+
+def test_on_amd_gsplat_loads_its_own_way(gsplat_package, monkeypatch):
+    monkeypatch.setattr(torch.version, "cuda", None)
+    (gsplat_package / "cuda/_backend.py").write_text("_C = object()")
+    assert choose_device(DeviceSettings()) == torch.device("cuda")
 
 
 def test_without_gsplat_the_training_stage_still_comes_to_its_one_sentence():

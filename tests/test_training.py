@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from drivesplat.errors import DeviceError, DriveSplatError, ResultError, TrainingError
+from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel, View
@@ -556,10 +556,10 @@ def test_views_that_show_no_gaussian_are_no_error(tmp_path):
     assert summary.iterations == 10
 
 
-def test_absolute_gradients_on_the_cpu_are_refused_by_their_setting(tmp_path):
-    settings = settings_of("default", default=DefaultSettings(absgrad=True))
-    with pytest.raises(DriveSplatError, match=r"train\.default\.absgrad"):
-        trained(tmp_path, settings)
+def test_absolute_gradients_grow_gaussians_on_the_cpu(tmp_path):
+    settings = settings_of("default", default=DefaultSettings(absgrad=True, grow_grad2d=1e-3, refine_every=5))
+    _, summary = trained(tmp_path, settings)
+    assert summary.gaussians > len(untrained(settings))
 
 
 # ---- what it tells

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from drivesplat.rasterize.rendering import Rendering
 
-BACKENDS = ("gsplat", "reference")
+BACKENDS = ("gsplat", "cpu", "reference")
 
 
 def rasterize(
@@ -34,9 +34,9 @@ def rasterize(
     `Ks` use the continuous pixel convention. The projection is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian
     Splatting (Kerbl et al. 2023); `antialiased` scales opacities by the 2D filter's loss (Yu et al. 2024).
 
-    `backend`: one of BACKENDS; None takes gsplat on a GPU and the reference on the CPU.
+    `backend`: one of BACKENDS; None takes gsplat on a GPU and cpu elsewhere.
     """
-    chosen = backend or ("gsplat" if means.is_cuda else "reference")
+    chosen = backend or ("gsplat" if means.is_cuda else "cpu")
     return _backend(chosen)(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         sh_degree=sh_degree, antialiased=antialiased, absgrad=absgrad, with_depth=with_depth,
@@ -48,6 +48,10 @@ def _backend(name: str) -> Callable[..., Rendering]:
         from drivesplat.rasterize.gpu import rasterize_gsplat
 
         return rasterize_gsplat
+    if name == "cpu":
+        from drivesplat.rasterize.cpu import rasterize_cpu
+
+        return rasterize_cpu
     if name == "reference":
         from drivesplat.rasterize.reference import rasterize_reference
 

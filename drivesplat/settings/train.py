@@ -31,7 +31,7 @@ class DefaultSettings(Settings):
     prune_opacity: float = Field(0.005, gt=0, lt=1)
     """Gaussians below it are removed."""
     absgrad: bool = False
-    """Use absolute gradients (needs a larger grow_grad2d, 8e-4 in gsplat's example; GPU only)."""
+    """Use absolute gradients (needs a larger grow_grad2d, 8e-4 in gsplat's example)."""
     refine_every: int = Field(100, ge=1)
     """Iterations between densifications."""
     reset_every: int = Field(3000, ge=1)

@@ -39,9 +39,8 @@ def make_optimizers(model: SplatModel) -> ModelOptimizers:
 
 
 def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
-    fused = next(iter(params.values())).is_cuda
     return {
-        name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15, fused=fused)
+        name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15, fused=True)
         for name, rate in rates.items()
         if params[name].requires_grad
     }

@@ -1,0 +1,144 @@
+"""The tables of nuScenes v1.0, filled row by row, every link kept.
+
+Schema: https://www.nuscenes.org/nuscenes (nuScenes schema), as nuscenes-devkit 1.2 reads it.
+"""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from drivesplat.demo.rig import Sensor
+from drivesplat.readers.nuscenes_layout import TABLES
+from drivesplat.storage import write_json
+
+MAP = "maps/empty.png"
+ATTRIBUTES = ("vehicle.moving", "vehicle.parked", "pedestrian.moving")
+VISIBILITY = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
+
+
+def token(*name: Any) -> str:
+    """The token of a record: 32 hexadecimal digits that depend on its name alone."""
+    return hashlib.sha256(" ".join(map(str, name)).encode()).hexdigest()[:32]
+
+
+def visibility_level(fraction: float) -> str:
+    """nuScenes' level of a visible fraction in [0, 1]: '1' up to 40 %, '2' to 60, '3' to 80, '4' beyond."""
+    return str(1 + sum(fraction > bound for bound in (0.4, 0.6, 0.8)))
+
+
+class NuScenesTables:
+    """The tables of one drive, `scene` its number; `made_from` (any text) stands in the log's name."""
+
+    def __init__(
+        self, scene: str, description: str, made_from: str, start_us: int, sensors: tuple[Sensor, ...], width: int
+    ):
+        self.scene = scene
+        self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
+        log = {"logfile": f"demo-{made_from}", "vehicle": "demo", "date_captured": "2026-01-01", "location": "demo"}
+        self._add("log", token(scene, "log"), **log)
+        self._add("map", token("map"), category="semantic_prior", filename=MAP, log_tokens=[token(scene, "log")])
+        for level, name in VISIBILITY.items():
+            self._add("visibility", level, level=name, description=f"visible fraction {name[1:]} %")
+        for attribute in ATTRIBUTES:
+            self._add("attribute", token(attribute), name=attribute, description="")
+        for sensor in sensors:
+            self._sensor(sensor, width)
+        self._scene_row = self._add(
+            "scene", token(scene), log_token=token(scene, "log"), nbr_samples=0, first_sample_token="",
+            last_sample_token="", name=f"scene-{scene}", description=description,
+        )  # fmt: skip
+        self._start_us = start_us
+        self._last: dict[tuple, dict[str, Any]] = {}
+
+    def _add(self, table: str, token: str, **values: Any) -> dict[str, Any]:
+        row = {"token": token, **values}
+        self.rows[table].append(row)
+        return row
+
+    def _add_linked(self, table: str, chain: tuple, token: str, **values: Any) -> dict[str, Any]:
+        """A row that knows the one before and after it in its `chain`."""
+        before = self._last.get((table, *chain))
+        row = self._add(table, token, prev=before["token"] if before else "", next="", **values)
+        if before:
+            before["next"] = row["token"]
+        self._last[(table, *chain)] = row
+        return row
+
+    def _sensor(self, sensor: Sensor, width: int) -> None:
+        modality = "camera" if sensor.is_camera else "lidar"
+        self._add("sensor", token("sensor", sensor.channel), channel=sensor.channel, modality=modality)
+        self._add(
+            "calibrated_sensor", token("calibrated", sensor.channel), sensor_token=token("sensor", sensor.channel),
+            translation=list(sensor.translation), rotation=list(sensor.rotation),
+            camera_intrinsic=sensor.intrinsics(width).tolist() if sensor.is_camera else [],
+        )  # fmt: skip
+
+    def sample(self, index: int, time_us: int) -> None:
+        """A key frame, `time_us` after the drive's start."""
+        row = self._add_linked(
+            "sample", (), token(self.scene, "sample", index), timestamp=self._start_us + time_us,
+            scene_token=token(self.scene),
+        )  # fmt: skip
+        self._scene_row["nbr_samples"] += 1
+        self._scene_row["first_sample_token"] = self._scene_row["first_sample_token"] or row["token"]
+        self._scene_row["last_sample_token"] = row["token"]
+
+    def data(
+        self, sensor: Sensor, index: int, time_us: int, is_key: bool, ego_to_global: np.ndarray, size: tuple[int, int]
+    ) -> tuple[str, str]:
+        """A recording of key frame `index`, its ego pose (4, 4); `size` = width, height, (0, 0) for LiDAR.
+
+        Returns its token and the path of its file, relative to the dataset's root.
+        """
+        timestamp = self._start_us + time_us
+        name = token(self.scene, sensor.channel, time_us)
+        suffix = "jpg" if sensor.is_camera else "pcd.bin"
+        folder = "samples" if is_key else "sweeps"
+        path = f"{folder}/{sensor.channel}/{self.scene}__{sensor.channel}__{timestamp}.{suffix}"
+        self._add("ego_pose", name, timestamp=timestamp, **_placed(ego_to_global))
+        self._add_linked(
+            "sample_data", (sensor.channel,), name, sample_token=token(self.scene, "sample", index),
+            ego_pose_token=name, calibrated_sensor_token=token("calibrated", sensor.channel), timestamp=timestamp,
+            fileformat=suffix.split(".")[0], is_key_frame=is_key, width=size[0], height=size[1], filename=path,
+        )  # fmt: skip
+        return name, path
+
+    def annotation(
+        self, thing: str, category: str, attribute: str | None, index: int, box_to_global: np.ndarray, size: np.ndarray,
+        visible: float, lidar_points: int,
+    ) -> None:  # fmt: skip
+        """A box at key frame `index`: pose (4, 4) of its centre, `size` (3,) = length, width, height in metres."""
+        instance = token(self.scene, "instance", thing)
+        row = self._add_linked(
+            "sample_annotation", (thing,), token(self.scene, "annotation", thing, index),
+            sample_token=token(self.scene, "sample", index), instance_token=instance,
+            visibility_token=visibility_level(visible), attribute_tokens=[token(attribute)] if attribute else [],
+            size=[size[1], size[0], size[2]], num_lidar_pts=lidar_points, num_radar_pts=0, **_placed(box_to_global),
+        )  # fmt: skip
+        if not any(r["name"] == category for r in self.rows["category"]):
+            self._add("category", token("category", category), name=category, description="")
+        known = next((r for r in self.rows["instance"] if r["token"] == instance), None)
+        if known is None:
+            self._add(
+                "instance", instance, category_token=token("category", category), nbr_annotations=1,
+                first_annotation_token=row["token"], last_annotation_token=row["token"],
+            )  # fmt: skip
+        else:
+            known["nbr_annotations"] += 1
+            known["last_annotation_token"] = row["token"]
+
+    def write(self, root: Path, version: str) -> None:
+        """Writes `root`/`version`/*.json and the map that the devkit insists on."""
+        (root / MAP).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (8, 8)).save(root / MAP)
+        for name, rows in self.rows.items():
+            write_json(root / version / f"{name}.json", rows)
+
+
+def _placed(pose: np.ndarray) -> dict[str, list[float]]:
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    return {"translation": pose[:3, 3].tolist(), "rotation": [w, x, y, z]}

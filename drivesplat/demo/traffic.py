@@ -1,0 +1,74 @@
+"""Who moves how along the street. Street frame: metres, x along the road, y to the left, z up, the road at z = 0."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drivesplat.rigid import rigid
+
+LANE_CENTER = 1.75
+"""Traffic drives on the right: at y = -LANE_CENTER along x, at +LANE_CENTER against it."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A way along the street: at `x`, `y` (metres) at second 0 with `speed` (m/s, negative: against x).
+
+    The speed swings by `surge` (m/s) and the way sways sideways by `sway` (metres), both over `period` seconds.
+    `heading` (radians) is that of what stands.
+    """
+
+    x: float
+    y: float
+    speed: float = 0.0
+    surge: float = 0.0
+    sway: float = 0.0
+    period: float = 8.0
+    heading: float = 0.0
+
+    def pose_at(self, seconds: float) -> np.ndarray:
+        """Object to street (4, 4): on the ground, heading along the way."""
+        omega = 2 * math.pi / self.period
+        x = self.x + self.speed * seconds + self.surge / omega * (1 - math.cos(omega * seconds))
+        y = self.y + self.sway * math.sin(omega * seconds)
+        vx = self.speed + self.surge * math.sin(omega * seconds)
+        vy = self.sway * omega * math.cos(omega * seconds)
+        heading = math.atan2(vy, vx) if self.speed else self.heading
+        return rigid(Rotation.from_euler("z", heading).as_matrix(), np.array([x, y, 0.0]))
+
+
+def ego_motion(drives: bool) -> Motion:
+    """The own car's way."""
+    return Motion(0.0, -LANE_CENTER, 8.0, 0.6, 0.12, 9.0) if drives else Motion(12.0, -LANE_CENTER)
+
+
+def ego_pose(motion: Motion, seconds: float) -> np.ndarray:
+    """Ego to street (4, 4): `motion` with the pitch, roll and heave of springs where the car drives."""
+    pose = motion.pose_at(seconds)
+    if motion.speed:
+        pitch, roll = 0.25 * math.sin(5.1 * seconds), 0.2 * math.sin(3.7 * seconds + 1.0)
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("yx", [pitch, roll], degrees=True).as_matrix()
+        pose[2, 3] = 0.012 * math.sin(6.3 * seconds + 0.5)
+    return pose
+
+
+def vehicle_motions(count: int, ego_drives: bool) -> list[Motion]:
+    """The ways of `count` vehicles: the first leads the own car, then oncoming and further leading ones by turns."""
+    starts = ((13.0, 8.6), (42.0, 9.2), (70.0, 9.0)) if ego_drives else ((24.0, 4.0), (48.0, 6.0), (76.0, 6.5))
+    leading = [Motion(x, -LANE_CENTER, speed, 1.2, 0.1, 7.0 + i) for i, (x, speed) in enumerate(starts)]
+    oncoming = [Motion(96.0 + 42.0 * i, LANE_CENTER, -(9.0 + 0.7 * i), 0.7, 0.1, 8.0) for i in range(3)]
+    by_turns = [motion for pair in zip(leading, oncoming, strict=True) for motion in pair]
+    return by_turns[:count]
+
+
+def pedestrian_motions(count: int, random: np.random.Generator) -> list[Motion]:
+    """The ways of `count` people on the sidewalks, to and fro."""
+    return [
+        Motion(
+            22.0 + 13.0 * i + random.uniform(-2, 2), (-1) ** (i + 1) * random.uniform(6.8, 7.6),
+            (1.0 if i % 3 < 2 else -1.0) * random.uniform(1.2, 1.6),
+        )
+        for i in range(count)
+    ]  # fmt: skip

@@ -1,0 +1,52 @@
+"""The CPU rasterizer behind the door."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from drivesplat.rasterize.cpu.compositing import Compositing
+from drivesplat.rasterize.cpu.harmonics import MAX_DEGREE, ViewColors
+from drivesplat.rasterize.cpu.projection import Projection
+from drivesplat.rasterize.rendering import Rendering
+
+
+def rasterize_cpu(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
+) -> Rendering:  # fmt: skip
+    """See `drivesplat.rasterize.rasterize`.
+
+    Works in float32 and float64, in as many threads as torch, and gives the same bits however many these are. Gradients
+    reach everything but `Ks`. Spherical harmonics go up to degree 3.
+    """
+    means2d, depths, conics, compensations, radii = Projection.apply(means, quats, scales, viewmats, Ks, width, height)
+    opacities2d = opacities.expand(len(viewmats), -1)
+    if antialiased:
+        opacities2d = opacities2d * compensations
+    if sh_degree is None:
+        values = colors.expand(len(viewmats), -1, -1)
+    else:
+        if not 0 <= sh_degree <= MAX_DEGREE or colors.shape[1] < (sh_degree + 1) ** 2:
+            raise ValueError(
+                f"spherical harmonics of degree {sh_degree} from {colors.shape[1]} coefficients: "
+                f"the CPU knows degrees 0 to {MAX_DEGREE}, and needs (degree + 1)² coefficients"
+            )
+        values = ViewColors.apply(means, colors, viewmats, radii, sh_degree)
+    if with_depth:
+        values = torch.cat([values, depths[..., None]], dim=-1)
+    image, alpha = Compositing.apply(means2d, depths, conics, radii, opacities2d, values, width, height, absgrad)
+    info: dict[str, Any] = {
+        "means2d": means2d,
+        "radii": radii,
+        "depths": depths,
+        "conics": conics,
+        "opacities": opacities2d,
+        "width": width,
+        "height": height,
+        "n_cameras": len(viewmats),
+        "gaussian_ids": None,
+    }
+    if not with_depth:
+        return Rendering(image, alpha, None, info)
+    return Rendering(image[..., :-1], alpha, image[..., -1:] / alpha.clamp(min=1e-10), info)
