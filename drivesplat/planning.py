@@ -105,9 +105,9 @@ class Plan:
         return [s for s in self.config.batch_scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
 
     def expected_stages(self) -> str:
-        """For every scene the settings and code its metrics.json should come from, as JSON, to tell stale results."""
+        """For every scene of the report the settings and code its metrics.json should come from, as JSON, to tell stale results."""
         codes = {stage: self.code(stage) for stage in (*SCENE_STAGES, *METHOD_STAGES)}
-        return canonical_json({scene: self._stages(scene, codes) for scene in self.config.scenes})
+        return canonical_json({scene: self._stages(scene, codes) for scene in self.config.batch_scenes})
 
     def _stages(self, scene: str, codes: Mapping[str, str]) -> dict[str, Any]:
         stages = {stage: (stage, None) for stage in SCENE_STAGES}

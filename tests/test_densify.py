@@ -241,7 +241,7 @@ def test_the_default_strategy_resets_opacities_every_so_many_iterations():
     for step in range(1, 4):
         train_step(model, densifier, step, optimizers)
         brightest.append(float(model.parts[0].at(0.0).opacities.detach().max()))
-    assert min(brightest[:2]) > 0.3
+    assert min(brightest[:2]) > 0.05
     assert brightest[2] == pytest.approx(0.01, rel=1e-3), "twice prune_opacity, as in 3DGS"
 
 

@@ -68,7 +68,9 @@ def test_a_gaussian_shows_where_its_ray_points():
     view = a_view()
     row, column = 5, 17
     at = view.camera_to_world[:3, 3] + 4.0 * view.rays()[row, column]
-    params = Background.from_points(at[None].numpy(), np.ones((1, 3)), GaussianSettings(sh_degree=0), 1.0).params
+    params = Background.from_points(
+        at[None].numpy(), np.ones((1, 3)), GaussianSettings(sh_degree=0, init_opacity=0.5), 1.0
+    ).params
     params["scales"].data.fill_(np.log(0.02))
     alpha = SplatModel([Background(dict(params), GaussianSettings(), 1.0)], None).render(view, 0).alpha.detach()
     assert torch.equal((alpha == alpha.max()).nonzero(), torch.tensor([[row, column]]))
@@ -126,7 +128,7 @@ def test_positions_learn_in_proportion_to_the_scene():
 
 @pytest.mark.parametrize("sky", [ConstantSky, CubemapSky])
 def test_the_sky_shows_through_what_the_gaussians_leave(sky):
-    part = Background.from_points(*seed_points(40), GaussianSettings(init_scale=0.3), 1.0)
+    part = Background.from_points(*seed_points(40), GaussianSettings(init_scale=0.3, init_opacity=0.5), 1.0)
     color = torch.tensor([0.3, 0.6, 0.9])
     behind = sky(color, 1e-2) if sky is ConstantSky else shaken(sky(4, color, 1e-2))
     view = a_view()

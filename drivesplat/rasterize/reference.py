@@ -32,7 +32,7 @@ def rasterize_reference(
     Works in float32 and float64; autograd gives every gradient but `absgrad`.
     """
     if absgrad:
-        raise ConfigError("absolute gradients need a GPU: set train.default.absgrad: false")
+        raise ConfigError("the reference rasterizer has no absolute gradients: set train.default.absgrad: false")
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_covar=True, compute_preci=False)
     projected = [_project(means, covars, viewmat, k, width, height) for viewmat, k in zip(viewmats, Ks, strict=True)]
     radii, means2d, depths, conics = (torch.stack(values) for values in zip(*projected, strict=True))
