@@ -151,7 +151,7 @@ class Config(Settings):
                     )
             if len(set(dataset.scenes)) != len(dataset.scenes):
                 raise ValueError(f"datasets.{name}.scenes names a scene twice")
-        made = [dataset.world_root for dataset in self.datasets.values() if dataset.world]
+        made = [Path(dataset.world_root).resolve() for dataset in self.datasets.values() if dataset.world]
         if len(set(made)) != len(made):
             raise ValueError("two datasets make their world in the same dataroot; give each its own")
         for name in self.methods:

@@ -105,7 +105,8 @@ class Plan:
         return [s for s in self.config.batch_scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
 
     def expected_stages(self) -> str:
-        """For every scene of the report the settings and code its metrics.json should come from, as JSON, to tell stale results."""
+        """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what
+        else is stale."""
         codes = {stage: self.code(stage) for stage in (*SCENE_STAGES, *METHOD_STAGES)}
         return canonical_json({scene: self._stages(scene, codes) for scene in self.config.batch_scenes})
 
@@ -139,15 +140,18 @@ class Plan:
                 refuse_foreign_data(Path(tables[0]).parents[1])
 
     def _scenes_of(self, targets: list[str]) -> list[str]:
-        results = f"{self.config.results_dir}/"
-        named = [target.removeprefix(results).split("/")[0] for target in targets if target.startswith(results)]
-        if (
-            not targets
-            or any(not target.startswith(results) for target in targets)
-            or set(named) - set(self.config.scenes)
-        ):
+        """The scenes that targets need; those of the batch where a target does not say."""
+        scenes = [self._scene_of(target) for target in targets]
+        if not scenes or any(scene not in self.config.scenes for scene in scenes):
             return self.report_scenes(targets)
-        return named
+        return scenes
+
+    def _scene_of(self, target: str) -> str | None:
+        """The scene whose file a target is."""
+        results = f"{self.config.results_dir}/"
+        if target.startswith(results):
+            return target.removeprefix(results).split("/")[0]
+        return next((scene for tables, scene in self.worlds.items() if target.startswith(f"{tables}/")), None)
 
     def hold_results(self) -> None:
         """Keeps a second run out of the results folder until this process ends, however it ends.

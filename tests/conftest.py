@@ -43,3 +43,39 @@ def real_scene_root() -> Path:
     if not (root / "v1.0-mini").is_dir():
         pytest.skip(f"no real nuScenes scene at {root}: set NUSCENES_SCENE0061 to one")
     return root
+
+
+@pytest.fixture(scope="session")
+def demo_job():
+    """The settings of a small synthetic drive by day."""
+    from drivesplat.settings.world import WorldJob, WorldSettings
+
+    return WorldJob(
+        scene="demo", version="v1.0-mini", world=WorldSettings(width=160, key_frames=6, samples_per_pixel=1)
+    )
+
+
+@pytest.fixture(scope="session")
+def demo_root(demo_job, tmp_path_factory) -> Path:
+    """A small synthetic drive in nuScenes format with its truth: scene demo, read only."""
+    from drivesplat.demo.world import make_world
+
+    root = tmp_path_factory.mktemp("demo")
+    make_world(root, demo_job, {"stages": {}}, workers=2)
+    return root
+
+
+@pytest.fixture(scope="session")
+def demo_recorder(demo_job):
+    """What recorded it."""
+    from drivesplat.demo.recorder import Recorder
+
+    return Recorder(demo_job.world)
+
+
+@pytest.fixture(scope="session")
+def demo_tables(demo_root):
+    """It as nuscenes-devkit reads it."""
+    from nuscenes.nuscenes import NuScenes
+
+    return NuScenes("v1.0-mini", str(demo_root), verbose=False)

@@ -1,5 +1,7 @@
 """A spinning LiDAR of 32 beams, as nuScenes has on the roof (Velodyne HDL-32E)."""
 
+from typing import no_type_check
+
 import numpy as np
 
 from drivesplat.demo.lighting import facing_normal, turned
@@ -52,6 +54,7 @@ def _beams() -> np.ndarray:
 
 
 @compiled
+@no_type_check
 def _returned(directions, origin, distance, thing, face, normal, to_body, material, color, out):
     """Fills `out` (n,) with the share of light that surfaces send back: reflectance times the cosine to the beam."""
     for i in range(len(directions)):

@@ -1,7 +1,7 @@
 """Light on surfaces, compiled: sun, shadows and sky by day; lamps, headlights and lit windows by night."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 
@@ -51,6 +51,7 @@ def lamplight(lamps: np.ndarray, ego_to_street: np.ndarray) -> Light:
 
 
 @compiled
+@no_type_check
 def sky_color(dx, dy, dz, light):
     """The radiance r, g, b of the sky in a direction."""
     up = max(dz, 0.0)
@@ -72,6 +73,7 @@ def sky_color(dx, dy, dz, light):
 
 
 @compiled
+@no_type_check
 def lamps_at(px, py, pz, nx, ny, nz, light):
     """The irradiance r, g, b of street lamps (shining down) and headlights at a point."""
     r = g = b = 0.0
@@ -98,6 +100,7 @@ def lamps_at(px, py, pz, nx, ny, nz, light):
 
 
 @compiled
+@no_type_check
 def shade(directions, origin, distance, thing, face, normal, lit, to_body, material, color, pixel_angle, light, out):
     """Fills `out` (n, 3) with the radiance that comes along rays `directions` (n, 3) to `origin` (3,).
 
@@ -141,6 +144,7 @@ def shade(directions, origin, distance, thing, face, normal, lit, to_body, mater
 
 
 @compiled
+@no_type_check
 def facing_normal(normal, direction):
     """The unit normal turned to the viewer, x, y, z, and the cosine (at least 0.04) between the two."""
     length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2) + 1e-30
@@ -152,6 +156,7 @@ def facing_normal(normal, direction):
 
 
 @compiled
+@no_type_check
 def turned(m, x, y, z):
     """A direction turned by the rotation in `m` (4, 4)."""
     return (

@@ -5,6 +5,7 @@ resolved fades to its mean instead of flickering.
 """
 
 import math
+from typing import no_type_check
 
 import numpy as np
 
@@ -23,6 +24,7 @@ PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES = (int(m) for m
 
 
 @compiled
+@no_type_check
 def lattice(x, y, z):
     """A number in [0, 1) for a whole-numbered place, without pattern to the eye."""
     h = np.uint32(np.int64(x) * 73856093 ^ np.int64(y) * 19349663 ^ np.int64(z) * 83492791)
@@ -31,6 +33,7 @@ def lattice(x, y, z):
 
 
 @compiled
+@no_type_check
 def noise(x, y, z):
     """Value noise in [0, 1), smooth over one unit."""
     ix, iy, iz = math.floor(x), math.floor(y), math.floor(z)
@@ -47,6 +50,7 @@ def noise(x, y, z):
 
 
 @compiled
+@no_type_check
 def mottle(x, y, z, wavelength, footprint):
     """Three octaves of noise around 0 (about +-0.5), without those finer than the footprint."""
     total, amplitude = 0.0, 0.5
@@ -62,6 +66,7 @@ def mottle(x, y, z, wavelength, footprint):
 
 
 @compiled
+@no_type_check
 def band(value, low, high, footprint):
     """How much of a pixel lies between two lines: 1 inside, 0 outside, a ramp as wide as the footprint."""
     width = footprint + 1e-4
@@ -69,6 +74,7 @@ def band(value, low, high, footprint):
 
 
 @compiled
+@no_type_check
 def ground(x, y, footprint):
     """Linear reflectance of road, markings, curb, sidewalk and grass."""
     a = abs(y)
@@ -104,6 +110,7 @@ def ground(x, y, footprint):
 
 
 @compiled
+@no_type_check
 def facade(r, g, b, along, z, footprint):
     """A wall with windows: colour, mirror share, and how brightly its windows are lit at night."""
     column, floor = math.floor(along / WINDOW[0]), math.floor(z / WINDOW[1])
@@ -125,6 +132,7 @@ def facade(r, g, b, along, z, footprint):
 
 
 @compiled
+@no_type_check
 def surface(material, r, g, b, x, y, z, nx, ny, nz, footprint):
     """Reflectance r, g, b of a point (in its body's frame, normal n), its mirror share, and its glow at night."""
     if material == ROAD_:

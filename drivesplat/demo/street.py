@@ -12,6 +12,7 @@ from drivesplat.settings.world import WorldSettings
 
 LENGTH = (-80.0, 260.0)
 """From where to where (metres along the road) the street is built up."""
+CONES = ((57.0, -4.6), (59.5, -4.3), (62.0, -4.0))
 PAINTS: tuple[Color, ...] = (
     (0.5, 0.5, 0.52), (0.55, 0.06, 0.05), (0.05, 0.12, 0.35), (0.03, 0.03, 0.04), (0.7, 0.7, 0.68), (0.08, 0.22, 0.14),
     (0.6, 0.4, 0.05),
@@ -137,11 +138,12 @@ def _furniture(lamp_places: np.ndarray, random: np.random.Generator) -> list[Bod
 
 
 def _parked(count: int, random: np.random.Generator) -> list[Thing]:
-    """Parked vehicles on both sides, clear of the crossing; every fifth is a van."""
+    """Parked vehicles on both sides, clear of the crossing and of the cones; every fifth is a van."""
     free = [(x, side) for x in np.arange(4.0, 130.0, 7.2) for side in (-1, 1) if not 40.0 < x < 54.0]
     things = []
-    for i, index in enumerate(random.permutation(len(free))[:count]):
-        x, side = free[index]
+    drawn = [free[index] for index in random.permutation(len(free))]
+    clear = [(x, side) for x, side in drawn if side > 0 or all(abs(x - cone) > 5.0 for cone, _ in CONES)]
+    for i, (x, side) in enumerate(clear[:count]):
         body, category = _vehicle_body(i % 5 == 4, random)
         facing = 0.0 if side < 0 else np.pi
         y = side * ((LANE + ROAD) / 2 + random.uniform(-0.1, 0.1))
@@ -167,6 +169,5 @@ def _vehicles(motions: list[Motion], random: np.random.Generator) -> list[Thing]
 
 def _cones() -> list[Thing]:
     return [
-        Thing(f"cone {i}", bodies.cone(), Motion(x, y), "movable_object.trafficcone")
-        for i, (x, y) in enumerate(((57.0, -4.6), (59.5, -4.3), (62.0, -4.0)))
+        Thing(f"cone {i}", bodies.cone(), Motion(x, y), "movable_object.trafficcone") for i, (x, y) in enumerate(CONES)
     ]

@@ -64,11 +64,10 @@ def vehicle_motions(count: int, ego_drives: bool) -> list[Motion]:
 
 
 def pedestrian_motions(count: int, random: np.random.Generator) -> list[Motion]:
-    """The ways of `count` people on the sidewalks, to and fro."""
-    return [
-        Motion(
-            22.0 + 13.0 * i + random.uniform(-2, 2), (-1) ** (i + 1) * random.uniform(6.8, 7.6),
-            (1.0 if i % 3 < 2 else -1.0) * random.uniform(1.2, 1.6),
-        )
-        for i in range(count)
-    ]  # fmt: skip
+    """The ways of `count` people: along x on the right sidewalk, against it on the left, by turns."""
+    motions = []
+    for i in range(count):
+        side = (-1) ** (i + 1)
+        x, y = 22.0 + 13.0 * i + random.uniform(-2, 2), side * random.uniform(6.8, 7.6)
+        motions.append(Motion(x, y, -side * random.uniform(1.2, 1.6)))
+    return motions

@@ -1,8 +1,8 @@
 """The truth that real logs lack, for the key frames of one camera: another view, an absent car, depth, instances.
 
 `truth/truth.json` lists per key frame the PNGs beside it. Images are lossless and free of sensor noise. `depth`: 16
-bits, 1/256 metre along the camera's axis up to 256 m, 0 for the sky (KITTI's convention). `instances`: 8 bits, a number of
-`instances`, 0 for what carries no box.
+bits, 1/256 metre along the camera's axis up to 256 m, 0 for the sky (KITTI's convention). `instances`: 8 bits, a number
+of `instances`, 0 for scenery; cars and people too far away for a box have numbers as well.
 """
 
 from dataclasses import asdict, dataclass

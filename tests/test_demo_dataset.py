@@ -1,0 +1,141 @@
+"""The demo world as a dataset: nuscenes-devkit and the project's own reader take it for nuScenes."""
+
+import numpy as np
+import pytest
+from nuscenes.utils.data_classes import LidarPointCloud
+from PIL import Image
+
+from drivesplat.extract import extract_scene
+from drivesplat.settings.extract import SceneSource
+
+CAMERAS = {"CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT"}
+KEY_FRAMES = 6
+
+
+def chain(tables, table: str, first: str) -> list[dict]:
+    """The records of a table from a first one on, checked to be linked back as well."""
+    records, before, token = [], "", first
+    while token:
+        records.append(tables.get(table, token))
+        assert records[-1]["prev"] == before
+        before, token = token, records[-1]["next"]
+    return records
+
+
+@pytest.fixture(scope="module")
+def samples(demo_tables) -> list[dict]:
+    return chain(demo_tables, "sample", demo_tables.scene[0]["first_sample_token"])
+
+
+def test_the_devkit_lists_its_scene(demo_tables, capsys):
+    demo_tables.list_scenes()
+    line = capsys.readouterr().out
+    assert "scene-demo" in line and "own car drives" in line
+
+
+def test_key_frames_come_at_2_hz_in_one_chain(demo_tables, samples):
+    scene = demo_tables.scene[0]
+    assert len(samples) == len(demo_tables.sample) == scene["nbr_samples"] == KEY_FRAMES
+    assert samples[-1]["token"] == scene["last_sample_token"]
+    assert set(np.diff([sample["timestamp"] for sample in samples])) == {500_000}
+
+
+def test_every_key_frame_has_six_cameras_and_the_lidar(samples):
+    for sample in samples:
+        assert set(sample["data"]) == CAMERAS | {"LIDAR_TOP"}
+
+
+def test_each_camera_fires_at_its_own_time_before_the_lidar(demo_tables, samples):
+    for sample in samples:
+        delays = {
+            channel: demo_tables.get("sample_data", token)["timestamp"] - sample["timestamp"]
+            for channel, token in sample["data"].items()
+        }
+        assert delays["LIDAR_TOP"] == 0 and delays["CAM_FRONT"] == -35_500
+        assert len(set(delays.values())) == 7
+        assert all(-50_000 < delays[camera] < 0 for camera in CAMERAS)
+
+
+@pytest.mark.parametrize("channel", sorted(CAMERAS | {"LIDAR_TOP"}))
+def test_recordings_of_a_sensor_are_one_chain_in_time_order(demo_tables, samples, channel):
+    records = chain(demo_tables, "sample_data", samples[0]["data"][channel])
+    assert len(records) == sum(data["channel"] == channel for data in demo_tables.sample_data)
+    times = np.array([record["timestamp"] for record in records])
+    assert (np.diff(times) > 0).all()
+    keys = [record["sample_token"] for record in records if record["is_key_frame"]]
+    assert keys == [sample["token"] for sample in samples]
+
+
+def test_the_front_camera_sweeps_at_12_hz_and_no_other_sensor_does(demo_tables, samples):
+    front = chain(demo_tables, "sample_data", samples[0]["data"]["CAM_FRONT"])
+    assert len(front) == 6 * (KEY_FRAMES - 1) + 1
+    assert np.abs(np.diff([record["timestamp"] for record in front]) - 1e6 / 12).max() <= 1.0
+    assert [record["is_key_frame"] for record in front] == [i % 6 == 0 for i in range(len(front))]
+    between = [data["channel"] for data in demo_tables.sample_data if not data["is_key_frame"]]
+    assert set(between) == {"CAM_FRONT"}
+
+
+def test_every_recording_has_its_file_of_the_stated_size_and_an_ego_pose_of_its_time(demo_tables, demo_root):
+    for data in demo_tables.sample_data:
+        assert demo_tables.get("ego_pose", data["ego_pose_token"])["timestamp"] == data["timestamp"]
+        path = demo_root / data["filename"]
+        if data["sensor_modality"] == "camera":
+            with Image.open(path) as image:
+                assert image.size == (data["width"], data["height"]) == (160, 90)
+        else:
+            assert path.stat().st_size % 20 == 0
+
+
+def test_annotations_of_a_thing_are_one_chain(demo_tables):
+    for instance in demo_tables.instance:
+        rows = chain(demo_tables, "sample_annotation", instance["first_annotation_token"])
+        assert len(rows) == instance["nbr_annotations"]
+        assert rows[-1]["token"] == instance["last_annotation_token"]
+        assert {row["instance_token"] for row in rows} == {instance["token"]}
+        times = [demo_tables.get("sample", row["sample_token"])["timestamp"] for row in rows]
+        assert times == sorted(set(times))
+
+
+def test_the_devkit_gives_path_boxes_and_intrinsics_of_an_image(demo_tables, demo_root, samples):
+    path, boxes, intrinsics = demo_tables.get_sample_data(samples[0]["data"]["CAM_FRONT"])
+    assert path.startswith(str(demo_root)) and intrinsics.shape == (3, 3)
+    assert "vehicle.car" in {box.name for box in boxes}
+    assert all(box.center[2] > 0 for box in boxes)
+
+
+def test_the_devkit_reads_the_lidar(demo_tables, demo_root, samples):
+    data = demo_tables.get("sample_data", samples[0]["data"]["LIDAR_TOP"])
+    cloud = LidarPointCloud.from_file(str(demo_root / data["filename"]))
+    assert cloud.points.shape[0] == 4 and cloud.points.shape[1] > 15_000
+    assert -2.0 < np.median(cloud.points[2]) < 0.0, "most returns come from the road below the sensor"
+
+
+def test_the_devkit_gives_the_speed_of_boxes(demo_tables, samples):
+    speeds = {}
+    for token in samples[2]["anns"]:
+        row = demo_tables.get("sample_annotation", token)
+        attribute = demo_tables.get("attribute", row["attribute_tokens"][0])["name"]
+        speeds.setdefault(attribute, []).append(np.linalg.norm(demo_tables.box_velocity(token)[:2]))
+    assert max(speeds["vehicle.parked"]) < 1e-9
+    assert min(speeds["vehicle.moving"]) > 5.0 and max(speeds["vehicle.moving"]) < 14.0
+    assert min(speeds["pedestrian.moving"]) > 0.5 and max(speeds["pedestrian.moving"]) < 2.0
+
+
+def test_global_coordinates_lie_far_from_zero(demo_tables):
+    for pose in demo_tables.ego_pose:
+        assert np.linalg.norm(pose["translation"][:2]) > 500.0
+
+
+@pytest.mark.parametrize("sweeps", [False, True])
+def test_the_projects_reader_reads_it(demo_root, sweeps):
+    source = SceneSource(
+        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None,
+        cameras=("CAM_FRONT",), sweeps=sweeps, on_missing="stop",
+    )  # fmt: skip
+    scene = extract_scene(source, demo_root)
+    assert len(scene.frames) == (31 if sweeps else KEY_FRAMES) and len(scene.sweeps) == KEY_FRAMES
+    assert scene.missing_images == 0
+    assert {frame.sample_index for frame in scene.frames} == set(range(KEY_FRAMES))
+    assert np.linalg.norm(scene.frames[0].camera_to_world[:3, 3]) < 5.0, "the scene's own origin is where it starts"
+    moving = {track.category for track in scene.tracks if np.ptp(track.object_to_world[:, 0, 3]) > 1.0}
+    assert "vehicle.car" in moving

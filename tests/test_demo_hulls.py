@@ -1,0 +1,78 @@
+"""Box hulls, which the measuring protocol takes for an object's pixels, against the pixels it truly covers."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from drivesplat.demo.imaging import central_hits
+from drivesplat.demo.recorder import Recorder
+from drivesplat.demo.rig import SENSORS
+from drivesplat.demo.tables import token
+from drivesplat.extract import extract_scene
+from drivesplat.regions import LABELS, LEAST_PIXELS, fill, hulls_in, label_image
+from drivesplat.settings.extract import SceneSource
+
+SIZE = (400, 225)
+"""The demo's own size."""
+FRONT = next(sensor for sensor in SENSORS if sensor.channel == "CAM_FRONT")
+
+
+@pytest.fixture(scope="module")
+def scene(demo_root):
+    source = SceneSource(
+        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None,
+        cameras=("CAM_FRONT",), sweeps=True, on_missing="stop",
+    )  # fmt: skip
+    return extract_scene(source, demo_root)
+
+
+@pytest.fixture(scope="module")
+def recorder(demo_job) -> Recorder:
+    return Recorder(demo_job.world.model_copy(update={"width": SIZE[0]}))
+
+
+@pytest.fixture(scope="module", params=[0, 8, 15, 23, 30])
+def seen(request, scene, recorder):
+    """An image (also one between key frames) and which thing (h, w) each of its pixels shows."""
+    frame = scene.frames[request.param]
+    seconds = (frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6
+    return frame, central_hits(recorder.stage(seconds), recorder.camera(FRONT, seconds))[1]
+
+
+def vehicles(scene, recorder, frame, things):
+    """Per vehicle in clear view: its name, its hull's pixels, its own pixels."""
+    tokens = {token("demo", "instance", thing.name): n for n, thing in enumerate(recorder.things)}
+    for hull in hulls_in(scene, frame, SIZE):
+        own = things == tokens[hull.box.track_id]
+        if hull.box.category.startswith("vehicle.") and hull.box.visibility == 4 and own.sum() >= LEAST_PIXELS:
+            yield recorder.things[tokens[hull.box.track_id]].name, fill(hull.polygon, SIZE), own
+
+
+def test_vehicles_lie_within_their_hulls_at_the_images_own_time(scene, recorder, seen):
+    frame, things = seen
+    for name, hull, own in vehicles(scene, recorder, frame, things):
+        assert not (own & ~binary_dilation(hull, np.ones((3, 3)))).any(), f"{name} sticks out of its hull"
+
+
+def test_hulls_at_the_images_own_time_cover_the_vehicles_and_little_else(scene, recorder, seen):
+    frame, things = seen
+    found = {}
+    for name, hull, own in vehicles(scene, recorder, frame, things):
+        if not hull[:, [0, -1]].any():  # of a vehicle that the border cuts, the hull holds a corner of air
+            found[name] = float((hull & own).sum() / (hull | own).sum())
+    print(f"key frame {frame.sample_index}:", {name: round(iou, 3) for name, iou in found.items()})
+    assert "vehicle 0" in found and len(found) >= 2
+    assert min(found.values()) > 0.6, found
+
+
+def test_the_label_image_calls_moving_what_moves_and_parked_what_is_parked(scene, recorder, seen):
+    frame, things = seen
+    labels = label_image(scene, frame, SIZE)
+    names = np.array([thing.name for thing in recorder.things])
+    for name, _, own in vehicles(scene, recorder, frame, things):
+        kind = "parked" if name.startswith("parked") else "moving"
+        expected = [LABELS[f"{kind}_car"], LABELS[f"{kind}_other_vehicle"]]
+        assert np.isin(labels[own], expected).mean() > 0.8, name
+    walker = things == list(names).index("pedestrian 0")
+    if walker.sum() >= LEAST_PIXELS:
+        assert (labels[walker] == LABELS["moving_human"]).mean() > 0.8

@@ -1,0 +1,102 @@
+"""The demo world's LiDAR: 32 beams like nuScenes', within its range, each sweep with noise of its own."""
+
+import numpy as np
+import pytest
+
+from drivesplat.demo.recorder import Recorder
+from drivesplat.demo.rig import SENSORS, firing_times
+from drivesplat.settings.world import WorldSettings
+
+LIDAR = SENSORS[0]
+
+
+@pytest.fixture(scope="module")
+def standing() -> Recorder:
+    """Nothing moves: sweeps differ by their noise alone."""
+    return Recorder(WorldSettings(ego="stands", vehicles=0, pedestrians=0))
+
+
+@pytest.fixture(scope="module")
+def points(standing) -> np.ndarray:
+    return standing.sweep(LIDAR, 0)[0]
+
+
+def test_returns_are_rows_of_five_floats_without_gaps(points):
+    assert points.dtype == np.float32 and points.shape[1] == 5
+    assert np.isfinite(points).all()
+    assert 15_000 < len(points) < 32 * 1085
+
+
+def test_rings_are_32_beams_from_the_lowest_to_the_highest_elevation(points):
+    x, y, z, _, ring = points.astype(np.float64).T
+    assert set(np.unique(ring)) == set(range(32))
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    step = (10.67 + 30.67) / 31
+    assert np.abs(elevation - (-30.67 + step * ring)).max() < 0.01
+    assert elevation.min() > -31.0 and elevation.max() < 11.0
+
+
+def test_beams_go_round_the_car_in_1085_firings(points):
+    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
+    firing = azimuth / (2 * np.pi) * 1085
+    offset = np.angle(np.mean(np.exp(2j * np.pi * firing))) / (2 * np.pi)
+    assert np.abs((firing - offset + 0.5) % 1.0 - 0.5).max() < 0.01
+    assert len(np.unique(np.round(firing - offset) % 1085)) == 1085
+
+
+def test_ranges_lie_between_the_cars_own_body_and_a_hundred_metres(points):
+    ranges = np.linalg.norm(points[:, :3], axis=1)
+    assert ranges.min() > 0.9 - 0.1 and ranges.max() < 100.0 + 0.1
+    assert ranges.max() > 50.0
+
+
+def test_intensities_are_whole_numbers_of_a_byte(points):
+    intensity = points[:, 3]
+    assert intensity.min() >= 0 and intensity.max() <= 255
+    assert (intensity == intensity.round()).all() and len(np.unique(intensity)) > 20
+
+
+def test_the_road_below_is_flat_at_the_sensors_height(points, standing):
+    to_ego = LIDAR.sensor_to_ego
+    in_ego = points[:, :3].astype(np.float64) @ to_ego[:3, :3].T + to_ego[:3, 3]
+    road = (np.abs(in_ego[:, 1] - 1.75) < 2.5) & (np.abs(in_ego[:, 0]) < 15.0)
+    assert road.sum() > 1000
+    assert np.abs(np.median(in_ego[road, 2])) < 0.01
+
+
+def test_the_range_noise_is_two_centimetres(standing):
+    a, b = (standing.sweep(LIDAR, time)[0] for time in (0, 500_000))
+    by_beam = [
+        {
+            (int(p[4]), round(float(np.arctan2(p[1], p[0])) / (2 * np.pi) * 10850)): float(np.linalg.norm(p[:3]))
+            for p in s
+        }
+        for s in (a.astype(np.float64), b.astype(np.float64))
+    ]
+    both = by_beam[0].keys() & by_beam[1].keys()
+    assert len(both) > 10_000
+    difference = np.array([by_beam[0][beam] - by_beam[1][beam] for beam in both])
+    assert difference.std() == pytest.approx(0.02 * np.sqrt(2), rel=0.05)
+    assert abs(difference.mean()) < 0.001
+
+
+def test_every_sweep_has_its_own_noise_and_the_same_one_every_time(standing):
+    first, again, later = (standing.sweep(LIDAR, time)[0] for time in (0, 0, 50_000))
+    np.testing.assert_array_equal(first, again)
+    assert len(first) != len(later) or not np.array_equal(first, later)
+
+
+def test_returns_are_counted_by_the_thing_they_come_from(standing):
+    points, counts = standing.sweep(LIDAR, 0)
+    assert counts.shape == (len(standing.things),) and counts.sum() == len(points)
+    scenery = [thing.name for thing in standing.things].index("scenery")
+    assert counts[scenery] > 0.8 * len(points)
+    assert (counts > 0).sum() > 3, "parked cars return some"
+
+
+def test_between_key_frames_the_lidar_turns_at_20_hz():
+    times = firing_times(LIDAR, 3, sweeps=True)
+    assert [time for time, _, _ in times] == list(range(0, 1_000_001, 50_000))
+    assert [index for _, _, index in times] == [0] + [1] * 10 + [2] * 10
+    assert [time for time, is_key, _ in times if is_key] == [0, 500_000, 1_000_000]
+    assert firing_times(LIDAR, 3, sweeps=False) == [(0, True, 0), (500_000, True, 1), (1_000_000, True, 2)]

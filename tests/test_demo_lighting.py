@@ -1,0 +1,162 @@
+"""Light and cameras of the demo world, against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drivesplat.demo import bodies
+from drivesplat.demo.bodies import Material
+from drivesplat.demo.imaging import Camera, central_hits, developed, photograph
+from drivesplat.demo.lighting import daylight, lamplight
+from drivesplat.demo.raycast import Stage
+from drivesplat.demo.street import Thing
+from drivesplat.demo.traffic import Motion
+
+SUN_HEIGHT = math.radians(50)
+SUN = np.array([math.cos(SUN_HEIGHT), 0.0, math.sin(SUN_HEIGHT)])
+LIGHT = daylight(np.random.default_rng(0))._replace(sun_direction=SUN, clouds=0.0)
+DARK = LIGHT._replace(sun=np.zeros(3))
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""An OpenCV camera that looks down: its x along the street's."""
+
+
+def floor(top: float = 0.0) -> Thing:
+    """A white plane; PLAIN's mottle fades where one pixel sees metres of it."""
+    body = bodies.box((-50.0, -50.0, top - 1.0), (50.0, 50.0, top), Material.PLAIN, (1.0, 1.0, 1.0))
+    return Thing("floor", body, Motion(0.0, 0.0))
+
+
+def roof(at: float) -> Thing:
+    body = bodies.box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0))
+    return Thing("roof", body, Motion(0.0, 0.0))
+
+
+def one_pixel(rotation: np.ndarray, height: float, focal: float = 0.1) -> Camera:
+    """A camera of one pixel above the origin that looks straight along its axis."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[2, 3] = rotation, height
+    return Camera(np.diag([focal, focal, 1.0]), pose, 1, 1)
+
+
+def radiance(things: list[Thing], light, camera: Camera) -> np.ndarray:
+    return photograph(Stage(things, 0.0), light, camera, 1)[0, 0]
+
+
+def hazy(value: np.ndarray, distance: float) -> np.ndarray:
+    haze = 1.0 - math.exp(-distance / 900.0)
+    return (1.0 - haze) * value + haze * LIGHT.horizon
+
+
+def test_a_white_plane_in_the_sun_sends_back_sun_times_cosine_and_the_sky():
+    expected = hazy(math.sin(SUN_HEIGHT) * LIGHT.sun + LIGHT.sky, 4.0)
+    np.testing.assert_allclose(radiance([floor()], LIGHT, one_pixel(DOWN, 4.0)), expected, rtol=1e-5)
+
+
+def test_in_the_shadow_the_sky_alone_is_left():
+    shading = roof(5.0 / math.tan(SUN_HEIGHT))
+    expected = hazy(LIGHT.sky, 4.0)
+    np.testing.assert_allclose(radiance([floor(), shading], LIGHT, one_pixel(DOWN, 4.0)), expected, rtol=1e-5)
+
+
+def test_what_stands_on_the_other_side_of_the_sun_shades_nothing():
+    lit = radiance([floor()], LIGHT, one_pixel(DOWN, 4.0))
+    beside = roof(-5.0 / math.tan(SUN_HEIGHT))
+    np.testing.assert_array_equal(radiance([floor(), beside], LIGHT, one_pixel(DOWN, 4.0)), lit)
+
+
+@pytest.mark.parametrize("elevation", [0.0, 10.0, 35.0, 90.0])
+def test_without_a_surface_there_is_the_sky_of_that_direction(elevation):
+    up = math.sin(math.radians(elevation))
+    direction = np.array([0.0, math.sqrt(1 - up * up), up])
+    side = np.array([1.0, 0.0, 0.0])
+    rotation = np.stack([side, np.cross(direction, side), direction], axis=1)
+    blend = 1.0 - math.exp(-4.0 * up)
+    expected = LIGHT.horizon + blend * (LIGHT.zenith - LIGHT.horizon)
+    expected = expected + 0.3 * max(0.0, float(direction @ SUN)) ** 60 * LIGHT.sun
+    found = radiance([floor(-100.0)], LIGHT, one_pixel(rotation, 500.0))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_by_day_clouds_whiten_some_of_the_sky():
+    camera = Camera(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), np.eye(4), 41, 41)
+    clear, cloudy = (photograph(Stage([floor(-100.0)], 0.0), DARK._replace(clouds=c), camera, 1) for c in (0.0, 0.8))
+    changed = np.abs(clear - cloudy).max(axis=2) > 0.01
+    assert 0.05 < changed.mean() < 0.95
+    assert (cloudy[changed].std(axis=1) < clear[changed].std(axis=1)).all()
+
+
+def test_a_street_lamp_lights_what_lies_below_it_by_the_inverse_square():
+    lamps = np.array([[0.0, 0.0, 6.0]])
+    night = lamplight(lamps, np.eye(4))._replace(headlight=0.0)
+    found = radiance([floor()], night, one_pixel(DOWN, 4.0))
+    squared = 36.0 + 1.0  # lamps are not points: one metre squared is added
+    facing = (6.0 / math.sqrt(squared)) ** 2
+    haze = 1.0 - math.exp(-4.0 / 900.0)
+    expected = (1 - haze) * (night.lamp * facing / squared + night.sky) + haze * night.horizon
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_headlights_shine_ahead_and_not_behind():
+    ego = np.eye(4)
+    night = lamplight(np.zeros((0, 3)), ego)
+    wall = {
+        x: Thing("wall", bodies.box((x, -9.0, -9.0), (x + 1.0, 9.0, 9.0), Material.PLAIN, (1.0,) * 3), Motion(0.0, 0.0))
+        for x in (20.0, -21.0)
+    }
+    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    backward = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    ahead = radiance([wall[20.0]], night, one_pixel(forward, 0.7))
+    behind = radiance([wall[-21.0]], night, one_pixel(backward, 0.7))
+    distance = 20.0 - 3.6
+    assert ahead[0] - behind[0] == pytest.approx(90.0 / (distance**2 + 1), rel=0.1)
+
+
+def test_development_is_a_gamma_of_the_exposed_radiance():
+    radiances = np.array([[[0.0, 0.5, 1.0]], [[-0.1, 5.0, 1.0 / 0.62]]])
+    expected = [0.0, 255 * 0.31 ** (1 / 2.2), 255 * 0.62 ** (1 / 2.2), 0.0, 255.0, 255.0]
+    found = developed(radiances)
+    assert found.dtype == np.uint8
+    np.testing.assert_allclose(found.ravel(), expected, atol=0.51)
+
+
+def test_sensor_noise_has_the_stated_strength():
+    grey = np.full((60, 60, 3), 0.4)
+    noisy = developed(grey, 0.02, np.random.default_rng(0)).astype(float)
+    assert noisy.mean() == pytest.approx(float(developed(grey)[0, 0, 0]), abs=0.6)
+    assert noisy.std() == pytest.approx(0.02 * 255, rel=0.05)
+
+
+def test_depth_is_along_the_axis_and_infinite_in_the_sky():
+    camera = Camera(np.array([[10.0, 0, 10], [0, 10.0, 10], [0, 0, 1]]), one_pixel(DOWN, 4.0).camera_to_street, 21, 21)
+    depth, things = central_hits(Stage([floor()], 0.0), camera)
+    np.testing.assert_allclose(depth, 4.0, rtol=1e-5)
+    assert (things == 0).all()
+    upward = Camera(camera.intrinsics, one_pixel(np.eye(3), 4.0).camera_to_street, 21, 21)
+    depth, things = central_hits(Stage([floor()], 0.0), upward)
+    assert np.isinf(depth).all() and (things == -1).all()
+
+
+def test_one_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
+    camera = Camera(np.array([[50.0, 0, 2], [0, 50.0, 1], [0, 0, 1]]), np.eye(4), 5, 3)
+
+    def pixels(samples: int) -> np.ndarray:
+        rays = camera.rays(slice(0, 3), samples)
+        return (rays[:, :2] / rays[:, 2:] * 50.0 + [2, 1]).reshape(3, 5, samples, 2)
+
+    x, y = np.meshgrid(np.arange(5), np.arange(3))
+    np.testing.assert_allclose(pixels(1)[:, :, 0], np.stack([x, y], axis=-1), atol=1e-9)
+    within = pixels(16) - np.stack([x, y], axis=-1)[:, :, None]
+    assert np.abs(within).max() <= 0.5
+    np.testing.assert_allclose(within.mean(axis=2), 0.0, atol=0.1)
+    quarters = (within[0, 0] > 0) @ [1, 2]
+    assert np.bincount(quarters, minlength=4).min() >= 2
+
+
+def test_more_samples_smooth_edges_and_keep_the_mean():
+    wall = bodies.box((-50.0, 0.3, -9.0), (50.0, 20.0, 9.0), Material.PLAIN, (0.0, 0.0, 0.0))
+    things = [Thing("wall", wall, Motion(0.0, 0.0))]
+    camera = Camera(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), one_pixel(DOWN, 30.0).camera_to_street, 41, 41)
+    sharp, smooth = (photograph(Stage(things, 0.0), LIGHT, camera, samples)[..., 0] for samples in (1, 16))
+    assert len(np.unique(smooth.round(2))) > len(np.unique(sharp.round(2)))
+    assert smooth.mean() == pytest.approx(sharp.mean(), rel=0.1)

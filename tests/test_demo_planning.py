@@ -1,0 +1,80 @@
+"""What the workflow knows of a synthetic world: its tables are made, it stays out of the batch, a CPU will do."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from drivesplat.config import load
+from drivesplat.device import choose_device
+from drivesplat.planning import Plan
+from drivesplat.readers.nuscenes_layout import TABLES
+from drivesplat.settings.device import DeviceSettings
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+def plan(**config) -> Plan:
+    return Plan(config, str(REPOSITORY))
+
+
+def scene(name: str) -> SimpleNamespace:
+    return SimpleNamespace(scene=name)
+
+
+@pytest.mark.parametrize(
+    ("written", "synthetic", "recorded"),
+    [("auto", "any", "auto"), ("any", "any", "any"), ("cuda", "cuda", "cuda"), ("cpu", "cpu", "cpu")],
+)
+def test_auto_makes_do_with_the_cpu_for_synthetic_worlds_alone(written, synthetic, recorded):
+    made = plan(device=written)
+    assert json.loads(made.device(scene("demo")))["kind"] == synthetic
+    assert json.loads(made.device(scene("0103")))["kind"] == recorded
+
+
+def test_without_a_word_about_the_device_the_demo_makes_do_with_the_cpu():
+    assert json.loads(plan().device(scene("demo")))["kind"] == "any"
+    assert json.loads(plan().device(scene("0103")))["kind"] == "auto"
+
+
+def test_the_demo_asks_for_little_gpu_memory_and_keeps_the_rest_of_the_device():
+    told = json.loads(plan(device={"kind": "cuda", "min_free_gb": 6, "max_gb": 10}).device(scene("demo")))
+    assert told == {"kind": "cuda", "min_free_gb": 1.0, "max_gb": 10.0}
+
+
+def test_any_device_without_a_gpu_is_the_cpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device(DeviceSettings(kind="any")) == torch.device("cpu")
+
+
+def test_the_demo_is_there_by_default_and_out_of_the_batch():
+    config = load({})
+    assert "demo" in config.scenes and "demo" not in config.batch_scenes
+    assert config.batch_scenes == [s for s in config.scenes if s != "demo"]
+    assert plan().report_scenes([]) == config.batch_scenes
+
+
+def test_a_world_can_be_part_of_the_batch():
+    datasets = {"made": {"dataroot": "resources/made", "scenes": ["made"], "world": {}}}
+    assert load({"datasets": datasets}).batch_scenes == ["made"]
+
+
+def test_a_world_is_known_by_its_folder_of_tables(tmp_path):
+    datasets = {
+        "a": {"dataroot": str(tmp_path / "a"), "scenes": ["a"], "world": {"random_seed": 5}},
+        "b": {"dataroot": str(tmp_path / "b"), "version": "v1.0-trainval", "scenes": ["b"], "world": {}},
+        "real": {"dataroot": str(tmp_path / "real"), "scenes": ["0001"]},
+    }
+    made = plan(datasets=datasets)
+    assert made.worlds == {f"{tmp_path}/a/v1.0-mini": "a", f"{tmp_path}/b/v1.0-trainval": "b"}
+    told = json.loads(made.world_settings(SimpleNamespace(tables=f"{tmp_path}/a/v1.0-mini")))
+    assert (told["scene"], told["world"]["random_seed"]) == ("a", 5)
+
+
+def test_the_tables_a_scene_of_a_world_needs_are_those_that_the_world_makes(tmp_path):
+    datasets = {"a": {"dataroot": str(tmp_path / "a"), "scenes": ["a"], "world": {}}}
+    made = plan(datasets=datasets)
+    assert made.tables(scene("a")) == [f"{tmp_path}/a/v1.0-mini/{table}.json" for table in made.world_tables]
+    assert set(made.world_tables) == set(TABLES) and len(TABLES) == 13
