@@ -1,0 +1,57 @@
+"""What a metrics.json says, in sentences."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from drivesplat.evaluation.in_words import in_words
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+def method(**groups) -> dict:
+    empty = {"gap_db": None, "static": None, "moving_vehicle": None}
+    return {
+        "interpolation": groups.get("interpolation", empty), "extrapolation": groups.get("extrapolation", empty),
+        "gaussians": 40000, "train_seconds": 91.4, "device": "cpu (x86_64)",
+    }  # fmt: skip
+
+
+def group(static: float | None, moving: float | None) -> dict:
+    gap = static - moving if moving is not None else None
+    return {
+        "gap_db": gap, "static": {"psnr": static}, "moving_vehicle": {"psnr": moving} if moving is not None else None
+    }  # fmt: skip
+
+
+def test_each_group_is_a_sentence_with_its_gap():
+    metrics = {"methods": {"vanilla": method(interpolation=group(27.1, 16.0), extrapolation=group(22.0, 12.5))}}
+    lines = in_words(metrics, "results/demo/metrics.json")
+    assert "vanilla, frames between training frames: static 27.1 dB, moving vehicles 16.0 dB: a gap of 11.1 dB" in lines
+    assert (
+        "vanilla, frames beyond the last training frame: static 22.0 dB, moving vehicles 12.5 dB: a gap of 9.5 dB"
+        in lines
+    )
+    assert "vanilla: 40,000 Gaussians, trained in 91 s on cpu (x86_64)" in lines
+    assert "results/demo/metrics.json" in lines[-1] and "results/demo" in lines[-1].rpartition(" ")[2]
+
+
+def test_a_group_that_is_off_is_not_spoken_of():
+    lines = in_words({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}, "m.json")
+    assert not any("beyond" in line for line in lines)
+
+
+def test_a_scene_where_nothing_moves_has_no_gap():
+    lines = in_words({"methods": {"vanilla": method(interpolation=group(27.1, None))}}, "m.json")
+    assert lines[0].endswith("static 27.1 dB, no moving vehicle to compare with")
+
+
+def test_the_command_line_prints_it_and_names_a_missing_file(tmp_path):
+    file = tmp_path / "metrics.json"
+    command = [sys.executable, "-m", "drivesplat.evaluation.in_words", str(file)]
+    absent = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert absent.returncode and str(file) in absent.stderr and "Traceback" not in absent.stderr
+    file.write_text(json.dumps({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}))
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert "a gap of 11.1 dB" in done.stdout

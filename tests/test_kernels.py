@@ -1,0 +1,52 @@
+"""Compiled functions: what is kept on disk goes when anything compiled into it changes."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+CALLEE = "from drivesplat.kernels import kernel\n\nSCALE = {scale}\n\n\n@kernel\ndef scaled(x):\n    return SCALE * x\n"
+CALLER = (
+    "from drivesplat.kernels import kernel\nfrom drivesplat.callee import SCALE, scaled\n\n\n"
+    "@kernel\ndef total(x):\n    return scaled(x) + SCALE\n"
+)
+SHOW = "from drivesplat.caller import total\nprint(total(10.0))\nprint(sum(total.stats.cache_hits.values()))\n"
+
+
+def small_package(root: Path) -> Path:
+    """A package of this one's name with nothing but kernels in it: its digests see what a kernel imports."""
+    package = root / "drivesplat"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    for name in ("kernels", "rerun"):
+        (package / f"{name}.py").write_text((Path(__file__).parents[1] / "drivesplat" / f"{name}.py").read_text())
+    (package / "caller.py").write_text(CALLER)
+    return package
+
+
+def show(root: Path, **environment: str) -> tuple[float, int]:
+    """The kernel's value in a fresh process, and how often it was found on disk."""
+    env = {**{k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}, "PYTHONPATH": str(root), **environment}
+    done = subprocess.run([sys.executable, "-c", SHOW], env=env, cwd=root, capture_output=True, text=True, check=True)
+    value, hits = done.stdout.split()
+    return float(value), int(hits)
+
+
+def test_what_was_compiled_is_kept_until_an_imported_constant_changes(tmp_path):
+    package = small_package(tmp_path)
+    (package / "callee.py").write_text(CALLEE.format(scale=2.0))
+    assert show(tmp_path) == (22.0, 0)
+    assert show(tmp_path) == (22.0, 1)
+    (package / "callee.py").write_text(CALLEE.format(scale=3.0))
+    assert show(tmp_path) == (33.0, 0), "numba alone would have kept 22"
+    kept = [path.name.rpartition("-")[0] for path in (package / "__pycache__").glob("kernels-*")]
+    assert sorted(kept) == ["kernels-callee", "kernels-caller"], "what earlier code left is removed"
+
+
+def test_a_folder_that_is_named_for_the_cache_is_used(tmp_path):
+    package = small_package(tmp_path)
+    (package / "callee.py").write_text(CALLEE.format(scale=2.0))
+    elsewhere = tmp_path / "cache"
+    show(tmp_path, NUMBA_CACHE_DIR=str(elsewhere))
+    assert list(elsewhere.glob("kernels-caller-*")) and not list(package.glob("__pycache__/kernels-*"))
+    assert show(tmp_path, NUMBA_CACHE_DIR=str(elsewhere)) == (22.0, 1)
