@@ -4,7 +4,9 @@ numba itself looks at the time of a function's own file alone, and would keep wh
 or callee for ever.
 """
 
+import os
 import shutil
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -13,13 +15,17 @@ from typing import Any
 import numba
 
 from drivesplat.rerun import code_digest
+from drivesplat.storage import sha256_text
+
+KEPT_S = 14 * 24 * 3600
+"""How long (seconds) what earlier code compiled is kept: another run may still be at it."""
 
 
 def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Callable[..., Any]:
     """Compiles a function (or makes a decorator that does) to run without the GIL.
 
-    What has been compiled is kept in NUMBA_CACHE_DIR, or beside the file. Where numba finds no place to write, neither
-    there nor in the user's cache, each process compiles anew.
+    What has been compiled is kept in NUMBA_CACHE_DIR, or beside the file, or in the user's cache. Where none of these
+    can be written, each process compiles anew.
     """
     if function is None:
         return lambda f: kernel(f, fastmath=fastmath)
@@ -35,11 +41,20 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
 
 
 def _cache_folder(file: Path, given: str) -> Path:
-    """The folder for what is compiled from `file` and the code it imports; those of earlier code are removed."""
-    parent = Path(given) if given else file.parent / "__pycache__"
-    folder = parent / f"kernels-{file.stem}-{code_digest(file)[:16]}"
-    if not folder.exists():
-        for earlier in parent.glob(f"kernels-{file.stem}-*"):
-            with suppress(OSError):
+    """The folder for what is compiled from `file` and the code it imports, below the first that can be written of
+    `given`, __pycache__ beside the file, and the user's cache. What earlier code left there weeks ago is removed."""
+    beside, users = file.parent / "__pycache__", Path.home() / ".cache" / "drivesplat"
+    parent = Path(given) if given else next((folder for folder in (beside, users) if _writable(folder)), beside)
+    name = f"kernels-{file.stem}-{sha256_text(str(file))[:8]}"
+    folder = parent / f"{name}-{code_digest(file)[:16]}"
+    for earlier in parent.glob(f"{name}-*"):
+        with suppress(OSError):
+            if earlier != folder and time.time() - earlier.stat().st_mtime > KEPT_S:
                 shutil.rmtree(earlier)
     return folder
+
+
+def _writable(folder: Path) -> bool:
+    """Whether a file can be made in a folder, or in the one that it would be made in."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    return os.access(there, os.W_OK | os.X_OK)

@@ -61,18 +61,16 @@ class Plan:
 
     @property
     def worlds(self) -> dict[str, str]:
-        """The scenes of synthetic worlds, by the folder of tables that each is made in."""
-        made = [dataset for dataset in self.config.datasets.values() if dataset.world]
-        return {f"{dataset.world_root}/{dataset.version}": dataset.scenes[0] for dataset in made}
+        """The scenes of synthetic worlds, by the names of their datasets."""
+        return {name: dataset.scenes[0] for name, dataset in self.config.datasets.items() if dataset.world}
 
-    @property
-    def world_tables(self) -> tuple[str, ...]:
-        """The names of the tables that a world consists of."""
-        return layout("nuscenes").TABLES
+    def world_tables(self, dataset: str) -> list[str]:
+        """The files that a synthetic world consists of, as far as rules know them."""
+        return self.tables(SimpleNamespace(scene=self.worlds[dataset]))
 
-    def world_settings(self, wildcards: Any) -> str:
-        """The settings of the world whose folder of tables is `wildcards.tables`."""
-        return stage_settings(self.config, "demo_world", self.worlds[wildcards.tables])
+    def world_settings(self, dataset: str) -> str:
+        """The settings of a dataset's synthetic world."""
+        return stage_settings(self.config, "demo_world", self.worlds[dataset])
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, where given."""
@@ -121,9 +119,7 @@ class Plan:
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError, listing what there is, where a target names a scene or method the config does not."""
         for target in targets:
-            if not target.startswith(f"{self.config.results_dir}/"):
-                continue
-            scene, *rest = target.removeprefix(f"{self.config.results_dir}/").split("/")
+            scene, *rest = self._inside_results(target)
             if not rest:
                 continue
             self.config.dataset_of(scene)
@@ -142,16 +138,22 @@ class Plan:
     def _scenes_of(self, targets: list[str]) -> list[str]:
         """The scenes that targets need; those of the batch where a target does not say."""
         scenes = [self._scene_of(target) for target in targets]
-        if not scenes or any(scene not in self.config.scenes for scene in scenes):
+        if not scenes or any(scene is not None and scene not in self.config.scenes for scene in scenes):
             return self.report_scenes(targets)
-        return scenes
+        return [scene for scene in scenes if scene is not None]
 
     def _scene_of(self, target: str) -> str | None:
-        """The scene whose file a target is."""
-        results = f"{self.config.results_dir}/"
-        if target.startswith(results):
-            return target.removeprefix(results).split("/")[0]
-        return next((scene for tables, scene in self.worlds.items() if target.startswith(f"{tables}/")), None)
+        """The scene whose file a target is: empty for a rule's name, None for a file that is no scene's result, of
+        which Snakemake knows whether it can be made."""
+        for dataset, scene in self.worlds.items():
+            if os.path.normpath(target) in map(os.path.normpath, self.world_tables(dataset)):
+                return scene
+        return self._inside_results(target)[0] or (None if os.sep in target else "")
+
+    def _inside_results(self, target: str) -> list[str]:
+        """The parts of a target's path below the results folder; an empty one where it lies elsewhere."""
+        path, results = (Path(os.path.normpath(name)) for name in (target, self.config.results_dir))
+        return list(path.relative_to(results).parts) or [""] if path.is_relative_to(results) else [""]
 
     def hold_results(self) -> None:
         """Keeps a second run out of the results folder until this process ends, however it ends.

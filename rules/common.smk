@@ -36,7 +36,6 @@ pathvars:
 wildcard_constraints:
     scene=plan.known(plan.config.scenes),
     method=plan.known(plan.config.methods),
-    tables=plan.known(plan.worlds),
 
 
 onstart:

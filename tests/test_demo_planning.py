@@ -9,6 +9,7 @@ import torch
 
 from drivesplat.config import load
 from drivesplat.device import choose_device
+from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.planning import Plan
 from drivesplat.readers.nuscenes_layout import TABLES
 from drivesplat.settings.device import DeviceSettings
@@ -61,20 +62,40 @@ def test_a_world_can_be_part_of_the_batch():
     assert load({"datasets": datasets}).batch_scenes == ["made"]
 
 
-def test_a_world_is_known_by_its_folder_of_tables(tmp_path):
+def test_a_world_is_known_by_its_dataset(tmp_path):
     datasets = {
         "a": {"dataroot": str(tmp_path / "a"), "scenes": ["a"], "world": {"random_seed": 5}},
         "b": {"dataroot": str(tmp_path / "b"), "version": "v1.0-trainval", "scenes": ["b"], "world": {}},
         "real": {"dataroot": str(tmp_path / "real"), "scenes": ["0001"]},
     }
     made = plan(datasets=datasets)
-    assert made.worlds == {f"{tmp_path}/a/v1.0-mini": "a", f"{tmp_path}/b/v1.0-trainval": "b"}
-    told = json.loads(made.world_settings(SimpleNamespace(tables=f"{tmp_path}/a/v1.0-mini")))
+    assert made.worlds == {"a": "a", "b": "b"}
+    assert {str(Path(table).parent) for table in made.world_tables("b")} == {f"{tmp_path}/b/v1.0-trainval"}
+    told = json.loads(made.world_settings("a"))
     assert (told["scene"], told["world"]["random_seed"]) == ("a", 5)
 
 
 def test_the_tables_a_scene_of_a_world_needs_are_those_that_the_world_makes(tmp_path):
     datasets = {"a": {"dataroot": str(tmp_path / "a"), "scenes": ["a"], "world": {}}}
     made = plan(datasets=datasets)
-    assert made.tables(scene("a")) == [f"{tmp_path}/a/v1.0-mini/{table}.json" for table in made.world_tables]
-    assert set(made.world_tables) == set(TABLES) and len(TABLES) == 13
+    assert made.tables(scene("a")) == made.world_tables("a")
+    assert made.world_tables("a") == [f"{tmp_path}/a/v1.0-mini/{table}.json" for table in TABLES] and len(TABLES) == 13
+
+
+@pytest.mark.parametrize(
+    "target", ["results/demo/metrics.json", "./results/demo//metrics.json", "resources/x/scene.json"]
+)
+def test_a_target_that_needs_no_recorded_drive_is_not_refused_for_want_of_one(target, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    demo = {"dataroot": "resources/demo", "scenes": ["demo"], "world": {}, "batch": False}
+    made = plan(datasets={"nuscenes": {"dataroot": str(tmp_path / "nowhere")}, "demo": demo})
+    made.refuse_absent_data([target])
+    with pytest.raises(DatasetError, match="nowhere"):
+        made.refuse_absent_data(["./results/0103/metrics.json"])
+    with pytest.raises(DatasetError, match="nowhere"):
+        made.refuse_absent_data(["metrics"])
+
+
+def test_an_unknown_scene_is_refused_however_its_path_is_spelled():
+    with pytest.raises(ConfigError, match="9999"):
+        plan().refuse_unknown(["./results/9999/metrics.json"])

@@ -215,3 +215,22 @@ def test_width_sets_the_images_size_and_scales_the_intrinsics(width):
     scale = width / 1600
     assert camera.intrinsics[0, 0] == camera.intrinsics[1, 1] == pytest.approx(1266.4 * scale)
     np.testing.assert_allclose(camera.intrinsics[:2, 2] + 0.5, np.array([816.8, 492.0]) * scale)
+
+
+def test_walkers_keep_clear_of_lamps_bins_and_trees():
+    for seed in range(6):
+        recorder = Recorder(WorldSettings(random_seed=seed, pedestrians=6, vehicles=0))
+        scenery = recorder.things[0].body.vertices
+        feet = scenery[(scenery[:, 2] > -0.01) & (scenery[:, 2] < 0.01)][:, :2]
+        walkers = [thing for thing in recorder.things if thing.walks]
+        assert len(walkers) == 6
+        for walker in walkers:
+            for seconds in np.arange(0.0, 20.0, 0.2):
+                beside = np.abs(feet - walker.motion.pose_at(float(seconds))[:2, 3]) < walker.body.size[:2] / 2
+                assert not beside.all(axis=1).any(), (seed, walker.name, seconds)
+
+
+def test_walkers_that_nothing_hides_are_wholly_visible():
+    recorder = Recorder(WorldSettings(pedestrians=6, vehicles=0, parked=0, key_frames=8, **SMALL))
+    walkers = [number for number, thing in enumerate(recorder.things) if thing.walks]
+    assert np.median([recorder.visible_fractions(index)[walkers] for index in (1, 4, 7)]) > 0.95

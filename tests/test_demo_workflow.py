@@ -60,7 +60,7 @@ def test_a_second_call_plans_nothing(finished):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"world": {"random_seed": 5}}, {"demo_world": 1, **AFTER_THE_WORLD}),
+        ({"world": {"random_seed": 5}}, {"demo_world_demo": 1, **AFTER_THE_WORLD}),
         ({"overrides": {"train": {"iterations": 31}}}, {"train": 1, "evaluate": 1, "scene_metrics": 1}),
         ({"device": {"kind": "cpu"}, "batch": True}, {}),
     ],

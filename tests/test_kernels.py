@@ -18,7 +18,7 @@ def small_package(root: Path) -> Path:
     package = root / "drivesplat"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    for name in ("kernels", "rerun"):
+    for name in ("kernels", "rerun", "storage", "errors"):
         (package / f"{name}.py").write_text((Path(__file__).parents[1] / "drivesplat" / f"{name}.py").read_text())
     (package / "caller.py").write_text(CALLER)
     return package
@@ -39,8 +39,34 @@ def test_what_was_compiled_is_kept_until_an_imported_constant_changes(tmp_path):
     assert show(tmp_path) == (22.0, 1)
     (package / "callee.py").write_text(CALLEE.format(scale=3.0))
     assert show(tmp_path) == (33.0, 0), "numba alone would have kept 22"
-    kept = [path.name.rpartition("-")[0] for path in (package / "__pycache__").glob("kernels-*")]
-    assert sorted(kept) == ["kernels-callee", "kernels-caller"], "what earlier code left is removed"
+
+
+def test_what_earlier_code_left_goes_after_two_weeks_and_not_before(tmp_path):
+    package = small_package(tmp_path)
+    (package / "callee.py").write_text(CALLEE.format(scale=2.0))
+    show(tmp_path)
+    (package / "callee.py").write_text(CALLEE.format(scale=3.0))
+    show(tmp_path)
+    folders = sorted((package / "__pycache__").glob("kernels-caller-*"), key=lambda path: path.stat().st_mtime)
+    assert len(folders) == 2, "another run may still use the earlier one"
+    weeks_ago = folders[0].stat().st_mtime - 15 * 24 * 3600
+    for folder in folders:
+        os.utime(folder, (weeks_ago, weeks_ago))
+    assert show(tmp_path) == (33.0, 1)
+    assert list((package / "__pycache__").glob("kernels-caller-*")) == [folders[1]]
+
+
+def test_where_the_installation_cannot_be_written_the_users_cache_is_used_just_as_carefully(tmp_path):
+    package = small_package(tmp_path)
+    (package / "callee.py").write_text(CALLEE.format(scale=2.0))
+    (package / "__pycache__").write_text("a file, so that nothing can be written below it")
+    home = tmp_path / "home"
+    home.mkdir()
+    assert show(tmp_path, HOME=str(home)) == (22.0, 0)
+    assert show(tmp_path, HOME=str(home)) == (22.0, 1)
+    (package / "callee.py").write_text(CALLEE.format(scale=3.0))
+    assert show(tmp_path, HOME=str(home)) == (33.0, 0)
+    assert len(list((home / ".cache" / "drivesplat").glob("kernels-caller-*"))) == 2
 
 
 def test_a_folder_that_is_named_for_the_cache_is_used(tmp_path):

@@ -463,6 +463,12 @@ def test_a_scene_without_lidar_stops_unless_told_to_go_on(tiny_scene):
     assert (seed.note["lidar"], seed.note["far"]) == (0, 200)
 
 
+def test_a_hold_out_that_takes_all_key_frames_is_named(tiny_scene):
+    everything = job().model_copy(update={"holdout": HoldoutSettings(last_block=10)})
+    with pytest.raises(DatasetError, match=r"0001.*none of its 10 key frames.*holdout\.last_block"):
+        seed_points(tiny_scene, everything)
+
+
 def test_nothing_to_start_from_is_an_error_that_says_so(tiny_scene):
     scene = dataclasses.replace(tiny_scene, sweeps=())
     with pytest.raises(DatasetError, match=r"0001.*no seed points.*far_points"):

@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from drivesplat.demo.bodies import Body
 from drivesplat.demo.imaging import Camera, central_hits, developed, photograph
 from drivesplat.demo.lidar import revolution
 from drivesplat.demo.lighting import Light, daylight, lamplight
@@ -102,7 +103,7 @@ class Recorder:
         for number, thing in enumerate(self.things):
             if thing.category is None:
                 continue
-            points = apply(stage.poses[number], self._surface_points(thing))
+            points = apply(stage.poses[number], _surface_points(thing.body_at(seconds)))
             pixels, depth = project(points, inverse(camera.camera_to_street), camera.intrinsics)
             inside = (
                 (depth > 0.1)
@@ -114,10 +115,6 @@ class Recorder:
             hits = stage.meet(camera.center, rays)
             seen[number] += (hits.thing == number).sum()
             aimed[number] += inside.sum()
-
-    def _surface_points(self, thing: Thing) -> np.ndarray:
-        mesh = trimesh.Trimesh(thing.body.vertices, thing.body.faces, process=False)
-        return trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0]
 
     def ego_to_global(self, seconds: float) -> np.ndarray:
         """The ego pose (4, 4) that the tables state."""
@@ -143,3 +140,8 @@ class Recorder:
     def _random(self, *name: str | int) -> np.random.Generator:
         words = [n if isinstance(n, int) else sum(ord(c) * 31**i for i, c in enumerate(n)) for n in name]
         return np.random.default_rng([self.world.random_seed, *(w % 2**32 for w in words)])
+
+
+def _surface_points(body: Body) -> np.ndarray:
+    mesh = trimesh.Trimesh(body.vertices, body.faces, process=False)
+    return trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0]

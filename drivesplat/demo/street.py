@@ -64,7 +64,7 @@ class Street:
 def build_street(world: WorldSettings) -> Street:
     """The street that the settings describe."""
     random = np.random.default_rng(world.random_seed)
-    lamp_places = np.array([(x, 6.6 * (-1) ** i) for i, x in enumerate(range(-30, 200, 24))], dtype=float)
+    lamp_places = np.array([(x, 6.5 * (-1) ** i) for i, x in enumerate(range(-30, 200, 24))], dtype=float)
     scenery = bodies.joined([*_ground(), *_houses(random), *_trees(random), *_furniture(lamp_places, random)])
     things = [Thing("scenery", scenery, Motion(0.0, 0.0)), *_parked(world.parked, random), *_cones()]
     vehicles = _vehicles(vehicle_motions(world.vehicles, world.ego == "drives"), random)
@@ -119,7 +119,7 @@ def _trees(random: np.random.Generator) -> list[Body]:
     trees = []
     for side in (-1, 1):
         for x in np.arange(LENGTH[0] + 6 * side, 190.0, 17.0):
-            place = (x + random.uniform(-2, 2), side * random.uniform(7.6, 8.6), 0.0)
+            place = (x + random.uniform(-2, 2), side * random.uniform(7.75, 8.6), 0.0)
             trees.append(bodies.tree(random.uniform(5.0, 8.0), random).moved(place))
     return trees
 
@@ -127,11 +127,11 @@ def _trees(random: np.random.Generator) -> list[Body]:
 def _furniture(lamp_places: np.ndarray, random: np.random.Generator) -> list[Body]:
     lamps = [bodies.street_lamp(6.5, -np.sign(y) * 1.5).moved((x, y, 0.0)) for x, y in lamp_places]
     signs = [
-        bodies.sign(color).moved((x + random.uniform(-3, 3), -6.6, 0.0))
+        bodies.sign(color).moved((x + random.uniform(-3, 3), -6.5, 0.0))
         for x, color in ((28.0, (0.6, 0.04, 0.03)), (44.5, (0.04, 0.1, 0.5)), (90.0, (0.6, 0.04, 0.03)))
     ]
     bins = [
-        bodies.cylinder((x, side * 6.7, 0), (x, side * 6.7, 0.95), 0.28, Material.PLAIN, (0.05, 0.12, 0.06))
+        bodies.cylinder((x, side * 6.4, 0), (x, side * 6.4, 0.95), 0.28, Material.PLAIN, (0.05, 0.12, 0.06))
         for x, side in ((17.0, 1), (52.0, -1), (81.0, 1), (110.0, -1))
     ]
     return [*lamps, *signs, *bins]

@@ -64,10 +64,11 @@ def vehicle_motions(count: int, ego_drives: bool) -> list[Motion]:
 
 
 def pedestrian_motions(count: int, random: np.random.Generator) -> list[Motion]:
-    """The ways of `count` people: along x on the right sidewalk, against it on the left, by turns."""
+    """The ways of `count` people: along x on the right sidewalk, against it on the left, by turns,
+    between lamps and trees."""
     motions = []
     for i in range(count):
         side = (-1) ** (i + 1)
-        x, y = 22.0 + 13.0 * i + random.uniform(-2, 2), side * random.uniform(6.8, 7.6)
+        x, y = 22.0 + 13.0 * i + random.uniform(-2, 2), side * random.uniform(7.02, 7.12)
         motions.append(Motion(x, y, -side * random.uniform(1.2, 1.6)))
     return motions

@@ -35,6 +35,11 @@ def seed_points(scene: Scene, job: SeedJob) -> PointCloud:
     """
     random = np.random.default_rng(job.random_seed)
     views = training_views(scene, job)
+    if not views:
+        raise DatasetError(
+            f"scene {scene.name}: the hold-out leaves none of its {len(scene.key_frame_timestamps)} key frames to "
+            "train on; lower holdout.last_block, or set holdout.every_nth: 0"
+        )
     lidar, times, missing = lidar_points(scene, job)
     extra = extra_points(scene, job.lidar_seed.points_file)
     positions = np.concatenate([lidar, extra])
@@ -56,7 +61,7 @@ def seed_points(scene: Scene, job: SeedJob) -> PointCloud:
     if len(positions) + len(far) == 0:
         raise DatasetError(
             f"scene {scene.name}: no seed points: "
-            "no LiDAR return is seen by a training image and lidar_seed.far_points is 0"
+            "no LiDAR return is seen by a training image, and there are no far points (lidar_seed.far_points)"
         )
     log.info("%d seed points: %s", len(positions) + len(far), note)
     return PointCloud(np.concatenate([positions, far]).astype(np.float32), np.concatenate([colors, far_colors]), note)

@@ -19,7 +19,7 @@ class WorldSettings(Settings):
     width: int = Field(400, ge=64, le=1600)
     """Width of all images in pixels; nuScenes has 1600. The height is 9/16 of it."""
     samples_per_pixel: int = Field(4, ge=1, le=64)
-    """Rays a pixel, spread evenly over it; each also looks for the sun."""
+    """Rays a pixel, spread evenly over it; by day each also looks for the sun."""
     key_frames: int = Field(20, ge=2, le=40)
     """Length of the drive; key frames come at 2 Hz, from all six cameras and the LiDAR."""
     sweeps: tuple[Channel, ...] = ("CAM_FRONT",)

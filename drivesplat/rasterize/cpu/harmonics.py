@@ -1,7 +1,7 @@
 """Colours from spherical harmonics, and their gradients.
 
 The real basis up to degree 3 with the signs of Kerbl et al. 2023; see Sloan, "Efficient Spherical Harmonic Evaluation"
-(JCGT 2013). Arithmetic, `no_type_check` and one file: as in projection.py.
+(JCGT 2013). Arithmetic and `no_type_check`: as in projection.py.
 """
 
 import math

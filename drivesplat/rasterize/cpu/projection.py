@@ -4,9 +4,8 @@ The covariance in the image is T Tᵀ with T = J W R S: scales S, rotation R, wo
 perspective division. With m the cross product of T's two rows its determinant is |m|², which neither cancels nor turns
 negative, as ac - b² does in float32 for needles.
 
-The arithmetic is in float64 whatever the tensors are. Every function that a kernel calls stands in the kernel's own
-file, since numba's cache notices changes in that file alone. `no_type_check` keeps the tests' shape checks off them:
-numba does not see through those.
+The arithmetic is in float64 whatever the tensors are. `no_type_check` keeps the tests' shape checks off compiled
+functions: numba does not see through those.
 """
 
 import math
