@@ -24,6 +24,7 @@ from drivesplat.seeding.far_points import far_points
 from drivesplat.seeding.seed import color_view, lidar_points, seed_points
 from drivesplat.seeding.sweeps import moving_boxes, outside_boxes, read_sweep, thin, without_own_car
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.tracks import Box, box_at
