@@ -7,7 +7,7 @@ import subprocess
 import sys
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -93,6 +93,22 @@ def test_too_little_free_memory_is_refused_with_both_numbers(a_gpu):
     assert "RTX 4090" in message
     assert "10.0 GB" in message and "12.5" in message
     assert "device.min_free_gb" in message and "train.cap_max" in message
+
+
+def test_what_makes_do_with_the_cpu_says_why_it_does(a_gpu, caplog):
+    assert choose_device(DeviceSettings(kind="any", min_free_gb=1.0)) == torch.device("cuda")
+    assert not caplog.records
+    assert choose_device(DeviceSettings(kind="any", min_free_gb=12.5)) == torch.device("cpu")
+    assert "going on with the CPU" in caplog.text and "12.5" in caplog.text
+
+
+@pytest.mark.parametrize(("max_gb", "fraction"), [(None, None), (6.0, 0.25), (48.0, 1.0)])
+def test_a_job_takes_no_more_memory_than_it_may(a_gpu, monkeypatch, max_gb, fraction):
+    limits = []
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda *_: SimpleNamespace(total_memory=24_000_000_000))
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", limits.append)
+    choose_device(DeviceSettings(max_gb=max_gb, min_free_gb=1.0))
+    assert limits == ([] if fraction is None else [fraction])
 
 
 @pytest.mark.parametrize(("asked", "enough"), [(10.0, True), (10.1, False), (0.0, True)])
