@@ -9,6 +9,7 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,11 @@ KEPT_S = 14 * 24 * 3600
 """How long (seconds) what earlier code compiled is kept: another run may still be at it."""
 
 
+OPTIONS = {"nogil": True, "error_model": "numpy"}
+callee = numba.njit(**OPTIONS)
+"""Compiles a function that kernels alone call: it is kept with them."""
+
+
 def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Callable[..., Any]:
     """Compiles a function (or makes a decorator that does) to run without the GIL.
 
@@ -29,7 +35,7 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
     """
     if function is None:
         return lambda f: kernel(f, fastmath=fastmath)
-    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+    options = {**OPTIONS, "fastmath": fastmath}
     given = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(_cache_folder(Path(function.__code__.co_filename), given))
     try:
@@ -40,6 +46,7 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
         numba.config.CACHE_DIR = given
 
 
+@cache
 def _cache_folder(file: Path, given: str) -> Path:
     """The folder for what is compiled from `file` and the code it imports, below the first that can be written of
     `given`, __pycache__ beside the file, and the user's cache. What earlier code left there weeks ago is removed."""

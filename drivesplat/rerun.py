@@ -19,7 +19,7 @@ def code_digest(script: str | Path) -> str:
     The meaning is the syntax tree without bare strings (docstrings, field comments). Imports inside functions count.
     """
     path = Path(script)
-    modules, waiting = {}, _imports(path, package="")
+    modules, waiting = {}, set(_imports(path, package=""))
     while waiting:
         name = waiting.pop()
         if name not in modules:
@@ -56,7 +56,8 @@ def _is_bare_string(statement: ast.AST) -> bool:
     )
 
 
-def _imports(path: Path, package: str) -> set[str]:
+@cache
+def _imports(path: Path, package: str) -> frozenset[str]:
     """The modules of this package that a file imports, packages on the way to them included."""
     names: set[str] = set()
     for node in ast.walk(_tree(path)):
@@ -69,7 +70,7 @@ def _imports(path: Path, package: str) -> set[str]:
             names.add(node.value)
     parts = (name.split(".") for name in names if name.split(".")[0] == PACKAGE)
     candidates = {".".join(p[: i + 1]) for p in parts for i in range(len(p))}
-    return {name for name in candidates if _file_of(name) is not None}
+    return frozenset(name for name in candidates if _file_of(name) is not None)
 
 
 def _names_a_module(value: object) -> bool:

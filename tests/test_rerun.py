@@ -96,7 +96,7 @@ def toy(tmp_path, monkeypatch) -> Path:
 
 def forget() -> None:
     """As a new process would: it reads every file anew."""
-    for remembered in (rerun._meaning, rerun._tree, rerun._file_of):
+    for remembered in (rerun._meaning, rerun._imports, rerun._tree, rerun._file_of):
         remembered.cache_clear()
 
 

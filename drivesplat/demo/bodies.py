@@ -194,7 +194,7 @@ def pedestrian(height: float, shirt: Color, trousers: Color, stride: float) -> B
         hand = (-0.8 * step, side * 0.27, hip)
         parts.append(cylinder((0, side * 0.24, shoulder), hand, 0.05, Material.CLOTH, shirt))
     body = joined(parts)
-    return replace(body, vertices=body.vertices * [1, 1, 1] + [0, 0, -min(0.0, body.vertices[:, 2].min())])
+    return body.moved((0.0, 0.0, -min(0.0, body.vertices[:, 2].min())))
 
 
 def tree(height: float, rng: np.random.Generator) -> Body:

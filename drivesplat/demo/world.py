@@ -60,7 +60,7 @@ def make_world(root: Path, job: WorldJob, provenance: dict[str, Any], workers: i
         lidar = {r.index: n for r, n in zip(recordings, counts, strict=True) if n is not None and r.is_key_frame}
         for index, fractions in enumerate(visible):
             _annotate(tables, recorder, index, fractions, lidar[index])
-        write_truth(root, recorder, job.scene, TRUTH_CAMERA, [truth for truth in truths if truth])
+        write_truth(root, recorder, job.scene, TRUTH_CAMERA, list(truths))
     tables.write(root, job.version)
     log.info("%d recordings, %d boxes in %s", len(recordings), len(tables.rows["sample_annotation"]), root)
 

@@ -5,14 +5,12 @@ gsplat's cut-offs: alpha at most 0.999, contributions under 1/255 dropped, a ray
 1e-4.
 """
 
-from typing import Any
-
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
 from drivesplat.errors import ConfigError
-from drivesplat.rasterize.rendering import Rendering
+from drivesplat.rasterize.rendering import Rendering, assembled
 
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1.0 / 255.0
@@ -50,20 +48,9 @@ def rasterize_reference(
         images.append(image)
         alphas.append(alpha)
     image, alpha = torch.stack(images), torch.stack(alphas)
-    info: dict[str, Any] = {
-        "means2d": means2d,
-        "radii": radii,
-        "depths": depths,
-        "conics": conics,
-        "opacities": opacities2d,
-        "width": width,
-        "height": height,
-        "n_cameras": len(viewmats),
-        "gaussian_ids": None,
-    }
-    if not with_depth:
-        return Rendering(image, alpha, None, info)
-    return Rendering(image[..., :-1], alpha, image[..., -1:] / alpha.clamp(min=1e-10), info)
+    return assembled(
+        image, alpha, with_depth, means2d=means2d, radii=radii, depths=depths, conics=conics, opacities=opacities2d
+    )
 
 
 def _project(means: Tensor, covars: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, ...]:

@@ -10,11 +10,10 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels import kernel
+from drivesplat.kernels import callee, kernel
 from drivesplat.rasterize.cpu.projection import arrays
 from drivesplat.rasterize.cpu.threads import parallel_for
 
@@ -83,7 +82,7 @@ def _center(viewmat: Float[Tensor, "4 4"]) -> np.ndarray:
     return -view[:3, :3].T @ view[:3, 3]
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _direction(mean, center):
     """The unit vector from the camera to `mean`, and their distance."""
@@ -92,7 +91,7 @@ def _direction(mean, center):
     return x / distance, y / distance, z / distance, distance
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _basis(degree, x, y, z, basis):
     basis[0] = C0
@@ -109,7 +108,7 @@ def _basis(degree, x, y, z, basis):
         basis[12] = C30 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _basis_backward(degree, x, y, z, v):
     """The gradient of x, y and z, taken as independent, from that of the basis."""
@@ -131,7 +130,7 @@ def _basis_backward(degree, x, y, z, v):
     return v_x, v_y, v_z
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _color(basis, used, coefficients):
     """Red, green and blue before they are held above 0."""

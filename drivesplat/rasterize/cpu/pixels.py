@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit, types
 from numba.extending import overload
 
-from drivesplat.kernels import kernel
+from drivesplat.kernels import OPTIONS, callee, kernel
 from drivesplat.rasterize.cpu import tiles
 from drivesplat.rasterize.cpu.gradients import MOMENTS
 
@@ -33,7 +33,7 @@ OUT = 4
 """Plane of alpha in the forward pass, which the channels follow."""
 RAW, VALUE, REST, GRADIENT = range(4, 8)
 """Planes of the backward pass; GRADIENT is alpha's, which the channels' follow."""
-FAST = {"reassoc", "contract", "nsz", "arcp"}
+fast_callee = njit(**OPTIONS, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 
 def _exp(x):
@@ -70,7 +70,7 @@ def _at(plane):
     return np.uint64(plane * PIXELS)
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _rows(shape, x0, y0):
     """First and last pixel (excluded) of a tile's rows that a Gaussian reaches; the tile's corner is `x0`, `y0`."""
@@ -96,7 +96,7 @@ def _rows(shape, x0, y0):
     return np.uint64(int(begin) * (ROWS * tiles.TILE_WIDTH)), np.uint64(int(end) * (ROWS * tiles.TILE_WIDTH))
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _begin_tile(s, x0, y0, width, height):
     """Coordinates of the pixels' centres, and transmittance: 1, and 0 beyond the image."""
@@ -106,7 +106,7 @@ def _begin_tile(s, x0, y0, width, height):
         s[TRANSMITTANCE * PIXELS + p] = 1.0 if x < width and y < height else 0.0
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _ended(s):
     """Whether no ray of the tile is left."""
@@ -116,7 +116,7 @@ def _ended(s):
     return total == 0
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@fast_callee
 @no_type_check
 def _alpha(dx, dy, a, b, c, opacity):
     """The opacity that a Gaussian has at an offset from its centre, before it is held at 0.999; 0 below 1/255."""
@@ -129,7 +129,7 @@ def _alpha(dx, dy, a, b, c, opacity):
     return alpha if (exponent <= zero) & (alpha >= real(tiles.MIN_ALPHA)) else zero
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@fast_callee
 @no_type_check
 def _weigh(s, begin, end, shape):
     """Advances the transmittance of pixels `begin` to `end` by one Gaussian, and writes its weights.
@@ -149,7 +149,7 @@ def _weigh(s, begin, end, shape):
         s[_at(TRANSMITTANCE) + p] = after if after > min_transmittance else zero
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@fast_callee
 @no_type_check
 def _add(s, begin, end, target, source, factor):
     """Adds `factor` times plane `source` to plane `target`."""
@@ -184,7 +184,7 @@ def composite_tiles(start, stop, first, offsets, ranks, shapes, values, columns,
                     image[y, x, k] = s[(OUT + 1 + k) * PIXELS + p]
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha):
     """Loads the gradients of a tile's pixels, and what its rays have to come at their beginning."""
@@ -201,7 +201,7 @@ def _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha):
             s[REST * PIXELS + p] = rest
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@fast_callee
 @no_type_check
 def _weigh_again(s, begin, end, shape):
     """As _weigh; RAW gets alpha before it is held at 0.999, and VALUE the gradient of alpha as a channel."""
@@ -212,7 +212,7 @@ def _weigh_again(s, begin, end, shape):
         s[_at(VALUE) + p] = s[_at(GRADIENT) + p]
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@fast_callee
 @no_type_check
 def _moments(s, begin, end, shape, out):
     """Advances transmittance and REST, and writes weights, gradients of exponents (to RAW) and their moments."""
@@ -241,7 +241,7 @@ def _moments(s, begin, end, shape, out):
     out[0], out[1], out[2], out[3], out[4], out[5] = m, m_x, m_y, m_xx, m_xy, m_yy
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@fast_callee
 @no_type_check
 def _weighted_sum(s, begin, end, plane):
     """The sum of a plane times the weights."""
@@ -251,7 +251,7 @@ def _weighted_sum(s, begin, end, plane):
     return total
 
 
-@njit(nogil=True, fastmath=FAST, error_model="numpy")
+@fast_callee
 @no_type_check
 def _absolute_sums(s, begin, end, shape):
     """The sums over pixels of the absolute gradients of the Gaussian's centre."""

@@ -14,11 +14,10 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels import kernel
+from drivesplat.kernels import callee, kernel
 from drivesplat.rasterize.cpu.threads import parallel_for
 
 EPS2D = 0.3
@@ -109,7 +108,7 @@ def pinhole(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, 
     return np.concatenate([view[:3, :3].ravel(), view[:3, 3], k[:2].ravel(), limits.ravel(), size])
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _rotation(quat):
     """The unit quaternion, the norm of `quat`, and its rotation row by row."""
@@ -124,7 +123,7 @@ def _rotation(quat):
     )  # fmt: skip
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _to_camera(mean, quat, scale, camera, at, axes, in_camera):
     """Writes the mean (3,) in the camera, R S (3, 3) to `axes` and W R S (3, 3) to `in_camera`."""
@@ -139,7 +138,7 @@ def _to_camera(mean, quat, scale, camera, at, axes, in_camera):
             in_camera[i, j] = w0 * axes[0, j] + w1 * axes[1, j] + w2 * axes[2, j]
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _to_image(at, in_camera, camera, t):
     """Writes T (2, 3); returns the slopes x/z and y/z at which the Gaussian is linearised and det(T Tᵀ)."""
@@ -155,7 +154,7 @@ def _to_image(at, in_camera, camera, t):
     return slope_x, slope_y, m0 * m0 + m1 * m1 + m2 * m2
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _covariance(t):
     """The entries xx, xy and yy of T Tᵀ."""
@@ -248,7 +247,7 @@ def _project_backward(
     v_viewmat[start // GRAIN] = sums.ravel()
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _covariance_backward(t, area, v_conic, v_compensation, v_t):
     """Writes the gradient of T."""
@@ -271,7 +270,7 @@ def _covariance_backward(t, area, v_conic, v_compensation, v_t):
         v_t[1, j] = 2.0 * v_yy * t[1, j] + v_xy * t[0, j] + 2.0 * v_area * (t[0, i] * m_k - t[0, k] * m_i)
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _axes_backward(quat, scale, v_axes, v_quat, v_scale):
     """Adds the gradients of R S to those of quaternion and scale."""

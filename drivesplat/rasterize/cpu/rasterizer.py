@@ -1,14 +1,12 @@
 """The CPU rasterizer behind the door."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from drivesplat.rasterize.cpu.compositing import Compositing
 from drivesplat.rasterize.cpu.harmonics import MAX_DEGREE, ViewColors
 from drivesplat.rasterize.cpu.projection import Projection
-from drivesplat.rasterize.rendering import Rendering
+from drivesplat.rasterize.rendering import Rendering, assembled
 
 
 def rasterize_cpu(
@@ -36,17 +34,6 @@ def rasterize_cpu(
     if with_depth:
         values = torch.cat([values, depths[..., None]], dim=-1)
     image, alpha = Compositing.apply(means2d, depths, conics, radii, opacities2d, values, width, height, absgrad)
-    info: dict[str, Any] = {
-        "means2d": means2d,
-        "radii": radii,
-        "depths": depths,
-        "conics": conics,
-        "opacities": opacities2d,
-        "width": width,
-        "height": height,
-        "n_cameras": len(viewmats),
-        "gaussian_ids": None,
-    }
-    if not with_depth:
-        return Rendering(image, alpha, None, info)
-    return Rendering(image[..., :-1], alpha, image[..., -1:] / alpha.clamp(min=1e-10), info)
+    return assembled(
+        image, alpha, with_depth, means2d=means2d, radii=radii, depths=depths, conics=conics, opacities=opacities2d
+    )

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-from drivesplat.kernels import kernel
+from drivesplat.kernels import callee, kernel
 from drivesplat.rasterize.cpu.threads import parallel_for
 
 TILE_WIDTH = 16
@@ -129,7 +128,7 @@ def _count(splats: Splats, columns: int, first: int, last: int) -> tuple[np.ndar
     return counts, tiles_of
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _digit(key, shift):
     return np.int64((np.uint64(key) >> np.uint64(shift)) & np.uint64(2047))
@@ -172,7 +171,7 @@ def _gather(start, stop, order, means2d, conics, opacities, radii, values, shape
             gathered[r, k] = values[g, k]
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _span(a, b, c, reach, low, high, bound):
     """The range of u in which a u² + 2 b u v + c v² <= reach for some v in [low, high], within ±bound.
@@ -195,7 +194,7 @@ def _span(a, b, c, reach, low, high, bound):
     return max(left - SLACK, -bound), min(right + SLACK, bound)
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _tile_rows(shape, columns, first, last):
     """First and last row (excluded) of tiles that a Gaussian may reach."""
@@ -208,7 +207,7 @@ def _tile_rows(shape, columns, first, last):
     return int(begin), int(end)
 
 
-@njit(nogil=True, error_model="numpy")
+@callee
 @no_type_check
 def _tile_columns(shape, row, columns, first, last):
     """First and last tile (excluded), in the image's numbering, that a Gaussian reaches in a row of tiles."""
