@@ -13,24 +13,24 @@ from pydantic import Field, field_validator, model_validator
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
+from drivesplat.settings.actor import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.evaluate import EvaluateJob, LpipsSettings
-from drivesplat.settings.extract import ExtractSettings, SceneSource
+from drivesplat.settings.evaluate import LpipsSettings
+from drivesplat.settings.export import ExportSettings
+from drivesplat.settings.extract import ExtractSettings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
-from drivesplat.settings.masks import MaskJob, MaskSettings
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.lidar_seed import LidarSeedSettings
+from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.render import RenderSettings
-from drivesplat.settings.train import PartName, SkyKind, TrainJob, TrainSettings
-from drivesplat.settings.world import WorldJob, WorldSettings
-from drivesplat.storage import canonical_json
+from drivesplat.settings.train import PartName, SkyKind, TrainSettings
+from drivesplat.settings.world import WorldSettings
 
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "masks", "sky", "train", "render",
-    "device",
+    "ghosts", "removal", "export", "device",
 )  # fmt: skip
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
@@ -39,8 +39,6 @@ DEMO_OVERRIDES = {
 }
 """What makes the demo world train in minutes on a CPU."""
 METHOD_OVERRIDES = ("sky", "train")
-SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
-METHOD_STAGES = ("train", "evaluate")
 
 
 class DatasetSettings(Settings):
@@ -132,6 +130,11 @@ class Config(Settings):
     pixels) or 'none' (black). The cube map does best on nuScenes: without one, Gaussians fill the sky."""
     train: TrainSettings = TrainSettings()
     render: RenderSettings = RenderSettings()
+    subjects: dict[str, SubjectSettings] = Field(default_factory=dict)
+    """Per scene the vehicle to look at, as {"0061": {track: 6e5c..., key_frame: 12}}; elsewhere it is chosen."""
+    ghosts: GhostSettings = GhostSettings()
+    removal: RemovalSettings = RemovalSettings()
+    export: ExportSettings = ExportSettings()
     lpips: LpipsSettings = LpipsSettings()
     device: DeviceSettings = DeviceSettings()
     random_seed: int = Field(0, ge=0, lt=2**31)
@@ -154,8 +157,12 @@ class Config(Settings):
         made = [Path(dataset.world_root).resolve() for dataset in self.datasets.values() if dataset.world]
         if len(set(made)) != len(made):
             raise ValueError("two datasets make their world in the same dataroot; give each its own")
-        for name in self.methods:
-            _require_name(name, "method")
+        for kind, names in (("method", self.methods), ("trajectory", self.render.trajectories)):
+            for name in names:
+                _require_name(name, kind)
+        for scene in self.subjects:
+            if scene not in owners:
+                raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")
         if self.eval_camera not in self.cameras:
             raise ValueError(f"eval_camera {self.eval_camera} is not among cameras ({', '.join(self.cameras)})")
         return self
@@ -224,48 +231,3 @@ def _require_known(overrides: Mapping[str, Any], allowed: tuple[str, ...], where
     for key in overrides:
         if key not in allowed:
             raise ConfigError(f"'{where}.{key}' cannot be set there; what can: {', '.join(allowed)}")
-
-
-def stage_settings(config: Config, stage: str, scene: str, method: str | None = None) -> str:
-    """The canonical JSON of everything a stage of a scene (and method) may know: the one param Snakemake compares."""
-    return canonical_json(_record(for_scene(config, scene, method), stage, scene, method).model_dump(mode="json"))
-
-
-def _record(config: Config, stage: str, scene: str, method: str | None) -> Settings:
-    name = config.dataset_of(scene)
-    dataset = config.datasets[name]
-    if stage == "demo_world":
-        return WorldJob(scene=scene, version=dataset.version, world=dataset.world)
-    if stage == "extract":
-        return SceneSource(
-            dataset=name,
-            reader=dataset.reader,
-            version=dataset.version,
-            scene=scene,
-            frames=dataset.frames.get(scene),
-            cameras=config.cameras,
-            sweeps=config.sweeps,
-            on_missing=config.extract.on_missing,
-        )
-    if stage == "lidar_seed":
-        return SeedJob(
-            lidar_seed=config.lidar_seed, holdout=config.holdout, images=config.images, random_seed=config.random_seed
-        )
-    if stage == "parser":
-        return ParserJob(holdout=config.holdout, images=config.images)
-    if stage == "masks":
-        return MaskJob(masks=config.masks, images=config.images)
-    if stage == "train":
-        parts = config.methods[method].parts
-        return TrainJob(parts=parts, sky=config.sky, train=config.train, random_seed=config.random_seed)
-    if stage == "evaluate":
-        return EvaluateJob(
-            eval_camera=config.eval_camera,
-            cameras=config.cameras,
-            sweeps=config.sweeps,
-            holdout=config.holdout,
-            lpips=config.lpips.enabled,
-        )
-    if stage == "scene_metrics":
-        return Settings()
-    raise ValueError(f"no stage is called {stage!r}")

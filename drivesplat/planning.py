@@ -12,12 +12,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from drivesplat.config import METHOD_STAGES, SCENE_STAGES, Config, for_scene, load, stage_settings
+from drivesplat.config import Config, for_scene, load
 from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.readers import layout
 from drivesplat.rerun import code_digest
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
+from drivesplat.stages import METHOD_STAGES, SCENE_STAGES, stage_settings
 from drivesplat.storage import canonical_json
 
 SCRIPTS = "workflow_scripts"
@@ -41,7 +42,8 @@ class Plan:
         """The function of wildcards that gives a stage's settings as canonical JSON."""
 
         def settings_of(wildcards: Any) -> str:
-            return stage_settings(self.config, stage, wildcards.scene, getattr(wildcards, "method", None))
+            method, trajectory = (getattr(wildcards, name, None) for name in ("method", "trajectory"))
+            return stage_settings(self.config, stage, wildcards.scene, method, trajectory)
 
         return settings_of
 
@@ -101,6 +103,10 @@ class Plan:
         if not targets or not set(targets) <= reports:
             return self.config.batch_scenes
         return [s for s in self.config.batch_scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
+
+    def trajectories(self, scene: str) -> list[str]:
+        """The names of a scene's films."""
+        return list(for_scene(self.config, scene).render.trajectories)
 
     def expected_stages(self) -> str:
         """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what

@@ -94,6 +94,10 @@ class Scene:
             return 500_000.0
         return float(np.median(np.diff(self.key_frame_timestamps)))
 
+    def seconds(self, timestamp: int | np.integer) -> float:
+        """A timestamp (microseconds) as seconds since the first image, the time that models know."""
+        return float(timestamp - min(frame.timestamp for frame in self.frames)) * 1e-6
+
     def nearest_key_frame(self, timestamp: int) -> int:
         """The index of the key frame nearest to `timestamp` (microseconds)."""
         return int(np.argmin(np.abs(self.key_frame_timestamps - timestamp)))

@@ -34,21 +34,20 @@ def unreadable(path: str | Path, rule: str, why: str) -> ResultError:
 
 
 @contextmanager
-def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
-    """A binary file that appears at `path` only once its content is complete and on disk.
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A path beside `path`, of the same suffix, for what another program or library writes: it becomes `path` only once
+    the context ends well and the content is on disk.
 
     Raises ResultError, naming `path`, where the disk is full or the folder cannot be written.
     """
     path = Path(path)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(aside, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield aside
+        _fsync(aside)
         aside.replace(path)
-        _fsync_folder(path.parent)
+        _fsync(path.parent)
     except OSError as error:
         raise ResultError(
             f"{path}: cannot be written ({error.strerror or error}); free space or fix its permissions"
@@ -58,8 +57,18 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
             aside.unlink(missing_ok=True)
 
 
-def _fsync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
+    """A binary file that appears at `path` only once its content is complete and on disk.
+
+    Raises ResultError, naming `path`, where the disk is full or the folder cannot be written.
+    """
+    with atomic_path(path) as aside, open(aside, "wb") as file:
+        yield file
+
+
+def _fsync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

@@ -9,13 +9,21 @@ import jsonschema
 import pytest
 import yaml
 
-from drivesplat.config import Config, for_scene, load, merged, stage_settings
+from drivesplat.config import Config, for_scene, load, merged
 from drivesplat.config_document import config_schema, config_yaml
 from drivesplat.errors import ConfigError
+from drivesplat.stages import SCENE_STAGES, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
-SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
-STAGES = (*SCENE_STAGES, "train", "evaluate")
+LOOKS = ("film", "ghost_panel", "remove_actor", "export", "export_usd", "export_viewer")
+STAGES = (*SCENE_STAGES, "train", "evaluate", *LOOKS)
+
+
+def told(values: dict[str, Any] | Config, stage: str) -> str:
+    """What a stage of scene 0061, vanilla, its film `original`, is told."""
+    config = values if isinstance(values, Config) else load(values)
+    method = None if stage in SCENE_STAGES else "vanilla"
+    return stage_settings(config, stage, "0061", method, "original" if stage == "film" else None)
 
 
 @pytest.fixture(scope="module")
@@ -297,19 +305,21 @@ def reversed_keys(value: Any) -> Any:
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stage_is_told(defaults, stage):
-    method = None if stage in SCENE_STAGES else "vanilla"
-    plain = stage_settings(load({}), stage, "0061", method)
+    plain = told({}, stage)
     for values in (defaults, reversed_keys(defaults), {"train": {"iterations": defaults["train"]["iterations"]}}):
-        assert stage_settings(load(values), stage, "0061", method) == plain
+        assert told(values, stage) == plain
     written_out = {"sky": defaults["sky"], "train": {"iterations": defaults["train"]["iterations"]}}
-    assert stage_settings(load(at("methods.vanilla.overrides", written_out)), stage, "0061", method) == plain
+    assert told(at("methods.vanilla.overrides", written_out), stage) == plain
 
 
 @pytest.mark.parametrize(
     ("change", "readers"),
     [
         (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract evaluate"),
-        ({"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"}, "extract evaluate"),
+        (
+            {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
+            "extract evaluate film ghost_panel remove_actor export_usd export_viewer",
+        ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks"),
         (at("holdout.every_nth", 5), "lidar_seed parser evaluate"),
@@ -330,7 +340,16 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
         (at("random_seed", 1), "lidar_seed train"),
         (at("lpips.enabled", False), "evaluate"),
         (at("lpips.timeout_s", 5), ""),
-        (at("render.fps", 60), ""),
+        (at("render.fps", 60), "film"),
+        (at("render.width", 64), "film"),
+        (at("render.trajectories.original.lateral", 1.0), "film"),
+        (at("render.trajectories.aside", {"lateral": -1.0}), ""),
+        (at("subjects", {"0061": {"key_frame": 3}}), "ghost_panel remove_actor"),
+        (at("subjects", {"0103": {"key_frame": 3}}), ""),
+        (at("ghosts.clearance", 0.5), "ghost_panel remove_actor"),
+        (at("removal.margin", 0.5), "evaluate remove_actor"),
+        (at("export.usd_gaussians", 9), "export_usd"),
+        (at("export.viewer_gaussians", 9), "export_viewer"),
         (at("device", "cpu"), ""),
         (at("device.min_free_gb", 3), ""),
         (at("results_dir", "elsewhere"), ""),
@@ -346,12 +365,7 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
 )
 def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, change, readers):
     before, after = load(defaults), load(merged(defaults, with_methods_kept(change)))
-    changed = set()
-    for stage in STAGES:
-        method = None if stage in SCENE_STAGES else "vanilla"
-        if stage_settings(before, stage, "0061", method) != stage_settings(after, stage, "0061", method):
-            changed.add(stage)
-    assert changed == set(readers.split())
+    assert {stage for stage in STAGES if told(before, stage) != told(after, stage)} == set(readers.split())
 
 
 def with_methods_kept(change: dict[str, Any]) -> dict[str, Any]:

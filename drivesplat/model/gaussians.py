@@ -1,10 +1,11 @@
 """Gaussians in world coordinates, ready for the rasterizer."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -20,6 +21,15 @@ class Gaussians:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __getitem__(self, chosen: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> "Gaussians":
+        """Those that a mask or indices choose."""
+        return Gaussians(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree that the number of coefficients stands for: k = (degree + 1)²."""
+        return math.isqrt(self.sh.shape[1]) - 1
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:

@@ -5,7 +5,8 @@ Each part owns its parameters, their learning rates and its densification. A met
 
 from abc import ABC, abstractmethod
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians
@@ -27,6 +28,10 @@ class Part(nn.Module, ABC):
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every entry of `params`."""
+
+    def of_track(self, track_id: str) -> Bool[Tensor, " n"]:
+        """Which of its Gaussians are a track's own: none, where a part does not take objects apart."""
+        return torch.zeros(len(self), dtype=torch.bool, device=self.params["means"].device)
 
     def __len__(self) -> int:
         return len(self.params["means"])

@@ -6,10 +6,10 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from drivesplat.model.gaussians import concatenate
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Part, Sky
 from drivesplat.rasterize import rasterize
 
@@ -60,18 +60,34 @@ class SplatModel(nn.Module):
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
 
-    def render(
-        self, view: View, sh_degree: int, *, absgrad: bool = False, with_depth: bool = False, rays: Tensor | None = None
-    ) -> Picture:
-        """The view, with spherical harmonics up to `sh_degree`.
+    def gaussians_at(self, time: float) -> Gaussians:
+        """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
+        return concatenate([part.at(time) for part in self.parts])
 
-        `rays` (h, w, 3) saves computing `view.rays()` again.
+    def of_track(self, track_id: str) -> Bool[Tensor, " n"]:
+        """Which of `gaussians_at`'s rows are a track's own; none where no part takes that track apart."""
+        return torch.cat([part.of_track(track_id) for part in self.parts])
+
+    def render(
+        self,
+        view: View,
+        sh_degree: int | None = None,
+        *,
+        gaussians: Gaussians | None = None,
+        absgrad: bool = False,
+        with_depth: bool = False,
+        rays: Tensor | None = None,
+    ) -> Picture:
+        """The view, with spherical harmonics up to `sh_degree` (None: all there are).
+
+        `gaussians` stand in for `gaussians_at(view.time)`; `rays` (h, w, 3) saves computing `view.rays()` again.
         """
-        gaussians = concatenate([part.at(view.time) for part in self.parts])
+        shown = self.gaussians_at(view.time) if gaussians is None else gaussians
         rendering = rasterize(
-            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh,
+            shown.means, shown.quats, shown.scales, shown.opacities, shown.sh,
             view.viewmat[None], view.K[None], view.width, view.height,
-            sh_degree=sh_degree, antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
+            sh_degree=shown.sh_degree if sh_degree is None else sh_degree,
+            antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
         )  # fmt: skip
         image, alpha = rendering.image[0], rendering.alpha[0]
         if self.sky is not None:

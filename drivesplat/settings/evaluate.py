@@ -3,6 +3,7 @@
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.actor import RemovalSettings
 from drivesplat.settings.holdout import HoldoutSettings
 
 BACKBONE = "resources/lpips/alexnet.pth"
@@ -30,3 +31,4 @@ class EvaluateJob(Settings):
     sweeps: bool
     holdout: HoldoutSettings
     lpips: bool
+    removal: RemovalSettings
