@@ -19,7 +19,7 @@ LOOKS = ("film", "ghost_panel", "remove_actor", "export", "export_usd", "export_
 STAGES = (*SCENE_STAGES, "train", "evaluate", *LOOKS)
 
 
-def told(values: dict[str, Any] | Config, stage: str) -> str:
+def spelled(values: dict[str, Any] | Config, stage: str) -> str:
     """What a stage of scene 0061, vanilla, its film `original`, is told."""
     config = values if isinstance(values, Config) else load(values)
     method = None if stage in SCENE_STAGES else "vanilla"
@@ -305,11 +305,11 @@ def reversed_keys(value: Any) -> Any:
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stage_is_told(defaults, stage):
-    plain = told({}, stage)
+    plain = spelled({}, stage)
     for values in (defaults, reversed_keys(defaults), {"train": {"iterations": defaults["train"]["iterations"]}}):
-        assert told(values, stage) == plain
+        assert spelled(values, stage) == plain
     written_out = {"sky": defaults["sky"], "train": {"iterations": defaults["train"]["iterations"]}}
-    assert told(at("methods.vanilla.overrides", written_out), stage) == plain
+    assert spelled(at("methods.vanilla.overrides", written_out), stage) == plain
 
 
 @pytest.mark.parametrize(
@@ -365,7 +365,7 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
 )
 def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, change, readers):
     before, after = load(defaults), load(merged(defaults, with_methods_kept(change)))
-    assert {stage for stage in STAGES if told(before, stage) != told(after, stage)} == set(readers.split())
+    assert {stage for stage in STAGES if spelled(before, stage) != spelled(after, stage)} == set(readers.split())
 
 
 def with_methods_kept(change: dict[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ class ExportSettings(Settings):
     usd_gaussians: int = Field(1_000_000, ge=1)
     """At most so many Gaussians in scene.usdz: those that cover most."""
     viewer_gaussians: int = Field(300_000, ge=1)
-    """At most so many Gaussians in viewer.html: those that cover most. A browser's memory and download are the limit."""
+    """At most so many Gaussians in viewer.html: those that cover most. A browser's memory is the limit."""
 
 
 class UsdJob(Settings):
