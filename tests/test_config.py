@@ -19,11 +19,11 @@ LOOKS = ("film", "ghost_panel", "remove_actor", "export", "export_usd", "export_
 STAGES = (*SCENE_STAGES, "train", "evaluate", *LOOKS)
 
 
-def spelled(values: dict[str, Any] | Config, stage: str) -> str:
-    """What a stage of scene 0061, vanilla, its film `original`, is told."""
+def spelled(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> str:
+    """What a stage is told, of a film the one called `original`."""
     config = values if isinstance(values, Config) else load(values)
-    method = None if stage in SCENE_STAGES else "vanilla"
-    return stage_settings(config, stage, "0061", method, "original" if stage == "film" else None)
+    film = "original" if stage == "film" else None
+    return stage_settings(config, stage, scene, None if stage in SCENE_STAGES else method, film)
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +225,7 @@ def test_mappings_are_merged_key_by_key_and_the_rest_is_replaced():
 
 
 def told(values: dict[str, Any], stage: str, scene: str = "0061", method: str = "vanilla") -> dict[str, Any]:
-    return json.loads(stage_settings(load(values), stage, scene, method if stage not in SCENE_STAGES else None))
+    return json.loads(spelled(values, stage, scene, method))
 
 
 def test_overrides_of_a_dataset_reach_the_stages_of_its_scenes_only():
