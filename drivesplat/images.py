@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from drivesplat.errors import DatasetError
 from drivesplat.scene import Frame
 from drivesplat.settings.images import ImageSettings
+from drivesplat.storage import atomic_write
 
 
 def target_size(frame: Frame, images: ImageSettings) -> tuple[int, int]:
@@ -43,6 +44,12 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
     if size is None or size == (pixels.shape[1], pixels.shape[0]):
         return pixels
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+
+def write_image(path: str | Path, colors: np.ndarray) -> None:
+    """Writes colours (h, w, 3) in [0, 1] as a PNG. Raises ResultError naming the path where that fails."""
+    with atomic_write(path) as file:
+        Image.fromarray((colors.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)).save(file, format="PNG")
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:

@@ -20,6 +20,7 @@ from drivesplat.rerun import code_digest
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.stages import METHOD_STAGES, SCENE_STAGES, stage_settings
 from drivesplat.storage import canonical_json
+from drivesplat.truth import TRUTH_FILE
 
 SCRIPTS = "workflow_scripts"
 
@@ -73,6 +74,18 @@ class Plan:
     def world_settings(self, dataset: str) -> str:
         """The settings of a dataset's synthetic world."""
         return stage_settings(self.config, "demo_world", self.worlds[dataset])
+
+    def truth_file(self, dataset: str) -> str:
+        """Where the truth of a synthetic world is stated."""
+        return f"{self.config.datasets[dataset].world_root}/{TRUTH_FILE}"
+
+    def truth(self, wildcards: Any) -> list[str]:
+        """The truth of a scene: a synthetic world's; recorded drives have none, unless it lies beside their tables."""
+        name = self.config.dataset_of(wildcards.scene)
+        if name in self.worlds:
+            return [self.truth_file(name)]
+        beside = Path(self.tables(wildcards)[0]).parents[1] / TRUTH_FILE
+        return [str(beside)] if beside.is_file() else []
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, where given."""
@@ -152,7 +165,8 @@ class Plan:
         """The scene whose file a target is: empty for a rule's name, None for a file that is no scene's result, of
         which Snakemake knows whether it can be made."""
         for dataset, scene in self.worlds.items():
-            if os.path.normpath(target) in map(os.path.normpath, self.world_tables(dataset)):
+            made = (*self.world_tables(dataset), self.truth_file(dataset))
+            if os.path.normpath(target) in map(os.path.normpath, made):
                 return scene
         return self._inside_results(target)[0] or (None if os.sep in target else "")
 

@@ -58,6 +58,11 @@ def region_mask(labels: np.ndarray, region: str) -> np.ndarray:
     return np.isin(labels, [LABELS[name] for name in REGIONS[region]])
 
 
+def region_masks(labels: np.ndarray) -> dict[str, np.ndarray]:
+    """The pixels (h, w) bool of every region in a label image (h, w)."""
+    return {region: region_mask(labels, region) for region in REGIONS}
+
+
 def is_dynamic(category: str) -> bool:
     """Whether a class can move at all; cones, barriers and the like count as static."""
     return category.startswith(("vehicle.", "human.")) or category == "animal"
@@ -112,19 +117,30 @@ def fill(polygon: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return mask
 
 
+def owner_image(hulls: list[Hull], size: tuple[int, int]) -> tuple[np.ndarray, list[int]]:
+    """Whose every pixel is, as a position in `hulls` (farthest first), -1 where it is nobody's: (h, w); and how many
+    pixels each hull covers, hidden ones included. Where hulls overlap the nearer box wins."""
+    owners, covered = np.full((size[1], size[0]), -1), []
+    for position, hull in enumerate(hulls):
+        mask = fill(hull.polygon, size)
+        owners[mask] = position
+        covered.append(int(mask.sum()))
+    return owners, covered
+
+
 def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     """The label (h, w) uint8 of every pixel of a frame at `size` (width, height), from the scene's boxes.
 
     Where hulls overlap the nearer box wins, whether it is measured or left out.
     """
-    labels = np.full((size[1], size[0]), LABELS["static"], dtype=np.uint8)
-    for hull in hulls_in(scene, frame, size):
-        mask = fill(hull.polygon, size)
-        labels[mask] = LABELS[_label(hull, int(mask.sum()))]
-    return labels
+    hulls = hulls_in(scene, frame, size)
+    owners, covered = owner_image(hulls, size)
+    names = [*(label_of(hull, pixels) for hull, pixels in zip(hulls, covered, strict=True)), "static"]
+    return np.array([LABELS[name] for name in names], dtype=np.uint8)[owners]
 
 
-def _label(hull: Hull, pixels: int) -> str:
+def label_of(hull: Hull, pixels: int) -> str:
+    """The label of a hull that covers so many pixels."""
     box = hull.box
     hidden = 0 < box.visibility < LEAST_VISIBILITY
     if hidden or hull.distance > FARTHEST or pixels < LEAST_PIXELS:

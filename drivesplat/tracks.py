@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.rigid import interpolate
+from drivesplat.rigid import apply, interpolate, inverse
 from drivesplat.scene import Scene, Track
 
 MOVING_VEHICLE = 1.0
@@ -29,6 +29,18 @@ class Box:
         """The eight corners (8, 3) in world coordinates; index bits 2, 1, 0 are the signs of x, y, z."""
         signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         return (signs * self.size) @ self.object_to_world[:3, :3].T + self.object_to_world[:3, 3]
+
+    def holds(self, points: np.ndarray, margin: float = 0.0, floor: float = 0.0) -> np.ndarray:
+        """Which world points (n, 3) lie in the box grown by `margin` metres at its sides and roof, its floor raised by
+        `floor` metres: (n,) bool."""
+        inside = np.zeros(len(points), dtype=bool)
+        reach = np.linalg.norm(self.size) / 2 + 2 * max(margin, -floor, 0.0)
+        near = np.flatnonzero(np.linalg.norm(points - self.object_to_world[:3, 3], axis=1) < reach)
+        in_box = apply(inverse(self.object_to_world), points[near])
+        above_floor = in_box[:, 2] > floor - self.size[2] / 2
+        inside[near] = (np.abs(in_box[:, :2]) < self.size[:2] / 2 + margin).all(axis=1) & above_floor
+        inside[near] &= in_box[:, 2] < self.size[2] / 2 + margin
+        return inside
 
     @property
     def moves(self) -> bool:

@@ -14,6 +14,7 @@ for dataset in plan.worlds:
             f"demo_world_{dataset}"
         output:
             tables=plan.world_tables(dataset),
+            truth=plan.truth_file(dataset),
         log:
             f"<logs>/demo_world/{dataset}.log",
         benchmark:

@@ -28,9 +28,12 @@ rule lpips_backbone:
 
 rule evaluate:
     """
-    Renders the held-out images of the evaluated camera and measures PSNR, SSIM and LPIPS over static and moving pixels.
+    Renders the held-out images of the evaluated camera and measures PSNR, SSIM and LPIPS over static and moving pixels;
+    on a synthetic world also the view from the side and the street without the car ahead, against the truth.
     """
     input:
+        scene="<results>/{scene}/scene.json",
+        truth=plan.truth,
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
         summary="<results>/{scene}/{method}/train.json",
         parser="<results>/{scene}/parser.pkl",

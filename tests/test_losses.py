@@ -42,7 +42,8 @@ def a_case(sky_known: bool = True) -> tuple[Picture, TrainingView]:
     alpha = torch.from_numpy(np.random.default_rng(2).uniform(0.05, 0.95, (HEIGHT, WIDTH))).float()
     sky = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     sky[: HEIGHT // 3] = True
-    return Picture(random_image(3), alpha, None, {}), a_view(pixels, sky if sky_known else None)
+    image = random_image(3)
+    return Picture(image, image, alpha, None, {}), a_view(pixels, sky if sky_known else None)
 
 
 def zero_padded_ssim(image: np.ndarray, target: np.ndarray) -> float:
@@ -178,10 +179,11 @@ def test_a_regulariser_makes_its_parameter_smaller_and_no_other(term, parameter)
 def test_a_colour_term_pulls_the_image_towards_the_recording(term):
     picture, view = a_case()
     image = picture.image.clone().requires_grad_()
-    seen = Picture(image, picture.alpha, None, {})
+    seen = Picture(image, image, picture.alpha, None, {})
     before = loss_terms(seen, view, a_model(), TrainSettings())[term]
     before.backward()
-    stepped = Picture((image - 1e-2 * image.grad / image.grad.norm()).detach(), picture.alpha, None, {})
+    colors = (image - 1e-2 * image.grad / image.grad.norm()).detach()
+    stepped = Picture(colors, colors, picture.alpha, None, {})
     assert float(loss_terms(stepped, view, a_model(), TrainSettings())[term]) < float(before.detach())
     assert float((image.grad * (image - view.target())).sum().detach()) > 0
 
@@ -189,5 +191,7 @@ def test_a_colour_term_pulls_the_image_towards_the_recording(term):
 def test_a_perfect_picture_costs_nothing():
     _, view = a_case()
     settings = TrainSettings(opacity_reg=0, scale_reg=0)
-    terms = loss_terms(Picture(view.target(), torch.zeros(HEIGHT, WIDTH), None, {}), view, a_model(), settings)
+    terms = loss_terms(
+        Picture(view.target(), view.target(), torch.zeros(HEIGHT, WIDTH), None, {}), view, a_model(), settings
+    )
     assert float(sum(terms.values()).detach()) == pytest.approx(0.0, abs=1e-5)

@@ -10,8 +10,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation.evaluate import findings
-from drivesplat.evaluation.metrics import RegionMetrics, gap_db, psnr, ssim_map
-from drivesplat.regions import LABELS, REGIONS
+from drivesplat.evaluation.metrics import RegionMetrics, gap_db, psnr, ssim_map, with_gap
+from drivesplat.regions import LABELS, REGIONS, region_masks
 
 HEIGHT, WIDTH = 40, 50
 
@@ -36,8 +36,9 @@ def labels_of(**pixels: int) -> np.ndarray:
 def measured(*frames: tuple[np.ndarray, np.ndarray, np.ndarray], lpips_map: Any = None) -> dict[str, Any]:
     metrics = RegionMetrics(lpips_map)
     for frame in frames:
-        metrics.add(*frame)
-    return metrics.summary()
+        image, truth, labels = frame
+        metrics.add(image, truth, region_masks(labels))
+    return with_gap(metrics.summary())
 
 
 @pytest.mark.parametrize(("error", "expected"), [(1.0, 0.0), (0.1, 10.0), (0.01, 20.0), (2.5e-3, 26.0206)])

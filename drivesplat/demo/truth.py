@@ -5,7 +5,6 @@ bits, 1/256 metre along the camera's axis up to 256 m, 0 for the sky (KITTI's co
 of `instances`, 0 for scenery; cars and people too far away for a box have numbers as well.
 """
 
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,28 +13,12 @@ from PIL import Image
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.demo.rig import Sensor, height_of
 from drivesplat.demo.tables import token
-from drivesplat.storage import atomic_write, write_json
+from drivesplat.storage import atomic_write
+from drivesplat.truth import TRUTH_FILE, Truth, TruthFrame, write_truth_file
 
-SCHEMA = 1
-FOLDER = "truth"
 LEFT = 2.0
 """How far (metres) to the own car's left the other view lies."""
 DEPTH_UNIT = 256.0
-
-
-@dataclass(frozen=True)
-class TruthFrame:
-    """The truth of one key frame: the token of its image's sample_data, its number, file names, camera poses (4, 4) in
-    the dataset's global frame. `without_leading` is None where no car leads."""
-
-    sample_data: str
-    sample_index: int
-    lateral: str
-    without_leading: str | None
-    depth: str
-    instances: str
-    camera_to_global: list[list[float]]
-    lateral_camera_to_global: list[list[float]]
 
 
 def write_truth_frame(
@@ -55,7 +38,7 @@ def write_truth_frame(
     for kind, image in images.items():
         names[kind] = f"{kind}/{index:04}.png" if image is not None else None
         if image is not None:
-            with atomic_write(root / FOLDER / names[kind]) as file:
+            with atomic_write((root / TRUTH_FILE).parent / names[kind]) as file:
                 Image.fromarray(image).save(file, "PNG")
     poses = {}
     for kind, left in (("", 0.0), ("lateral_", LEFT)):
@@ -74,18 +57,17 @@ def write_truth(root: Path, recorder: Recorder, scene: str, camera: str, frames:
     """Writes truth.json."""
     numbers = zip(_instance_numbers(recorder), recorder.things, strict=True)
     leading = recorder.street.leading
-    write_json(
-        root / FOLDER / "truth.json",
-        {
-            "schema": SCHEMA,
-            "scene": scene,
-            "camera": camera,
-            "width": recorder.world.width,
-            "height": height_of(recorder.world.width),
-            "samples_per_pixel": recorder.world.samples_per_pixel,
-            "lateral_left_m": LEFT,
-            "leading": token(scene, "instance", leading) if leading else None,
-            "instances": {str(n): token(scene, "instance", thing.name) for n, thing in numbers if n},
-            "frames": [asdict(frame) for frame in frames],
-        },
+    write_truth_file(
+        root,
+        Truth(
+            scene=scene,
+            camera=camera,
+            width=recorder.world.width,
+            height=height_of(recorder.world.width),
+            samples_per_pixel=recorder.world.samples_per_pixel,
+            lateral_left_m=LEFT,
+            leading=token(scene, "instance", leading) if leading else None,
+            instances={str(n): token(scene, "instance", thing.name) for n, thing in numbers if n},
+            frames=tuple(frames),
+        ),
     )

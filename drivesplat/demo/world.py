@@ -14,9 +14,10 @@ from drivesplat.demo.mark import begin
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor, firing_times, height_of
 from drivesplat.demo.tables import NuScenesTables
-from drivesplat.demo.truth import TruthFrame, write_truth, write_truth_frame
+from drivesplat.demo.truth import write_truth, write_truth_frame
 from drivesplat.settings.world import WorldJob, WorldSettings
 from drivesplat.storage import atomic_write, canonical_json, sha256_text
+from drivesplat.truth import TruthFrame
 
 log = logging.getLogger(__name__)
 

@@ -1,57 +1,67 @@
 """The stage `evaluate`: held-out images against renderings, split into static and moving pixels."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.lpips_map import unavailable_or_map
-from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics
+from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
+from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.images import read_image
 from drivesplat.masks import read_labels
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size
+from drivesplat.regions import region_masks
+from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.training.run import trained_model
 from drivesplat.training.views import view_of
+from drivesplat.truth import read_truth
 
 STATIC_FINDING_DB = 22.0
 VEHICLE_FINDING_DB = 18.0
 
 
-def evaluate_method(
-    checkpoint: dict[str, Any],
-    summary: dict[str, Any],
-    parser: dict[str, Any],
-    masks: Path,
-    masks_record: dict[str, Any],
-    lpips_record: dict[str, Any] | None,
-    job: EvaluateJob,
-    device_settings: DeviceSettings,
-) -> dict[str, Any]:
-    """The content of one method's eval.json, provenance aside.
+@dataclass(frozen=True)
+class EvaluationInputs:
+    """What an evaluation reads: the contents of checkpoint.pt, train.json, parser.pkl, scene.json, masks.json and of
+    LPIPS's backbone.json (None where LPIPS is not wanted), the folder `masks`, and the path `truth` of a synthetic
+    world's truth.json (None for a recorded drive)."""
 
-    `checkpoint`, `summary` and `parser` are the contents of checkpoint.pt, train.json and parser.pkl; `lpips_record`
-    that of LPIPS's backbone, None where LPIPS is not wanted.
-    """
+    checkpoint: dict[str, Any]
+    summary: dict[str, Any]
+    parser: dict[str, Any]
+    scene: Scene
+    masks: Path
+    masks_record: dict[str, Any]
+    lpips_record: dict[str, Any] | None
+    truth: Path | None
+
+
+def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings: DeviceSettings) -> dict[str, Any]:
+    """The content of one method's eval.json, provenance aside."""
     device = choose_device(device_settings, min_free_gb=0.0)
-    model, train_job = trained_model(checkpoint)
-    unavailable, lpips_map = unavailable_or_map(lpips_record, device)
-    sh_degree = train_job.train.gaussians.sh_degree
+    model, _ = trained_model(inputs.checkpoint)
+    unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
+    summary = inputs.summary
     with telling_out_of_memory(lambda: len(model)):
-        groups = evaluate_groups(model.to(device), parser, masks, job.eval_camera, sh_degree, lpips_map, device)
+        model = model.to(device)
+        groups = evaluate_groups(model, inputs.parser, inputs.masks, job.eval_camera, lpips_map, device)
+        against = against_truth(model, inputs, job, lpips_map, device)
     return {
         "schema": 1,
-        "scene": parser["scene"]["name"],
-        "dataset": parser["scene"]["dataset"],
-        "protocol": protocol(parser, masks_record, job),
+        "scene": inputs.parser["scene"]["name"],
+        "dataset": inputs.parser["scene"]["dataset"],
+        "protocol": protocol(inputs.parser, inputs.masks_record, job),
         "result": {
             **groups,
+            **against,
             "gaussians": summary["gaussians"],
             "train_seconds": summary["seconds"],
             "train_iterations": summary["iterations"],
@@ -62,6 +72,18 @@ def evaluate_method(
             **({"lpips_unavailable": unavailable} if unavailable else {}),
         },
     }
+
+
+def against_truth(
+    model: SplatModel, inputs: EvaluationInputs, job: EvaluateJob, lpips_map: LpipsMap | None, device: torch.device
+) -> dict[str, Any]:
+    """`lateral` and `removal`, where truth for them exists: for a synthetic world, not for a recorded drive."""
+    if inputs.truth is None:
+        return {}
+    known = KnownTruth(read_truth(inputs.truth), inputs.truth, inputs.scene, inputs.parser, inputs.masks)
+    lateral = lateral_metrics(model, known, job.eval_camera, lpips_map, device)
+    removal = removal_metrics(model, known, job.eval_camera, job.removal.margin, lpips_map, device)
+    return {**({"lateral": lateral} if lateral else {}), **({"removal": removal} if removal else {})}
 
 
 def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
@@ -116,9 +138,13 @@ def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int
 
 
 def evaluate_groups(
-    model: SplatModel, parser: dict[str, Any], masks: Path, camera: str, sh_degree: int, lpips_map: LpipsMap | None,
-    device: torch.device
-) -> dict[str, dict[str, Any]]:  # fmt: skip
+    model: SplatModel,
+    parser: dict[str, Any],
+    masks: Path,
+    camera: str,
+    lpips_map: LpipsMap | None,
+    device: torch.device,
+) -> dict[str, dict[str, Any]]:
     """The metrics of every held-out group, by region. `masks` is the folder of the stage `masks`."""
     groups = {}
     for group in HELD_OUT_GROUPS:
@@ -127,12 +153,6 @@ def evaluate_groups(
             size = image_size(parser, index)
             truth = read_image(parser["image_paths"][index], size) / 255.0
             labels = read_labels(masks, camera, int(parser["timestamps"][index]), size)
-            metrics.add(render(model, parser, index, sh_degree, device), truth, labels)
-        groups[group] = metrics.summary()
+            metrics.add(rendered(model, view_of(parser, index, device)), truth, region_masks(labels))
+        groups[group] = with_gap(metrics.summary())
     return groups
-
-
-@torch.no_grad()
-def render(model: SplatModel, parser: dict[str, Any], index: int, sh_degree: int, device: torch.device) -> np.ndarray:
-    """Image `index` of a parser record as the model renders it: (h, w, 3) float32, not clamped."""
-    return model.render(view_of(parser, index, device), sh_degree).image.float().cpu().numpy()

@@ -4,7 +4,7 @@ Maps are computed per frame and accumulated per region, so memory does not grow 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from drivesplat.errors import ResultError
-from drivesplat.regions import REGIONS, region_mask
+from drivesplat.regions import REGIONS
 
 LEAST_REGION_PIXELS = 1000
 """A region with fewer pixels in a group is null."""
@@ -25,6 +25,16 @@ LpipsMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
 def psnr(squared_error: float) -> float | None:
     """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]; None where it is 0."""
     return -10.0 * math.log10(squared_error) if squared_error > 0 else None
+
+
+def psnr_record(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, Any] | None:
+    """`psnr` of one image (h, w, 3) against another over a mask (h, w) bool, `identical` where they are, and `pixels`;
+    None where the mask is empty."""
+    pixels = int(mask.sum())
+    if pixels == 0:
+        return None
+    value = psnr(float(((image - truth)[mask] ** 2).mean()))
+    return {"psnr": value, **({"identical": True} if value is None else {}), "pixels": pixels}
 
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -52,14 +62,14 @@ class _Sums:
 
 
 class RegionMetrics:
-    """Metrics of one group of frames: `add` each frame, then `summary`."""
+    """Metrics of one group of frames over named regions: `add` each frame, then `summary`."""
 
-    def __init__(self, lpips_map: LpipsMap | None):
+    def __init__(self, lpips_map: LpipsMap | None, regions: Iterable[str] = REGIONS):
         self._lpips_map = lpips_map
-        self._sums = {region: _Sums() for region in REGIONS}
+        self._sums = {region: _Sums() for region in regions}
 
-    def add(self, image: np.ndarray, truth: np.ndarray, labels: np.ndarray) -> None:
-        """A rendered and a recorded image (h, w, 3) in [0, 1], and the frame's label image (h, w).
+    def add(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> None:
+        """A rendered and a true image (h, w, 3) in [0, 1], and the frame's pixels (h, w) bool of every region.
 
         Raises ResultError where the rendering is not finite.
         """
@@ -70,7 +80,7 @@ class RegionMetrics:
         similarity = ssim_map(image, truth)
         perceptual = self._lpips_map(image, truth) if self._lpips_map else np.zeros_like(similarity)
         for region, sums in self._sums.items():
-            mask = region_mask(labels, region)
+            mask = masks[region]
             pixels = int(mask.sum())
             if pixels == 0:
                 continue
@@ -83,10 +93,9 @@ class RegionMetrics:
             if pixels >= LEAST_FRAME_PIXELS and frame_psnr is not None:
                 sums.frame_psnrs.append(frame_psnr)
 
-    def summary(self) -> dict[str, Any]:
-        """`gap_db` and a record per region; None where a region has too few pixels."""
-        regions = {region: self._record(sums) for region, sums in self._sums.items()}
-        return {"gap_db": gap_db(regions), **regions}
+    def summary(self) -> dict[str, dict[str, Any] | None]:
+        """A record per region; None where a region has too few pixels."""
+        return {region: self._record(sums) for region, sums in self._sums.items()}
 
     def _record(self, sums: _Sums) -> dict[str, Any] | None:
         if sums.pixels < LEAST_REGION_PIXELS:
@@ -100,6 +109,11 @@ class RegionMetrics:
             "lpips": sums.lpips / sums.pixels if self._lpips_map else None,
             "pixels": sums.pixels,
         }
+
+
+def with_gap(regions: dict[str, dict[str, Any] | None]) -> dict[str, Any]:
+    """The record of a group of held-out frames: `gap_db` before its regions."""
+    return {"gap_db": gap_db(regions), **regions}
 
 
 def gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:

@@ -40,9 +40,11 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view shows: `image` with the sky behind, `alpha` of the Gaussians, `depth` in metres or None."""
+    """What a view shows: `image` with the sky behind, `splats` without it (premultiplied by their `alpha`), `depth` in
+    metres or None."""
 
     image: Float[Tensor, "h w 3"]
+    splats: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
     depth: Float[Tensor, "h w"] | None
     info: dict[str, Any]
@@ -89,8 +91,9 @@ class SplatModel(nn.Module):
             sh_degree=shown.sh_degree if sh_degree is None else sh_degree,
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
         )  # fmt: skip
-        image, alpha = rendering.image[0], rendering.alpha[0]
+        splats, alpha = rendering.image[0], rendering.alpha[0]
+        image = splats
         if self.sky is not None:
-            image = image + (1.0 - alpha) * self.sky.colors(view.rays() if rays is None else rays)
+            image = splats + (1.0 - alpha) * self.sky.colors(view.rays() if rays is None else rays)
         depth = rendering.depth[0, ..., 0] if rendering.depth is not None else None
-        return Picture(image, alpha[..., 0], depth, rendering.info)
+        return Picture(image, splats, alpha[..., 0], depth, rendering.info)

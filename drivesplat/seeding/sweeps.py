@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Scene, Sweep
 from drivesplat.tracks import Box, box_at, moves_at_all
 
@@ -50,11 +49,7 @@ def outside_boxes(points: np.ndarray, boxes: list[Box], margin: float) -> np.nda
     """Which world points (n, 3) lie outside all boxes grown by `margin` metres on every side: (n,) bool."""
     outside = np.ones(len(points), dtype=bool)
     for box in boxes:
-        near = np.flatnonzero(
-            np.linalg.norm(points - box.object_to_world[:3, 3], axis=1) < np.linalg.norm(box.size) / 2 + 2 * margin
-        )
-        in_box = apply(inverse(box.object_to_world), points[near])
-        outside[near[(np.abs(in_box) < box.size / 2 + margin).all(axis=1)]] = False
+        outside &= ~box.holds(points, margin, floor=-margin)
     return outside
 
 

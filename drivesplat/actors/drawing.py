@@ -1,0 +1,114 @@
+"""Panels as pictures: titled, labelled, 1600 pixels wide."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from drivesplat.actors.panel import STRENGTHENED, Panel
+from drivesplat.actors.remove import RemovalPair
+from drivesplat.storage import atomic_write
+
+DPI = 100
+WIDTH = 16.0
+"""Inches."""
+LARGEST_ERROR = 0.5
+BOX = "#ffd166"
+WAY = "#4cc9f0"
+
+
+def draw_panel(panel: Panel, record: dict[str, Any], method: str) -> Figure:
+    """ground truth | render over absolute error | ghosts."""
+    title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
+    subject = record["subject"]
+    if subject is None:
+        title += f"\n{record['why_null']}"
+    else:
+        seen = "training image" if subject["split"] == "train" else f"held out: {subject['split']}"
+        title += (
+            f" ({seen})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m ahead"
+        )
+    figure, axes = _figure(panel.truth.shape, rows=2, columns=2, title=title)
+    _show(axes[0], panel.truth, "Ground truth")
+    _show(
+        axes[1], panel.render, f"Render: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}"
+    )
+    _show_error(axes[2], panel.render, panel.truth, "Absolute error, mean over the channels")
+    _show(axes[3], panel.haunted, _ghosts_in_words(record["ghosts"]))
+    if len(panel.way) > 1:
+        axes[3].plot(*_clipped(panel.way, panel.truth.shape).T, color=WAY, linewidth=2.0, alpha=0.9)
+    _outline(axes, panel.outline)
+    return figure
+
+
+def _ghosts_in_words(ghosts: dict[str, Any] | None) -> str:
+    if ghosts is None:
+        return "Ghosts: none, nothing moves"
+    if not ghosts["gaussians"]:
+        return "Ghosts: none on the vehicle's way (blue)"
+    count, mean = ghosts["gaussians"], ghosts["opacity_mean"]
+    return f"Ghosts (drawn {STRENGTHENED:g}x) along its way (blue): {count:,}, mean opacity {mean:.2f}"
+
+
+def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figure:
+    """with | without | difference."""
+    title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
+    removed = record["gaussians_removed"]
+    title += f"\n{record['why_null']}" if record["subject"] is None else f": {removed:,} Gaussians removed"
+    figure, axes = _figure(pair.with_car.shape, rows=1, columns=3, title=title)
+    _show(axes[0], pair.with_car, "With the vehicle")
+    _show(axes[1], pair.without_car, "Without it")
+    _show_error(axes[2], pair.without_car, pair.with_car, "Difference, mean over the channels")
+    _outline(axes, pair.outline)
+    return figure
+
+
+def save_figure(path: str | Path, figure: Figure) -> None:
+    """Writes a PNG. Raises ResultError naming `path` where that fails."""
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", dpi=DPI, facecolor="white")
+
+
+def _figure(shape: tuple[int, ...], rows: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
+    """A landscape figure with room for pictures of `shape` (h, w, ...), and its axes."""
+    picture_height = WIDTH / columns * shape[0] / shape[1]
+    figure = Figure(figsize=(WIDTH, rows * (picture_height + 0.35) + 0.85), dpi=DPI, layout="constrained")
+    figure.suptitle(title, fontsize=18, x=0.01, ha="left")
+    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(rows * columns)]
+    for axis in axes:
+        axis.set_axis_off()
+    return figure, axes
+
+
+def _show(axis: Axes, image: np.ndarray, title: str) -> None:
+    axis.imshow(image)
+    axis.set_title(title, loc="left", fontsize=15)
+
+
+def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) -> None:
+    error = axis.imshow(np.abs(image - truth).mean(axis=2), cmap="inferno", vmin=0.0, vmax=LARGEST_ERROR)
+    axis.set_title(title, loc="left", fontsize=15)
+    bar = axis.inset_axes((0.7, 0.12, 0.26, 0.03))
+    axis.figure.colorbar(error, cax=bar, orientation="horizontal", ticks=[0.0, LARGEST_ERROR])
+    bar.tick_params(colors="white", labelsize=11)
+
+
+def _outline(axes: list[Axes], outline: np.ndarray) -> None:
+    """Draws the box (n, 2) in continuous pixels into every picture, where there is one."""
+    for axis in axes if len(outline) else ():
+        axis.add_patch(Polygon(outline - 0.5, fill=False, edgecolor=BOX, linewidth=1.2))
+
+
+def _clipped(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A line (m, 2) of continuous pixels in an image's coordinates, NaN (a gap) outside of it."""
+    inside = ((pixels >= 0) & (pixels <= [shape[1], shape[0]])).all(axis=1)
+    return np.where(inside[:, None], pixels - 0.5, np.nan)
+
+
+def _decibels(record: dict[str, Any] | None) -> str:
+    if record is None:
+        return "none"
+    return "identical" if record["psnr"] is None else f"{record['psnr']:.1f} dB"

@@ -1,0 +1,85 @@
+"""Ghosts: the Gaussians that a static model leaves along the way of something that moved."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from drivesplat.actors.sight import Sight
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.scene import Track
+from drivesplat.settings.actor import GhostSettings
+from drivesplat.tracks import Box, box_at
+
+STEP = 0.25
+"""The box is looked at every so many metres of its way."""
+LONGEST_PAUSE = 0.25
+"""... and every so many seconds."""
+
+
+def boxes_along(track: Track, interval: float) -> list[Box]:
+    """The boxes of a track's way over the scene, in time, so close that together they fill the volume it swept.
+
+    `interval` is the scene's key-frame interval in microseconds.
+    """
+    boxes: list[Box] = []
+    start, end = int(track.timestamps[0] - interval / 2), int(track.timestamps[-1] + interval / 2)
+    time = start
+    while time <= end:
+        box = box_at(track, time, interval)
+        if box is not None:
+            boxes.append(box)
+        speed = box.speed if box is not None else 0.0
+        time += int(1e6 * min(LONGEST_PAUSE, STEP / max(speed, 1e-6)))
+    return boxes
+
+
+def swept(track: Track, interval: float, points: np.ndarray, floor: float = 0.0) -> np.ndarray:
+    """Which world points (n, 3) lie in the volume that a track's box swept, its floor raised by `floor` metres: (n,)
+    bool."""
+    inside = np.zeros(len(points), dtype=bool)
+    boxes = boxes_along(track, interval)
+    if not boxes or len(points) == 0:
+        return inside
+    corners = np.concatenate([box.corners for box in boxes])
+    near = np.flatnonzero(((points > corners.min(axis=0)) & (points < corners.max(axis=0))).all(axis=1))
+    if len(near) == 0:
+        return inside
+    tree = cKDTree(points[near])
+    for box in boxes:
+        around = near[tree.query_ball_point(box.object_to_world[:3, 3], np.linalg.norm(box.size) / 2)]
+        inside[around] |= box.holds(points[around], floor=floor)
+    return inside
+
+
+@dataclass(frozen=True)
+class Ghosts:
+    """`rows` (n,) bool: which Gaussians are ghosts of a box at one moment."""
+
+    rows: Bool[Tensor, " n"]
+
+    def figures(self, gaussians: Gaussians) -> dict[str, Any]:
+        """How many there are and how opaque: sums and means over them, None where there are none."""
+        opacities = gaussians.opacities[self.rows]
+        count = len(opacities)
+        return {
+            "gaussians": count,
+            "opacity_sum": float(opacities.sum()),
+            "opacity_mean": float(opacities.mean()) if count else None,
+            "opacity_median": float(opacities.median()) if count else None,
+        }
+
+
+def ghosts_of(sight: Sight, box: Box, settings: GhostSettings) -> Ghosts:
+    """The ghosts of what is at `box` now: Gaussians in the volume that its box swept over the scene, but outside the
+    box. Those that a model knows as the object's own are none: they go where it goes."""
+    scene, gaussians = sight.drive.scene, sight.gaussians
+    track = next(track for track in scene.tracks if track.id == box.track_id)
+    points = gaussians.means.cpu().double().numpy()
+    rows = swept(track, scene.key_frame_interval, points, settings.clearance) & ~box.holds(points)
+    own = sight.drive.model.of_track(box.track_id)
+    return Ghosts(torch.from_numpy(rows).to(own.device) & ~own)

@@ -1,0 +1,83 @@
+"""The stage `ghost_panel`: a moving vehicle as it was, as a model shows it, where that fails, and what it leaves."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.actors.ghosts import boxes_along, ghosts_of
+from drivesplat.actors.sight import Drive, Sight, colors_of
+from drivesplat.actors.subject import Subject, choose_subject, described, middle_image
+from drivesplat.evaluation.metrics import psnr_record
+from drivesplat.images import continuous_intrinsics, project, read_image
+from drivesplat.masks import read_labels
+from drivesplat.regions import region_mask
+from drivesplat.rigid import inverse
+from drivesplat.settings.actor import PanelJob
+
+SCHEMA = 1
+DIMMED = 0.3
+STRENGTHENED = 4.0
+"""Ghosts are drawn so many times more opaque than they are: faint is what they are, and they are to be seen."""
+COVERING = 0.05
+"""A pixel is called covered by ghosts where these alone are at least so opaque."""
+IN_FRONT = 0.5
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What is drawn: pictures (h, w, 3) in [0, 1], `haunted` the dimmed image under the STRENGTHENED ghosts; and in
+    continuous pixels the `outline` (n, 2) of the box and the `way` (m, 2) of its centre over the ground, both empty
+    where nothing moves."""
+
+    truth: np.ndarray
+    render: np.ndarray
+    haunted: np.ndarray
+    outline: np.ndarray
+    way: np.ndarray
+
+
+def ghost_panel(drive: Drive, masks: Path, job: PanelJob) -> tuple[Panel, dict[str, Any]]:
+    """What is drawn, and the content of ghost_panel.json, provenance aside. `masks` is the folder of the stage `masks`.
+
+    Where no vehicle moves before the camera the middle key frame is shown, and the figures of the vehicle and its
+    ghosts are None, with the reason.
+    """
+    subject = choose_subject(drive.scene, drive.parser, job.eval_camera, job.subject)
+    sight = Sight(drive, subject.index if subject else middle_image(drive.parser, job.eval_camera))
+    truth = read_image(sight.frame.image_path, sight.size) / 255.0
+    render = colors_of(sight.of().image)
+    labels = read_labels(masks, job.eval_camera, sight.frame.timestamp, sight.size)
+    record = {
+        "schema": SCHEMA,
+        "scene": drive.scene.name,
+        "key_frame": sight.frame.sample_index,
+        "subject": described(subject, drive.scene, drive.parser) if subject else None,
+        "static": psnr_record(render, truth, region_mask(labels, "static")),
+        "vehicle": psnr_record(render, truth, subject.visible) if subject else None,
+        "ghosts": None,
+        "why_null": None if subject else f"no vehicle moves before {job.eval_camera} in this scene",
+    }
+    dimmed = DIMMED * np.repeat(truth.mean(axis=2, keepdims=True), 3, axis=2)
+    if subject is None:
+        return Panel(truth, render, dimmed, np.zeros((0, 2)), np.zeros((0, 2))), record
+    ghosts = ghosts_of(sight, subject.box, job.ghosts)
+    alone = sight.of(ghosts.rows)
+    opacity = colors_of(alone.alpha)
+    record["ghosts"] = {**ghosts.figures(sight.gaussians), "covered_share": float((opacity >= COVERING).mean())}
+    own_color = colors_of(alone.splats) / np.maximum(opacity, 1e-6)[..., None]
+    shown = np.minimum(STRENGTHENED * opacity, 1.0)[..., None]
+    haunted = shown * own_color.clip(0.0, 1.0) + (1.0 - shown) * dimmed
+    return Panel(truth, render, haunted, subject.hull.polygon, _way(sight, subject)), record
+
+
+def _way(sight: Sight, subject: Subject) -> np.ndarray:
+    """Where the vehicle's way over the ground lies in the image, as far as it is in front: (m, 2) continuous pixels."""
+    track = next(track for track in sight.drive.scene.tracks if track.id == subject.box.track_id)
+    boxes = boxes_along(track, sight.drive.scene.key_frame_interval)
+    ground = np.array([box.object_to_world[:3, 3] - box.object_to_world[:3, 2] * box.size[2] / 2 for box in boxes])
+    pixels, depth = project(
+        ground, inverse(sight.frame.camera_to_world), continuous_intrinsics(sight.frame, sight.size)
+    )
+    return pixels[depth > IN_FRONT]

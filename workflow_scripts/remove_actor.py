@@ -1,0 +1,22 @@
+"""checkpoint.pt with and without a vehicle, into with_car.png, without_car.png, removal.png and removal.json."""
+
+from drivesplat.actors.drawing import draw_removal, save_figure
+from drivesplat.actors.remove import remove_actor
+from drivesplat.actors.sight import open_drive
+from drivesplat.images import write_image
+from drivesplat.job import job
+from drivesplat.parser import read_parser
+from drivesplat.scene import read_scene
+from drivesplat.settings.actor import RemovalJob
+from drivesplat.storage import write_json
+from drivesplat.training.run import read_checkpoint
+
+with job(snakemake) as current:
+    files, made = current.input, current.output
+    parser, checkpoint, scene = read_parser(files.parser), read_checkpoint(files.checkpoint), read_scene(files.scene)
+    provenance = current.provenance(parser["provenance"], checkpoint["provenance"], scene.provenance)
+    pair, record = remove_actor(open_drive(checkpoint, scene, parser, current.device()), current.settings(RemovalJob))
+    write_image(made.with_car, pair.with_car)
+    write_image(made.without_car, pair.without_car)
+    save_figure(made.triptych, draw_removal(pair, record, current.wildcards.method))
+    write_json(made.figures, {**record, "provenance": provenance})
