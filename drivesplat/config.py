@@ -35,9 +35,10 @@ DATASET_OVERRIDES = (
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
     "train": {"iterations": 1_000, "cap_max": 40_000},
+    "render": {"fps": 15, "width": 800, "height": 450},
     "device": {"min_free_gb": 1.0},
 }
-"""What makes the demo world train in minutes on a CPU."""
+"""What makes the demo world train, and its films render, in minutes on a CPU."""
 METHOD_OVERRIDES = ("sky", "train")
 
 

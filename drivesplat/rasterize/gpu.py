@@ -5,7 +5,7 @@ from typing import Any
 from gsplat import rasterization
 from torch import Tensor
 
-from drivesplat.rasterize.rendering import Rendering
+from drivesplat.rasterize.rendering import Rendering, assembled
 
 
 def rasterize_gsplat(
@@ -13,6 +13,10 @@ def rasterize_gsplat(
     width: int, height: int, *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
 ) -> Rendering:  # fmt: skip
     """See `drivesplat.rasterize.rasterize`. Needs a GPU."""
+    if len(means) == 0:  # gsplat's kernels do not start on nothing
+        shape = (len(viewmats), height, width)
+        values = colors.shape[-1] + with_depth
+        return assembled(means.new_zeros(*shape, values), means.new_zeros(*shape, 1), with_depth)
     image, alpha, info = rasterization(
         means, quats, scales, opacities, colors, viewmats, Ks, width, height,
         sh_degree=sh_degree,

@@ -31,7 +31,7 @@ class RenderSettings(Settings):
     """Height in pixels; even."""
     horizontal_fov: float | None = Field(None, gt=1, lt=170)
     """Horizontal field of view in degrees. null = the evaluated camera's own."""
-    crf: int = Field(18, ge=0, le=51)
+    crf: int = Field(18, ge=1, le=51)
     """H.264's constant rate factor: lower is better and larger, 18 is visually lossless."""
     trajectories: dict[str, TrajectorySettings] = Field(default_factory=_default_trajectories)
     """Films to make, each under a name of your choice."""

@@ -1,0 +1,17 @@
+"""checkpoint.pt along a trajectory, into an MP4 and the record of its cameras."""
+
+from pathlib import Path
+
+from drivesplat.film import render_film
+from drivesplat.job import job
+from drivesplat.scene import read_scene
+from drivesplat.settings.render import FilmJob
+from drivesplat.storage import write_json
+from drivesplat.training.run import read_checkpoint
+
+with job(snakemake) as current:
+    scene = read_scene(current.input.scene)
+    checkpoint = read_checkpoint(current.input.checkpoint)
+    provenance = current.provenance(scene.provenance, checkpoint["provenance"])
+    record = render_film(scene, checkpoint, current.settings(FilmJob), current.device(), Path(current.output.film))
+    write_json(current.output.cameras, {**record, "provenance": provenance})
