@@ -1,9 +1,14 @@
 # A recorded drive of nuScenes into 3D Gaussian splats, and what that is worth on held-out frames.
 #
 #   snakemake --cores 1 results/0103/metrics.json     one scene, every configured method
-#   snakemake --cores 4                               all scenes, and the report across them
-#   snakemake --cores 2 results/demo/metrics.json     the synthetic demo world: no dataset, no GPU
+#   snakemake --cores 4                               all scenes: metrics, films, panels, exports, and the report
+#   snakemake --cores 4 metrics                       the figures alone; `films`, `looks`, `exports` likewise
 #   snakemake --cores 1 gap_report                    the report over what has been measured
+#   snakemake --report report.zip                     all there is to look at, as a page that opens offline
+#
+# The demo world needs no dataset and no GPU:
+#   snakemake --cores 2 results/demo/metrics.json
+#   snakemake --cores 2 --configfile presets/demo.yaml -- all
 #
 # rules/ says what depends on what, workflow_scripts/ calls one library function a rule, drivesplat/ is the library.
 from snakemake.utils import min_version
@@ -14,21 +19,47 @@ min_version("9.27")
 configfile: "config.yaml"
 
 
+report: "report/workflow.rst"
+
+
 include: "rules/common.smk"
 include: "rules/demo.smk"
 include: "rules/scene.smk"
 include: "rules/train.smk"
 include: "rules/measure.smk"
+include: "rules/look.smk"
+include: "rules/export.smk"
 include: "rules/report.smk"
 
 
-rule all:
-    default_target: True
-    input:
-        expand("<results>/{scene}/metrics.json", scene=plan.config.batch_scenes),
-        "<results>/gap_report.csv",
+of_methods = expand("<results>/{scene}/{method}", scene=plan.config.batch_scenes, method=plan.config.methods)
 
 
 rule metrics:
     input:
         expand("<results>/{scene}/metrics.json", scene=plan.config.batch_scenes),
+
+
+rule films:
+    input:
+        plan.films(plan.config.batch_scenes),
+
+
+rule looks:
+    input:
+        expand("{folder}/{look}", folder=of_methods, look=["ghost_panel.png", "removal.png"]),
+
+
+rule exports:
+    input:
+        expand("{folder}/{asset}", folder=of_methods, asset=["splat.ply", "scene.usdz", "viewer.html"]),
+
+
+rule all:
+    default_target: True
+    input:
+        rules.metrics.input,
+        rules.films.input,
+        rules.looks.input,
+        rules.exports.input,
+        rules.gap_report.output,

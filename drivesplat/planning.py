@@ -117,9 +117,20 @@ class Plan:
             return self.config.batch_scenes
         return [s for s in self.config.batch_scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
 
-    def trajectories(self, scene: str) -> list[str]:
-        """The names of a scene's films."""
-        return list(for_scene(self.config, scene).render.trajectories)
+    @property
+    def all_trajectories(self) -> list[str]:
+        """The names of all films of any scene."""
+        films = (for_scene(self.config, scene).render.trajectories for scene in self.config.scenes)
+        return list(dict.fromkeys(name for trajectories in films for name in trajectories))
+
+    def films(self, scenes: list[str]) -> list[str]:
+        """The films of every method of `scenes`."""
+        return [
+            f"{self.config.results_dir}/{scene}/{method}/{trajectory}.mp4"
+            for scene in scenes
+            for method in self.config.methods
+            for trajectory in for_scene(self.config, scene).render.trajectories
+        ]
 
     def expected_stages(self) -> str:
         """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what

@@ -36,6 +36,7 @@ pathvars:
 wildcard_constraints:
     scene=plan.known(plan.config.scenes),
     method=plan.known(plan.config.methods),
+    trajectory=plan.known(plan.all_trajectories),
 
 
 onstart:

@@ -67,7 +67,13 @@ rule scene_metrics:
     input:
         evals=expand("<results>/{{scene}}/{method}/eval.json", method=plan.config.methods),
     output:
-        metrics="<results>/{scene}/metrics.json",
+        metrics=report(
+            "<results>/{scene}/metrics.json",
+            caption="../report/metrics.rst",
+            category="Scene {scene}",
+            subcategory="figures",
+            labels={"what": "metrics of all methods"},
+        ),
     log:
         "<logs>/{scene}/metrics.log",
     benchmark:

@@ -11,7 +11,12 @@ rule gap_report:
     input:
         metrics=expand("<results>/{scene}/metrics.json", scene=plan.report_scenes(asked.targets)),
     output:
-        table="<results>/gap_report.csv",
+        table=report(
+            "<results>/gap_report.csv",
+            caption="../report/gap_report.rst",
+            category="Across scenes",
+            labels={"what": "the gap, by scene and method"},
+        ),
         report="<results>/gap_report.json",
     log:
         "<logs>/gap_report.log",

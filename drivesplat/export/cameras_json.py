@@ -1,0 +1,61 @@
+"""The trajectory as cameras.json: with it, splat.ply is an asset that can be placed, played back and measured."""
+
+from typing import Any
+
+import numpy as np
+
+from drivesplat.parser import image_size
+from drivesplat.scene import Frame, Scene
+
+SCHEMA = 1
+CONVENTIONS = {
+    "world": "Metres, z up, the axes of the dataset's global frame; splat.ply is in these coordinates.",
+    "global": "A position in the dataset's global frame is its world position plus origin.",
+    "camera": "OpenCV: x right, y down, z forward, metres; pinhole without distortion.",
+    "ego": "The recording vehicle: x forward, y left, z up, on the ground under the rear axle.",
+    "K": "Continuous pixels of an image of width x height: the image's corner is (0, 0), "
+    "the first pixel's centre (0.5, 0.5).",
+    "transforms": "Matrices 4x4, row by row, applied to column vectors: world = camera_to_world camera.",
+    "timestamp": "Microseconds of the dataset's clock; each image has its own, and its poses are those at that time.",
+    "sample_index": "The key frame an image belongs to: the index of its own, else of the nearest in time.",
+    "split": "What an image was used for: train, held out for interpolation or extrapolation, "
+    "or excluded for being near to one that is held out.",
+}
+
+
+def cameras_record(scene: Scene, parser: dict[str, Any]) -> dict[str, Any]:
+    """The images of a scene as plain data in the order of `scene.frames`, of which `parser` is the training record.
+
+    Poses and `origin` keep their float64; sizes and K are those at which images are trained.
+    """
+    split_of = {int(i): split for split, images in parser["splits"].items() for i in images}
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "dataset": scene.dataset,
+        "version": scene.version,
+        "poses": scene.poses,
+        "conventions": CONVENTIONS,
+        "origin": scene.origin.tolist(),
+        "key_frame_timestamps": scene.key_frame_timestamps.tolist(),
+        "images": [
+            _image(frame, parser["image_names"][i], image_size(parser, i), parser["Ks"][i], split_of[i])
+            for i, frame in enumerate(scene.frames)
+        ],
+    }
+
+
+def _image(frame: Frame, name: str, size: tuple[int, int], K: np.ndarray, split: str) -> dict[str, Any]:
+    return {
+        "camera": frame.camera,
+        "timestamp": frame.timestamp,
+        "image": name,
+        "width": size[0],
+        "height": size[1],
+        "K": K.tolist(),
+        "camera_to_world": frame.camera_to_world.tolist(),
+        "ego_to_world": frame.ego_to_world.tolist(),
+        "is_key_frame": frame.is_key_frame,
+        "sample_index": frame.sample_index,
+        "split": split,
+    }

@@ -1,0 +1,97 @@
+"""Gaussians as splat.ply, in the layout that 3D Gaussian Splatting (Kerbl et al. 2023) saves and viewers read.
+
+One vertex a Gaussian, all float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (channel-major: every coefficient of
+red, then of green, then of blue), opacity as its logit, scale_0..2 as logarithms of metres, rot_0..3 as a unit
+quaternion w x y z. gsplat's exporter is not used: it leaves out the normals, without which SIBR reads every value
+three floats off, has no place for a note, and one bad opacity makes it drop every Gaussian.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor
+
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.storage import atomic_write, canonical_json, unreadable
+
+_NOTE = "drivesplat "
+_TINY = torch.finfo(torch.float32).tiny
+_ALMOST_ONE = 1.0 - 2.0**-24
+"""The float32 before 1: the largest opacity with a finite logit."""
+
+
+def write_splat_ply(path: str | Path, gaussians: Gaussians, note: dict[str, Any]) -> None:
+    """Writes all of `gaussians`, with `note` as JSON in a comment of the header.
+
+    Opacities of 0 and 1 become the nearest that have a finite logit, quaternions become unit ones. Keep the note below
+    some 8 kB: antimatter15's viewer looks for the end of the header in the first 10.
+    """
+    # SIBR expects "element vertex" in the header's third line: the comment stands after it, as the element's own.
+    element = PlyElement.describe(_vertices(gaussians), "vertex", comments=[_NOTE + canonical_json(note)])
+    with atomic_write(path) as file:
+        PlyData([element], byte_order="<").write(file)
+
+
+def read_splat_ply(path: str | Path) -> Gaussians:
+    """Reads what `write_splat_ply` or another program of the same convention wrote, on the CPU.
+
+    Raises ResultError naming the file where it is truncated, or lacks a property of the convention.
+    """
+    try:
+        vertices = PlyData.read(str(path))["vertex"]
+        coefficients = _coefficients([p.name for p in vertices.properties])
+        names = _property_names(coefficients)
+        columns = {name: np.asarray(vertices[name], dtype=np.float32) for name in names if name[0] != "n"}
+        if not all(np.isfinite(column).all() for column in columns.values()):
+            raise ValueError("it has values that are not finite")
+        return _gaussians(torch.from_numpy(np.stack(list(columns.values()), axis=1)), coefficients)
+    except (OSError, PlyParseError, KeyError, ValueError, TypeError) as error:
+        raise unreadable(
+            path, "export", f"not a splat in the 3DGS convention ({error or type(error).__name__})"
+        ) from error
+
+
+def _coefficients(names: list[str]) -> int:
+    """How many coefficients a channel there are beyond the first. Raises ValueError where they make no whole degree."""
+    count = sum(name.startswith("f_rest_") for name in names)
+    if count % 3 or math.isqrt(count // 3 + 1) ** 2 != count // 3 + 1:
+        raise ValueError(f"{count} f_rest properties make no degree of spherical harmonics")
+    return count // 3
+
+
+def _property_names(coefficients: int) -> list[str]:
+    """The properties in order, for Gaussians with so many coefficients a channel beyond the first."""
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(3 * coefficients)]
+    return [*names, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+def _vertices(gaussians: Gaussians) -> np.ndarray:
+    """The Gaussians (n,) as records of the convention."""
+    count, coefficients = len(gaussians), gaussians.sh.shape[1] - 1
+    names = _property_names(coefficients)
+    opacities = gaussians.opacities.double().clamp(_TINY, _ALMOST_ONE)
+    columns = [
+        gaussians.means,
+        torch.zeros(count, 3),
+        gaussians.sh[:, 0],
+        gaussians.sh[:, 1:].transpose(1, 2).reshape(count, 3 * coefficients),
+        torch.logit(opacities)[:, None],
+        torch.log(gaussians.scales.clamp_min(_TINY)),
+        torch.nn.functional.normalize(gaussians.quats, dim=-1),
+    ]
+    values = torch.cat([column.detach().cpu().float() for column in columns], dim=1)
+    return values.numpy().view([(name, "<f4") for name in names])[:, 0]
+
+
+def _gaussians(values: Float[Tensor, "n columns"], coefficients: int) -> Gaussians:
+    """The Gaussians of the columns without normals."""
+    means, sh0, rest, opacity, scales, quats = values.split([3, 3, 3 * coefficients, 1, 3, 4], dim=1)
+    shN = rest.reshape(len(values), 3, coefficients).transpose(1, 2)
+    sh = torch.cat([sh0[:, None], shN], dim=1)
+    return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacity[:, 0]), sh)

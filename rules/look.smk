@@ -1,0 +1,117 @@
+# A trained method as a person sees it: films, the ghosts of what moved, the drive without a car.
+#
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, scene.json, parser.pkl, masks/.
+# OUTPUTS: <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json; ghost_panel.png and .json;
+# with_car.png, without_car.png, removal.png and removal.json.
+
+
+rule film:
+    """
+    Drives the recorded path again, or one beside it, at the speed of the drive, and films what the model shows.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        scene="<results>/{scene}/scene.json",
+    output:
+        film=report(
+            "<results>/{scene}/{method}/{trajectory}.mp4",
+            caption="../report/film.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "film: {trajectory}"},
+        ),
+        cameras="<results>/{scene}/{method}/{trajectory}.cameras.json",
+    log:
+        "<logs>/{scene}/{method}/film_{trajectory}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/film_{trajectory}.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 8
+    resources:
+        gpu=1,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("film"),
+        code=plan.code("film"),
+    script:
+        "../workflow_scripts/film.py"
+
+
+rule ghost_panel:
+    """
+    Ground truth, render, error and ghosts of the moving vehicle that fills most pixels: what a static world makes of
+    what moves.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        scene="<results>/{scene}/scene.json",
+        parser="<results>/{scene}/parser.pkl",
+        masks="<results>/{scene}/masks/masks.json",
+    output:
+        panel=report(
+            "<results>/{scene}/{method}/ghost_panel.png",
+            caption="../report/ghost_panel.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "ghost panel"},
+        ),
+        figures="<results>/{scene}/{method}/ghost_panel.json",
+    log:
+        "<logs>/{scene}/{method}/ghost_panel.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/ghost_panel.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 4
+    resources:
+        gpu=1,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=15,
+    params:
+        settings=plan.settings("ghost_panel"),
+        code=plan.code("ghost_panel"),
+    script:
+        "../workflow_scripts/ghost_panel.py"
+
+
+rule remove_actor:
+    """
+    Takes that vehicle out of the model, by its own Gaussians where the method knows them, else by its box, and reports
+    what that leaves: holes, edges, ghosts.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        scene="<results>/{scene}/scene.json",
+        parser="<results>/{scene}/parser.pkl",
+    output:
+        with_car="<results>/{scene}/{method}/with_car.png",
+        without_car="<results>/{scene}/{method}/without_car.png",
+        triptych=report(
+            "<results>/{scene}/{method}/removal.png",
+            caption="../report/removal.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "removal of a vehicle"},
+        ),
+        figures="<results>/{scene}/{method}/removal.json",
+    log:
+        "<logs>/{scene}/{method}/remove_actor.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/remove_actor.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 4
+    resources:
+        gpu=1,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=15,
+    params:
+        settings=plan.settings("remove_actor"),
+        code=plan.code("remove_actor"),
+    script:
+        "../workflow_scripts/remove_actor.py"

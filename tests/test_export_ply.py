@@ -1,0 +1,290 @@
+"""splat.ply: the layout that viewers expect, Gaussians that return, foreign files refused; thinning."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from drivesplat.errors import ResultError
+from drivesplat.export.splat_asset import export_splat
+from drivesplat.export.splat_ply import read_splat_ply, write_splat_ply
+from drivesplat.export.thinning import thinned, thinned_parts
+from drivesplat.export.trained_parts import trained_parts
+from drivesplat.model.background import Background
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.parser import parser_dict
+from drivesplat.point_cloud import PointCloud
+from drivesplat.rasterize import rasterize
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.train import TrainJob, TrainSettings
+
+DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
+PROVENANCE = {**DIGESTS, "stages": {"train": {"settings": {"long": "x" * 20_000}}}}
+
+
+def some_gaussians(count: int = 30, sh_degree: int = 3, seed: int = 0) -> Gaussians:
+    """Gaussians two to six metres before a camera at the origin, with quaternions of any length."""
+    generator = torch.Generator().manual_seed(seed)
+    random = torch.rand(count, 8, generator=generator)
+    return Gaussians(
+        means=random[:, :3] * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 2.0]),
+        quats=torch.randn(count, 4, generator=generator) * 3.0,
+        scales=torch.exp(4.0 * random[:, 3:6] - 4.0),
+        opacities=random[:, 6],
+        sh=torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator) * 0.3,
+    )
+
+
+def checkpoint_of(params: dict[str, torch.Tensor], settings: TrainSettings) -> dict:
+    """What a training of a background with these parameters would have left."""
+    model = SplatModel([Background(params, settings.gaussians, 1.0)], None)
+    job = TrainJob(parts=("background",), sky="none", train=settings, random_seed=0)
+    state = {key: value.detach() for key, value in model.state_dict().items()}
+    return {"model": state, "job": job.model_dump_json(), "scene_scale": 1.0, "provenance": PROVENANCE}
+
+
+def trained_params(count: int, sh_degree: int) -> dict[str, torch.Tensor]:
+    """Parameters as they are optimised: logits, logarithms."""
+    shown = some_gaussians(count, sh_degree)
+    return {
+        "means": shown.means, "quats": shown.quats, "scales": torch.log(shown.scales),
+        "opacities": torch.logit(shown.opacities), "sh0": shown.sh[:, :1], "shN": shown.sh[:, 1:],
+    }  # fmt: skip
+
+
+def unit(quats: torch.Tensor) -> torch.Tensor:
+    return quats / quats.norm(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize(("sh_degree", "rest"), [(0, 0), (1, 9), (2, 24), (3, 45)])
+def test_properties_stand_in_the_order_of_the_convention_as_float32(tmp_path, sh_degree, rest):
+    write_splat_ply(tmp_path / "splat.ply", some_gaussians(sh_degree=sh_degree), {})
+    data = PlyData.read(str(tmp_path / "splat.ply"))
+    assert [element.name for element in data.elements] == ["vertex"] and not data.text and data.byte_order == "<"
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    expected += [f"f_rest_{i}" for i in range(rest)]
+    expected += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert [p.name for p in data["vertex"].properties] == expected
+    assert {p.val_dtype for p in data["vertex"].properties} == {"f4"}
+
+
+def test_the_header_is_one_that_viewers_with_simple_parsers_understand(tmp_path):
+    """SIBR takes the count from the third line; antimatter15's viewer looks at the first 10 kB."""
+    write_splat_ply(tmp_path / "splat.ply", some_gaussians(7), {"scene": "ä"})
+    content = (tmp_path / "splat.ply").read_bytes()
+    lines = content[: content.index(b"end_header\n")].decode("ascii").splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 7"]
+    notes = [line.removeprefix("comment drivesplat ") for line in lines if line.startswith("comment")]
+    assert [json.loads(note) for note in notes] == [{"scene": "ä"}]
+    assert len(content) == content.index(b"end_header\n") + len(b"end_header\n") + 7 * 62 * 4
+
+
+def test_values_are_those_before_the_activations(tmp_path):
+    shown = some_gaussians(sh_degree=2)
+    write_splat_ply(tmp_path / "splat.ply", shown, {})
+    vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([np.asarray(vertices[name], dtype=np.float64) for name in names], axis=1)
+
+    np.testing.assert_array_equal(columns("x", "y", "z"), shown.means)
+    np.testing.assert_array_equal(columns("nx", "ny", "nz"), 0.0)
+    np.testing.assert_array_equal(columns("f_dc_0", "f_dc_1", "f_dc_2"), shown.sh[:, 0])
+    np.testing.assert_allclose(1 / (1 + np.exp(-columns("opacity")[:, 0])), shown.opacities, rtol=1e-6)
+    np.testing.assert_allclose(np.exp(columns("scale_0", "scale_1", "scale_2")), shown.scales, rtol=1e-6)
+    np.testing.assert_allclose(columns("rot_0", "rot_1", "rot_2", "rot_3"), unit(shown.quats), atol=1e-6)
+
+
+def test_coefficients_stand_channel_by_channel(tmp_path):
+    """Coefficient i of channel c is 100 c + i: f_rest has red's 1 to 15, then green's, then blue's."""
+    sh = torch.arange(16.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])
+    shown = dataclasses.replace(some_gaussians(2), sh=sh.repeat(2, 1, 1))
+    write_splat_ply(tmp_path / "splat.ply", shown, {})
+    vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+    assert [float(vertices[f"f_dc_{i}"][1]) for i in range(3)] == [0.0, 100.0, 200.0]
+    expected = [*range(1, 16), *range(101, 116), *range(201, 216)]
+    assert [float(vertices[f"f_rest_{i}"][1]) for i in range(45)] == expected
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_gaussians_return(tmp_path, count, sh_degree):
+    shown = some_gaussians(count, sh_degree)
+    write_splat_ply(tmp_path / "splat.ply", shown, {})
+    again = read_splat_ply(tmp_path / "splat.ply")
+    assert torch.equal(again.means, shown.means) and torch.equal(again.sh, shown.sh)
+    torch.testing.assert_close(again.opacities, shown.opacities, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(again.scales, shown.scales, rtol=1e-6, atol=0)
+    torch.testing.assert_close(again.quats, unit(shown.quats))
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1e-30, 1e-6, 1 - 1e-6, 1 - 2**-24, 1.0])
+@pytest.mark.parametrize("scale", [0.0, 1e-20, 1e4])
+def test_extreme_opacities_and_scales_return_from_finite_values(tmp_path, opacity, scale):
+    shown = some_gaussians(3)
+    shown.opacities.fill_(opacity)
+    shown.scales.fill_(scale)
+    write_splat_ply(tmp_path / "splat.ply", shown, {})
+    vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+    assert all(np.isfinite(vertices[name]).all() for name in ("opacity", "scale_0"))
+    again = read_splat_ply(tmp_path / "splat.ply")
+    torch.testing.assert_close(again.opacities, shown.opacities, rtol=1e-5, atol=1e-37)
+    torch.testing.assert_close(again.scales, shown.scales, rtol=1e-5, atol=1e-37)
+
+
+def test_what_returns_renders_the_same_image(tmp_path):
+    shown = some_gaussians(200)
+    write_splat_ply(tmp_path / "splat.ply", shown, {})
+    K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+    images = [
+        rasterize(
+            g.means, g.quats, g.scales, g.opacities, g.sh, torch.eye(4)[None], K[None], 32, 24,
+            sh_degree=g.sh_degree, backend="cpu",
+        ).image
+        for g in (shown, read_splat_ply(tmp_path / "splat.ply"))
+    ]  # fmt: skip
+    assert float(images[0].std()) > 0.05
+    torch.testing.assert_close(images[1], images[0], rtol=0, atol=1e-4)
+
+
+def test_a_splat_truncated_anywhere_is_refused_naming_file_and_rule(tmp_path):
+    write_splat_ply(tmp_path / "whole.ply", some_gaussians(2, sh_degree=0), {"scene": "a"})
+    whole = (tmp_path / "whole.ply").read_bytes()
+    for length in range(len(whole)):
+        (tmp_path / "cut.ply").write_bytes(whole[:length])
+        with pytest.raises(ResultError, match=r"cut\.ply.*'export'"):
+            read_splat_ply(tmp_path / "cut.ply")
+
+
+def ply_of(names: list[str], kind: str = "f4", value: float = 0.0) -> PlyElement:
+    return PlyElement.describe(np.full(2, value, dtype=[(name, kind) for name in names]), "vertex")
+
+
+SH0 = [
+    "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+    "rot_0", "rot_1", "rot_2", "rot_3",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        pytest.param(ply_of(["x", "y", "z", "red", "green", "blue"]), id="a point cloud"),
+        pytest.param(ply_of([name for name in SH0 if name != "rot_3"]), id="no rot_3"),
+        pytest.param(ply_of([*SH0, "f_rest_0"]), id="one coefficient too many"),
+        pytest.param(ply_of([*SH0, *(f"f_rest_{i}" for i in range(42))]), id="no whole degree"),
+        pytest.param(ply_of([*SH0, *(f"f_rest_{i}" for i in range(1, 10))]), id="coefficients misnamed"),
+        pytest.param(ply_of(SH0, value=np.nan), id="not finite"),
+        pytest.param(PlyElement.describe(np.zeros(2, [("x", "f4")]), "face"), id="no vertices"),
+    ],
+)
+def test_a_ply_of_something_else_is_refused_naming_file_and_rule(tmp_path, element):
+    PlyData([element]).write(str(tmp_path / "foreign.ply"))
+    with pytest.raises(ResultError, match=r"foreign\.ply.*'export'"):
+        read_splat_ply(tmp_path / "foreign.ply")
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not a ply", b"\x89PNG\r\n\x1a\n"])
+def test_no_ply_at_all_is_refused_naming_file_and_rule(tmp_path, content):
+    if content is not None:
+        (tmp_path / "foreign.ply").write_bytes(content)
+    with pytest.raises(ResultError, match=r"foreign\.ply.*'export'"):
+        read_splat_ply(tmp_path / "foreign.ply")
+
+
+def test_a_splat_of_another_program_without_normals_can_be_read(tmp_path):
+    PlyData([ply_of(SH0, value=1.0)]).write(str(tmp_path / "other.ply"))
+    other = read_splat_ply(tmp_path / "other.ply")
+    assert len(other) == 2 and other.sh_degree == 0
+    torch.testing.assert_close(other.scales, torch.full((2, 3), float(np.e)))
+
+
+def test_a_splat_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultError, match=r"file/splat\.ply: cannot be written"):
+        write_splat_ply(tmp_path / "file/splat.ply", some_gaussians(), {})
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def gaussians_of(scales: list[list[float]], opacities: list[float]) -> Gaussians:
+    count = len(scales)
+    means = torch.arange(float(count))[:, None].repeat(1, 3)
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    return Gaussians(means, quats, torch.tensor(scales), torch.tensor(opacities), torch.zeros(count, 1, 3))
+
+
+def places(gaussians: Gaussians) -> list[int]:
+    """Which of `gaussians_of` these are."""
+    return gaussians.means[:, 0].int().tolist()
+
+
+@pytest.mark.parametrize(
+    ("scales", "opacities", "kept"),
+    [
+        pytest.param([[1, 1, 1]] * 4, [0.2, 0.9, 0.1, 0.8], [1, 3], id="the opaque, in their order"),
+        pytest.param([[0.5] * 3, [0.4] * 3, [0.6] * 3, [0.7] * 3], [0.5] * 4, [2, 3], id="the large"),
+        pytest.param([[1, 1, 0.1], [3, 0.2, 0.2], [0.9] * 3, [0.1, 1.2, 1]], [0.5] * 4, [0, 3], id="by cross-section"),
+        pytest.param([[1, 1, 1]] * 4, [0.5] * 4, [0, 1], id="the first among equals"),
+    ],
+)
+def test_those_stay_that_cover_most(scales, opacities, kept):
+    assert places(thinned(gaussians_of([[float(s) for s in row] for row in scales], opacities), 2)) == kept
+
+
+def test_faint_giants_do_not_crowd_out_what_is_sharp():
+    """40 giants of 100 m and an opacity of 0.05 among 60 opaque Gaussians of 5 cm."""
+    crowd = gaussians_of([[100.0] * 3] * 40 + [[0.05] * 3] * 60, [0.05] * 40 + [0.9] * 60)
+    assert places(thinned(crowd, 60)) == list(range(40, 100))
+
+
+def test_an_opaque_giant_stays():
+    assert places(thinned(gaussians_of([[0.05] * 3] * 9 + [[5.0] * 3], [0.9] * 10), 1)) == [9]
+
+
+@pytest.mark.parametrize("count", [30, 31, 10_000])
+def test_enough_room_changes_nothing(count):
+    shown = some_gaussians(30)
+    for field in dataclasses.fields(Gaussians):
+        assert torch.equal(getattr(thinned(shown, count), field.name), getattr(shown, field.name))
+
+
+def test_parts_share_the_room_by_what_covers_most():
+    parts = {"a": gaussians_of([[1.0] * 3] * 3, [0.9, 0.1, 0.8]), "b": gaussians_of([[1.0] * 3] * 3, [0.2, 0.7, 0.3])}
+    kept = thinned_parts(parts, 3)
+    assert {name: places(part) for name, part in kept.items()} == {"a": [0, 2], "b": [1]}
+    nothing = {"a": parts["a"][torch.zeros(3, dtype=torch.bool)]}
+    assert len(thinned_parts(nothing, 3)["a"]) == 0
+
+
+def test_the_stage_exports_every_gaussian_of_the_checkpoint(tmp_path, tiny_scene):
+    settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2))
+    params = trained_params(50, sh_degree=2)
+    seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
+    parser = parser_dict(tiny_scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings()))
+    splat, cameras = tmp_path / "splat.ply", tmp_path / "cameras.json"
+    export_splat(splat, cameras, checkpoint_of(params, settings), parser, tiny_scene, PROVENANCE)
+    vertices = PlyData.read(str(splat))["vertex"]
+    np.testing.assert_array_equal(vertices["y"], params["means"][:, 1])
+    np.testing.assert_allclose(vertices["opacity"], params["opacities"], atol=1e-5)
+    np.testing.assert_allclose(vertices["scale_2"], params["scales"][:, 2], atol=1e-5)
+    np.testing.assert_array_equal(vertices["f_rest_9"], params["shN"][:, 1, 1])
+    note = json.loads(vertices.comments[0].removeprefix("drivesplat "))
+    assert note == {"scene": "0001", "origin": tiny_scene.origin.tolist(), **DIGESTS}
+    assert splat.read_bytes().index(b"end_header\n") < 8_000
+    assert json.loads(cameras.read_text())["provenance"] == PROVENANCE
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_gaussians_that_are_not_finite_stay_behind(tiny_scene, name):
+    params = trained_params(10, sh_degree=1)
+    params[name][4] = torch.nan
+    settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1))
+    kept = trained_parts(checkpoint_of(params, settings), tiny_scene)["background"]
+    assert torch.equal(kept.means, torch.cat([params["means"][:4], params["means"][5:]]))

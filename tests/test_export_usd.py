@@ -1,0 +1,256 @@
+"""scene.usdz as OpenUSD reads it again: Gaussians in the schema's terms, and the camera that recorded them."""
+
+import dataclasses
+import resource
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from pxr import Gf, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
+from scipy.spatial.transform import Rotation
+
+from drivesplat.errors import DatasetError, ResultError
+from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
+from drivesplat.export.usd_asset import export_usd
+from drivesplat.images import project
+from drivesplat.model.background import Background
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.parser import parser_dict
+from drivesplat.point_cloud import PointCloud
+from drivesplat.rigid import inverse, rigid
+from drivesplat.settings.export import UsdJob
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.train import TrainJob, TrainSettings
+
+COUNT, KEPT = 60, 40
+PROVENANCE = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64, "stages": {}}
+
+
+def random_splats(count: int = COUNT, sh_degree: int = 2, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    random = torch.rand(count, 8, generator=generator)
+    quats = torch.randn(count, 4, generator=generator)
+    sh = torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator)
+    return Gaussians(20.0 * random[:, :3], quats, 0.01 + random[:, 3:6], 0.01 + 0.98 * random[:, 6], sh)
+
+
+def oblique_camera() -> tuple[np.ndarray, tuple[int, int], np.ndarray]:
+    """K with oblong pixels and its principal point off the middle, size, and a turned and moved pose."""
+    K = np.array([[310.0, 0.0, 175.5], [0.0, 290.0, 81.25], [0.0, 0.0, 1.0]])
+    turned = Rotation.from_euler("xyz", [-1.4, 0.1, 0.7]).as_matrix()
+    return K, (320, 180), rigid(turned, np.array([5.0, -3.0, 1.6]))
+
+
+@pytest.fixture(scope="module")
+def parser(tiny_scene):
+    seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
+    return parser_dict(tiny_scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings(width=48)))
+
+
+@pytest.fixture(scope="module")
+def checkpoint():
+    splats = random_splats()
+    settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2))
+    params = {
+        "means": splats.means, "quats": splats.quats, "scales": torch.log(splats.scales),
+        "opacities": torch.logit(splats.opacities), "sh0": splats.sh[:, :1], "shN": splats.sh[:, 1:],
+    }  # fmt: skip
+    model = SplatModel([Background(params, settings.gaussians, 1.0)], None)
+    job = TrainJob(parts=("background",), sky="none", train=settings, random_seed=0)
+    state = {key: value.detach() for key, value in model.state_dict().items()}
+    return {"model": state, "job": job.model_dump_json(), "scene_scale": 1.0, "provenance": PROVENANCE}
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory, checkpoint, parser, tiny_scene):
+    path = tmp_path_factory.mktemp("usd") / "scene.usdz"
+    job = UsdJob(eval_camera="CAM_FRONT", gaussians=KEPT)
+    export_usd(path, checkpoint, parser, tiny_scene, job, PROVENANCE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def stage(package):
+    return Usd.Stage.Open(str(package))
+
+
+def splat_at(stage: Usd.Stage, path: str = "/World/background") -> UsdVol.ParticleField3DGaussianSplat:
+    prim = stage.GetPrimAtPath(path)
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
+    return UsdVol.ParticleField3DGaussianSplat(prim)
+
+
+def pixels_by_usd(camera: Gf.Camera, size: tuple[int, int], points: np.ndarray) -> np.ndarray:
+    """Where the camera's frustum shows world points: (n, 2) continuous pixels."""
+    seen = camera.frustum.ComputeViewMatrix() * camera.frustum.ComputeProjectionMatrix()
+    device = np.array([seen.Transform(Gf.Vec3d(*point)) for point in points.tolist()])
+    return (device[:, :2] * [1, -1] + 1) / 2 * size
+
+
+def test_the_stage_is_in_metres_with_z_up_and_says_where_it_is_from(stage, tiny_scene):
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    note = stage.GetRootLayer().customLayerData["drivesplat"]
+    assert list(note.pop("origin")) == tiny_scene.origin.tolist()
+    digests = {name: PROVENANCE[name] for name in ("settings_sha256", "code_sha256", "inputs_sha256")}
+    assert note == {"scene": "0001", "dataset": "tiny", **digests}
+
+
+def test_the_gaussians_that_cover_most_are_there_in_linear_values(stage):
+    splats = random_splats()
+    areas = splats.scales.sort(dim=1).values[:, 1:].prod(dim=1)
+    assert float(areas.max()) < 10 * float(areas.median())
+    chosen = (splats.opacities * areas).argsort(descending=True)[:KEPT].sort().values
+    expected = splats[chosen]
+    splat = splat_at(stage)
+    np.testing.assert_array_equal(splat.GetPositionsAttr().Get(), expected.means)
+    np.testing.assert_allclose(splat.GetScalesAttr().Get(), expected.scales, rtol=1e-5)
+    np.testing.assert_allclose(splat.GetOpacitiesAttr().Get(), expected.opacities, rtol=1e-5)
+    assert splat.GetProjectionModeHintAttr().Get() == "perspective"
+    assert splat.GetSortingModeHintAttr().Get() == "zDepth"
+
+
+def test_orientations_are_unit_quaternions_that_turn_as_ours_do(stage):
+    w, x, y, z = random_splats().quats.double().numpy().T
+    turned = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).apply([1.0, 2.0, 3.0])
+    by_position = {tuple(m): t for m, t in zip(random_splats().means.tolist(), turned, strict=True)}
+    splat = splat_at(stage)
+    for position, quat in zip(splat.GetPositionsAttr().Get(), splat.GetOrientationsAttr().Get(), strict=True):
+        assert quat.GetLength() == pytest.approx(1.0, abs=1e-6)
+        np.testing.assert_allclose(quat.Transform(Gf.Vec3f(1, 2, 3)), by_position[tuple(position)], atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_coefficients_of_a_gaussian_stand_together(tmp_path, degree):
+    """Gaussian g's coefficient i in channel c is 1000 g + 10 i + c."""
+    size = (degree + 1) ** 2
+    g, i, c = torch.meshgrid(torch.arange(3.0), torch.arange(float(size)), torch.arange(3.0), indexing="ij")
+    splats = dataclasses.replace(random_splats(3), sh=1000 * g + 10 * i + c)
+    write_usdz(tmp_path / "a.usdz", splat_stage({"background": splats}, [(0.0, Gf.Camera())], {}))
+    again = Usd.Stage.Open(str(tmp_path / "a.usdz"))
+    splat = splat_at(again)
+    assert splat.GetRadianceSphericalHarmonicsDegreeAttr().Get() == degree
+    expected = [[1000 * g + 10 * i + c for c in range(3)] for g in range(3) for i in range(size)]
+    np.testing.assert_array_equal(splat.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(), expected)
+
+
+def test_the_extent_holds_three_sigmas_of_every_gaussian(stage):
+    splat = splat_at(stage)
+    low, high = np.array(splat.GetExtentAttr().Get())
+    quats = np.array([[*q.GetImaginary(), q.GetReal()] for q in splat.GetOrientationsAttr().Get()])
+    axes = Rotation.from_quat(quats).as_matrix() * np.array(splat.GetScalesAttr().Get())[:, None, :]
+    reach = 3.0 * np.linalg.norm(axes, axis=2)
+    positions = np.array(splat.GetPositionsAttr().Get())
+    assert (low <= positions - reach + 1e-5).all() and (high >= positions + reach - 1e-5).all()
+    assert (high - low < 30.0).all()
+
+
+def test_every_part_is_a_prim(tmp_path):
+    parts = {"background": random_splats(4), "car 7/x": random_splats(2, seed=1), "empty": random_splats(0)}
+    write_usdz(tmp_path / "a.usdz", splat_stage(parts, [(0.0, Gf.Camera())], {}))
+    again = Usd.Stage.Open(str(tmp_path / "a.usdz"))
+    counts = {
+        prim.GetName(): len(splat_at(again, prim.GetPath()).GetPositionsAttr().Get())
+        for prim in again.Traverse()
+        if prim.IsA(UsdVol.ParticleField)
+    }
+    assert counts == {"background": 4, "car_7_x": 2, "empty": 0}
+
+
+def test_the_camera_is_where_and_when_it_recorded(stage, tiny_scene, parser):
+    """Time codes are thirtieths of seconds since the first image; a world point falls on the pixel that K gives."""
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/camera"))
+    assert stage.GetTimeCodesPerSecond() == 30.0
+    first = min(frame.timestamp for frame in tiny_scene.frames)
+    codes = [(frame.timestamp - first) * 1e-6 * 30.0 for frame in tiny_scene.frames]
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == pytest.approx((codes[0], codes[-1]))
+    transform = camera.GetOrderedXformOps()
+    assert [op.GetOpType() for op in transform] == [UsdGeom.XformOp.TypeTransform]
+    assert transform[0].GetTimeSamples() == pytest.approx(codes)
+    for i, frame in enumerate(tiny_scene.frames):
+        at_code = camera.GetCamera(codes[i])
+        points = frame.ego_to_world[:3, 3] + np.array([[12.0, 3.0, 0.5], [20.0, -4.0, 2.0], [9.0, 0.0, 0.0]])
+        expected, _ = project(points, inverse(frame.camera_to_world), parser["Ks"][i])
+        np.testing.assert_allclose(pixels_by_usd(at_code, (48, 27), points), expected, atol=1e-4)
+        np.testing.assert_allclose(at_code.frustum.GetPosition(), frame.camera_to_world[:3, 3], atol=1e-9)
+
+
+def test_oblong_pixels_and_an_axis_off_the_middle_are_those_of_K():
+    K, size, camera_to_world = oblique_camera()
+    in_camera = np.random.default_rng(0).uniform([-2, -1, 3], [2, 1, 9], (20, 3))
+    points = in_camera @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    projected = in_camera @ K.T
+    found = pixels_by_usd(usd_camera(K, size, camera_to_world), size, points)
+    np.testing.assert_allclose(found, projected[:, :2] / projected[:, 2:], atol=1e-3)
+
+
+def test_the_lens_is_one_of_a_sensor_36_mm_wide():
+    """UsdGeom.Camera's lengths are tenths of the scene's unit, which is a metre."""
+    K, size, camera_to_world = oblique_camera()
+    camera = usd_camera(K, size, camera_to_world)
+    assert camera.horizontalAperture / 10 == pytest.approx(0.036)
+    assert camera.focalLength / 10 == pytest.approx(0.036 * 310 / 320)
+    assert camera.GetFieldOfView(Gf.Camera.FOVHorizontal) == pytest.approx(np.degrees(2 * np.arctan(160 / 310)))
+
+
+def test_the_package_is_one_binary_layer_without_the_machines_paths(package, stage):
+    with zipfile.ZipFile(package) as archive:
+        assert archive.namelist() == ["scene.usdc"]
+        assert archive.read("scene.usdc").startswith(b"PXR-USDC")
+    assert str(package.parent).encode() not in package.read_bytes()
+    _, assets, unresolved = UsdUtils.ComputeAllDependencies(str(package))
+    assert not assets and not unresolved
+    assert [path.name for path in package.parent.iterdir()] == ["scene.usdz"]
+
+
+def test_openusds_own_validators_find_nothing(stage):
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [error.GetErrorAsString() for error in errors] == []
+
+
+def test_a_package_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultError, match=r"file/scene\.usdz: cannot be written"):
+        write_usdz(tmp_path / "file/scene.usdz", splat_stage({}, [(0.0, Gf.Camera())], {}))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.fixture
+def little_room():
+    """No file may grow beyond 100 kB, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_a_disk_that_is_full_is_told_and_the_package_before_stays(tmp_path, little_room):
+    (tmp_path / "scene.usdz").write_text("the one before")
+    with pytest.raises(ResultError, match=r"scene\.usdz: cannot be written .*File too large.*; free space"):
+        write_usdz(tmp_path / "scene.usdz", splat_stage({"background": random_splats(3000)}, [(0.0, Gf.Camera())], {}))
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.usdz"]
+    assert (tmp_path / "scene.usdz").read_text() == "the one before"
+
+
+@pytest.mark.parametrize("raises", [True, False])
+def test_a_packer_that_fails_is_told_and_leaves_nothing(tmp_path, monkeypatch, raises):
+    """OpenUSD raises its own error, or only returns False."""
+    pack = UsdUtils.CreateNewUsdzPackage
+    failing = (lambda layer, _: pack(layer, "/proc/nowhere/scene.usdz")) if raises else lambda *_: False
+    monkeypatch.setattr(UsdUtils, "CreateNewUsdzPackage", failing)
+    with pytest.raises(ResultError, match=r"scene\.usdz: cannot be written"):
+        write_usdz(tmp_path / "scene.usdz", splat_stage({}, [(0.0, Gf.Camera())], {}))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_camera_that_the_scene_lacks_is_named(tmp_path, checkpoint, parser, tiny_scene):
+    job = UsdJob(eval_camera="CAM_BACK", gaussians=KEPT)
+    with pytest.raises(DatasetError, match=r"scene 0001: eval_camera CAM_BACK .*CAM_FRONT"):
+        export_usd(tmp_path / "scene.usdz", checkpoint, parser, tiny_scene, job, PROVENANCE)
+    assert not list(tmp_path.iterdir())

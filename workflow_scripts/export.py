@@ -1,0 +1,13 @@
+"""checkpoint.pt as splat.ply, in the convention of splat viewers, and cameras.json."""
+
+from drivesplat.export.splat_asset import export_splat
+from drivesplat.job import job
+from drivesplat.parser import read_parser
+from drivesplat.scene import read_scene
+from drivesplat.training.run import read_checkpoint
+
+with job(snakemake) as current:
+    scene, parser = read_scene(current.input.scene), read_parser(current.input.parser)
+    checkpoint = read_checkpoint(current.input.checkpoint)
+    provenance = current.provenance(scene.provenance, parser["provenance"], checkpoint["provenance"])
+    export_splat(current.output.splat, current.output.cameras, checkpoint, parser, scene, provenance)
