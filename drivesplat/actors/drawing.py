@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from drivesplat.actors.panel import STRENGTHENED, Panel
+from drivesplat.actors.panel import Panel
 from drivesplat.actors.remove import RemovalPair
 from drivesplat.storage import atomic_write
 
@@ -50,7 +50,8 @@ def _ghosts_in_words(ghosts: dict[str, Any] | None) -> str:
     if not ghosts["gaussians"]:
         return "Ghosts: none on the vehicle's way (blue)"
     count, mean = ghosts["gaussians"], ghosts["opacity_mean"]
-    return f"Ghosts (drawn {STRENGTHENED:g}x) along its way (blue): {count:,}, mean opacity {mean:.2f}"
+    drawn = f" (drawn {ghosts['drawn_times']:.1f}x)" if ghosts["drawn_times"] > 1.0 else ""
+    return f"Ghosts{drawn} along its way (blue): {count:,}, mean opacity {mean:.2f}"
 
 
 def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figure:
@@ -85,11 +86,13 @@ def _figure(shape: tuple[int, ...], rows: int, columns: int, title: str) -> tupl
 
 def _show(axis: Axes, image: np.ndarray, title: str) -> None:
     axis.imshow(image)
+    axis.set_autoscale_on(False)  # what is drawn over a picture may reach beyond it
     axis.set_title(title, loc="left", fontsize=15)
 
 
 def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) -> None:
     error = axis.imshow(np.abs(image - truth).mean(axis=2), cmap="inferno", vmin=0.0, vmax=LARGEST_ERROR)
+    axis.set_autoscale_on(False)
     axis.set_title(title, loc="left", fontsize=15)
     bar = axis.inset_axes((0.7, 0.12, 0.26, 0.03))
     axis.figure.colorbar(error, cax=bar, orientation="horizontal", ticks=[0.0, LARGEST_ERROR])

@@ -14,12 +14,14 @@ from drivesplat.images import continuous_intrinsics, project, read_image
 from drivesplat.masks import read_labels
 from drivesplat.regions import region_mask
 from drivesplat.rigid import inverse
-from drivesplat.settings.actor import PanelJob
+from drivesplat.settings.actor import GhostSettings, PanelJob
 
 SCHEMA = 1
 DIMMED = 0.3
-STRENGTHENED = 4.0
-"""Ghosts are drawn so many times more opaque than they are: faint is what they are, and they are to be seen."""
+LARGEST_STRENGTH = 4.0
+"""Ghosts are drawn at most so many times more opaque than they are: they are faint, and they are to be seen."""
+WELL_SEEN = 0.9
+"""The opacity at which nearly all of them should stay below."""
 COVERING = 0.05
 """A pixel is called covered by ghosts where these alone are at least so opaque."""
 IN_FRONT = 0.5
@@ -27,7 +29,7 @@ IN_FRONT = 0.5
 
 @dataclass(frozen=True)
 class Panel:
-    """What is drawn: pictures (h, w, 3) in [0, 1], `haunted` the dimmed image under the STRENGTHENED ghosts; and in
+    """What is drawn: pictures (h, w, 3) in [0, 1], `haunted` the dimmed image under the strengthened ghosts; and in
     continuous pixels the `outline` (n, 2) of the box and the `way` (m, 2) of its centre over the ground, both empty
     where nothing moves."""
 
@@ -49,27 +51,40 @@ def ghost_panel(drive: Drive, masks: Path, job: PanelJob) -> tuple[Panel, dict[s
     truth = read_image(sight.frame.image_path, sight.size) / 255.0
     render = colors_of(sight.of().image)
     labels = read_labels(masks, job.eval_camera, sight.frame.timestamp, sight.size)
+    measured = region_mask(labels, "all")
     record = {
         "schema": SCHEMA,
         "scene": drive.scene.name,
         "key_frame": sight.frame.sample_index,
         "subject": described(subject, drive.scene, drive.parser) if subject else None,
         "static": psnr_record(render, truth, region_mask(labels, "static")),
-        "vehicle": psnr_record(render, truth, subject.visible) if subject else None,
+        "vehicle": psnr_record(render, truth, subject.visible & measured) if subject else None,
         "ghosts": None,
         "why_null": None if subject else f"no vehicle moves before {job.eval_camera} in this scene",
     }
     dimmed = DIMMED * np.repeat(truth.mean(axis=2, keepdims=True), 3, axis=2)
     if subject is None:
         return Panel(truth, render, dimmed, np.zeros((0, 2)), np.zeros((0, 2))), record
-    ghosts = ghosts_of(sight, subject.box, job.ghosts)
+    haunted, record["ghosts"] = _haunting(sight, subject, dimmed, job.ghosts)
+    return Panel(truth, render, haunted, subject.hull.polygon, _way(sight, subject)), record
+
+
+def _haunting(
+    sight: Sight, subject: Subject, dimmed: np.ndarray, settings: GhostSettings
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """The ghosts in their own colours over the `dimmed` image (h, w, 3), strengthened to be seen, and their figures."""
+    ghosts = ghosts_of(sight, subject.box, settings)
     alone = sight.of(ghosts.rows)
     opacity = colors_of(alone.alpha)
-    record["ghosts"] = {**ghosts.figures(sight.gaussians), "covered_share": float((opacity >= COVERING).mean())}
+    covered = opacity >= COVERING
+    strength = 1.0
+    if covered.any():
+        strength = float(np.clip(WELL_SEEN / np.quantile(opacity[covered], 0.95), 1.0, LARGEST_STRENGTH))
     own_color = colors_of(alone.splats) / np.maximum(opacity, 1e-6)[..., None]
-    shown = np.minimum(STRENGTHENED * opacity, 1.0)[..., None]
+    shown = np.minimum(strength * opacity, 1.0)[..., None]
     haunted = shown * own_color.clip(0.0, 1.0) + (1.0 - shown) * dimmed
-    return Panel(truth, render, haunted, subject.hull.polygon, _way(sight, subject)), record
+    figures = {"covered_share": float(covered.mean()), "drawn_times": strength}
+    return haunted, {**ghosts.figures(sight.gaussians), **figures}
 
 
 def _way(sight: Sight, subject: Subject) -> np.ndarray:
