@@ -47,6 +47,20 @@ def test_a_scene_where_nothing_moves_has_no_gap():
     assert lines[0].endswith("static 27.1 dB, no moving vehicle to compare with")
 
 
+def test_what_was_measured_against_truth_is_told():
+    lateral = {"2.0": {"all": {"psnr": 21.5}, "static": {"psnr": 22.7}}}
+    removal = {"box": {"psnr": 17.0}, "outside": {"psnr": 26.2}}
+    metrics = {"methods": {"vanilla": {**method(), "lateral": lateral, "removal": removal}}}
+    lines = in_words(metrics, "m.json")
+    assert "vanilla, from 2 m to the left, against truth: static 22.7 dB" in lines
+    assert "vanilla, the car ahead removed, against truth: 17.0 dB in its box, 26.2 dB elsewhere" in lines
+
+
+def test_truth_over_too_few_pixels_is_not_spoken_of():
+    metrics = {"methods": {"vanilla": {**method(), "lateral": {"2.0": {"static": None}}, "removal": {"box": None}}}}
+    assert not any("truth" in line for line in in_words(metrics, "m.json"))
+
+
 def test_the_command_line_prints_it_and_names_a_missing_file(tmp_path):
     file = tmp_path / "metrics.json"
     command = [sys.executable, "-m", "drivesplat.evaluation.in_words", str(file)]

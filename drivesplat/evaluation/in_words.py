@@ -11,13 +11,21 @@ BETWEEN = {"interpolation": "between training frames", "extrapolation": "beyond 
 
 
 def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
-    """A sentence per method and group of held-out frames, and one that says where to look."""
+    """A sentence per method and group of held-out frames, more where there is truth, and where to look."""
     lines = []
     for name, method in metrics["methods"].items():
         for group, where in BETWEEN.items():
-            static, gap = (method[group].get(key) for key in ("static", "gap_db"))
-            if static and static.get("psnr") is not None:
-                lines.append(f"{name}, frames {where}: static {static['psnr']:.1f} dB, {_movers(method[group], gap)}")
+            gap = method[group].get("gap_db")
+            if (static := _psnr(method[group], "static")) is not None:
+                lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_movers(method[group], gap)}")
+        for metres, regions in method.get("lateral", {}).items():
+            if (static := _psnr(regions, "static")) is not None:
+                lines.append(f"{name}, from {float(metres):g} m to the left, against truth: static {static:.1f} dB")
+        box, outside = (_psnr(method.get("removal", {}), region) for region in ("box", "outside"))
+        if box is not None and outside is not None:
+            lines.append(
+                f"{name}, the car ahead removed, against truth: {box:.1f} dB in its box, {outside:.1f} dB elsewhere"
+            )
         seconds, device = method["train_seconds"], method["device"]
         lines.append(f"{name}: {method['gaussians']:,} Gaussians, trained in {seconds:.0f} s on {device}")
     folder = Path(path).parent
@@ -25,11 +33,16 @@ def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
     return lines
 
 
+def _psnr(regions: dict[str, Any], region: str) -> float | None:
+    """The PSNR of a region, None where that is null or missing."""
+    return (regions.get(region) or {}).get("psnr")
+
+
 def _movers(group: dict[str, Any], gap: float | None) -> str:
-    moving = group.get("moving_vehicle")
-    if gap is None or not moving or moving.get("psnr") is None:
+    moving = _psnr(group, "moving_vehicle")
+    if gap is None or moving is None:
         return "no moving vehicle to compare with"
-    return f"moving vehicles {moving['psnr']:.1f} dB: a gap of {gap:.1f} dB"
+    return f"moving vehicles {moving:.1f} dB: a gap of {gap:.1f} dB"
 
 
 if __name__ == "__main__":
