@@ -12,7 +12,7 @@ WORKERS ?= 2
 CORES ?= all
 
 demo: setup
-	$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json
+	$(BIN)/snakemake --cores $(CORES) --configfile presets/demo.yaml -- all
 	@$(BIN)/python -m drivesplat.evaluation.in_words results/demo/metrics.json
 
 setup:

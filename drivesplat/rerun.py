@@ -17,6 +17,7 @@ def code_digest(script: str | Path) -> str:
     """A hash of the meaning of a script and of every module of this package it imports, directly or through others.
 
     The meaning is the syntax tree without bare strings (docstrings, field comments). Imports inside functions count.
+    What lies in a package and is no Python (viewer.html's scripts) is part of it, every byte.
     """
     path = Path(script)
     modules, waiting = {}, set(_imports(path, package=""))
@@ -37,7 +38,11 @@ def _tree(path: Path) -> ast.Module:
 
 @cache
 def _meaning(path: Path) -> str:
-    return ast.unparse(_WithoutBareStrings().visit(ast.parse(path.read_text(encoding="utf-8"))))
+    code = ast.unparse(_WithoutBareStrings().visit(ast.parse(path.read_text(encoding="utf-8"))))
+    if path.name != "__init__.py":
+        return code
+    others = sorted(file for file in path.parent.iterdir() if file.is_file() and file.suffix not in (".py", ".pyc"))
+    return "\n".join([code, *(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in others)])
 
 
 class _WithoutBareStrings(ast.NodeTransformer):

@@ -93,7 +93,8 @@ def _pair(sight: Sight, subject: Subject, removal: Removal) -> RemovalPair:
 def figures(pair: RemovalPair) -> dict[str, Any]:
     """What the removal changed: nothing here is a gate, all of it is to be known.
 
-    `box`: pixels of the hull, the share that changed. `holes`: pixels that lost their surface. `edge`: mean gradient of
+    `box`: pixels of the hull, the share that changed, and how much of what they show is the sky behind all Gaussians,
+    where a learned sky may have kept the vehicle. `holes`: pixels that lost their surface. `edge`: mean gradient of
     the luminance along the hull, with and without. `outside`: PSNR between both pictures off the hull, the share that
     changed there and how far (pixels) from the hull the change reaches. `outside_footprint`: the same PSNR where no
     removed Gaussian reaches, which is to be infinite.
@@ -104,7 +105,12 @@ def figures(pair: RemovalPair) -> dict[str, Any]:
     distance = distance_transform_edt(outside)
     leaked = distance[outside & changed]
     return {
-        "box": {"pixels": int(pair.inside.sum()), "changed_share": _share(changed, pair.inside)},
+        "box": {
+            "pixels": int(pair.inside.sum()),
+            "changed_share": _share(changed, pair.inside),
+            "sky_share_with": _mean(1.0 - pair.alpha_with, pair.inside),
+            "sky_share_without": _mean(1.0 - pair.alpha_without, pair.inside),
+        },
         "holes": {"pixels": int(holes.sum()), "share_of_box": _share(holes, pair.inside)},
         "edge": _edge(pair, distance),
         "outside": {
@@ -156,6 +162,11 @@ def _nothing_to_remove(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict
     }
 
 
+def _mean(values: np.ndarray, among: np.ndarray) -> float | None:
+    """The mean of values over a mask; None for an empty one."""
+    return float(values[among].mean()) if among.any() else None
+
+
 def _share(chosen: np.ndarray, among: np.ndarray) -> float | None:
     """How much of a mask another one holds; None for an empty mask."""
-    return float((chosen & among).sum() / among.sum()) if among.any() else None
+    return _mean(chosen, among)

@@ -1,0 +1,163 @@
+"""The stage `export_viewer`: a trained model as viewer.html, one page that needs a browser and no network.
+
+The page is our own WebGL 2 in `viewer_page/`: it projects, cuts off and colours as gsplat does, spherical harmonics
+included, and shows the learned sky, without which a street's pictures lack what training has put into the sky. Nothing
+in it has an address, and its content security policy keeps the browser from fetching anything.
+
+The payload is base64 of what zlib deflated: little-endian arrays one after the other, each at a multiple of 4 bytes,
+listed in the JSON of #scene. Coefficients of spherical harmonics beyond the first are `sh_range` t |t| with t the
+stored byte over 127, finest where most of them are: near zero.
+"""
+
+import base64
+import html
+import logging
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.errors import DatasetError
+from drivesplat.export.thinning import thinned
+from drivesplat.export.trained_parts import trained_parts
+from drivesplat.export.viewer_page import filled_page
+from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.part import Sky
+from drivesplat.scene import Frame, Scene
+from drivesplat.settings.export import ViewerJob
+from drivesplat.storage import atomic_write, canonical_json
+from drivesplat.training.run import trained_model
+
+log = logging.getLogger(__name__)
+
+SKY_SIZE = 256
+"""Texels along an edge of the sky's cube map in the page."""
+
+
+def export_viewer(
+    path: str | Path,
+    checkpoint: dict[str, Any],
+    scene: Scene,
+    job: ViewerJob,
+    method: str,
+    provenance: dict[str, Any],
+) -> None:
+    """Writes the page with the `job.gaussians` of a checkpoint's content that cover most, seen from `job.eval_camera`.
+
+    Raises DatasetError where the scene has no key frame of that camera.
+    """
+    start = middle_key_frame(scene, job.eval_camera)
+    model, _ = trained_model(checkpoint)
+    gaussians = concatenate(list(trained_parts(checkpoint, scene).values()))
+    kept = thinned(gaussians, job.gaussians)
+    page = viewer_page(kept, model.sky, model.antialiased, start, f"{scene.name} · {method}", provenance)
+    with atomic_write(path) as file:
+        file.write(page.encode())
+    log.info("%d of %d Gaussians, %.1f MB", len(kept), len(gaussians), len(page) * 1e-6)
+
+
+def middle_key_frame(scene: Scene, camera: str) -> Frame:
+    """The key frame of a camera in the middle of the drive. Raises DatasetError where it has none."""
+    frames = sorted((f for f in scene.frames if f.camera == camera and f.is_key_frame), key=lambda f: f.timestamp)
+    if not frames:
+        known = ", ".join(sorted({f.camera for f in scene.frames if f.is_key_frame}))
+        raise DatasetError(
+            f"scene {scene.name}: eval_camera {camera} has no key frame; choose one of {known or 'none'}"
+        )
+    return frames[len(frames) // 2]
+
+
+def viewer_page(
+    gaussians: Gaussians, sky: Sky | None, antialiased: bool, start: Frame, title: str, provenance: dict[str, Any]
+) -> str:
+    """The page: equal inputs, equal text. Its first view is that of `start`; no sky is a black one."""
+    arrays, sh_range = splat_arrays(gaussians)
+    layout, payload = packed({**arrays, "sky": sky_faces(sky, SKY_SIZE)})
+    scene = {
+        "count": len(gaussians),
+        "coefficients": gaussians.sh.shape[1],
+        "antialiased": antialiased,
+        "sh_range": sh_range,
+        "sky_size": SKY_SIZE,
+        "start": start_pose(start),
+        "arrays": layout,
+    }
+    return filled_page(
+        title=html.escape(title),
+        provenance=_json_in_html(provenance),
+        scene=_json_in_html(scene),
+        payload=base64.b64encode(payload).decode(),
+    )
+
+
+def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
+    """The Gaussians as the page stores them, and the largest coefficient of spherical harmonics beyond the first.
+
+    `means` (n, 3) float32 and `scales` (n, 3) float16 in metres, unit `quats` (n, 4) float16, `opacities` (n,) of 255,
+    `sh0` (n, 3) float16, `shN` (n, k - 1, 3) int8.
+    """
+    shN = gaussians.sh[:, 1:].float()
+    sh_range = float(shN.abs().max()) if shN.numel() else 0.0
+    roots = torch.sign(shN) * torch.sqrt(shN.abs() / (sh_range or 1.0))
+    largest = torch.finfo(torch.float16).max
+    arrays = {
+        "means": gaussians.means.float(),
+        "scales": gaussians.scales.clamp(max=largest).half(),
+        "quats": torch.nn.functional.normalize(gaussians.quats.float(), dim=-1).half(),
+        "opacities": torch.round(gaussians.opacities * 255.0).to(torch.uint8),
+        "sh0": gaussians.sh[:, 0].clamp(-largest, largest).half(),
+        "shN": torch.round(roots * 127.0).to(torch.int8),
+    }
+    return {name: array.detach().contiguous().numpy() for name, array in arrays.items()}, sh_range
+
+
+@torch.no_grad()
+def sky_faces(sky: Sky | None, size: int) -> np.ndarray:
+    """The sky (6, size, size, 3) uint8 as OpenGL's cube map in world directions: faces +x -x +y -y +z -z."""
+    if sky is None:
+        return np.zeros((6, size, size, 3), np.uint8)
+    return torch.stack([_bytes(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
+
+
+def cube_rays(size: int) -> Float[Tensor, "6 size size 3"]:
+    """Unit directions of a cube map's texels (face, t, s), by the table of section 8.13 of the OpenGL 4.5 spec."""
+    line = (torch.arange(size) + 0.5) * (2.0 / size) - 1.0
+    t, s = torch.meshgrid(line, line, indexing="ij")
+    one = torch.ones_like(s)
+    faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
+    return torch.nn.functional.normalize(torch.stack([torch.stack(face, dim=-1) for face in faces]), dim=-1)
+
+
+def start_pose(frame: Frame) -> dict[str, Any]:
+    """The camera of a recorded frame: `K` in continuous pixels of width x height, OpenCV `camera_to_world` (4, 4)."""
+    K = frame.intrinsics.copy()
+    K[:2, 2] += 0.5  # OpenCV counts from the first pixel's centre
+    return {
+        "width": frame.width,
+        "height": frame.height,
+        "K": K.tolist(),
+        "camera_to_world": frame.camera_to_world.tolist(),
+    }
+
+
+def packed(arrays: dict[str, np.ndarray]) -> tuple[list[dict[str, Any]], bytes]:
+    """Where each array lies (bytes) with how many values, and all of them deflated."""
+    layout, content = [], bytearray()
+    for name, array in arrays.items():
+        content.extend(bytes(-len(content) % 4))
+        layout.append({"name": name, "dtype": array.dtype.name, "offset": len(content), "length": array.size})
+        content.extend(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return layout, zlib.compress(bytes(content), level=9)
+
+
+def _bytes(colors: Tensor) -> Tensor:
+    return torch.round(colors.clamp(0.0, 1.0) * 255.0).to(torch.uint8)
+
+
+def _json_in_html(value: Any) -> str:
+    """JSON that cannot end the element it stands in."""
+    return canonical_json(value).replace("<", "\\u003c")

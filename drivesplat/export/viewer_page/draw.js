@@ -1,0 +1,123 @@
+// The splat and its sky on the graphics card: textures from the page's arrays, and the drawing of one view.
+
+const NEAR = 0.01; // metres: gsplat's near plane
+const TEXTURE_WIDTH = 4096;
+
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+  }
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) {
+    throw new Error(`the shaders do not link (${gl.getProgramInfoLog(made)})`);
+  }
+  const uniforms = {};
+  for (let i = 0; i < gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS); i++) {
+    const { name } = gl.getActiveUniform(made, i);
+    uniforms[name] = gl.getUniformLocation(made, name);
+  }
+  return { made, uniforms };
+}
+
+// Rows of `channels` values as texels, TEXTURE_WIDTH to a line.
+function valueTexture(gl, unit, values, channels, [internal, format, type]) {
+  const texels = values.length / channels;
+  const width = Math.max(1, Math.min(TEXTURE_WIDTH, texels));
+  const height = Math.max(1, Math.ceil(texels / width));
+  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+    throw new Error("this graphics card cannot hold so many Gaussians; set export.viewer_gaussians lower");
+  }
+  const padded = new values.constructor(width * height * channels);
+  padded.set(values);
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+  gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, padded);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+}
+
+function skyTexture(gl, unit, texels, size) {
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.bindTexture(gl.TEXTURE_CUBE_MAP, gl.createTexture());
+  for (let face = 0; face < 6; face++) {
+    const pixels = texels.subarray(face * size * size * 3, (face + 1) * size * size * 3);
+    const target = gl.TEXTURE_CUBE_MAP_POSITIVE_X + face;
+    gl.texImage2D(target, 0, gl.RGB8, size, size, 0, gl.RGB, gl.UNSIGNED_BYTE, pixels);
+  }
+  gl.texParameteri(gl.TEXTURE_CUBE_MAP, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+}
+
+// The arrays of the page as textures, each on the unit at which the shaders look for it.
+function uploadTextures(gl, arrays, skySize, uniforms) {
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  const formats = {
+    means: [3, [gl.RGB32F, gl.RGB, gl.FLOAT]],
+    scales: [3, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT]],
+    quats: [4, [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT]],
+    opacities: [1, [gl.R8, gl.RED, gl.UNSIGNED_BYTE]],
+    sh0: [3, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT]],
+    shN: [3, [gl.RGB8_SNORM, gl.RGB, gl.BYTE]],
+  };
+  Object.entries(formats).forEach(([name, [channels, format]], unit) => {
+    valueTexture(gl, unit, arrays[name], channels, format);
+    gl.uniform1i(uniforms[name], unit);
+  });
+  skyTexture(gl, Object.keys(formats).length, arrays.sky, skySize);
+  return Object.keys(formats).length;
+}
+
+// Two triangles over [-1, 1]², and for every instance which Gaussian it is.
+function geometry(gl) {
+  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
+  gl.enableVertexAttribArray(0);
+  gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+  const indices = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, indices);
+  gl.enableVertexAttribArray(1);
+  gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
+  gl.vertexAttribDivisor(1, 1);
+}
+
+function setCamera(gl, { made, uniforms }, rotation, position, { focal, center }, size) {
+  gl.useProgram(made);
+  gl.uniformMatrix3fv(uniforms.cameraToWorld, true, rotation.flat());
+  if (uniforms.position) gl.uniform3fv(uniforms.position, position);
+  gl.uniform2fv(uniforms.focal, focal);
+  gl.uniform2fv(uniforms.center, center);
+  gl.uniform2fv(uniforms.size, size);
+}
+
+// Returns draw(view): the sky, then the Gaussians over it, far to near. Throws where the browser has no WebGL 2.
+function painter(canvas, scene, arrays) {
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+  if (!gl) throw new Error("this browser has no WebGL 2; update it, or allow it to use the graphics card");
+  const [sky, splat] = [program(gl, SKY_VERTEX, SKY_FRAGMENT), program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT)];
+  gl.useProgram(splat.made);
+  const skyUnit = uploadTextures(gl, arrays, scene.sky_size, splat.uniforms);
+  gl.uniform1f(splat.uniforms.shRange, scene.sh_range);
+  gl.uniform1i(splat.uniforms.coefficients, scene.coefficients);
+  gl.uniform1i(splat.uniforms.antialiased, scene.antialiased);
+  gl.useProgram(sky.made);
+  gl.uniform1i(sky.uniforms.sky, skyUnit);
+  geometry(gl);
+  gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  const order = depthOrder(arrays.means, NEAR);
+  return (view) => {
+    const size = [canvas.width, canvas.height];
+    const [rotation, lens] = [rotationOf(view), pinhole(scene.start, ...size)];
+    const shown = order(rotation.map((row) => row[2]), view.position);
+    gl.bufferData(gl.ARRAY_BUFFER, shown, gl.DYNAMIC_DRAW);
+    gl.viewport(0, 0, ...size);
+    gl.disable(gl.BLEND);
+    setCamera(gl, sky, rotation, view.position, lens, size);
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    gl.enable(gl.BLEND);
+    setCamera(gl, splat, rotation, view.position, lens, size);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, shown.length);
+  };
+}

@@ -1,0 +1,13 @@
+"""checkpoint.pt as viewer.html: one page that shows the splat under a mouse."""
+
+from drivesplat.export.viewer import export_viewer
+from drivesplat.job import job
+from drivesplat.scene import read_scene
+from drivesplat.settings.export import ViewerJob
+from drivesplat.training.run import read_checkpoint
+
+with job(snakemake) as current:
+    scene, checkpoint = read_scene(current.input.scene), read_checkpoint(current.input.checkpoint)
+    provenance = current.provenance(scene.provenance, checkpoint["provenance"])
+    settings, method = current.settings(ViewerJob), current.wildcards.method
+    export_viewer(current.output.viewer, checkpoint, scene, settings, method, provenance)
