@@ -141,12 +141,84 @@ def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
 
 def test_a_scene_without_vehicles_gets_nulls(tmp_path):
     copy = WorkflowCopy.make(tmp_path / "workflow", World(things=[]), train=TINY_TRAINING | {"iterations": 20})
-    done = copy.run("results/0001/metrics.json")
+    done = copy.run("results/0001/metrics.json", "looks")
     assert done.returncode == 0, done.stdout
     result = copy.read("results/0001/metrics.json")["methods"]["vanilla"]["extrapolation"]
     assert result["vehicle"] is None and result["moving_vehicle"] is None and result["gap_db"] is None
     assert result["static"]["psnr"] == result["all"]["psnr"]
     assert "NaN" not in (copy.folder / "results/0001/metrics.json").read_text()
+    for name in ("ghost_panel", "removal"):
+        figures = copy.read(f"results/0001/vanilla/{name}.json")
+        assert figures["subject"] is figures["ghosts"] is None and "no vehicle moves" in figures["why_null"]
+        assert "NaN" not in (copy.folder / f"results/0001/vanilla/{name}.json").read_text()
+    with_car, without_car = (copy.folder / f"results/0001/vanilla/{name}_car.png" for name in ("with", "without"))
+    assert with_car.read_bytes() == without_car.read_bytes()
+
+
+FFMPEG_THAT_DIES = "#!/bin/sh\nhead -c 10000 > /dev/null\necho 'x264: no space for a reference frame' >&2\nexit 3\n"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> WorkflowCopy:
+    """A finished training, to be looked at."""
+    copy = WorkflowCopy.make(tmp_path_factory.mktemp("trained"), train=TINY_TRAINING | {"iterations": 20})
+    done = copy.run("results/0001/vanilla/train.json")
+    assert done.returncode == 0, done.stdout
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("ffmpeg", "words"),
+    [(None, ["cannot be started"]), (FFMPEG_THAT_DIES, ["exit status 3", "x264: no space for a reference frame"])],
+    ids=["absent", "dying"],
+)
+def test_an_ffmpeg_that_is_absent_or_dies_is_named_and_leaves_no_half_film(trained, monkeypatch, ffmpeg, words):
+    program = trained.folder / "ffmpeg"
+    program.unlink(missing_ok=True)
+    if ffmpeg:
+        program.write_text(ffmpeg)
+        program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    line = told(trained.run("results/0001/vanilla/original.mp4"))
+    assert all(word in line for word in ["results/0001/vanilla/original.mp4", "ffmpeg", *words]), line
+    assert not list(trained.folder.glob("results/0001/vanilla/*original*"))
+
+
+@pytest.mark.parametrize(
+    ("script", "name"),
+    [
+        ("film", "original.mp4"),
+        ("ghost_panel", "ghost_panel.png"),
+        ("remove_actor", "with_car.png"),
+        ("export", "splat.ply"),
+        ("export_usd", "scene.usdz"),
+        ("export_viewer", "viewer.html"),
+    ],
+)
+def test_a_full_disk_stops_a_look_and_names_the_file(trained, script, name):
+    """A limit on the size of the job's files stands in for a disk without room: the same write fails the same way."""
+    path = trained.folder / f"workflow_scripts/{script}.py"
+    whole, folder = path.read_text(), trained.folder / "results/0001/vanilla"
+    before = {file.name for file in folder.iterdir()}
+    limit = f"import resource\n\nresource.setrlimit(resource.RLIMIT_FSIZE, ({LARGEST_FILE}, {LARGEST_FILE}))\n"
+    path.write_text(limit + whole)
+    try:
+        line = told(trained.run(f"results/0001/vanilla/{name}"))
+    finally:
+        path.write_text(whole)
+    assert f"results/0001/vanilla/{name}: " in line
+    assert {file.name for file in folder.iterdir()} == before
+
+
+LARGEST_FILE = 2500
+"""Bytes: less than any of these files has, more than a log takes."""
+
+
+def test_a_results_folder_that_cannot_be_written_is_named(trained, tmp_path):
+    other = WorkflowCopy(trained.folder, trained.config)
+    (tmp_path / "results").write_text("a file")
+    done = other.run("results/0001/vanilla/splat.ply", flags=("--config", f"results_dir={tmp_path}/results/in"))
+    assert done.returncode != 0 and f"{tmp_path}/results" in done.stdout and "Traceback" not in done.stdout, done.stdout
 
 
 def test_a_second_run_in_one_folder_is_refused(copy):

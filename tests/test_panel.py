@@ -39,6 +39,8 @@ HELD_OUT = 2
 """A key frame of the group interpolation."""
 GHOST_AT = np.array([8.6, 1.2, 0.9])
 """Where the car was: 3.04 m before the camera at key frame HELD_OUT, 1.2 m nearer than the car is."""
+OWN_CAR_FROM = 44
+"""The row below which the own car's body hides what is in the image, the lower rows of the other car's box as well."""
 ROAD_AT = np.array([9.0, -2.5, 0.5])
 """Beside the car's way."""
 
@@ -69,9 +71,9 @@ def drive_of(scene: Scene, places=(GHOST_AT, ROAD_AT), opacities=0.6, colors=(0.
 
 @pytest.fixture(scope="module")
 def masks(tiny_scene, tmp_path_factory) -> Path:
-    """Label images, the same for every frame: the upper rows left out, a column of the own car's body, static."""
+    """Label images, the same for every frame: the upper rows left out, the lowest the own car's body, static."""
     labels = np.full((54, 96), LABELS["static"], dtype=np.uint8)
-    labels[:10], labels[:, :7] = LABELS["left_out"], LABELS["own_car"]
+    labels[:10], labels[OWN_CAR_FROM:] = LABELS["left_out"], LABELS["own_car"]
     folder = tmp_path_factory.mktemp("masks")
     (folder / "regions" / "CAM_FRONT").mkdir(parents=True)
     for frame in tiny_scene.frames:
@@ -119,7 +121,7 @@ def test_the_render_is_the_models(haunted):
 def test_psnr_of_vehicle_and_static_pixels_is_skimages(haunted, masks):
     panel, record, _ = haunted
     static = np.zeros((54, 96), dtype=bool)
-    static[10:, 7:] = True
+    static[10:OWN_CAR_FROM] = True
     assert record["static"]["psnr"] == pytest.approx(
         peak_signal_noise_ratio(panel.truth[static], panel.render[static], data_range=1.0)
     )
@@ -127,10 +129,12 @@ def test_psnr_of_vehicle_and_static_pixels_is_skimages(haunted, masks):
     box = np.zeros((54, 96), dtype=bool)
     (left, top), (right, bottom) = np.ceil(near_face(HELD_OUT) - 0.5).astype(int)
     box[top:bottom, left:right] = True
+    assert record["subject"]["pixels"] == box.sum() and bottom > OWN_CAR_FROM
+    box[OWN_CAR_FROM:] = False
     assert record["vehicle"]["psnr"] == pytest.approx(
         peak_signal_noise_ratio(panel.truth[box], panel.render[box], data_range=1.0)
     )
-    assert record["vehicle"]["pixels"] == record["subject"]["pixels"] == box.sum()
+    assert record["vehicle"]["pixels"] == box.sum()
 
 
 def near_face(key_frame: int) -> np.ndarray:
@@ -183,7 +187,7 @@ def test_haunted_is_the_dimmed_image_but_for_the_ghost(haunted):
 
 
 def test_a_ghost_is_drawn_in_its_own_colour_and_stronger_than_it_is(tiny_scene, masks):
-    """Opacity 0.1 at the centre's pixel, drawn four times as strong."""
+    """Opacity 0.1 at the centre's pixel, drawn four times as strong: the most there is."""
     drive = drive_of(one_car(tiny_scene), places=[GHOST_AT], opacities=0.1, colors=(0.9, 0.1, 0.2))
     panel, record = ghost_panel(drive, masks, job_of())
     column, row = np.floor(seen_at(drive, HELD_OUT, GHOST_AT[None])[0][0]).astype(int)
@@ -191,6 +195,18 @@ def test_a_ghost_is_drawn_in_its_own_colour_and_stronger_than_it_is(tiny_scene, 
     expected = 0.4 * np.array([0.9, 0.1, 0.2]) + 0.6 * dimmed
     np.testing.assert_allclose(panel.haunted[row, column], expected, atol=0.02)
     assert record["ghosts"]["opacity_mean"] == pytest.approx(0.1, abs=1e-6)
+    assert record["ghosts"]["drawn_times"] == 4.0
+
+
+@pytest.mark.parametrize("opacity", [0.3, 0.6, 0.99])
+def test_ghosts_are_strengthened_until_nearly_all_stay_below_nine_tenths(tiny_scene, masks, opacity):
+    panel, record = ghost_panel(drive_of(one_car(tiny_scene), places=[GHOST_AT], opacities=opacity), masks, job_of())
+    pixel, depth = seen_at(drive_of(one_car(tiny_scene)), HELD_OUT, GHOST_AT[None])
+    x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
+    distance = np.hypot(x - pixel[0, 0], y - pixel[0, 1])
+    profile = opacity * np.exp(-0.5 * distance**2 / ((59.52 * 0.1 / depth[0]) ** 2 + 0.3))
+    strength = 0.9 / np.quantile(profile[profile >= 0.05], 0.95)
+    assert record["ghosts"]["drawn_times"] == pytest.approx(np.clip(strength, 1.0, 4.0), rel=0.08)
 
 
 def test_the_covered_share_is_that_of_the_ghosts_alone(haunted):
@@ -283,6 +299,14 @@ def test_outline_and_way_are_drawn_where_they_lie_in_the_image(haunted):
     inside = ((panel.way >= 0) & (panel.way <= [96, 54])).all(axis=1)
     np.testing.assert_allclose(drawn[inside], panel.way[inside] - 0.5)
     assert np.isnan(drawn[~inside]).all() and inside.any() and not inside.all()
+
+
+def test_what_is_drawn_over_a_picture_does_not_shrink_it(haunted):
+    """Way and box may reach far beyond the image."""
+    panel, record, _ = haunted
+    beyond = dataclasses.replace(panel, outline=panel.outline * 5.0 - 200.0)
+    for axis in draw_panel(beyond, record, "vanilla").axes:
+        assert axis.get_xlim() == (-0.5, 95.5) and axis.get_ylim() == (53.5, -0.5)
 
 
 def test_a_training_image_is_called_one(tiny_scene, masks):

@@ -287,7 +287,8 @@ def pair_of(seed: int = 0, **changes) -> RemovalPair:
 def test_changed_shares_and_reach_of_a_pair_made_by_hand():
     """The hull is columns 10 to 23 and rows 8 to 19; columns 24 to 28 of the block lie outside."""
     found = figures(pair_of())
-    assert found["box"] == {"pixels": 14 * 12, "changed_share": pytest.approx(4 * 4 / (14 * 12))}
+    assert found["box"]["pixels"] == 14 * 12
+    assert found["box"]["changed_share"] == pytest.approx(4 * 4 / (14 * 12))
     assert found["outside"]["changed_share"] == pytest.approx(4 * 5 / (HEIGHT * WIDTH - 14 * 12))
     assert found["outside"]["reach_px"] == pytest.approx(5.0)
     error = 4 * 5 * 0.2**2 / 3 / (HEIGHT * WIDTH - 14 * 12)
@@ -323,6 +324,13 @@ def test_holes_are_pixels_that_lose_their_surface():
     found = figures(pair_of(alpha_with=alpha, alpha_without=after))["holes"]
     assert found["pixels"] == 9
     assert found["share_of_box"] == pytest.approx(8 / 168)
+
+
+def test_the_skys_share_of_the_box_is_what_the_gaussians_leave_there():
+    """Opacity 0.9 everywhere; nine pixels of the hull fall to 0.3."""
+    found = figures(pair_of())["box"]
+    assert found["sky_share_with"] == pytest.approx(0.1)
+    assert found["sky_share_without"] == pytest.approx((9 * 0.7 + (168 - 9) * 0.1) / 168)
 
 
 def gradient(image: np.ndarray) -> np.ndarray:

@@ -381,10 +381,9 @@ def test_a_truth_that_is_none_is_refused_naming_file_and_rule(known, tmp_path, h
 @pytest.mark.xfail(
     strict=True, reason="values are not looked at: a pose that is none fails later, without the file's name"
 )
-@pytest.mark.parametrize("pose", ["nonsense", [[1.0, 0.0]], None])
-def test_a_truth_whose_poses_are_none_is_refused_naming_file_and_rule(known, tmp_path, pose):
+def test_a_truth_whose_poses_are_none_is_refused_naming_file_and_rule(known, tmp_path):
     content = good(known)
-    content["frames"][0]["lateral_camera_to_global"] = pose
+    content["frames"][0]["lateral_camera_to_global"] = [[1.0, 0.0]]
     path = tmp_path / "truth.json"
     path.write_text(json.dumps(content))
     with pytest.raises(ResultError, match="demo_world"):

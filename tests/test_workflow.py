@@ -1,7 +1,11 @@
 """The whole DAG on a tiny world, as users run it."""
 
 import math
+import subprocess
+import zipfile
+from pathlib import Path
 
+import numpy as np
 import pytest
 from workflow_copy import WorkflowCopy
 
@@ -60,11 +64,62 @@ def test_the_report_has_a_row_per_scene_and_method(finished):
 
 def test_what_a_training_leaves_behind(finished):
     folder = finished.folder / "results/0001/vanilla"
-    assert {"checkpoint.pt", "train.json", "eval.json", "tensorboard"} == {path.name for path in folder.iterdir()}
+    trained = {"checkpoint.pt", "train.json", "eval.json", "tensorboard"}
+    films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
+    looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
+    exports = {"splat.ply", "cameras.json", "scene.usdz", "viewer.html"}
+    assert trained | films | looks | exports == {path.name for path in folder.iterdir()}
     assert list((folder / "tensorboard").glob("events.*"))
 
 
-TRAINING_AND_AFTER = {"train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1}
+def test_a_film_lasts_as_long_as_the_drive_and_runs_beside_it(finished):
+    drive = finished.read("results/0001/scene.json")
+    times = [frame["timestamp"] for frame in drive["frames"]]
+    recorded, beside = (
+        finished.read(f"results/0001/vanilla/{film}.cameras.json") for film in ("original", "lateral_2m")
+    )
+    assert abs(recorded["duration_s"] - (max(times) - min(times)) * 1e-6) <= 1 / recorded["fps"]
+    assert (recorded["width"], recorded["height"], recorded["fps"]) == (64, 36, 4)
+    centers = [np.array(film["camera_to_world"])[:, :3, 3] for film in (recorded, beside)]
+    left = np.array(drive["frames"][0]["ego_to_world"])[:3, 1]  # the tiny drive goes straight on
+    np.testing.assert_allclose(centers[1] - centers[0], np.tile(2.0 * left, (recorded["frames"], 1)), atol=1e-6)
+
+
+def test_the_vehicle_looked_at_is_the_one_removed(finished):
+    panel, removal = (finished.read(f"results/0001/vanilla/{name}.json") for name in ("ghost_panel", "removal"))
+    assert panel["subject"] == removal["subject"] and panel["subject"]["category"] == "vehicle.car"
+    assert removal["removed_by"] == "box"
+    kept = removal["outside_footprint"]
+    assert kept.get("identical") or kept["psnr"] >= 90.0
+
+
+def test_every_result_remembers_where_it_came_from(finished):
+    for name in ("original.cameras.json", "ghost_panel.json", "removal.json", "cameras.json", "eval.json"):
+        stages = finished.read(f"results/0001/vanilla/{name}")["provenance"]["stages"]
+        assert {"extract", "vanilla/train"} < stages.keys(), name
+
+
+def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
+    command = finished.command("--report", "report.zip")
+    done = subprocess.run(command, cwd=finished.folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(finished.folder / "report.zip") as report:
+        names = {Path(name).name for name in report.namelist()}
+        page = report.read("report/report.html").decode()
+    pictures = {"ghost_panel.png", "removal.png", "original.mp4", "lateral_2m.mp4", "metrics.json", "gap_report.csv"}
+    assert pictures < names
+    assert "Scene 0001" in page and "Across scenes" in page and "the moving vehicle that fills most pixels" in page
+
+
+FILMS_AND_LOOKS = {"film": 4, "ghost_panel": 2, "remove_actor": 2}
+EXPORTS = {"export": 2, "export_usd": 2, "export_viewer": 2}
+TRAINING_AND_AFTER = {
+    "train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1, **FILMS_AND_LOOKS, **EXPORTS
+}  # fmt: skip
+ONE_TRAINING_AND_AFTER = {
+    "train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1, "film": 2, "ghost_panel": 1, "remove_actor": 1,
+    "export": 1, "export_usd": 1, "export_viewer": 1,
+}  # fmt: skip
 EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, **TRAINING_AND_AFTER}
 
 
@@ -74,16 +129,19 @@ EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, **TRAINING
         ({}, {}),
         ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
         ({"methods": {"plain": {"overrides": {"sky": "mask", "train": {"strategy": "default"}}}}},
-         {"train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1}),
+         ONE_TRAINING_AND_AFTER),
         ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, **TRAINING_AND_AFTER}),
         ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
          {"masks": 1, **TRAINING_AND_AFTER}),
         ({"holdout": {"last_block": 3}}, {"lidar_seed": 1, "parser": 1, **TRAINING_AND_AFTER}),
         ({"extract": {"on_missing": "warn"}}, EVERYTHING),
-        ({"render": {"fps": 60}}, {}),
+        ({"render": {"fps": 5}}, {"film": 4}),
+        ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2}),
+        ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2}),
+        ({"export": {"viewer_gaussians": 100}}, {"export_viewer": 2}),
         ({"device": {"kind": "cpu", "min_free_gb": 1}}, {}),
         ({"lpips": {"enabled": False, "timeout_s": 3}}, {}),
-        ({"methods": {"third": {}}}, {"train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1}),
+        ({"methods": {"third": {}}}, ONE_TRAINING_AND_AFTER),
     ],
 )  # fmt: skip
 def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, setting, expected):
@@ -123,7 +181,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
     ("file", "old", "new", "expected"),
     [
         ("drivesplat/evaluation/metrics.py", "LEAST_FRAME_PIXELS = 100", "LEAST_FRAME_PIXELS = 90",
-         {"evaluate": 2, "scene_metrics": 1, "gap_report": 1}),
+         {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2, "remove_actor": 2}),
         ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
         ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71", {"masks": 1, **TRAINING_AND_AFTER}),
         ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
@@ -131,6 +189,8 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
         ("drivesplat/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING | {"extract": 0}),
         ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
+        ("drivesplat/video.py", "bicubic", "bilinear", {"film": 4}),
+        ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report.py", "SCHEMA = 1", "SCHEMA = 2", {"gap_report": 1}),
     ],
 )  # fmt: skip

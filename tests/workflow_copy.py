@@ -20,7 +20,9 @@ PARTS = (
     "config.schema.json",
     "drivesplat",
     "envs",
+    "presets",
     "profiles",
+    "report",
     "rules",
     "workflow_scripts",
 )
@@ -57,6 +59,7 @@ class WorkflowCopy:
             "datasets": {"nuscenes": {"dataroot": "data", "scenes": list(world.scenes)}},
             "lidar_seed": {"max_points": 500, "far_points": 100},
             "train": TINY_TRAINING,
+            "render": {"width": 64, "height": 36, "fps": 4},
             "lpips": {"enabled": False},
             "device": "cpu",
         }
