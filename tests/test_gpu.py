@@ -25,8 +25,10 @@ from test_training import (
 
 from drivesplat.device import choose_device
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
+from drivesplat.film import film_frame
 from drivesplat.model.background import Background
-from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.sky import ConstantSky
+from drivesplat.model.splat_model import SplatModel, View
 from drivesplat.rasterize import rasterize
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
@@ -108,6 +110,44 @@ def test_nothing_in_view_is_zeros_and_finite_gradients():
     assert all((seen == 0).all() for seen in (rendering.image, rendering.alpha, rendering.depth))
     (rendering.image.sum() + rendering.depth.sum()).backward()
     assert all(torch.isfinite(scene[name].grad).all() for name in INPUTS)
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_no_gaussians_at_all_show_nothing(with_depth):
+    scene = {name: tensor.to(GPU).float() for name, tensor in random_scene(count=5).items()}
+    none = [scene[name][:0] for name in INPUTS]
+    rendering = rasterize(*none, scene["viewmats"], scene["Ks"], WIDTH, HEIGHT, sh_degree=3, with_depth=with_depth)
+    assert rendering.image.shape == (2, HEIGHT, WIDTH, 3) and rendering.alpha.shape == (2, HEIGHT, WIDTH, 1)
+    assert not rendering.image.any() and not rendering.alpha.any() and (rendering.depth is not None) == with_depth
+
+
+def test_a_films_frame_and_a_removal_are_those_of_the_cpu():
+    """The card shows what the CPU shows, and where no removed Gaussian reaches both of its pictures are equal."""
+    scene = random_scene()
+    background = Background(
+        {
+            "means": scene["means"], "quats": scene["quats"], "scales": scene["scales"].log(),
+            "opacities": torch.logit(scene["opacities"].clamp(max=0.999)), "sh0": scene["colors"][:, :1],
+            "shN": scene["colors"][:, 1:],
+        },
+        GaussianSettings(), 1.0,
+    ).float()  # fmt: skip
+    model = SplatModel([background], ConstantSky(torch.full((3,), 0.6), 0.01))
+    view = View(scene["Ks"][0].float(), torch.eye(4), WIDTH, HEIGHT, 0.0)
+    on_gpu = View(view.K.to(GPU), view.camera_to_world.to(GPU), WIDTH, HEIGHT, 0.0)
+    on_cpu_frame = film_frame(model, view).astype(int)
+    model = model.to(GPU)
+    assert np.percentile(np.abs(film_frame(model, on_gpu) - on_cpu_frame), 99) <= 1
+    with torch.no_grad():
+        gaussians = model.gaussians_at(0.0)
+        removed = (gaussians.means[:, 0] < 0) & (gaussians.means[:, 2] < 4)
+        before, after, alone = (
+            model.render(on_gpu, gaussians=some) for some in (gaussians, gaussians[~removed], gaussians[removed])
+        )
+    untouched = alone.alpha == 0.0
+    assert 0.0 < untouched.float().mean() < 1.0
+    assert torch.equal(before.image[untouched], after.image[untouched])
+    assert not torch.equal(before.image, after.image)
 
 
 def test_relocation_is_gsplats():
