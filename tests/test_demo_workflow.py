@@ -45,6 +45,14 @@ def test_metrics_come_from_nothing_on_the_cpu(finished):
     assert finished.read("results/demo/vanilla/train.json")["device"].startswith("cpu")
 
 
+def test_what_only_a_synthetic_world_knows_is_measured_too(finished):
+    result = finished.read(TARGET)["methods"]["vanilla"]
+    assert set(result["lateral"]) == {"2.0"} and set(result["lateral"]["2.0"]) == {"all", "static"}
+    assert result["lateral"]["2.0"]["all"]["pixels"] == 6 * 128 * 72
+    assert result["lateral"]["2.0"]["static"]["psnr"] > 8.0
+    assert set(result["removal"]) == {"box", "outside"} and result["removal"]["outside"]["psnr"] > 8.0
+
+
 def test_the_world_and_its_truth_lie_at_the_dataroot(finished):
     root = finished.folder / "resources/demo"
     assert {path.name for path in root.iterdir()} == {

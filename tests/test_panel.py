@@ -200,7 +200,7 @@ def test_a_ghost_is_drawn_in_its_own_colour_and_stronger_than_it_is(tiny_scene, 
 
 @pytest.mark.parametrize("opacity", [0.3, 0.6, 0.99])
 def test_ghosts_are_strengthened_until_nearly_all_stay_below_nine_tenths(tiny_scene, masks, opacity):
-    panel, record = ghost_panel(drive_of(one_car(tiny_scene), places=[GHOST_AT], opacities=opacity), masks, job_of())
+    _, record = ghost_panel(drive_of(one_car(tiny_scene), places=[GHOST_AT], opacities=opacity), masks, job_of())
     pixel, depth = seen_at(drive_of(one_car(tiny_scene)), HELD_OUT, GHOST_AT[None])
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
     distance = np.hypot(x - pixel[0, 0], y - pixel[0, 1])
