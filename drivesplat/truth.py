@@ -7,6 +7,8 @@ sensor noise.
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
 from drivesplat.storage import read_json, unreadable, write_json
 
 SCHEMA = 1
@@ -63,6 +65,9 @@ def read_truth(path: str | Path) -> Truth:
         if content.pop("schema") != SCHEMA:
             raise ValueError("it has another schema")
         frames = tuple(TruthFrame(**frame) for frame in content.pop("frames"))
+        for frame in frames:
+            if any(np.shape(pose) != (4, 4) for pose in (frame.camera_to_global, frame.lateral_camera_to_global)):
+                raise ValueError(f"a pose of key frame {frame.sample_index} is no 4x4 matrix")
         return Truth(**content, frames=frames)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise unreadable(path, RULE, f"not a record of truth ({error})") from error

@@ -176,9 +176,6 @@ def test_nothing_is_swept_where_the_annotation_has_a_gap(speed):
     assert found[nearest < -SLACK].all()
 
 
-@pytest.mark.xfail(
-    strict=True, reason="boxes_along steps over a gap by quarters of a second, and late into what follows"
-)
 @pytest.mark.parametrize("late", [0.01, 0.1])
 def test_after_a_gap_the_way_begins_as_early_as_at_the_start(late):
     """Key frames are not quite half a second apart: the way back is met between two looks."""
@@ -188,7 +185,6 @@ def test_after_a_gap_the_way_begins_as_early_as_at_the_start(late):
     assert swept(it, INTERVAL, axis_points(begins + SLACK, begins + 10.0)).all()
 
 
-@pytest.mark.xfail(strict=True, reason="boxes_along takes its step from the speed now, not from that it steps into")
 def test_a_box_that_jumps_off_leaves_nothing_out():
     """A crash of the annotation, or a coarse one: still for a segment, then 30 m/s; a short box shows the hole."""
     seconds = np.array([0.0, 0.45, 0.95, 1.45])
@@ -321,7 +317,6 @@ def test_ghosts_in_figures(tiny_scene):
     assert figures["opacity_median"] == pytest.approx(0.4, abs=1e-6)
 
 
-@pytest.mark.xfail(strict=True, reason="torch's median of an even count is the lower of the two in the middle")
 def test_the_median_of_two_lies_between_them(tiny_scene):
     sight = sight_of(drive_ahead(tiny_scene), part_of(PLACES[:2], [0.2, 0.6]), index=LATER)
     assert ghosts_at(sight).figures(sight.gaussians)["opacity_median"] == pytest.approx(0.4, abs=1e-6)

@@ -381,7 +381,6 @@ def test_figures_of_boxes_of_any_size_are_numbers(share):
     assert found["box"]["pixels"] == inside.sum()
 
 
-@pytest.mark.xfail(strict=True, reason="without a border, distances count from a place outside of the image")
 def test_a_box_that_fills_the_image_has_no_edge():
     found = figures(pair_of(inside=np.ones((HEIGHT, WIDTH), dtype=bool)))
     assert found["edge"]["ratio"] is None

@@ -255,7 +255,7 @@ def test_what_is_not_there_is_refused_with_what_there_is(tiny_scene, settings, a
     assert message.startswith(f"subjects.{scene.name}: CAM_FRONT")
     for words in (*asked, "leading in 0-9", "late in 4-7"):
         assert words in message
-    known = message.split("key frames:")[1]
+    known = message.split("last key frame:")[1]
     assert "behind" not in known and "parked" not in known
 
 

@@ -378,9 +378,6 @@ def test_a_truth_that_is_none_is_refused_naming_file_and_rule(known, tmp_path, h
     assert str(path) in str(refusal.value) and "demo_world" in str(refusal.value)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="values are not looked at: a pose that is none fails later, without the file's name"
-)
 def test_a_truth_whose_poses_are_none_is_refused_naming_file_and_rule(known, tmp_path):
     content = good(known)
     content["frames"][0]["lateral_camera_to_global"] = [[1.0, 0.0]]

@@ -26,16 +26,12 @@ def boxes_along(track: Track, interval: float) -> list[Box]:
 
     `interval` is the scene's key-frame interval in microseconds.
     """
-    boxes: list[Box] = []
-    start, end = int(track.timestamps[0] - interval / 2), int(track.timestamps[-1] + interval / 2)
-    time = start
-    while time <= end:
-        box = box_at(track, time, interval)
-        if box is not None:
-            boxes.append(box)
-        speed = box.speed if box is not None else 0.0
-        time += int(1e6 * min(LONGEST_PAUSE, STEP / max(speed, 1e-6)))
-    return boxes
+    annotated = (box_at(track, int(time), interval) for time in track.timestamps)
+    fastest = max(box.speed for box in annotated if box is not None)
+    step = int(1e6 * min(LONGEST_PAUSE, STEP / max(fastest, 1e-6)))
+    times = range(int(track.timestamps[0] - interval / 2), int(track.timestamps[-1] + interval / 2) + 1, step)
+    boxes = (box_at(track, time, interval) for time in times)
+    return [box for box in boxes if box is not None]
 
 
 def swept(track: Track, interval: float, points: np.ndarray, floor: float = 0.0) -> np.ndarray:
@@ -70,7 +66,7 @@ class Ghosts:
             "gaussians": count,
             "opacity_sum": float(opacities.sum()),
             "opacity_mean": float(opacities.mean()) if count else None,
-            "opacity_median": float(opacities.median()) if count else None,
+            "opacity_median": float(np.median(opacities.cpu().numpy())) if count else None,
         }
 
 

@@ -88,11 +88,11 @@ def _haunting(
 
 
 def _way(sight: Sight, subject: Subject) -> np.ndarray:
-    """Where the vehicle's way over the ground lies in the image, as far as it is in front: (m, 2) continuous pixels."""
+    """Where the vehicle's way over the ground lies in the image: (m, 2) continuous pixels, NaN behind the camera."""
     track = next(track for track in sight.drive.scene.tracks if track.id == subject.box.track_id)
     boxes = boxes_along(track, sight.drive.scene.key_frame_interval)
     ground = np.array([box.object_to_world[:3, 3] - box.object_to_world[:3, 2] * box.size[2] / 2 for box in boxes])
     pixels, depth = project(
         ground, inverse(sight.frame.camera_to_world), continuous_intrinsics(sight.frame, sight.size)
     )
-    return pixels[depth > IN_FRONT]
+    return np.where(depth[:, None] > IN_FRONT, pixels, np.nan)

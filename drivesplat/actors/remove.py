@@ -114,7 +114,7 @@ def figures(pair: RemovalPair) -> dict[str, Any]:
         "holes": {"pixels": int(holes.sum()), "share_of_box": _share(holes, pair.inside)},
         "edge": _edge(pair, distance),
         "outside": {
-            **(psnr_record(pair.without_car, pair.with_car, outside) or {}),
+            **(psnr_record(pair.without_car, pair.with_car, outside) or {"psnr": None, "pixels": 0}),
             "changed_share": _share(changed, outside),
             "reach_px": float(leaked.max()) if len(leaked) else 0.0,
         },
@@ -123,7 +123,10 @@ def figures(pair: RemovalPair) -> dict[str, Any]:
 
 
 def _edge(pair: RemovalPair, distance_outside: np.ndarray) -> dict[str, float | None]:
-    """The mean gradient along the hull in both pictures, and their ratio: above 1, the removal draws an outline."""
+    """The mean gradient along the hull in both pictures, and their ratio: above 1, the removal draws an
+    outline. None where the hull has no edge in the image."""
+    if pair.inside.all() or not pair.inside.any():
+        return {"with_car": None, "without_car": None, "ratio": None}
     band = (distance_outside <= EDGE_BAND) & (distance_transform_edt(pair.inside) <= EDGE_BAND)
     before, after = (
         float(sobel(rgb2gray(image))[band].mean()) if band.any() else 0.0 for image in (pair.with_car, pair.without_car)

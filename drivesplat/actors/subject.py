@@ -76,8 +76,8 @@ def _nothing_there(scene: Scene, parser: dict[str, Any], camera: str, settings: 
         anywhere.setdefault(subject.box.track_id, []).append(subject.frame.sample_index)
     known = "; ".join(f"{track} in {min(frames)}-{max(frames)}" for track, frames in anywhere.items())
     return (
-        f"subjects.{scene.name}: {camera} sees no such vehicle ({asked}); "
-        f"what moves, with its key frames: {known or 'nothing'}"
+        f"subjects.{scene.name}: {camera} sees no vehicle that moves, or not the one asked for ({asked}); "
+        f"what moves, with its first and last key frame: {known or 'nothing'}"
     )
 
 

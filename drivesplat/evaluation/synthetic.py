@@ -49,11 +49,17 @@ class KnownTruth:
         """A true image (h, w, 3) in [0, 1] at `size` (width, height)."""
         return read_image(truth_image(self.path, name), size) / 255.0
 
-    def leading_box(self, frame: Frame) -> Box | None:
-        """Where the car that `without_leading` lacks is in a frame; None where it is absent."""
-        interval = self.scene.key_frame_interval
+    def leading_in(self, index: int, frame: Frame) -> tuple[Box, np.ndarray] | None:
+        """The car that `without_leading` lacks in a frame, and the pixels (h, w) bool of its hull; None where it is not
+        to be seen."""
+        interval, size = self.scene.key_frame_interval, image_size(self.parser, index)
         leading = (track for track in self.scene.tracks if track.id == self.truth.leading)
-        return next((box_at(track, frame.timestamp, interval) for track in leading), None)
+        box = next((box_at(track, frame.timestamp, interval) for track in leading), None)
+        if box is None:
+            return None
+        hull = hull_of(box, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
+        inside = fill(hull, size) if hull is not None else np.zeros(0, dtype=bool)
+        return (box, inside) if inside.any() else None
 
 
 @torch.no_grad()
@@ -86,16 +92,14 @@ def removal_metrics(
     the car: the pixels of its box, and the others. None where there is no truth."""
     metrics, measured = RegionMetrics(lpips_map, REMOVAL_REGIONS), False
     for index, frame, truth in known.frames(camera):
-        box = known.leading_box(frame)
-        size = image_size(known.parser, index)
-        hull = hull_of(box, inverse(frame.camera_to_world), continuous_intrinsics(frame, size)) if box else None
-        if hull is None or truth.without_leading is None:
+        seen = known.leading_in(index, frame) if truth.without_leading else None
+        if seen is None:
             continue
-        view = view_of(known.parser, index, device)
+        box, inside = seen
+        view, size = view_of(known.parser, index, device), image_size(known.parser, index)
         with torch.no_grad():
             gaussians = model.gaussians_at(view.time)
             kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
-        inside = fill(hull, size)
         own_car = read_labels(known.masks, camera, frame.timestamp, size) == LABELS["own_car"]
         masks = {"box": inside & ~own_car, "outside": ~inside & ~own_car}
         metrics.add(rendered(model, view, kept), known.image(truth.without_leading, size), masks)
