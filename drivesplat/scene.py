@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.errors import DatasetError
 from drivesplat.storage import read_json, unreadable, write_json
 
 SCHEMA = 1
@@ -97,6 +98,19 @@ class Scene:
     def seconds(self, timestamp: int | np.integer) -> float:
         """A timestamp (microseconds) as seconds since the first image, the time that models know."""
         return float(timestamp - min(frame.timestamp for frame in self.frames)) * 1e-6
+
+    def middle_key_frame(self, camera: str) -> int:
+        """Which of `frames` is the key frame of `camera` in the middle of the drive.
+
+        Raises DatasetError where it has none, naming the cameras that do.
+        """
+        found = [i for i, frame in enumerate(self.frames) if frame.camera == camera and frame.is_key_frame]
+        if not found:
+            known = ", ".join(dict.fromkeys(frame.camera for frame in self.frames if frame.is_key_frame))
+            raise DatasetError(
+                f"scene {self.name}: eval_camera {camera} has no key frame; choose one of {known or 'none'}"
+            )
+        return sorted(found, key=lambda i: self.frames[i].timestamp)[len(found) // 2]
 
     def nearest_key_frame(self, timestamp: int) -> int:
         """The index of the key frame nearest to `timestamp` (microseconds)."""

@@ -8,12 +8,12 @@ import pytest
 import torch
 from scipy.ndimage import convolve
 
-from drivesplat.actors.removal import removal_of
 from drivesplat.actors.remove import RemovalPair, figures, remove_actor
 from drivesplat.actors.sight import Drive
 from drivesplat.model.background import SH_C0, Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
+from drivesplat.model.removal import removal_of
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import parser_dict

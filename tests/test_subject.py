@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivesplat.actors.subject import choose_subject, described, middle_image
-from drivesplat.errors import ConfigError
+from drivesplat.actors.subject import choose_subject, described
+from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.parser import parser_dict
 from drivesplat.point_cloud import PointCloud
 from drivesplat.regions import LABELS
@@ -293,19 +293,19 @@ def test_a_subject_is_described_in_plain_figures(tiny_scene, key_frame, split):
     }
 
 
-def test_the_middle_image_is_a_key_frame_of_the_camera_in_the_middle_of_the_drive(tiny_scene):
+def test_the_middle_key_frame_of_a_camera_is_that_in_the_middle_of_the_drive(tiny_scene):
     """Of ten key frames, 0 to 9, the sixth; images between them do not count."""
-    index = middle_image(parser_of(tiny_scene), "CAM_FRONT")
+    index = tiny_scene.middle_key_frame("CAM_FRONT")
     assert tiny_scene.frames[index].is_key_frame and tiny_scene.frames[index].sample_index == 5
     others = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames[:7]]
     both = dataclasses.replace(tiny_scene, frames=(*others, *tiny_scene.frames[7:]))
-    assert both.frames[middle_image(parser_of(both), "CAM_FRONT")].sample_index == 7
-    assert both.frames[middle_image(parser_of(both), "CAM_BACK")].sample_index == 2
+    assert both.frames[both.middle_key_frame("CAM_FRONT")].sample_index == 7
+    assert both.frames[both.middle_key_frame("CAM_BACK")].sample_index == 2
 
 
 @pytest.mark.parametrize("camera", ["CAM_BACK", "CAM_LEFT"])
-def test_without_key_frames_of_the_camera_there_is_no_middle_and_the_setting_is_named(tiny_scene, camera):
+def test_without_key_frames_of_the_camera_there_is_no_middle_and_those_with_some_are_named(tiny_scene, camera):
     between = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames if not frame.is_key_frame]
     scene = dataclasses.replace(tiny_scene, frames=(*tiny_scene.frames, *between))
-    with pytest.raises(ConfigError, match=f"eval_camera {camera}.*{scene.name}"):
-        middle_image(parser_of(scene), camera)
+    with pytest.raises(DatasetError, match=f"{scene.name}.*eval_camera {camera} has no key frame; .* CAM_FRONT$"):
+        scene.middle_key_frame(camera)

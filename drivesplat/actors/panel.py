@@ -8,7 +8,7 @@ import numpy as np
 
 from drivesplat.actors.ghosts import boxes_along, ghosts_of
 from drivesplat.actors.sight import Drive, Sight, colors_of
-from drivesplat.actors.subject import Subject, choose_subject, described, middle_image
+from drivesplat.actors.subject import Subject, choose_subject, described
 from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.images import continuous_intrinsics, project, read_image
 from drivesplat.masks import read_labels
@@ -47,7 +47,7 @@ def ghost_panel(drive: Drive, masks: Path, job: PanelJob) -> tuple[Panel, dict[s
     ghosts are None, with the reason.
     """
     subject = choose_subject(drive.scene, drive.parser, job.eval_camera, job.subject)
-    sight = Sight(drive, subject.index if subject else middle_image(drive.parser, job.eval_camera))
+    sight = Sight(drive, subject.index if subject else drive.scene.middle_key_frame(job.eval_camera))
     truth = read_image(sight.frame.image_path, sight.size) / 255.0
     render = colors_of(sight.of().image)
     labels = read_labels(masks, job.eval_camera, sight.frame.timestamp, sight.size)

@@ -10,10 +10,10 @@ from skimage.color import rgb2gray
 from skimage.filters import sobel
 
 from drivesplat.actors.ghosts import ghosts_of
-from drivesplat.actors.removal import Removal, removal_of
 from drivesplat.actors.sight import Drive, Sight, colors_of
-from drivesplat.actors.subject import Subject, choose_subject, described, middle_image
+from drivesplat.actors.subject import Subject, choose_subject, described
 from drivesplat.evaluation.metrics import psnr_record
+from drivesplat.model.removal import Removal, removal_of
 from drivesplat.regions import fill
 from drivesplat.settings.actor import RemovalJob
 
@@ -147,7 +147,7 @@ def _ghost_figures(sight: Sight, subject: Subject, pair: RemovalPair, job: Remov
 
 
 def _nothing_to_remove(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
-    sight = Sight(drive, middle_image(drive.parser, job.eval_camera))
+    sight = Sight(drive, drive.scene.middle_key_frame(job.eval_camera))
     picture = sight.of()
     image, alpha = colors_of(picture.image), colors_of(picture.alpha)
     nowhere = np.zeros(alpha.shape, dtype=bool)

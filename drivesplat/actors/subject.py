@@ -101,16 +101,3 @@ def described(subject: Subject, scene: Scene, parser: dict[str, Any]) -> dict[st
         "origin": scene.origin.tolist(),
         "object_to_world": box.object_to_world.tolist(),
     }
-
-
-def middle_image(parser: dict[str, Any], camera: str) -> int:
-    """The image in the middle of the drive, to look at where there is no subject: a key frame of `camera`.
-
-    Raises ConfigError where the scene has none.
-    """
-    if camera in parser["camera_names"]:
-        of_camera = parser["camera_indices"] == parser["camera_names"].index(camera)
-        found = np.flatnonzero(of_camera & parser["is_key_frame"])
-        if len(found):
-            return int(found[len(found) // 2])
-    raise ConfigError(f"eval_camera {camera} has no key frames in scene {parser['scene']['name']}")

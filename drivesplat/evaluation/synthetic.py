@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.actors.removal import removal_of
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics
 from drivesplat.images import continuous_intrinsics, read_image
 from drivesplat.masks import read_labels
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel, View
 from drivesplat.parser import image_size
 from drivesplat.regions import LABELS, fill, hull_of, label_image, region_masks

@@ -21,7 +21,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.errors import DatasetError
 from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_parts
 from drivesplat.export.viewer_page import filled_page
@@ -50,7 +49,7 @@ def export_viewer(
 
     Raises DatasetError where the scene has no key frame of that camera.
     """
-    start = middle_key_frame(scene, job.eval_camera)
+    start = scene.frames[scene.middle_key_frame(job.eval_camera)]
     model, _ = trained_model(checkpoint)
     gaussians = concatenate(list(trained_parts(checkpoint, scene).values()))
     kept = thinned(gaussians, job.gaussians)
@@ -58,17 +57,6 @@ def export_viewer(
     with atomic_write(path) as file:
         file.write(page.encode())
     log.info("%d of %d Gaussians, %.1f MB", len(kept), len(gaussians), len(page) * 1e-6)
-
-
-def middle_key_frame(scene: Scene, camera: str) -> Frame:
-    """The key frame of a camera in the middle of the drive. Raises DatasetError where it has none."""
-    frames = sorted((f for f in scene.frames if f.camera == camera and f.is_key_frame), key=lambda f: f.timestamp)
-    if not frames:
-        known = ", ".join(sorted({f.camera for f in scene.frames if f.is_key_frame}))
-        raise DatasetError(
-            f"scene {scene.name}: eval_camera {camera} has no key frame; choose one of {known or 'none'}"
-        )
-    return frames[len(frames) // 2]
 
 
 def viewer_page(

@@ -7,8 +7,7 @@ import torch
 
 from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
-
-Optimizers = dict[str, torch.optim.Optimizer]
+from drivesplat.training.optimizers import Optimizers
 
 
 class Densifier:

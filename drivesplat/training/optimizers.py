@@ -6,7 +6,8 @@ import torch
 from torch import nn
 
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.training.densify import Optimizers
+
+Optimizers = dict[str, torch.optim.Optimizer]
 
 MEANS_DECAY = 0.01
 """Positions learn at the end at this fraction of their initial rate."""

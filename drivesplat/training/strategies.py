@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.densify import Optimizers
+from drivesplat.training.optimizers import Optimizers
 
 
 class CappedDefaultStrategy(DefaultStrategy):
