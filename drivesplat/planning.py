@@ -18,7 +18,7 @@ from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.readers import layout
 from drivesplat.rerun import code_digest
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
-from drivesplat.stages import METHOD_STAGES, SCENE_STAGES, stage_settings
+from drivesplat.stages import METHOD_STAGES, SCENE_STAGES, no_such_film, stage_settings
 from drivesplat.storage import canonical_json
 from drivesplat.truth import TRUTH_FILE
 
@@ -80,12 +80,9 @@ class Plan:
         return f"{self.config.datasets[dataset].world_root}/{TRUTH_FILE}"
 
     def truth(self, wildcards: Any) -> list[str]:
-        """The truth of a scene: a synthetic world's; recorded drives have none, unless it lies beside their tables."""
+        """The truth of a scene: recorded drives have none."""
         name = self.config.dataset_of(wildcards.scene)
-        if name in self.worlds:
-            return [self.truth_file(name)]
-        beside = Path(self.tables(wildcards)[0]).parents[1] / TRUTH_FILE
-        return [str(beside)] if beside.is_file() else []
+        return [self.truth_file(name)] if name in self.worlds else []
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, where given."""
@@ -147,7 +144,7 @@ class Plan:
         }
 
     def refuse_unknown(self, targets: list[str]) -> None:
-        """Raises ConfigError, listing what there is, where a target names a scene or method the config does not."""
+        """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know."""
         for target in targets:
             scene, *rest = self._inside_results(target)
             if not rest:
@@ -157,6 +154,10 @@ class Plan:
                 raise ConfigError(
                     f"method {rest[0]!r} is not in the config; there are: {', '.join(self.config.methods)}"
                 )
+            film = rest[1].removesuffix(".mp4").removesuffix(".cameras.json") if len(rest) == 2 else ""
+            config = for_scene(self.config, scene)
+            if film not in (rest[-1], "", *config.render.trajectories):
+                raise ConfigError(no_such_film(config, scene, film))
 
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""

@@ -11,13 +11,15 @@ from pathlib import Path
 
 PACKAGE = "drivesplat"
 PACKAGE_FOLDER = Path(__file__).parent
+PAGE_FILES = (".html", ".js")
+"""What decides a result, too, where it lies beside a package's modules."""
 
 
 def code_digest(script: str | Path) -> str:
     """A hash of the meaning of a script and of every module of this package it imports, directly or through others.
 
     The meaning is the syntax tree without bare strings (docstrings, field comments). Imports inside functions count.
-    What lies in a package and is no Python (viewer.html's scripts) is part of it, every byte.
+    Scripts and pages that lie in a package (viewer.html's) are part of it, every byte.
     """
     path = Path(script)
     modules, waiting = {}, set(_imports(path, package=""))
@@ -41,7 +43,7 @@ def _meaning(path: Path) -> str:
     code = ast.unparse(_WithoutBareStrings().visit(ast.parse(path.read_text(encoding="utf-8"))))
     if path.name != "__init__.py":
         return code
-    others = sorted(file for file in path.parent.iterdir() if file.is_file() and file.suffix not in (".py", ".pyc"))
+    others = sorted(file for kind in PAGE_FILES for file in path.parent.glob(f"[!.]*{kind}"))
     return "\n".join([code, *(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in others)])
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivesplat.config import Config, DatasetSettings, for_scene
+from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings
 from drivesplat.settings.actor import PanelJob, RemovalJob, SubjectSettings
 from drivesplat.settings.evaluate import EvaluateJob
@@ -93,17 +94,25 @@ def _evaluate(place: Place) -> EvaluateJob:
         sweeps=config.sweeps,
         holdout=config.holdout,
         lpips=config.lpips.enabled,
-        removal=config.removal,
+        removal=config.removal if place.dataset.world else None,
     )
 
 
 def _film(place: Place) -> FilmJob:
     render = place.config.render
+    if place.trajectory not in render.trajectories:
+        raise ConfigError(no_such_film(place.config, place.scene, place.trajectory))
     return FilmJob(
         camera=place.config.eval_camera,
         trajectory=render.trajectories[place.trajectory],
         **{name: getattr(render, name) for name in ("fps", "width", "height", "horizontal_fov", "crf")},
     )
+
+
+def no_such_film(config: Config, scene: str, name: str) -> str:
+    """What to tell who asks for a film that there is none of; `config` as it holds for the scene."""
+    known = ", ".join(config.render.trajectories)
+    return f"scene {scene} has no film called {name!r}; there are: {known} (add it to render.trajectories)"
 
 
 def _ghost_panel(place: Place) -> PanelJob:

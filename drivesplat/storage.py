@@ -4,11 +4,13 @@ Every writer writes beside its target, flushes to disk and renames. Every reader
 file into a ResultError that names the file and the rule that rebuilds it.
 """
 
+import glob
 import hashlib
 import io
 import json
 import os
 import pickle
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from drivesplat.errors import ResultError
+
+ABANDONED_SECONDS = 3600.0
 
 _PLAIN_GLOBALS = {
     ("numpy", "ndarray"),
@@ -44,6 +48,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(path)
         yield aside
         _fsync(aside)
         aside.replace(path)
@@ -65,6 +70,14 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
     """
     with atomic_path(path) as aside, open(aside, "wb") as file:
         yield file
+
+
+def _sweep(path: Path) -> None:
+    """Removes what killed writers of `path` left behind: partial files that nobody has written to for an hour."""
+    for partial in path.parent.glob(f".{glob.escape(path.stem)}.[0-9]*.partial{glob.escape(path.suffix)}"):
+        with suppress(OSError):
+            if time.time() - partial.stat().st_mtime > ABANDONED_SECONDS:
+                partial.unlink()
 
 
 def _fsync(path: Path) -> None:

@@ -52,7 +52,7 @@ def recorded_frames(scene: Scene, camera: str) -> list[Frame]:
     if not by_time:
         cameras = ", ".join(dict.fromkeys(frame.camera for frame in scene.frames))
         raise DatasetError(
-            f"scene {scene.name} has no image of camera {camera} to film from; its cameras are {cameras or 'none'}: "
+            f"scene {scene.name} has no image of camera {camera}; its cameras are {cameras or 'none'}: "
             "choose eval_camera among them, or add it to cameras"
         )
     return [by_time[timestamp] for timestamp in sorted(by_time)]

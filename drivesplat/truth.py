@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drivesplat.errors import ResultError
 from drivesplat.storage import read_json, unreadable, write_json
 
 SCHEMA = 1
@@ -77,5 +78,7 @@ def truth_image(path: str | Path, name: str) -> Path:
     """Where an image that the truth.json at `path` names lies. Raises ResultError where it is missing."""
     image = Path(path).parent / name
     if not image.is_file():
-        raise unreadable(image, RULE, "it is missing")
+        raise ResultError(
+            f"{image} is missing; delete {path} and rerun: the rule '{RULE}' makes the world anew, with its truth"
+        )
     return image

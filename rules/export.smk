@@ -38,7 +38,6 @@ rule export_usd:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
         scene="<results>/{scene}/scene.json",
-        parser="<results>/{scene}/parser.pkl",
     output:
         usd="<results>/{scene}/{method}/scene.usdz",
     log:

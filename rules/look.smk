@@ -87,6 +87,7 @@ rule remove_actor:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
         scene="<results>/{scene}/scene.json",
         parser="<results>/{scene}/parser.pkl",
+        masks="<results>/{scene}/masks/masks.json",
     output:
         with_car="<results>/{scene}/{method}/with_car.png",
         without_car="<results>/{scene}/{method}/without_car.png",

@@ -224,7 +224,7 @@ def test_mappings_are_merged_key_by_key_and_the_rest_is_replaced():
     assert base == {"a": {"b": 1, "c": {"d": 2}}, "e": [1, 2], "f": {"g": 1}}
 
 
-def told(values: dict[str, Any], stage: str, scene: str = "0061", method: str = "vanilla") -> dict[str, Any]:
+def told(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> dict[str, Any]:
     return json.loads(spelled(values, stage, scene, method))
 
 
@@ -347,7 +347,7 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
         (at("subjects", {"0061": {"key_frame": 3}}), "ghost_panel remove_actor"),
         (at("subjects", {"0103": {"key_frame": 3}}), ""),
         (at("ghosts.clearance", 0.5), "ghost_panel remove_actor"),
-        (at("removal.margin", 0.5), "evaluate remove_actor"),
+        (at("removal.margin", 0.5), "remove_actor"),
         (at("export.usd_gaussians", 9), "export_usd"),
         (at("export.viewer_gaussians", 9), "export_viewer"),
         (at("device", "cpu"), ""),
@@ -366,6 +366,30 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
 def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, change, readers):
     before, after = load(defaults), load(merged(defaults, with_methods_kept(change)))
     assert {stage for stage in STAGES if spelled(before, stage) != spelled(after, stage)} == set(readers.split())
+
+
+def test_of_a_synthetic_world_the_evaluation_is_told_what_a_removal_takes(defaults):
+    """Only there is a street without the car to hold it to."""
+    before, after = load(defaults), load(merged(defaults, at("removal.margin", 0.5)))
+    changed = {stage for stage in STAGES if spelled(before, stage, "demo") != spelled(after, stage, "demo")}
+    assert changed == {"evaluate", "remove_actor"}
+    assert told(after, "evaluate", "demo")["removal"]["margin"] == 0.5
+    assert told(after, "evaluate", "0061")["removal"] is None
+
+
+def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has():
+    aside = {"render": {"trajectories": {"aside": {"lateral": 1.0}}}}
+    config = load({"datasets": {"a": {"scenes": ["a"], "overrides": aside}, "b": {"scenes": ["b"]}}})
+    assert json.loads(stage_settings(config, "film", "a", "vanilla", "aside"))["trajectory"]["lateral"] == 1.0
+    for scene, name in (("b", "aside"), ("a", "nowhere")):
+        with pytest.raises(ConfigError, match=f"scene {scene} has no film called '{name}'; there are: .*original"):
+            stage_settings(config, "film", scene, "vanilla", name)
+
+
+@pytest.mark.parametrize("where", ["render", "datasets.nuscenes.overrides.render"])
+def test_no_film_along_a_path_is_called_parts(defaults, where):
+    message = refusal(merged(defaults, at(f"{where}.trajectories.parts", {"lateral": 1.0})))
+    assert "trajectory" in message and "'parts'" in message and "\n" not in message
 
 
 def with_methods_kept(change: dict[str, Any]) -> dict[str, Any]:

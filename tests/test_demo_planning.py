@@ -13,6 +13,7 @@ from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.planning import Plan
 from drivesplat.readers.nuscenes_layout import TABLES
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.truth import TRUTH_FILE
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -94,6 +95,59 @@ def test_a_target_that_needs_no_recorded_drive_is_not_refused_for_want_of_one(ta
         made.refuse_absent_data(["./results/0103/metrics.json"])
     with pytest.raises(DatasetError, match="nowhere"):
         made.refuse_absent_data(["metrics"])
+
+
+def test_only_a_synthetic_world_has_a_truth_whatever_lies_beside_recorded_tables(tmp_path):
+    datasets = {
+        "made": {"dataroot": str(tmp_path / "made"), "scenes": ["made"], "world": {}},
+        "real": {"dataroot": str(tmp_path / "real"), "scenes": ["real"]},
+    }
+    for table in TABLES:
+        path = tmp_path / "real" / "v1.0-mini" / f"{table}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("[]")
+    (tmp_path / "real" / "truth").mkdir()
+    (tmp_path / "real" / TRUTH_FILE).write_text("{}")
+    made = plan(datasets=datasets)
+    assert made.truth(scene("made")) == [f"{tmp_path}/made/{TRUTH_FILE}"]
+    assert made.truth(scene("real")) == []
+
+
+def films() -> Plan:
+    """Scenes a and b, of which a alone has a film called aside."""
+    aside = {"render": {"trajectories": {"aside": {"lateral": 1.0}}}}
+    return plan(datasets={"a": {"scenes": ["a"], "overrides": aside}, "b": {"scenes": ["b"]}})
+
+
+@pytest.mark.parametrize("kind", ["mp4", "cameras.json"])
+@pytest.mark.parametrize(
+    ("target", "known"),
+    [
+        pytest.param("a/vanilla/nowhere", ["original", "lateral_2m", "aside"], id="of no scene"),
+        pytest.param("b/vanilla/aside", ["original", "lateral_2m"], id="of another scene"),
+        pytest.param("b/vanilla/parts", ["original", "lateral_2m"], id="of the parts"),
+        pytest.param("./b//vanilla/../vanilla/aside", ["original", "lateral_2m"], id="spelled otherwise"),
+    ],
+)
+def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has(target, known, kind):
+    with pytest.raises(ConfigError) as refusal:
+        films().refuse_unknown([f"results/{target}.{kind}"])
+    message, name = str(refusal.value), Path(target).name
+    assert f"has no film called '{name}'; there are: {', '.join(known)} (" in message
+    assert "render.trajectories" in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "results/a/vanilla/aside.mp4", "results/b/vanilla/original.cameras.json", "results/b/vanilla/cameras.json",
+        "results/b/vanilla/ghost_panel.png", "results/b/vanilla/checkpoint.pt", "results/b/masks/masks.json",
+        "results/b/metrics.json", "results/b/vanilla/tensorboard/nowhere.mp4", "elsewhere/b/vanilla/nowhere.mp4",
+        "films",
+    ],
+)  # fmt: skip
+def test_films_that_there_are_and_what_is_no_film_are_not_refused(target):
+    films().refuse_unknown([target])
 
 
 def test_an_unknown_scene_is_refused_however_its_path_is_spelled():

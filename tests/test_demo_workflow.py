@@ -50,7 +50,11 @@ def test_what_only_a_synthetic_world_knows_is_measured_too(finished):
     assert set(result["lateral"]) == {"2.0"} and set(result["lateral"]["2.0"]) == {"all", "static"}
     assert result["lateral"]["2.0"]["all"]["pixels"] == 6 * 128 * 72
     assert result["lateral"]["2.0"]["static"]["psnr"] > 8.0
-    assert set(result["removal"]) == {"box", "outside"} and result["removal"]["outside"]["psnr"] > 8.0
+    removal = result["removal"]
+    assert set(removal) == {"box", "outside", "not_removed"} and set(removal["not_removed"]) == {"box", "outside"}
+    for region in ("box", "outside"):
+        assert removal[region]["psnr"] > 8.0
+        assert removal[region]["pixels"] == removal["not_removed"][region]["pixels"]
 
 
 def test_the_world_and_its_truth_lie_at_the_dataroot(finished):

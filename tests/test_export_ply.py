@@ -24,6 +24,7 @@ from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.training.run import trained_model
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {"train": {"settings": {"long": "x" * 20_000}}}}
@@ -286,5 +287,6 @@ def test_gaussians_that_are_not_finite_stay_behind(tiny_scene, name):
     params = trained_params(10, sh_degree=1)
     params[name][4] = torch.nan
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1))
-    kept = trained_parts(checkpoint_of(params, settings), tiny_scene)["background"]
+    model, _ = trained_model(checkpoint_of(params, settings))
+    kept = trained_parts(model, tiny_scene)["background"]
     assert torch.equal(kept.means, torch.cat([params["means"][:4], params["means"][5:]]))

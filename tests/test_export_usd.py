@@ -12,19 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
-from drivesplat.export.usd_asset import export_usd
-from drivesplat.images import project
+from drivesplat.export.usd_asset import export_usd, recorded_cameras
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
-from drivesplat.rigid import inverse, rigid
+from drivesplat.rigid import rigid
 from drivesplat.settings.export import UsdJob
 from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob, TrainSettings
 
 COUNT, KEPT = 60, 40
@@ -47,12 +41,6 @@ def oblique_camera() -> tuple[np.ndarray, tuple[int, int], np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def parser(tiny_scene):
-    seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    return parser_dict(tiny_scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings(width=48)))
-
-
-@pytest.fixture(scope="module")
 def checkpoint():
     splats = random_splats()
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2))
@@ -67,10 +55,10 @@ def checkpoint():
 
 
 @pytest.fixture(scope="module")
-def package(tmp_path_factory, checkpoint, parser, tiny_scene):
+def package(tmp_path_factory, checkpoint, tiny_scene):
     path = tmp_path_factory.mktemp("usd") / "scene.usdz"
     job = UsdJob(eval_camera="CAM_FRONT", gaussians=KEPT)
-    export_usd(path, checkpoint, parser, tiny_scene, job, PROVENANCE)
+    export_usd(path, checkpoint, tiny_scene, job, PROVENANCE)
     return path
 
 
@@ -162,7 +150,7 @@ def test_every_part_is_a_prim(tmp_path):
     assert counts == {"background": 4, "car_7_x": 2, "empty": 0}
 
 
-def test_the_camera_is_where_and_when_it_recorded(stage, tiny_scene, parser):
+def test_the_camera_is_where_and_when_it_recorded(stage, tiny_scene):
     """Time codes are thirtieths of seconds since the first image; a world point falls on the pixel that K gives."""
     camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/camera"))
     assert stage.GetTimeCodesPerSecond() == 30.0
@@ -171,13 +159,76 @@ def test_the_camera_is_where_and_when_it_recorded(stage, tiny_scene, parser):
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == pytest.approx((codes[0], codes[-1]))
     transform = camera.GetOrderedXformOps()
     assert [op.GetOpType() for op in transform] == [UsdGeom.XformOp.TypeTransform]
-    assert transform[0].GetTimeSamples() == pytest.approx(codes)
+    samples = np.array(transform[0].GetTimeSamples())
+    assert all(np.abs(samples - code).min() < 1e-6 for code in codes)
+    assert np.diff(samples).min() > 0.0 and np.diff(samples).max() < 1.001, "thirty times a second at least"
     for i, frame in enumerate(tiny_scene.frames):
         at_code = camera.GetCamera(codes[i])
         points = frame.ego_to_world[:3, 3] + np.array([[12.0, 3.0, 0.5], [20.0, -4.0, 2.0], [9.0, 0.0, 0.0]])
-        expected, _ = project(points, inverse(frame.camera_to_world), parser["Ks"][i])
-        np.testing.assert_allclose(pixels_by_usd(at_code, (48, 27), points), expected, atol=1e-4)
+        in_camera = np.column_stack([points, np.ones(3)]) @ np.linalg.inv(frame.camera_to_world).T
+        projected = in_camera[:, :3] @ frame.intrinsics.T
+        expected = projected[:, :2] / projected[:, 2:] + 0.5  # OpenCV counts from the first pixel's centre
+        np.testing.assert_allclose(pixels_by_usd(at_code, (96, 54), points), expected, atol=2e-4)
         np.testing.assert_allclose(at_code.frustum.GetPosition(), frame.camera_to_world[:3, 3], atol=1e-9)
+
+
+OPENCV_TO_USD = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def on_a_circle(seconds: float) -> np.ndarray:
+    """A camera (4, 4) that drives at 10 m/s around a circle of 10 m, a radian a second, looking ahead, tilted."""
+    turned = Rotation.from_euler("z", seconds) * Rotation.from_euler("xyz", [-1.5, 0.1, -1.6])
+    return rigid(turned.as_matrix(), np.array([10.0 * np.sin(seconds), 10.0 - 10.0 * np.cos(seconds), 1.5]))
+
+
+@pytest.fixture(scope="module")
+def turning(tiny_scene):
+    """The tiny drive on that circle, four images a second; its first image at 0 s."""
+    first = min(frame.timestamp for frame in tiny_scene.frames)
+    frames = tuple(
+        dataclasses.replace(frame, camera_to_world=on_a_circle((frame.timestamp - first) * 1e-6))
+        for frame in tiny_scene.frames
+    )
+    return dataclasses.replace(tiny_scene, frames=frames)
+
+
+def pose_by_usd(stage: Usd.Stage, code: float) -> np.ndarray:
+    """The camera's OpenCV pose (4, 4) as a program that plays the stage finds it."""
+    prim = UsdGeom.Xformable(stage.GetPrimAtPath("/World/camera"))
+    return np.array(prim.ComputeLocalToWorldTransform(Usd.TimeCode(code))).T @ OPENCV_TO_USD
+
+
+def test_on_a_turning_path_the_camera_is_recorded_at_recorded_times(turning):
+    stage = splat_stage({}, recorded_cameras(turning, "CAM_FRONT"), {})
+    for frame in turning.frames:
+        code = turning.seconds(frame.timestamp) * 30.0
+        np.testing.assert_allclose(pose_by_usd(stage, code), frame.camera_to_world, atol=1e-7)
+
+
+def test_between_recorded_times_the_camera_stays_rigid_and_on_its_way(turning):
+    """OpenUSD interpolates a matrix entry by entry: between poses that are far apart it shrinks and shears."""
+    stage = splat_stage({}, recorded_cameras(turning, "CAM_FRONT"), {})
+    last = max(turning.seconds(frame.timestamp) for frame in turning.frames)
+    for seconds in np.random.default_rng(0).uniform(0.0, last, 400):
+        pose = pose_by_usd(stage, seconds * 30.0)
+        np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-3)
+        expected = on_a_circle(seconds)
+        np.testing.assert_allclose(pose[:3, :3], expected[:3, :3], atol=5e-3)
+        np.testing.assert_allclose(pose[:3, 3], expected[:3, 3], atol=0.02)
+
+
+def test_the_camera_shown_is_the_one_asked_for(turning):
+    """Images of another camera, elsewhere and between, are none of its path's."""
+    other = tuple(
+        dataclasses.replace(
+            frame, camera="CAM_BACK", timestamp=frame.timestamp + 40_000, camera_to_world=on_a_circle(90.0)
+        )
+        for frame in turning.frames
+    )
+    both = dataclasses.replace(turning, frames=(*turning.frames, *other))
+    alone, among = (recorded_cameras(scene, "CAM_FRONT") for scene in (turning, both))
+    assert [time for time, _ in alone] == [time for time, _ in among]
+    assert all(a.transform == b.transform for (_, a), (_, b) in zip(alone, among, strict=True))
 
 
 def test_oblong_pixels_and_an_axis_off_the_middle_are_those_of_K():
@@ -249,8 +300,8 @@ def test_a_packer_that_fails_is_told_and_leaves_nothing(tmp_path, monkeypatch, r
     assert not list(tmp_path.iterdir())
 
 
-def test_a_camera_that_the_scene_lacks_is_named(tmp_path, checkpoint, parser, tiny_scene):
+def test_a_camera_that_the_scene_lacks_is_named(tmp_path, checkpoint, tiny_scene):
     job = UsdJob(eval_camera="CAM_BACK", gaussians=KEPT)
-    with pytest.raises(DatasetError, match=r"scene 0001: eval_camera CAM_BACK .*CAM_FRONT"):
-        export_usd(tmp_path / "scene.usdz", checkpoint, parser, tiny_scene, job, PROVENANCE)
+    with pytest.raises(DatasetError, match=r"scene 0001 .*CAM_BACK.*CAM_FRONT.*eval_camera"):
+        export_usd(tmp_path / "scene.usdz", checkpoint, tiny_scene, job, PROVENANCE)
     assert not list(tmp_path.iterdir())

@@ -64,6 +64,13 @@ def test_an_unknown_method_lists_those_there_are(copy):
     assert "vanila" in line and "vanilla" in line
 
 
+@pytest.mark.parametrize("target", ["nowhere.mp4", "parts.cameras.json"])
+def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy, target):
+    line = told(copy.run(f"results/0001/vanilla/{target}"))
+    assert f"'{target.split('.')[0]}'" in line and "original, lateral_2m" in line and "render.trajectories" in line
+    assert not (copy.folder / "results/0001").exists()
+
+
 @pytest.mark.parametrize(
     ("dataset", "words"),
     [

@@ -6,22 +6,15 @@ import json
 import numpy as np
 import pytest
 import torch
+from hand_made import Own, recording_of, round_gaussians
 from scipy.spatial.transform import Rotation
 
 from drivesplat.actors.ghosts import Ghosts, boxes_along, ghosts_of, swept
 from drivesplat.actors.sight import Drive, Sight
-from drivesplat.model.background import Background
-from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
 from drivesplat.scene import Scene, Track
 from drivesplat.settings.actor import GhostSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
 from drivesplat.tracks import box_at
 
 START = 1_532_402_927_647_951
@@ -207,46 +200,9 @@ def test_boxes_along_a_way_are_in_time_and_close(speed):
     assert 14 <= len(boxes) < 3.5 * max(speed / 0.25, 4.0) + 2
 
 
-class Ride(Part):
-    """A part that knows all of its Gaussians as the track's own."""
-
-    name = "ride"
-
-    def __init__(self, still: Background, track_id: str):
-        super().__init__()
-        self.params = still.params
-        self._still = still
-        self._track_id = track_id
-
-    def at(self, time: float) -> Gaussians:
-        return self._still.at(time)
-
-    def learning_rates(self) -> dict[str, float]:
-        return self._still.learning_rates()
-
-    def of_track(self, track_id: str) -> torch.Tensor:
-        return torch.full((len(self),), track_id == self._track_id)
-
-
-def part_of(places: np.ndarray, opacities=None) -> Background:
-    count = len(places)
-    chances = torch.tensor([0.5] * count if opacities is None else opacities)
-    params = {
-        "means": torch.tensor(places).float(),
-        "scales": torch.full((count, 3), np.log(0.1)),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        "opacities": torch.logit(chances),
-        "sh0": torch.zeros(count, 1, 3),
-        "shN": torch.zeros(count, 0, 3),
-    }
-    return Background(params, GaussianSettings(sh_degree=0), 1.0)
-
-
 def sight_of(scene: Scene, *parts: Part, index: int = 0) -> Sight:
-    job = ParserJob(holdout=HoldoutSettings(every_nth=0, last_block=0), images=ImageSettings(width=None))
-    parser = parser_dict(scene, PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {}), job)
     model = SplatModel(parts, None).requires_grad_(False)
-    return Sight(Drive(model, scene, parser, torch.device("cpu")), index)
+    return Sight(Drive(model, recording_of(scene), torch.device("cpu")), index)
 
 
 def drive_ahead(tiny_scene: Scene) -> Scene:
@@ -276,40 +232,45 @@ GHOSTS = np.array([True, True, False, False, False, False, False, False, True])
 
 
 def ghosts_at(sight: Sight, clearance: float = 0.2) -> Ghosts:
-    scene = sight.drive.scene
+    scene = sight.drive.recording.scene
     box = box_at(scene.tracks[0], sight.frame.timestamp, scene.key_frame_interval)
     return ghosts_of(sight, box, GhostSettings(clearance=clearance))
 
 
 def test_ghosts_lie_on_the_way_but_not_in_the_box_now(tiny_scene):
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), part_of(PLACES), index=LATER))
+    found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER))
     np.testing.assert_array_equal(found.rows, GHOSTS)
 
 
 def test_ghosts_are_other_ones_at_another_time(tiny_scene):
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), part_of(PLACES[:4]), index=1))
+    found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:4]), index=1))
     np.testing.assert_array_equal(found.rows, [True, True, True, False])
 
 
 def test_without_clearance_the_road_that_was_driven_over_counts(tiny_scene):
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), part_of(PLACES), index=LATER), clearance=0.0)
+    found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER), clearance=0.0)
     np.testing.assert_array_equal(np.flatnonzero(found.rows & ~torch.from_numpy(GHOSTS)), [4])
 
 
-def test_what_a_model_knows_as_the_objects_own_is_no_ghost_of_it(tiny_scene):
-    """Two parts of the same Gaussians: those that ride with the object are its own wherever they lie."""
-    sight = sight_of(drive_ahead(tiny_scene), part_of(PLACES), Ride(part_of(PLACES), "it"), index=LATER)
-    np.testing.assert_array_equal(ghosts_at(sight).rows, [*GHOSTS, *np.zeros_like(GHOSTS)])
+@pytest.mark.parametrize("whose", ["it", "another"])
+def test_what_moves_is_no_ghost_whoever_it_belongs_to(tiny_scene, whose):
+    """Two parts of the same Gaussians: those that go where their object goes are no ghosts wherever they lie."""
+    parts = round_gaussians(PLACES), Own(round_gaussians(PLACES), whose)
+    found = ghosts_at(sight_of(drive_ahead(tiny_scene), *parts, index=LATER))
+    np.testing.assert_array_equal(found.rows, [*GHOSTS, *np.zeros_like(GHOSTS)])
 
 
-def test_what_a_model_knows_as_anothers_own_may_be_a_ghost(tiny_scene):
-    sight = sight_of(drive_ahead(tiny_scene), part_of(PLACES), Ride(part_of(PLACES), "another"), index=LATER)
-    np.testing.assert_array_equal(ghosts_at(sight).rows, [*GHOSTS, *GHOSTS])
+def test_what_a_still_part_knows_as_the_objects_own_may_be_a_ghost(tiny_scene, monkeypatch):
+    """That it is known does not make it go: the part has to move."""
+    monkeypatch.setattr(Own, "moves", False)
+    parts = Own(round_gaussians(PLACES), "it"), round_gaussians(PLACES)
+    found = ghosts_at(sight_of(drive_ahead(tiny_scene), *parts, index=LATER))
+    np.testing.assert_array_equal(found.rows, [*GHOSTS, *GHOSTS])
 
 
 def test_ghosts_in_figures(tiny_scene):
     opacities = [0.1, 0.4, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9, 0.7]
-    sight = sight_of(drive_ahead(tiny_scene), part_of(PLACES, opacities), index=LATER)
+    sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES, opacities=opacities), index=LATER)
     figures = ghosts_at(sight).figures(sight.gaussians)
     assert figures["gaussians"] == 3
     assert figures["opacity_sum"] == pytest.approx(1.2, abs=1e-6)
@@ -318,13 +279,13 @@ def test_ghosts_in_figures(tiny_scene):
 
 
 def test_the_median_of_two_lies_between_them(tiny_scene):
-    sight = sight_of(drive_ahead(tiny_scene), part_of(PLACES[:2], [0.2, 0.6]), index=LATER)
+    sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:2], opacities=[0.2, 0.6]), index=LATER)
     assert ghosts_at(sight).figures(sight.gaussians)["opacity_median"] == pytest.approx(0.4, abs=1e-6)
 
 
 @pytest.mark.parametrize("places", [PLACES[4:6], PLACES[:0]])
 def test_no_ghosts_are_no_number_of_means(tiny_scene, places):
     """Nothing on the way, or no Gaussian at all."""
-    sight = sight_of(drive_ahead(tiny_scene), part_of(places), index=LATER)
+    sight = sight_of(drive_ahead(tiny_scene), round_gaussians(places), index=LATER)
     figures = json.loads(json.dumps(ghosts_at(sight).figures(sight.gaussians), allow_nan=False))
     assert figures == {"gaussians": 0, "opacity_sum": 0.0, "opacity_mean": None, "opacity_median": None}

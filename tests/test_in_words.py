@@ -34,7 +34,8 @@ def test_each_group_is_a_sentence_with_its_gap():
         in lines
     )
     assert "vanilla: 40,000 Gaussians, trained in 91 s on cpu (x86_64)" in lines
-    assert "results/demo/metrics.json" in lines[-1] and "results/demo" in lines[-1].rpartition(" ")[2]
+    figures = next(line for line in lines if line.startswith("All figures: "))
+    assert "results/demo/metrics.json" in figures and figures.endswith(" results/demo")
 
 
 def test_a_group_that_is_off_is_not_spoken_of():
@@ -49,16 +50,37 @@ def test_a_scene_where_nothing_moves_has_no_gap():
 
 def test_what_was_measured_against_truth_is_told():
     lateral = {"2.0": {"all": {"psnr": 21.5}, "static": {"psnr": 22.7}}}
-    removal = {"box": {"psnr": 17.0}, "outside": {"psnr": 26.2}}
+    before = {"box": {"psnr": 14.3}, "outside": {"psnr": 25.9}}
+    removal = {"box": {"psnr": 17.0}, "outside": {"psnr": 26.2}, "not_removed": before}
     metrics = {"methods": {"vanilla": {**method(), "lateral": lateral, "removal": removal}}}
     lines = in_words(metrics, "m.json")
     assert "vanilla, from 2 m to the left, against truth: static 22.7 dB" in lines
-    assert "vanilla, the car ahead removed, against truth: 17.0 dB in its box, 26.2 dB elsewhere" in lines
+    expected = "vanilla, the car ahead removed, against the empty street: 17.0 dB in its box (14.3 dB before)"
+    assert expected in lines
+
+
+def test_what_there_is_to_look_at_is_named_last_by_method(tmp_path):
+    """Of the files that are there; of a method that has none nothing is said."""
+    made = {"vanilla": ("viewer.html", "original.mp4", "train.json", "removal.png"), "plain": ("ghost_panel.png",)}
+    for name, files in {**made, "bare": ("train.json",)}.items():
+        (tmp_path / name).mkdir()
+        for file in files:
+            (tmp_path / name / file).touch()
+    (tmp_path / "plain" / "original.mp4").mkdir()
+    metrics = {"methods": {name: method() for name in ("vanilla", "plain", "bare", "absent")}}
+    lines = in_words(metrics, tmp_path / "metrics.json")
+    assert lines[-2:] == [
+        f"To look at, in {tmp_path}/vanilla: original.mp4, removal.png, viewer.html",
+        f"To look at, in {tmp_path}/plain: ghost_panel.png",
+    ]
+    assert sum("To look at" in line for line in lines) == 2
 
 
 def test_truth_over_too_few_pixels_is_not_spoken_of():
-    metrics = {"methods": {"vanilla": {**method(), "lateral": {"2.0": {"static": None}}, "removal": {"box": None}}}}
-    assert not any("truth" in line for line in in_words(metrics, "m.json"))
+    removal = {"box": None, "outside": {"psnr": 20.0}, "not_removed": {"box": None, "outside": {"psnr": 20.0}}}
+    metrics = {"methods": {"vanilla": {**method(), "lateral": {"2.0": {"static": None}}, "removal": removal}}}
+    lines = in_words(metrics, "m.json")
+    assert not any("truth" in line or "removed" in line for line in lines)
 
 
 def test_the_command_line_prints_it_and_names_a_missing_file(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hand_made import Own, recording_of, round_gaussians, write_labels
 from matplotlib.figure import Figure
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
@@ -15,21 +16,15 @@ from skimage.metrics import peak_signal_noise_ratio
 from drivesplat.actors.drawing import draw_panel, draw_removal, save_figure
 from drivesplat.actors.panel import Panel, ghost_panel
 from drivesplat.actors.remove import RemovalPair, remove_actor
-from drivesplat.actors.sight import Drive
-from drivesplat.errors import ResultError
-from drivesplat.model.background import SH_C0, Background
+from drivesplat.actors.sight import Drive, Sight
+from drivesplat.errors import DeviceError, ResultError
+from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
 from drivesplat.regions import LABELS
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene, Track
 from drivesplat.settings.actor import GhostSettings, PanelJob, RemovalJob, RemovalSettings, SubjectSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
 from drivesplat.training.views import view_of
 
 SIZE = np.array([4.0, 2.0, 1.6])
@@ -53,20 +48,19 @@ def one_car(scene: Scene, speed: float = SPEED) -> Scene:
     return dataclasses.replace(scene, tracks=(it,))
 
 
-def drive_of(scene: Scene, places=(GHOST_AT, ROAD_AT), opacities=0.6, colors=(0.9, 0.1, 0.1)) -> Drive:
-    n = len(places)
-    params = {
-        "means": torch.tensor(np.array(places)).reshape(-1, 3).float(),
-        "scales": torch.full((n, 3), np.log(0.1)),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        "opacities": torch.logit(torch.tensor(opacities).expand(n)),
-        "sh0": ((torch.tensor(colors).expand(n, 3) - 0.5) / SH_C0)[:, None, :],
-        "shN": torch.zeros(n, 0, 3),
-    }
-    model = SplatModel([Background(params, GaussianSettings(sh_degree=0), 1.0)], ConstantSky(SKY, 1e-2))
-    job = ParserJob(holdout=HoldoutSettings(every_nth=4, offset=2, last_block=0), images=ImageSettings(width=None))
-    seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    return Drive(model.requires_grad_(False), scene, parser_dict(scene, seed, job), torch.device("cpu"))
+def drive_of(
+    scene: Scene,
+    masks: Path | None = None,
+    *parts: Part,
+    places=(GHOST_AT, ROAD_AT),
+    opacities=0.6,
+    colors=(0.9, 0.1, 0.1),
+) -> Drive:
+    """A background of Gaussians at `places`, and `parts`. Every fourth key frame, from HELD_OUT on, is held out."""
+    background = round_gaussians(places, 0.1, opacities, colors)
+    model = SplatModel([background, *parts], ConstantSky(SKY, 1e-2))
+    recording = recording_of(scene, masks, every_nth=4, offset=HELD_OUT)
+    return Drive(model.requires_grad_(False), recording, torch.device("cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +68,7 @@ def masks(tiny_scene, tmp_path_factory) -> Path:
     """Label images, the same for every frame: the upper rows left out, the lowest the own car's body, static."""
     labels = np.full((54, 96), LABELS["static"], dtype=np.uint8)
     labels[:10], labels[OWN_CAR_FROM:] = LABELS["left_out"], LABELS["own_car"]
-    folder = tmp_path_factory.mktemp("masks")
-    (folder / "regions" / "CAM_FRONT").mkdir(parents=True)
-    for frame in tiny_scene.frames:
-        Image.fromarray(labels).save(folder / "regions" / "CAM_FRONT" / f"{frame.timestamp}.png")
-    return folder
+    return write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
 
 
 def job_of(key_frame: int | None = HELD_OUT) -> PanelJob:
@@ -87,13 +77,13 @@ def job_of(key_frame: int | None = HELD_OUT) -> PanelJob:
 
 @pytest.fixture(scope="module")
 def haunted(tiny_scene, masks) -> tuple[Panel, dict[str, Any], Drive]:
-    drive = drive_of(one_car(tiny_scene))
-    return *ghost_panel(drive, masks, job_of()), drive
+    drive = drive_of(one_car(tiny_scene), masks)
+    return *ghost_panel(drive, job_of()), drive
 
 
 def seen_at(drive: Drive, key_frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Continuous pixels (n, 2) of world points and their depths, by the camera's matrix."""
-    frame = drive.scene.frames[2 * key_frame]
+    frame = drive.recording.scene.frames[2 * key_frame]
     in_camera = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_to_world).T
     pixels = in_camera[:, :3] @ frame.intrinsics.T
     return pixels[:, :2] / pixels[:, 2:] + 0.5, in_camera[:, 2]
@@ -106,14 +96,14 @@ def near(pixel: np.ndarray, radius: float) -> np.ndarray:
 
 def test_the_truth_is_the_recorded_image(haunted):
     panel, record, drive = haunted
-    recorded = np.asarray(Image.open(drive.scene.frames[2 * HELD_OUT].image_path).convert("RGB"))
+    recorded = np.asarray(Image.open(drive.recording.scene.frames[2 * HELD_OUT].image_path).convert("RGB"))
     np.testing.assert_allclose(panel.truth * 255.0, recorded)
     assert record["key_frame"] == HELD_OUT and record["subject"]["split"] == "interpolation"
 
 
 def test_the_render_is_the_models(haunted):
     panel, _, drive = haunted
-    expected = drive.model.render(view_of(drive.parser, 2 * HELD_OUT, drive.device)).image
+    expected = drive.model.render(view_of(drive.recording.parser, 2 * HELD_OUT, drive.device)).image
     np.testing.assert_allclose(panel.render, expected.clamp(0, 1), atol=1e-6)
     assert (np.abs(panel.render - SKY.numpy()).max(axis=2) > 0.1).any(), "Gaussians must be seen"
 
@@ -129,8 +119,9 @@ def test_psnr_of_vehicle_and_static_pixels_is_skimages(haunted, masks):
     box = np.zeros((54, 96), dtype=bool)
     (left, top), (right, bottom) = np.ceil(near_face(HELD_OUT) - 0.5).astype(int)
     box[top:bottom, left:right] = True
-    assert record["subject"]["pixels"] == box.sum() and bottom > OWN_CAR_FROM
+    assert bottom > OWN_CAR_FROM
     box[OWN_CAR_FROM:] = False
+    assert record["subject"]["pixels"] == box.sum()
     assert record["vehicle"]["psnr"] == pytest.approx(
         peak_signal_noise_ratio(panel.truth[box], panel.render[box], data_range=1.0)
     )
@@ -169,10 +160,30 @@ def test_the_way_is_that_of_the_boxs_centre_over_the_ground(haunted):
 
 def test_no_pixel_of_the_way_is_of_what_lies_behind_the_camera(tiny_scene, masks):
     """At the ninth key frame the camera has driven past where the car began."""
-    drive = drive_of(one_car(tiny_scene))
-    panel, _ = ghost_panel(drive, masks, job_of(8))
+    drive = drive_of(one_car(tiny_scene), masks)
+    panel, _ = ghost_panel(drive, job_of(8))
     in_front = np.isfinite(panel.way).all(axis=1)
     assert 0 < in_front.sum() < len(in_front) and (panel.way[in_front, 1] > 27.0).all()
+
+
+@pytest.mark.parametrize("missing", [(), (6,), (5, 6)])
+def test_the_way_is_broken_where_the_annotation_has_a_gap(tiny_scene, masks, missing):
+    """Boxes reach a quarter of a second into a gap: a key frame that is missing leaves half a second, 3 m, open."""
+    scene = one_car(tiny_scene)
+    (it,) = scene.tracks
+    kept = [i for i in range(10) if i not in missing]
+    arrays = ("timestamps", "sample_indices", "object_to_world", "visibility")
+    gappy = dataclasses.replace(it, **{name: getattr(it, name)[kept] for name in arrays})
+    drive = drive_of(dataclasses.replace(scene, tracks=(gappy,)), masks)
+    panel, _ = ghost_panel(drive, job_of())
+    seen = np.flatnonzero(np.isfinite(panel.way).all(axis=1))
+    breaks = np.flatnonzero(np.diff(seen) > 1)
+    assert len(breaks) == bool(missing)
+    assert (np.diff(seen)[breaks] == 2).all(), "one row without numbers parts the line"
+    if missing:
+        sides = 6.0 + SPEED * np.array([0.5 * (min(missing) - 1) + 0.25, 0.5 * (max(missing) + 1) - 0.25])
+        ends, _ = seen_at(drive, HELD_OUT, np.stack([sides, np.full(2, 0.4), np.zeros(2)], axis=1))
+        np.testing.assert_allclose(panel.way[seen[[breaks[0], breaks[0] + 1]]], ends, atol=0.6)
 
 
 def test_haunted_is_the_dimmed_image_but_for_the_ghost(haunted):
@@ -190,8 +201,8 @@ def test_haunted_is_the_dimmed_image_but_for_the_ghost(haunted):
 
 def test_a_ghost_is_drawn_in_its_own_colour_and_stronger_than_it_is(tiny_scene, masks):
     """Opacity 0.1 at the centre's pixel, drawn four times as strong: the most there is."""
-    drive = drive_of(one_car(tiny_scene), places=[GHOST_AT], opacities=0.1, colors=(0.9, 0.1, 0.2))
-    panel, record = ghost_panel(drive, masks, job_of())
+    drive = drive_of(one_car(tiny_scene), masks, places=[GHOST_AT], opacities=0.1, colors=(0.9, 0.1, 0.2))
+    panel, record = ghost_panel(drive, job_of())
     column, row = np.floor(seen_at(drive, HELD_OUT, GHOST_AT[None])[0][0]).astype(int)
     dimmed = 0.3 * panel.truth[row, column].mean()
     expected = 0.4 * np.array([0.9, 0.1, 0.2]) + 0.6 * dimmed
@@ -202,7 +213,7 @@ def test_a_ghost_is_drawn_in_its_own_colour_and_stronger_than_it_is(tiny_scene, 
 
 @pytest.mark.parametrize("opacity", [0.3, 0.6, 0.99])
 def test_ghosts_are_strengthened_until_nearly_all_stay_below_nine_tenths(tiny_scene, masks, opacity):
-    _, record = ghost_panel(drive_of(one_car(tiny_scene), places=[GHOST_AT], opacities=opacity), masks, job_of())
+    _, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[GHOST_AT], opacities=opacity), job_of())
     pixel, depth = seen_at(drive_of(one_car(tiny_scene)), HELD_OUT, GHOST_AT[None])
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
     distance = np.hypot(x - pixel[0, 0], y - pixel[0, 1])
@@ -223,7 +234,7 @@ def test_the_covered_share_is_that_of_the_ghosts_alone(haunted):
 
 
 def test_a_model_without_ghosts_shows_the_dimmed_image(tiny_scene, masks):
-    panel, record = ghost_panel(drive_of(one_car(tiny_scene), places=[ROAD_AT]), masks, job_of())
+    panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[ROAD_AT]), job_of())
     np.testing.assert_allclose(panel.haunted, 0.3 * panel.truth.mean(axis=2)[..., None].repeat(3, axis=2))
     assert record["ghosts"]["gaussians"] == 0 and record["ghosts"]["covered_share"] == 0.0
     assert record["ghosts"]["opacity_mean"] is None
@@ -232,7 +243,7 @@ def test_a_model_without_ghosts_shows_the_dimmed_image(tiny_scene, masks):
 
 @pytest.fixture(scope="module")
 def still(tiny_scene, masks) -> tuple[Panel, dict[str, Any]]:
-    return ghost_panel(drive_of(one_car(tiny_scene, speed=0.0)), masks, job_of(None))
+    return ghost_panel(drive_of(one_car(tiny_scene, speed=0.0), masks), job_of(None))
 
 
 def test_where_nothing_moves_the_middle_key_frame_is_shown_and_figures_are_null(still, tiny_scene):
@@ -252,10 +263,23 @@ def test_the_record_has_the_same_fields_whether_something_moves_or_not(haunted, 
 
 
 def test_a_model_that_shows_no_numbers_is_refused(tiny_scene, masks):
-    drive = drive_of(one_car(tiny_scene))
+    drive = drive_of(one_car(tiny_scene), masks)
     drive.model.parts[0].params["sh0"].data.fill_(float("nan"))
     with pytest.raises(ResultError, match=r"checkpoint\.pt"):
-        ghost_panel(drive, masks, job_of())
+        ghost_panel(drive, job_of())
+
+
+def test_a_card_that_is_full_is_told_in_a_sentence(tiny_scene, masks, monkeypatch):
+    def full(*_, **__):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+    drive = drive_of(one_car(tiny_scene), masks)
+    monkeypatch.setattr(SplatModel, "render", full)
+    for rows, count in ((None, 2), (torch.tensor([True, False]), 1)):
+        with pytest.raises(DeviceError) as refusal:
+            Sight(drive, 0).of(rows)
+        message = str(refusal.value)
+        assert f"with {count} Gaussians" in message and "train.cap_max" in message and "\n" not in message
 
 
 def titles(figure: Figure) -> list[str]:
@@ -276,7 +300,7 @@ def test_the_panel_has_four_titled_pictures(haunted):
     assert second == f"Render: vehicle {vehicle:.1f} dB, static {static:.1f} dB"
     assert fourth.startswith("Ghosts") and ": 1, mean opacity 0.60" in fourth
     heading = figure.get_suptitle()
-    for words in ("0001", "vanilla", "key frame 2", "held out: interpolation", "vehicle.car", "6.0 m/s", "6 m ahead"):
+    for words in ("0001", "vanilla", "key frame 2", "held out: interpolation", "vehicle.car", "6.0 m/s", "6 m away"):
         assert words in heading, words
 
 
@@ -312,7 +336,7 @@ def test_what_is_drawn_over_a_picture_does_not_shrink_it(haunted):
 
 
 def test_a_training_image_is_called_one(tiny_scene, masks):
-    panel, record = ghost_panel(drive_of(one_car(tiny_scene)), masks, job_of(3))
+    panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks), job_of(3))
     assert "(training image)" in draw_panel(panel, record, "vanilla").get_suptitle()
 
 
@@ -326,29 +350,39 @@ def test_where_nothing_moves_the_drawn_panel_says_so(still):
 
 
 def test_without_ghosts_the_drawn_panel_says_so(tiny_scene, masks):
-    panel, record = ghost_panel(drive_of(one_car(tiny_scene), places=[ROAD_AT]), masks, job_of())
+    panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[ROAD_AT]), job_of())
     assert titles(draw_panel(panel, record, "vanilla"))[3].startswith("Ghosts: none")
 
 
-def removal(scene: Scene, key_frame: int | None) -> tuple[RemovalPair, dict[str, Any]]:
+def removal(scene: Scene, key_frame: int | None, *parts: Part) -> tuple[RemovalPair, dict[str, Any]]:
     job = RemovalJob(
         eval_camera="CAM_FRONT",
         subject=SubjectSettings(key_frame=key_frame),
         ghosts=GhostSettings(),
         removal=RemovalSettings(),
     )
-    return remove_actor(drive_of(scene, places=[[7.0, 0.4, 0.8], ROAD_AT]), job)
+    return remove_actor(drive_of(scene, None, *parts, places=[[7.0, 0.4, 0.8], ROAD_AT]), job)
 
 
 def test_the_removal_is_drawn_with_without_and_their_difference(tiny_scene):
     pair, record = removal(one_car(tiny_scene), 0)
     figure = draw_removal(pair, record, "street")
-    assert titles(figure)[:2] == ["With the vehicle", "Without it"] and titles(figure)[2].startswith("Difference")
+    assert titles(figure)[:2] == ["Render", "Without the Gaussians in its box"]
+    assert titles(figure)[2].startswith("Difference")
     np.testing.assert_array_equal(shown(figure, 0), pair.with_car)
     np.testing.assert_array_equal(shown(figure, 1), pair.without_car)
     np.testing.assert_allclose(shown(figure, 2), np.abs(pair.with_car - pair.without_car).mean(axis=2))
     assert shown(figure, 2).max() > 0.01
-    assert "street" in figure.get_suptitle() and "1 Gaussians removed" in figure.get_suptitle()
+    heading = figure.get_suptitle()
+    assert "street" in heading
+    assert f"1 Gaussians removed, which changes {record['box']['changed_share']:.0%} of its box's pixels" in heading
+    assert 0.01 < record["box"]["changed_share"] < 0.99
+
+
+def test_a_removal_of_the_actors_own_gaussians_is_called_one(tiny_scene):
+    pair, record = removal(one_car(tiny_scene), 0, Own(round_gaussians([[7.0, 0.4, 0.8]]), "it"))
+    assert record["removed_by"] == "actor"
+    assert titles(draw_removal(pair, record, "street"))[1] == "Without its Gaussians"
 
 
 def test_a_removal_of_nothing_is_drawn_and_says_so(tiny_scene):

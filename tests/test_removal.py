@@ -2,71 +2,28 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hand_made import Own, recording_of, round_gaussians, write_labels
 from scipy.ndimage import convolve
 
 from drivesplat.actors.remove import RemovalPair, figures, remove_actor
 from drivesplat.actors.sight import Drive
-from drivesplat.model.background import SH_C0, Background
-from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
 from drivesplat.model.removal import removal_of
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
-from drivesplat.regions import fill
+from drivesplat.regions import LABELS, fill
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene, Track
 from drivesplat.settings.actor import GhostSettings, RemovalJob, RemovalSettings, SubjectSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
 from drivesplat.tracks import Box
 
 SIZE = np.array([4.0, 2.0, 1.6])
 SKY = torch.tensor([0.2, 0.4, 0.7])
-CAR = [0.0, 0.0, 0.0]
-
-
-def background(places, sizes=0.1, opacities=0.95, colors=CAR) -> Background:
-    """Round Gaussians at world `places` (n, 3), their standard deviations `sizes` in metres."""
-    means = torch.tensor(np.asarray(places, dtype=float)).reshape(-1, 3).float()
-    n = len(means)
-    params = {
-        "means": means,
-        "scales": torch.log(torch.tensor(sizes).expand(n)).float()[:, None].repeat(1, 3),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        "opacities": torch.logit(torch.tensor(opacities).expand(n).float()),
-        "sh0": ((torch.tensor(colors).expand(n, 3).float() - 0.5) / SH_C0)[:, None, :],
-        "shN": torch.zeros(n, 0, 3),
-    }
-    return Background(params, GaussianSettings(sh_degree=0), 1.0)
-
-
-class Own(Part):
-    """Gaussians that are known as a track's own."""
-
-    name = "own"
-
-    def __init__(self, still: Background, track_id: str):
-        super().__init__()
-        self.params = still.params
-        self._still = still
-        self._track_id = track_id
-
-    def at(self, time: float) -> Gaussians:
-        return self._still.at(time)
-
-    def learning_rates(self) -> dict[str, float]:
-        return self._still.learning_rates()
-
-    def of_track(self, track_id: str) -> torch.Tensor:
-        return torch.full((len(self),), track_id == self._track_id)
 
 
 def model_of(*parts: Part) -> SplatModel:
@@ -99,7 +56,7 @@ def test_what_has_its_centre_in_the_box_goes_whatever_its_size(place, goes_witho
     """Places are the box's own coordinates; the margin 0.1 m grows sides and roof, not the floor."""
     box = turned_box()
     world = np.array(place) @ box.object_to_world[:3, :3].T + box.object_to_world[:3, 3]
-    model = model_of(background([world, [0.0, 0.0, 0.0]], size))
+    model = model_of(round_gaussians([world, [0.0, 0.0, 0.0]], size))
     for margin, goes in ((0.0, goes_without), (0.1, goes_with)):
         removal = removal_of(model, model.gaussians_at(0.0), box, margin)
         assert removal.by == "box" and removal.removed.tolist() == [goes, False]
@@ -108,21 +65,29 @@ def test_what_has_its_centre_in_the_box_goes_whatever_its_size(place, goes_witho
 def test_an_actors_own_gaussians_are_removed_and_nothing_by_box():
     box = turned_box()
     middle = box.object_to_world[:3, 3]
-    parts = background([middle, middle + 50.0]), Own(background([middle, middle + 9.0]), "it")
-    model = model_of(*parts, Own(background([middle]), "another"))
+    parts = round_gaussians([middle, middle + 50.0]), Own(round_gaussians([middle, middle + 9.0]), "it")
+    model = model_of(*parts, Own(round_gaussians([middle]), "another"))
     removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
     assert removal.by == "actor" and removal.removed.tolist() == [False, False, True, True, False]
 
 
 def test_of_a_model_that_knows_other_objects_only_the_box_is_emptied():
     box = turned_box()
-    model = model_of(background([box.object_to_world[:3, 3]]), Own(background([[0.0, 0.0, 0.0]]), "another"))
+    model = model_of(round_gaussians([box.object_to_world[:3, 3]]), Own(round_gaussians([[0.0, 0.0, 0.0]]), "another"))
     removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
     assert removal.by == "box" and removal.removed.tolist() == [True, False]
 
 
+def test_an_actor_without_gaussians_is_not_removed_by_its_box():
+    """All of its Gaussians died in training: what lies in its box is not its own."""
+    box = turned_box()
+    model = model_of(round_gaussians([box.object_to_world[:3, 3]]), Own(round_gaussians([]), "it"))
+    removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
+    assert removal.by == "actor" and removal.removed.tolist() == [False]
+
+
 def test_nothing_is_removed_of_an_empty_model():
-    model = model_of(background([]))
+    model = model_of(round_gaussians([]))
     assert removal_of(model, model.gaussians_at(0.0), turned_box(), 0.1).removed.shape == (0,)
 
 
@@ -134,10 +99,8 @@ def one_car(tiny_scene: Scene, speed: float = 4.0) -> Scene:
     return dataclasses.replace(tiny_scene, tracks=(it,))
 
 
-def drive_of(scene: Scene, *parts: Part) -> Drive:
-    job = ParserJob(holdout=HoldoutSettings(every_nth=0, last_block=0), images=ImageSettings(width=None))
-    parser = parser_dict(scene, PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {}), job)
-    return Drive(model_of(*parts), scene, parser, torch.device("cpu"))
+def drive_of(scene: Scene, *parts: Part, masks: Path | None = None) -> Drive:
+    return Drive(model_of(*parts), recording_of(scene, masks), torch.device("cpu"))
 
 
 def job_of(margin: float = 0.1, key_frame: int | None = 0) -> RemovalJob:
@@ -159,11 +122,11 @@ PLACES = [
 
 
 def test_what_lies_in_the_box_goes_from_the_picture_and_the_rest_stays(tiny_scene):
-    part = background(PLACES, 0.2, colors=[[0.0, 0.0, 0.0], [0.9, 0.1, 0.1], [0.1, 0.9, 0.1], [0.9, 0.9, 0.1]])
+    part = round_gaussians(PLACES, 0.2, colors=[[0.0, 0.0, 0.0], [0.9, 0.1, 0.1], [0.1, 0.9, 0.1], [0.9, 0.9, 0.1]])
     pair, record = remove_actor(drive_of(one_car(tiny_scene), part), job_of())
     assert record["removed_by"] == "box" and record["gaussians_removed"] == 3 and record["margin_m"] == 0.1
     assert record["subject"]["track"] == "it" and record["key_frame"] == 0 and record["why_null"] is None
-    kept = drive_of(one_car(tiny_scene), background(PLACES[2:3], 0.2, colors=[[0.1, 0.9, 0.1]]))
+    kept = drive_of(one_car(tiny_scene), round_gaussians(PLACES[2:3], 0.2, colors=[[0.1, 0.9, 0.1]]))
     expected, _ = remove_actor(kept, job_of())
     np.testing.assert_allclose(pair.without_car, expected.with_car, atol=1e-6)
     np.testing.assert_allclose(pair.alpha_without, expected.alpha_with, atol=1e-6)
@@ -172,14 +135,14 @@ def test_what_lies_in_the_box_goes_from_the_picture_and_the_rest_stays(tiny_scen
 
 
 def test_without_a_margin_what_straddles_the_box_stays(tiny_scene):
-    _, record = remove_actor(drive_of(one_car(tiny_scene), background(PLACES, 0.2)), job_of(margin=0.0))
+    _, record = remove_actor(drive_of(one_car(tiny_scene), round_gaussians(PLACES, 0.2)), job_of(margin=0.0))
     assert record["gaussians_removed"] == 2
 
 
 def test_off_the_footprint_of_what_was_removed_both_pictures_are_the_same(tiny_scene):
     random = np.random.default_rng(0)
     around = random.uniform([4.0, -4.0, 0.0], [30.0, 4.0, 4.0], (300, 3))
-    part = background(around, 0.25, opacities=0.7, colors=random.uniform(0, 1, (300, 3)).tolist())
+    part = round_gaussians(around, 0.25, opacities=0.7, colors=random.uniform(0, 1, (300, 3)).tolist())
     pair, record = remove_actor(drive_of(one_car(tiny_scene), part), job_of())
     off = ~pair.footprint
     assert record["gaussians_removed"] >= 5 and 0.2 < off.mean() < 0.95
@@ -192,7 +155,7 @@ def test_off_the_footprint_of_what_was_removed_both_pictures_are_the_same(tiny_s
 
 def test_the_footprint_is_where_the_removed_gaussian_reaches(tiny_scene):
     """One Gaussian of 0.2 m at 6.84 m from the camera: a disc around where its centre is projected."""
-    pair, _ = remove_actor(drive_of(one_car(tiny_scene), background([CAR_AT], 0.2)), job_of())
+    pair, _ = remove_actor(drive_of(one_car(tiny_scene), round_gaussians([CAR_AT], 0.2)), job_of())
     frame = tiny_scene.frames[0]
     ahead, left, up = np.array(CAR_AT) - frame.camera_to_world[:3, 3]
     focal = frame.intrinsics[0, 0]
@@ -206,24 +169,56 @@ def test_the_footprint_is_where_the_removed_gaussian_reaches(tiny_scene):
 
 def test_an_actors_gaussians_leave_the_picture_wherever_they_are(tiny_scene):
     """A method that takes the car apart: its Gaussian beside the box goes, the background's in the box stays."""
-    parts = background([CAR_AT], 0.2), Own(background([[9.0, 2.5, 1.0]], 0.2), "it")
+    parts = round_gaussians([CAR_AT], 0.2), Own(round_gaussians([[9.0, 2.5, 1.0]], 0.2), "it")
     pair, record = remove_actor(drive_of(one_car(tiny_scene), *parts), job_of())
     assert record["removed_by"] == "actor" and record["gaussians_removed"] == 1
-    kept, _ = remove_actor(drive_of(one_car(tiny_scene), background([CAR_AT], 0.2)), job_of())
+    kept, _ = remove_actor(drive_of(one_car(tiny_scene), round_gaussians([CAR_AT], 0.2)), job_of())
     np.testing.assert_allclose(pair.without_car, kept.with_car, atol=1e-6)
 
 
+BEFORE_THE_BOX = [5.5, 0.85, 0.4]
+"""On the car's way, nearer than its box and beside it in the image."""
+OWN_CAR_FROM = 36
+"""The row from which on the own car's body hides what is in the image, the lower part of the car's box as well."""
+
+
+def test_the_own_cars_pixels_are_neither_of_the_box_nor_outside_of_it(tiny_scene, tmp_path):
+    labels = np.full((54, 96), LABELS["static"], dtype=np.uint8)
+    labels[OWN_CAR_FROM:] = LABELS["own_car"]
+    scene, part = one_car(tiny_scene, speed=6.0), round_gaussians([*PLACES, BEFORE_THE_BOX], 0.2)
+    masks = write_labels(tmp_path, scene, labels)
+    (whole, unhidden), (pair, record) = (
+        remove_actor(drive_of(scene, part, masks=given), job_of()) for given in (None, masks)
+    )
+    np.testing.assert_array_equal(whole.outside, ~whole.inside)
+    hidden = np.zeros((54, 96), dtype=bool)
+    hidden[OWN_CAR_FROM:] = True
+    for name in ("inside", "outside"):
+        all_rows = getattr(whole, name)
+        assert (all_rows & hidden).any() and (all_rows & ~hidden).any()
+        np.testing.assert_array_equal(getattr(pair, name), all_rows & ~hidden)
+    assert record["box"]["pixels"] == (whole.inside & ~hidden).sum() < unhidden["box"]["pixels"]
+    assert record["outside"]["pixels"] == (whole.outside & ~hidden).sum()
+    assert record["subject"]["pixels"] == (whole.inside & ~hidden).sum()
+    error = ((pair.with_car - pair.without_car)[whole.outside & ~hidden] ** 2).mean()
+    assert record["outside"]["psnr"] == pytest.approx(-10 * np.log10(error))
+    assert [found["ghosts"]["gaussians"] for found in (record, unhidden)] == [1, 1]
+    assert unhidden["ghosts"]["reach_outside_box"] and unhidden["ghosts"]["covered_share_outside"] > 0.0
+    assert not record["ghosts"]["reach_outside_box"] and record["ghosts"]["covered_share_outside"] == 0.0
+
+
 def test_a_model_without_gaussians_in_the_box_changes_nothing(tiny_scene):
-    pair, record = remove_actor(drive_of(one_car(tiny_scene), background([[12.0, 3.0, 1.0]], 0.2)), job_of())
+    pair, record = remove_actor(drive_of(one_car(tiny_scene), round_gaussians([[12.0, 3.0, 1.0]], 0.2)), job_of())
     np.testing.assert_array_equal(pair.with_car, pair.without_car)
     assert record["gaussians_removed"] == 0 and not pair.footprint.any()
     assert record["box"]["changed_share"] == 0.0 and record["outside"]["identical"]
     json.dumps(record, allow_nan=False)
 
 
-def ghosts_record(tiny_scene: Scene, place) -> dict:
+def ghosts_record(tiny_scene: Scene, place, opacity: float = 0.95) -> dict:
     places = [CAR_AT] if place is None else [CAR_AT, place]
-    drive = drive_of(one_car(tiny_scene, speed=6.0), background(places, 0.15, colors=[0.9, 0.2, 0.1]))
+    part = round_gaussians(places, 0.15, [0.95, opacity][: len(places)], [0.9, 0.2, 0.1])
+    drive = drive_of(one_car(tiny_scene, speed=6.0), part)
     return remove_actor(drive, job_of())[1]["ghosts"]
 
 
@@ -231,7 +226,7 @@ def ghosts_record(tiny_scene: Scene, place) -> dict:
     ("place", "count", "seen"),
     [
         pytest.param(None, 0, False, id="there are none"),
-        pytest.param([5.5, 0.85, 0.4], 1, True, id="on the way here, before the box in the image"),
+        pytest.param(BEFORE_THE_BOX, 1, True, id="on the way here, before the box in the image"),
         pytest.param([30.0, 0.0, 0.8], 1, False, id="on the way ahead, behind the box in the image"),
         pytest.param([12.0, 3.0, 0.8], 0, False, id="beside the way: no ghost"),
     ],
@@ -243,9 +238,15 @@ def test_ghosts_that_stay_are_counted_and_said_to_be_seen_outside_the_box_or_not
     assert record["opacity_mean"] == (pytest.approx(0.95, abs=1e-5) if count else None)
 
 
+@pytest.mark.parametrize(("opacity", "seen"), [(0.04, False), (0.07, True)])
+def test_ghosts_are_seen_where_they_cover_a_twentieth_of_a_pixels_light(tiny_scene, opacity, seen):
+    record = ghosts_record(tiny_scene, BEFORE_THE_BOX, opacity)
+    assert record["gaussians"] == 1 and record["reach_outside_box"] is seen
+
+
 def test_where_nothing_moves_both_pictures_are_the_middle_ones_and_figures_are_null(tiny_scene):
     scene = one_car(tiny_scene, speed=0.0)
-    pair, record = remove_actor(drive_of(scene, background(PLACES, 0.2)), job_of(key_frame=None))
+    pair, record = remove_actor(drive_of(scene, round_gaussians(PLACES, 0.2)), job_of(key_frame=None))
     np.testing.assert_array_equal(pair.with_car, pair.without_car)
     assert pair.with_car.shape == (54, 96, 3) and not pair.footprint.any() and len(pair.outline) == 0
     record = json.loads(json.dumps(record, allow_nan=False))
@@ -257,7 +258,7 @@ def test_where_nothing_moves_both_pictures_are_the_middle_ones_and_figures_are_n
 
 def test_the_record_has_the_same_fields_whether_something_moves_or_not(tiny_scene):
     records = [
-        remove_actor(drive_of(one_car(tiny_scene, speed), background(PLACES, 0.2)), job_of(key_frame=None))[1]
+        remove_actor(drive_of(one_car(tiny_scene, speed), round_gaussians(PLACES, 0.2)), job_of(key_frame=None))[1]
         for speed in (4.0, 0.0)
     ]
     assert records[0].keys() == records[1].keys()
@@ -280,7 +281,7 @@ def pair_of(seed: int = 0, **changes) -> RemovalPair:
     inside = fill(HULL, (WIDTH, HEIGHT))
     footprint = np.zeros((HEIGHT, WIDTH), dtype=bool)
     footprint[12:16, 20:29] = footprint[9, 11] = True
-    pair = RemovalPair(before, after, alpha, holes, footprint, inside, HULL)
+    pair = RemovalPair(before, after, alpha, holes, footprint, inside, ~inside, HULL)
     return dataclasses.replace(pair, **changes)
 
 
@@ -348,6 +349,18 @@ def along_the_hull(inside: np.ndarray) -> np.ndarray:
     return (np.where(other, away, np.inf).min(axis=1) <= 2.0).reshape(inside.shape)
 
 
+@pytest.mark.parametrize("outside", [True, False])
+def test_what_changes_on_the_own_car_is_counted_nowhere(outside):
+    """The hull's upper half, and the rows from 14 on, which hold most of the change."""
+    seen = np.arange(HEIGHT)[:, None] < 14
+    inside = pair_of().inside
+    found = figures(pair_of(inside=inside & seen, outside=~inside & seen))
+    region = found["outside" if outside else "box"]
+    among, columns = (14 * WIDTH - 14 * 6, 5) if outside else (14 * 6, 4)
+    assert region["pixels"] == among and region["changed_share"] == pytest.approx(2 * columns / among)
+    assert found["outside"]["reach_px"] == pytest.approx(5.0), "from column 23 to column 28"
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_edge_is_the_mean_gradient_along_the_hull_with_and_without(seed):
     pair = pair_of(seed)
@@ -376,14 +389,26 @@ def test_where_there_was_no_edge_there_is_no_ratio():
 def test_figures_of_boxes_of_any_size_are_numbers(share):
     inside = np.zeros((HEIGHT, WIDTH), dtype=bool)
     inside[{"all": np.s_[:], "left half": np.s_[:, : WIDTH // 2], "one pixel": np.s_[3, 4]}[share]] = True
-    found = figures(pair_of(inside=inside))
+    found = figures(pair_of(inside=inside, outside=~inside))
     json.dumps(found, allow_nan=False)
     assert found["box"]["pixels"] == inside.sum()
 
 
 def test_a_box_that_fills_the_image_has_no_edge():
-    found = figures(pair_of(inside=np.ones((HEIGHT, WIDTH), dtype=bool)))
+    everywhere = np.ones((HEIGHT, WIDTH), dtype=bool)
+    found = figures(pair_of(inside=everywhere, outside=~everywhere))
     assert found["edge"]["ratio"] is None
+
+
+def test_where_the_own_car_cuts_the_box_is_no_edge():
+    """Nothing changes but on the own car, in the rows below 14, which cross the hull's rows 8 to 19."""
+    seen = np.repeat(np.arange(HEIGHT)[:, None] < 14, WIDTH, axis=1)
+    inside = pair_of().inside
+    flat = np.full((HEIGHT, WIDTH, 3), 0.5) + np.linspace(0, 0.1, WIDTH)[None, :, None]
+    on_own_car = flat.copy()
+    on_own_car[14:] = 0.9
+    pair = pair_of(with_car=flat, without_car=on_own_car, inside=inside & seen, outside=~inside & seen)
+    assert figures(pair)["edge"]["ratio"] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("footprint", [True, False])

@@ -1,5 +1,6 @@
 """The digest of a stage's code: blind to comments, docstrings and layout, exact about what is imported."""
 
+import itertools
 import os
 import shutil
 import subprocess
@@ -176,6 +177,27 @@ def test_a_change_of_a_package_alters_all_that_lies_below_it(toy):
     after = digests(toy)
     changed = {name for name in before if before[name] != after[name]}
     assert changed == {"relatively_from_below", "relatively_from_beside", "a_sibling_package"}
+
+
+@pytest.mark.parametrize(
+    ("file", "counts"),
+    [
+        ("draw.js", True), ("page.html", True),
+        (".DS_Store", False), ("inside.py~", False), ("notes.txt", False), (".#draw.js", False), ("draw.js~", False),
+        ("draw.js.orig", False), ("__pycache__/inside.cpython-311.pyc", False), ("deeper/draw.js", False),
+    ],
+)  # fmt: skip
+def test_pages_and_scripts_beside_a_packages_modules_count_and_nothing_else_does(toy, file, counts):
+    """Added, and then changed."""
+    path = toy / "toy" / "opening" / file
+    path.parent.mkdir(exist_ok=True)
+    found = [digests(toy)]
+    for content in (b"one", b"two"):
+        path.write_bytes(content)
+        found.append(digests(toy))
+    for before, after in itertools.pairwise(found):
+        changed = {name for name in before if before[name] != after[name]}
+        assert changed == ({"through_a_package_on_the_way"} if counts else set())
 
 
 def test_an_import_that_is_added_brings_its_module_in(toy):

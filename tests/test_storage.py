@@ -7,12 +7,15 @@ import errno
 import json
 import os
 import pickle
+import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
 from drivesplat.errors import ResultError
 from drivesplat.storage import (
+    ABANDONED_SECONDS,
     atomic_write,
     canonical_json,
     read_json,
@@ -76,6 +79,38 @@ def test_a_crash_while_writing_a_new_file_leaves_none(tmp_path):
         file.write(b"half")
         raise KeyboardInterrupt
     assert files_below(tmp_path) == set()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_partial_files_that_killed_writers_left_go_after_an_hour(tmp_path, whole):
+    """Those of the same target alone; whether the new file becomes whole or not."""
+    left = {
+        ".result.4711.partial.bin": ABANDONED_SECONDS + 60,
+        ".result.8.partial.bin": 10 * ABANDONED_SECONDS,
+        ".result.4712.partial.bin": ABANDONED_SECONDS - 60,
+        ".result.4713.partial.bin": 0,
+        ".result.4714.partial.json": 2 * ABANDONED_SECONDS,
+        ".results.4715.partial.bin": 2 * ABANDONED_SECONDS,
+        ".result.bin": 2 * ABANDONED_SECONDS,
+        "result.4711.partial.bin": 2 * ABANDONED_SECONDS,
+        ".result.mine.partial.bin": 2 * ABANDONED_SECONDS,
+    }
+    for name, age in left.items():
+        (tmp_path / name).write_bytes(b"half")
+        os.utime(tmp_path / name, (time.time() - age,) * 2)
+    with nullcontext() if whole else pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "result.bin") as file:
+        file.write(b"whole")
+        file.write(b"" if whole else bytes(1 // 0))
+    gone = {".result.4711.partial.bin", ".result.8.partial.bin"}
+    assert files_below(tmp_path) == left.keys() - gone | ({"result.bin"} if whole else set())
+
+
+def test_names_are_no_patterns_when_partial_files_are_swept(tmp_path):
+    other = tmp_path / ".a.4711.partial.bin"
+    other.write_bytes(b"half")
+    os.utime(other, (0, 0))
+    write(tmp_path / "[ab].bin", b"whole")
+    assert files_below(tmp_path) == {".a.4711.partial.bin", "[ab].bin"}
 
 
 def test_a_full_disk_is_told_with_the_name_of_the_file_and_keeps_the_old_one(tmp_path, monkeypatch):

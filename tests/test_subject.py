@@ -2,26 +2,22 @@
 
 import dataclasses
 import json
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_made import recording_of, write_labels
 
 from drivesplat.actors.subject import choose_subject, described
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
+from drivesplat.recording import Recording
 from drivesplat.regions import LABELS
 from drivesplat.rigid import rigid
 from drivesplat.scene import Frame, Scene, Track
 from drivesplat.settings.actor import SubjectSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
 
 WIDTH = 192
 """Twice as wide as the tiny drive's images."""
-SEED = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
 ANY = SubjectSettings()
 
 
@@ -51,13 +47,12 @@ def with_actors(scene: Scene, *actors: Actor) -> Scene:
     return dataclasses.replace(scene, tracks=tuple(actor.track(scene) for actor in actors))
 
 
-def parser_of(scene: Scene, width: int = WIDTH) -> dict[str, Any]:
-    job = ParserJob(holdout=HoldoutSettings(every_nth=4, offset=2, last_block=2), images=ImageSettings(width=width))
-    return parser_dict(scene, SEED, job)
+def recorded(scene: Scene, width: int = WIDTH, masks: Path | None = None) -> Recording:
+    return recording_of(scene, masks, width, every_nth=4, offset=2, last_block=2)
 
 
 def chosen(scene: Scene, settings: SubjectSettings = ANY, camera: str = "CAM_FRONT", width: int = WIDTH):
-    return choose_subject(scene, parser_of(scene, width), camera, settings)
+    return choose_subject(recorded(scene, width), camera, settings)
 
 
 def seen_alone(frame: Frame, actor: Actor, seconds: float, width: int = WIDTH) -> np.ndarray:
@@ -104,7 +99,7 @@ WALKER = Actor("walker", (7.0, 2.0, 0.9), (4.0, 0.0), size=(0.8, 0.8, 1.8), cate
 
 def test_of_the_tiny_drive_the_car_ahead_is_chosen_when_nearest(tiny_scene):
     """It drives off slowly: nearest in the first key frame. The parked truck is passed much nearer."""
-    subject = choose_subject(tiny_scene, parser_of(tiny_scene, 96), "CAM_FRONT", ANY)
+    subject = chosen(tiny_scene, width=96)
     assert (subject.box.category, subject.frame.sample_index, subject.index) == ("vehicle.car", 0, 0)
 
 
@@ -177,6 +172,38 @@ def test_nearer_boxes_hide_what_is_behind_them(tiny_scene):
     seconds = (frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6
     expected = seen_alone(frame, LEADING, seconds) & ~seen_alone(frame, van, seconds)
     assert (hidden.visible ^ expected).sum() <= 2
+
+
+def own_car_below(scene: Scene, row: int, folder: Path) -> Path:
+    """Masks (108, 192) of which the own car's body fills the rows from `row` on."""
+    labels = np.full((108, WIDTH), LABELS["static"], dtype=np.uint8)
+    labels[row:] = LABELS["own_car"]
+    return write_labels(folder, scene, labels)
+
+
+def test_pixels_of_the_own_car_are_not_the_subjects(tiny_scene, tmp_path):
+    scene = with_actors(tiny_scene, LEADING)
+    free = chosen(scene, SubjectSettings(key_frame=0))
+    recording = recorded(scene, masks=own_car_below(scene, 70, tmp_path))
+    subject = choose_subject(recording, "CAM_FRONT", SubjectSettings(key_frame=0))
+    assert free.visible[70:].any() and free.visible[:70].any()
+    np.testing.assert_array_equal(subject.visible[:70], free.visible[:70])
+    assert not subject.visible[70:].any() and subject.pixels == free.visible[:70].sum()
+
+
+def test_a_vehicle_that_is_largest_behind_the_own_car_is_not_chosen_then(tiny_scene, tmp_path):
+    """Its hull without hidden pixels is largest elsewhen: it is nearest, but mostly hidden, in the first key frame."""
+    low = dataclasses.replace(LEADING, size=(4.0, 2.0, 1.0), position=(9.0, 0.3, 0.5), velocity=(7.0, 0.0))
+    scene = with_actors(tiny_scene, low)
+    row = int(np.flatnonzero(chosen(scene).visible.any(axis=1)).min()) + 2
+    subject = choose_subject(recorded(scene, masks=own_car_below(scene, row, tmp_path)), "CAM_FRONT", ANY)
+    assert found(chosen(scene)) == ("leading", 0)
+    assert subject.frame.sample_index > 0 and subject.visible[row:].sum() == 0
+
+
+def test_a_vehicle_behind_the_own_car_altogether_is_not_chosen(tiny_scene, tmp_path):
+    scene = with_actors(tiny_scene, LEADING)
+    assert choose_subject(recorded(scene, masks=own_car_below(scene, 0, tmp_path)), "CAM_FRONT", ANY) is None
 
 
 def test_what_is_hidden_altogether_is_not_chosen(tiny_scene):
@@ -271,7 +298,7 @@ def test_a_subject_is_described_in_plain_figures(tiny_scene, key_frame, split):
     actor = dataclasses.replace(LEADING, velocity=(4.0, 0.5))
     scene = with_actors(tiny_scene, actor)
     subject = chosen(scene, SubjectSettings(key_frame=key_frame))
-    record = json.loads(json.dumps(described(subject, scene, parser_of(scene)), allow_nan=False))
+    record = json.loads(json.dumps(described(subject, recorded(scene)), allow_nan=False))
     frame = scene.frames[2 * key_frame]
     place = actor.place((frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6)
     away = float(np.linalg.norm(place - frame.camera_to_world[:3, 3]))

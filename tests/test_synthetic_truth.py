@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hand_made import Own, recording_of, round_gaussians, write_labels
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
@@ -18,22 +19,17 @@ from drivesplat.evaluation.evaluate import EvaluationInputs, against_truth
 from drivesplat.evaluation.metrics import RegionMetrics
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.extract import extract_scene
-from drivesplat.model.background import SH_C0, Background
+from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import Picture, SplatModel, View
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
 from drivesplat.regions import LABELS, is_dynamic
+from drivesplat.rigid import rigid
 from drivesplat.scene import Frame
 from drivesplat.settings.actor import RemovalSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
 from drivesplat.tracks import Box, box_at, boxes_at
 from drivesplat.training.views import view_of
 from drivesplat.truth import Truth, TruthFrame, read_truth, truth_image
@@ -53,40 +49,24 @@ def known(demo_root, tmp_path_factory) -> KnownTruth:
         cameras=("CAM_FRONT", "CAM_BACK"), sweeps=False, on_missing="stop",
     )  # fmt: skip
     scene = extract_scene(source, demo_root)
-    seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    parser = parser_dict(scene, seed, ParserJob(holdout=HOLDOUT, images=ImageSettings(width=None)))
-    masks = tmp_path_factory.mktemp("masks")
-    for frame in scene.frames:
-        labels = np.full((90, 160), LABELS["static"], dtype=np.uint8)
-        labels[90 - OWN_CAR_ROWS :] = LABELS["own_car"]
-        path = masks / "regions" / frame.camera / f"{frame.timestamp}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(labels).save(path)
+    labels = np.full((90, 160), LABELS["static"], dtype=np.uint8)
+    labels[90 - OWN_CAR_ROWS :] = LABELS["own_car"]
+    masks = write_labels(tmp_path_factory.mktemp("masks"), scene, labels)
     path = demo_root / "truth" / "truth.json"
-    return KnownTruth(read_truth(path), path, scene, parser, masks)
+    return KnownTruth(read_truth(path), path, recording_of(scene, masks, **HOLDOUT.model_dump()))
 
 
 def flat_model(color=GREY, parts=()) -> SplatModel:
     """No Gaussians but those of `parts`; a sky of one colour."""
-    return SplatModel([*parts, background([])], ConstantSky(torch.tensor(color), 1e-2)).requires_grad_(False)
+    return SplatModel([*parts, round_gaussians([])], ConstantSky(torch.tensor(color), 1e-2)).requires_grad_(False)
 
 
-def background(places, color=(0.9, 0.1, 0.9), size: float = 0.3) -> Background:
-    means = torch.tensor(np.asarray(places)).reshape(-1, 3).float()
-    n = len(means)
-    params = {
-        "means": means,
-        "scales": torch.full((n, 3), np.log(size)),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        "opacities": torch.full((n,), 4.0),
-        "sh0": ((torch.tensor(color).expand(n, 3) - 0.5) / SH_C0)[:, None, :],
-        "shN": torch.zeros(n, 0, 3),
-    }
-    return Background(params, GaussianSettings(sh_degree=0), 1.0)
+def purple(places) -> Background:
+    return round_gaussians(places, 0.3, 0.98, (0.9, 0.1, 0.9))
 
 
 def front_frames(known: KnownTruth) -> list[tuple[Frame, TruthFrame]]:
-    frames = [frame for frame in known.scene.frames if frame.camera == "CAM_FRONT"]
+    frames = [frame for frame in known.recording.scene.frames if frame.camera == "CAM_FRONT"]
     return list(zip(frames, known.truth.frames, strict=True))
 
 
@@ -107,13 +87,13 @@ def rays_meet(box: Box, camera_to_world: np.ndarray, frame: Frame) -> np.ndarray
 
 def lateral_pose(known: KnownTruth, truth: TruthFrame) -> np.ndarray:
     pose = np.array(truth.lateral_camera_to_global)
-    pose[:3, 3] -= known.scene.origin
+    pose[:3, 3] -= known.recording.scene.origin
     return pose
 
 
 def leading_box(known: KnownTruth, frame: Frame) -> Box:
-    track = next(track for track in known.scene.tracks if track.id == known.truth.leading)
-    return box_at(track, frame.timestamp, known.scene.key_frame_interval)
+    track = next(track for track in known.recording.scene.tracks if track.id == known.truth.leading)
+    return box_at(track, frame.timestamp, known.recording.scene.key_frame_interval)
 
 
 def by_hand(color, images: list[np.ndarray], masks: list[np.ndarray]) -> float:
@@ -144,7 +124,7 @@ def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known):
     """Outside every box of what can move, seen from the lateral camera, not from the recorded one."""
     images, static, recorded = [], [], []
     for frame, truth in front_frames(known):
-        boxes = [box for box in boxes_at(known.scene, frame.timestamp) if is_dynamic(box.category)]
+        boxes = [box for box in boxes_at(known.recording.scene, frame.timestamp) if is_dynamic(box.category)]
         images.append(pixels_of(known, truth.lateral))
         for masks, pose in ((static, lateral_pose(known, truth)), (recorded, frame.camera_to_world)):
             masks.append(~np.any([rays_meet(box, pose, frame) for box in boxes], axis=0))
@@ -158,7 +138,7 @@ class Watched(SplatModel):
     """A flat model that keeps the views it is asked for."""
 
     def __init__(self):
-        super().__init__([background([])], ConstantSky(torch.tensor(GREY), 1e-2))
+        super().__init__([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2))
         self.views: list[View] = []
 
     def render(self, view: View, *arguments: Any, **options: Any) -> Picture:
@@ -180,15 +160,54 @@ def test_the_model_is_looked_at_from_two_metres_to_the_own_cars_left(known, demo
     assert len(model.views) == 6
     for view, (frame, truth) in zip(model.views, front_frames(known), strict=True):
         pose = view.camera_to_world.double().numpy()
-        pose[:3, 3] += known.scene.origin
+        pose[:3, 3] += known.recording.scene.origin
         recorded = frame.camera_to_world.copy()
-        recorded[:3, 3] += known.scene.origin
+        recorded[:3, 3] += known.recording.scene.origin
         ego = ego_to_global(demo_tables, truth.sample_data)
         step = np.linalg.inv(ego) @ pose - np.linalg.inv(ego) @ recorded
         np.testing.assert_allclose(step[:3, 3], [0.0, 2.0, 0.0], atol=2e-5)
         np.testing.assert_allclose(pose[:3, :3], recorded[:3, :3], atol=1e-6)
-        assert view.time == pytest.approx(known.scene.seconds(frame.timestamp), abs=1e-6)
+        assert view.time == pytest.approx(known.recording.scene.seconds(frame.timestamp), abs=1e-6)
         assert (view.width, view.height) == (160, 90)
+
+
+def nudged(known: KnownTruth, seed: int) -> KnownTruth:
+    """The same truth with recorded poses that are off by decimetres and degrees, each otherwise."""
+    random = np.random.default_rng(seed)
+    frames = []
+    for frame in known.recording.scene.frames:
+        off = rigid(Rotation.from_rotvec(random.normal(0.0, 0.05, 3)).as_matrix(), random.normal(0.0, 0.3, 3))
+        frames.append(dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ off))
+    scene = dataclasses.replace(known.recording.scene, frames=tuple(frames))
+    return dataclasses.replace(known, recording=recording_of(scene, known.recording.masks, **HOLDOUT.model_dump()))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_recorded_poses_are_off_the_view_is_two_metres_to_the_left_of_the_recorded_one(known, demo_tables, seed):
+    """To the left as the camera is mounted: it moves along the own car's y axis, and does not turn."""
+    model, off = Watched(), nudged(known, seed)
+    lateral_metrics(model, off, "CAM_FRONT", None, CPU)
+    assert len(model.views) == 6
+    for view, (frame, truth) in zip(model.views, front_frames(off), strict=True):
+        data = demo_tables.get("sample_data", truth.sample_data)
+        w, x, y, z = demo_tables.get("calibrated_sensor", data["calibrated_sensor_token"])["rotation"]
+        to_left = Rotation.from_quat([x, y, z, w]).inv().apply([0.0, 2.0, 0.0])
+        step = np.linalg.inv(frame.camera_to_world) @ view.camera_to_world.double().numpy()
+        np.testing.assert_allclose(step, rigid(np.eye(3), to_left), atol=2e-5)
+        true_pose = lateral_pose(off, truth)
+        assert np.abs(view.camera_to_world.numpy() - true_pose).max() > 0.05, "the true view is elsewhere"
+
+
+def test_where_recorded_poses_are_off_what_moves_is_left_out_where_it_is_seen_from_there(known):
+    """Static pixels are those outside the boxes in the view that is rendered."""
+    model, off = Watched(), nudged(known, 0)
+    result = lateral_metrics(model, off, "CAM_FRONT", None, CPU)["2.0"]["static"]
+    count = 0
+    for view, (frame, _) in zip(model.views, front_frames(off), strict=True):
+        boxes = [box for box in boxes_at(off.recording.scene, frame.timestamp) if is_dynamic(box.category)]
+        pose = view.camera_to_world.double().numpy()
+        count += (~np.any([rays_meet(box, pose, frame) for box in boxes], axis=0)).sum()
+    assert result["pixels"] == pytest.approx(count, rel=1e-4)
 
 
 def hulls(known: KnownTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -202,7 +221,7 @@ def hulls(known: KnownTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarra
 def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known):
     images, inside, outside = (list(items) for items in zip(*hulls(known), strict=True))
     result = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
-    assert result.keys() == {"box", "outside"}
+    assert result.keys() == {"box", "outside", "not_removed"}
     for region, masks in (("box", inside), ("outside", outside)):
         assert result[region]["pixels"] == pytest.approx(sum(mask.sum() for mask in masks), abs=6)
         assert result[region]["psnr"] == pytest.approx(by_hand(GREY, images, masks), abs=0.02)
@@ -210,43 +229,48 @@ def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known):
     assert result["box"]["pixels"] + result["outside"]["pixels"] == 6 * 160 * (90 - OWN_CAR_ROWS)
 
 
-class Riding(Part):
+def test_the_own_cars_pixels_are_neither_of_the_removals_box_nor_outside_of_it(known, tmp_path):
+    """The own car's body hides all below the middle of the leading car's box in the first key frame."""
+    frame = front_frames(known)[0][0]
+    rows = np.flatnonzero(rays_meet(leading_box(known, frame), frame.camera_to_world, frame).any(axis=1))
+    free = np.arange(90)[:, None] < int(rows.mean())
+    labels = np.where(free, LABELS["static"], LABELS["own_car"]).repeat(160, axis=1).astype(np.uint8)
+    recording = dataclasses.replace(known.recording, masks=write_labels(tmp_path, known.recording.scene, labels))
+    hidden = dataclasses.replace(known, recording=recording)
+    result = removal_metrics(flat_model(), hidden, "CAM_FRONT", MARGIN, None, CPU)
+    images, inside, outside = (list(items) for items in zip(*hulls(known), strict=True))
+    assert sum((mask & ~free).sum() for mask in inside) > 0
+    for region, masks in (("box", inside), ("outside", outside)):
+        seen = [mask & free for mask in masks]
+        assert result[region]["pixels"] == pytest.approx(sum(mask.sum() for mask in seen), abs=6)
+        assert result[region]["psnr"] == pytest.approx(by_hand(GREY, images, seen), abs=0.02)
+
+
+class Riding(Own):
     """Gaussians in a grid that fills the leading car's box and rides with it; its own where `knows` says so."""
 
-    name = "riding"
-
     def __init__(self, known: KnownTruth, knows: bool, beside: float = 0.0):
-        super().__init__()
         axes = [np.linspace(-0.5, 0.5, n) * share for n, share in ((5, 0.95), (4, 0.95), (4, 0.95))]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         frames = [frame for frame, _ in front_frames(known)]
         boxes = [leading_box(known, frame) for frame in frames]
-        places = grid * boxes[0].size + [0.0, beside, 0.0]
-        self._still = background(places)
+        super().__init__(purple(grid * boxes[0].size + [0.0, beside, 0.0]), boxes[0].track_id if knows else "another")
         self._poses = {
-            round(known.scene.seconds(frame.timestamp), 3): torch.from_numpy(box.object_to_world).float()
+            round(known.recording.scene.seconds(frame.timestamp), 3): torch.from_numpy(box.object_to_world).float()
             for frame, box in zip(frames, boxes, strict=True)
         }
-        self._track_id = boxes[0].track_id if knows else None
-        self.params = self._still.params
 
     def at(self, time: float) -> Gaussians:
         pose = self._poses[round(time, 3)]
-        still = self._still.at(time)
+        still = super().at(time)
         return dataclasses.replace(still, means=still.means @ pose[:3, :3].T + pose[:3, 3])
-
-    def learning_rates(self) -> dict[str, float]:
-        return self._still.learning_rates()
-
-    def of_track(self, track_id: str) -> torch.Tensor:
-        return torch.full((len(self),), track_id == self._track_id)
 
 
 def unremoved(model: SplatModel, known: KnownTruth) -> dict[str, Any]:
     """The model with the car against the street without it."""
     metrics = RegionMetrics(None, ("box", "outside"))
     for (frame, _), (image, inside, outside) in zip(front_frames(known), hulls(known), strict=True):
-        view = view_of(known.parser, known.scene.frames.index(frame), CPU)
+        view = view_of(known.recording.parser, known.recording.scene.frames.index(frame), CPU)
         metrics.add(rendered(model, view), image, {"box": inside, "outside": outside})
     return metrics.summary()
 
@@ -261,6 +285,24 @@ def test_removing_a_car_that_lies_in_its_box_leaves_what_would_be_there_without_
         assert removed[region]["psnr"] == pytest.approx(never[region]["psnr"], abs=1e-6)
         assert removed[region]["ssim"] == pytest.approx(never[region]["ssim"], abs=1e-6)
     assert unremoved(model, known)["box"]["psnr"] < removed["box"]["psnr"] - 3.0
+
+
+@pytest.mark.parametrize("knows", [False, True])
+def test_what_the_removal_is_to_beat_are_the_same_pixels_of_the_model_as_it_is(known, knows):
+    model = flat_model(parts=[Riding(known, knows)])
+    removed = removal_metrics(model, known, "CAM_FRONT", MARGIN, None, CPU)
+    before, by_hand = removed["not_removed"], unremoved(model, known)
+    assert before.keys() == {"box", "outside"}
+    for region in ("box", "outside"):
+        assert before[region]["pixels"] == removed[region]["pixels"]
+        assert before[region]["psnr"] == pytest.approx(by_hand[region]["psnr"], abs=0.02)
+        assert before[region]["ssim"] == pytest.approx(by_hand[region]["ssim"], abs=1e-3)
+    assert before["box"]["psnr"] < removed["box"]["psnr"] - 3.0
+
+
+def test_where_nothing_is_removed_there_is_nothing_to_beat(known):
+    result = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
+    assert result.pop("not_removed") == result
 
 
 def test_what_lies_beside_the_box_is_not_removed_but_by_its_own_part(known):
@@ -279,7 +321,7 @@ def test_the_margin_decides_on_gaussians_near_the_box(known):
     frame = front_frames(known)[0][0]
     box = leading_box(known, frame)
     over = box.object_to_world @ np.array([0.0, 0.0, box.size[2] / 2 + 0.3, 1.0])
-    model = flat_model(parts=[background(over[None, :3])])
+    model = flat_model(parts=[purple(over[None, :3])])
     never = removal_metrics(flat_model(), known, "CAM_FRONT", 0.0, None, CPU)["outside"]["psnr"]
     psnrs = [removal_metrics(model, known, "CAM_FRONT", m, None, CPU)["outside"]["psnr"] for m in (0.1, 0.5)]
     assert abs(psnrs[0] - never) > abs(psnrs[1] - never)
@@ -293,15 +335,14 @@ def test_of_another_camera_there_is_no_truth(known, camera):
 
 def inputs_of(known: KnownTruth, truth: Path | None) -> EvaluationInputs:
     return EvaluationInputs(
-        checkpoint={}, summary={}, parser=known.parser, scene=known.scene, masks=known.masks, masks_record={},
-        lpips_record=None, truth=truth,
+        checkpoint={}, summary={}, recording=known.recording, masks_record={}, lpips_record=None, truth=truth
     )  # fmt: skip
 
 
-def job_of(camera: str) -> EvaluateJob:
+def job_of(camera: str, synthetic: bool = True) -> EvaluateJob:
     return EvaluateJob(
         eval_camera=camera, cameras=("CAM_FRONT", "CAM_BACK"), sweeps=False, holdout=HOLDOUT, lpips=False,
-        removal=RemovalSettings(margin=MARGIN),
+        removal=RemovalSettings(margin=MARGIN) if synthetic else None,
     )  # fmt: skip
 
 
@@ -313,6 +354,20 @@ def test_figures_against_truth_exist_only_where_truth_does(known, has_truth, cam
     found = against_truth(flat_model(), inputs_of(known, known.path if has_truth else None), job_of(camera), None, CPU)
     assert found.keys() == keys
     json.dumps(found, allow_nan=False)
+
+
+def test_a_recorded_drives_evaluation_is_held_to_no_truth(known):
+    """Its job says nothing of a removal; a truth.json that lies beside its tables is none of it."""
+    job = job_of("CAM_FRONT", synthetic=False)
+    assert against_truth(flat_model(), inputs_of(known, known.path), job, None, CPU) == {}
+
+
+def test_frames_that_have_truth_are_those_of_its_camera_by_their_numbers(known):
+    numbers = [index for index, _ in known.frames("CAM_FRONT")]
+    frames = known.recording.scene.frames
+    assert numbers == [index for index, frame in enumerate(frames) if frame.camera == "CAM_FRONT"] and len(numbers) == 6
+    assert [truth.sample_data for _, truth in known.frames("CAM_FRONT")] == [frames[i].token for i in numbers]
+    assert not list(known.frames("CAM_BACK"))
 
 
 def changed(known: KnownTruth, leading: str | None = None, **changes: Any) -> KnownTruth:
@@ -330,11 +385,12 @@ def test_a_street_where_no_car_leads_has_a_lateral_view_and_no_removal(known):
 def test_frames_without_the_leading_car_are_not_measured(known):
     """Its track ends with key frame 1, and reaches half an interval further."""
     tracks = []
-    for track in known.scene.tracks:
+    for track in known.recording.scene.tracks:
         cut = track.id == known.truth.leading
         arrays = ("timestamps", "sample_indices", "object_to_world", "visibility")
         tracks.append(dataclasses.replace(track, **{a: getattr(track, a)[:2] for a in arrays}) if cut else track)
-    short = dataclasses.replace(known, scene=dataclasses.replace(known.scene, tracks=tuple(tracks)))
+    scene = dataclasses.replace(known.recording.scene, tracks=tuple(tracks))
+    short = dataclasses.replace(known, recording=dataclasses.replace(known.recording, scene=scene))
     result = removal_metrics(flat_model(), short, "CAM_FRONT", MARGIN, None, CPU)
     seen = list(hulls(known))[:2]
     assert result["outside"]["pixels"] == pytest.approx(sum(outside.sum() for _, _, outside in seen), abs=4)

@@ -5,17 +5,16 @@ from drivesplat.actors.remove import remove_actor
 from drivesplat.actors.sight import open_drive
 from drivesplat.images import write_image
 from drivesplat.job import job
-from drivesplat.parser import read_parser
-from drivesplat.scene import read_scene
+from drivesplat.recording import read_recording
 from drivesplat.settings.actor import RemovalJob
 from drivesplat.storage import write_json
 from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:
-    files, made = current.input, current.output
-    parser, checkpoint, scene = read_parser(files.parser), read_checkpoint(files.checkpoint), read_scene(files.scene)
-    provenance = current.provenance(parser["provenance"], checkpoint["provenance"], scene.provenance)
-    pair, record = remove_actor(open_drive(checkpoint, scene, parser, current.device()), current.settings(RemovalJob))
+    files, made, checkpoint = current.input, current.output, read_checkpoint(current.input.checkpoint)
+    recording, upstream = read_recording(files.scene, files.parser, files.masks)
+    provenance = current.provenance(*upstream, checkpoint["provenance"])
+    pair, record = remove_actor(open_drive(checkpoint, recording, current.device()), current.settings(RemovalJob))
     write_image(made.with_car, pair.with_car)
     write_image(made.without_car, pair.without_car)
     save_figure(made.triptych, draw_removal(pair, record, current.wildcards.method))

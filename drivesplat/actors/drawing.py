@@ -28,9 +28,7 @@ def draw_panel(panel: Panel, record: dict[str, Any], method: str) -> Figure:
         title += f"\n{record['why_null']}"
     else:
         seen = "training image" if subject["split"] == "train" else f"held out: {subject['split']}"
-        title += (
-            f" ({seen})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m ahead"
-        )
+        title += f" ({seen})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m away"
     figure, axes = _figure(panel.truth.shape, rows=2, columns=2, title=title)
     _show(axes[0], panel.truth, "Ground truth")
     _show(
@@ -57,11 +55,15 @@ def _ghosts_in_words(ghosts: dict[str, Any] | None) -> str:
 def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figure:
     """with | without | difference."""
     title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
-    removed = record["gaussians_removed"]
-    title += f"\n{record['why_null']}" if record["subject"] is None else f": {removed:,} Gaussians removed"
+    without = "Without its Gaussians" if record["removed_by"] == "actor" else "Without the Gaussians in its box"
+    if record["subject"] is None:
+        title += f"\n{record['why_null']}"
+    else:
+        changed = record["box"]["changed_share"] or 0.0
+        title += f"\n{record['gaussians_removed']:,} Gaussians removed, which changes {changed:.0%} of its box's pixels"
     figure, axes = _figure(pair.with_car.shape, rows=1, columns=3, title=title)
-    _show(axes[0], pair.with_car, "With the vehicle")
-    _show(axes[1], pair.without_car, "Without it")
+    _show(axes[0], pair.with_car, "Render")
+    _show(axes[1], pair.without_car, without)
     _show_error(axes[2], pair.without_car, pair.with_car, "Difference, mean over the channels")
     _outline(axes, pair.outline)
     return figure

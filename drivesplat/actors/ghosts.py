@@ -19,6 +19,8 @@ STEP = 0.25
 """The box is looked at every so many metres of its way."""
 LONGEST_PAUSE = 0.25
 """... and every so many seconds."""
+COVERING = 0.05
+"""Ghosts cover a pixel where they alone are at least so opaque."""
 
 
 def boxes_along(track: Track, interval: float) -> list[Box]:
@@ -72,10 +74,10 @@ class Ghosts:
 
 def ghosts_of(sight: Sight, box: Box, settings: GhostSettings) -> Ghosts:
     """The ghosts of what is at `box` now: Gaussians in the volume that its box swept over the scene, but outside the
-    box. Those that a model knows as the object's own are none: they go where it goes."""
-    scene, gaussians = sight.drive.scene, sight.gaussians
+    box. Those of parts that move are none: they go where their objects go."""
+    scene, gaussians = sight.drive.recording.scene, sight.gaussians
     track = next(track for track in scene.tracks if track.id == box.track_id)
     points = gaussians.means.cpu().double().numpy()
     rows = swept(track, scene.key_frame_interval, points, settings.clearance) & ~box.holds(points)
-    own = sight.drive.model.of_track(box.track_id)
-    return Ghosts(torch.from_numpy(rows).to(own.device) & ~own)
+    moving = sight.drive.model.moving()
+    return Ghosts(torch.from_numpy(rows).to(moving.device) & ~moving)

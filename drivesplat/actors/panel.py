@@ -1,17 +1,15 @@
 """The stage `ghost_panel`: a moving vehicle as it was, as a model shows it, where that fails, and what it leaves."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivesplat.actors.ghosts import boxes_along, ghosts_of
+from drivesplat.actors.ghosts import COVERING, STEP, boxes_along, ghosts_of
 from drivesplat.actors.sight import Drive, Sight, colors_of
 from drivesplat.actors.subject import Subject, choose_subject, described
 from drivesplat.evaluation.metrics import psnr_record
-from drivesplat.images import continuous_intrinsics, project, read_image
-from drivesplat.masks import read_labels
+from drivesplat.images import continuous_intrinsics, project
 from drivesplat.regions import region_mask
 from drivesplat.rigid import inverse
 from drivesplat.settings.actor import GhostSettings, PanelJob
@@ -22,8 +20,6 @@ LARGEST_STRENGTH = 4.0
 """Ghosts are drawn at most so many times more opaque than they are: they are faint, and they are to be seen."""
 WELL_SEEN = 0.9
 """The opacity at which nearly all of them should stay below."""
-COVERING = 0.05
-"""A pixel is called covered by ghosts where these alone are at least so opaque."""
 IN_FRONT = 0.5
 
 
@@ -40,25 +36,24 @@ class Panel:
     way: np.ndarray
 
 
-def ghost_panel(drive: Drive, masks: Path, job: PanelJob) -> tuple[Panel, dict[str, Any]]:
-    """What is drawn, and the content of ghost_panel.json, provenance aside. `masks` is the folder of the stage `masks`.
+def ghost_panel(drive: Drive, job: PanelJob) -> tuple[Panel, dict[str, Any]]:
+    """What is drawn, and the content of ghost_panel.json, provenance aside.
 
     Where no vehicle moves before the camera the middle key frame is shown, and the figures of the vehicle and its
     ghosts are None, with the reason.
     """
-    subject = choose_subject(drive.scene, drive.parser, job.eval_camera, job.subject)
-    sight = Sight(drive, subject.index if subject else drive.scene.middle_key_frame(job.eval_camera))
-    truth = read_image(sight.frame.image_path, sight.size) / 255.0
-    render = colors_of(sight.of().image)
-    labels = read_labels(masks, job.eval_camera, sight.frame.timestamp, sight.size)
-    measured = region_mask(labels, "all")
+    recording = drive.recording
+    subject = choose_subject(recording, job.eval_camera, job.subject)
+    sight = Sight(drive, subject.index if subject else recording.scene.middle_key_frame(job.eval_camera))
+    truth, render = recording.image(sight.index), colors_of(sight.of().image)
+    static = region_mask(recording.labels(sight.index), "static")
     record = {
         "schema": SCHEMA,
-        "scene": drive.scene.name,
+        "scene": recording.scene.name,
         "key_frame": sight.frame.sample_index,
-        "subject": described(subject, drive.scene, drive.parser) if subject else None,
-        "static": psnr_record(render, truth, region_mask(labels, "static")),
-        "vehicle": psnr_record(render, truth, subject.visible & measured) if subject else None,
+        "subject": described(subject, recording) if subject else None,
+        "static": psnr_record(render, truth, static),
+        "vehicle": psnr_record(render, truth, subject.visible) if subject else None,
         "ghosts": None,
         "why_null": None if subject else f"no vehicle moves before {job.eval_camera} in this scene",
     }
@@ -88,11 +83,14 @@ def _haunting(
 
 
 def _way(sight: Sight, subject: Subject) -> np.ndarray:
-    """Where the vehicle's way over the ground lies in the image: (m, 2) continuous pixels, NaN behind the camera."""
-    track = next(track for track in sight.drive.scene.tracks if track.id == subject.box.track_id)
-    boxes = boxes_along(track, sight.drive.scene.key_frame_interval)
+    """Where the vehicle's way over the ground lies in the image: (m, 2) continuous pixels, NaN behind the camera and
+    where the annotation has a gap."""
+    track = next(track for track in sight.drive.recording.scene.tracks if track.id == subject.box.track_id)
+    boxes = boxes_along(track, sight.drive.recording.scene.key_frame_interval)
     ground = np.array([box.object_to_world[:3, 3] - box.object_to_world[:3, 2] * box.size[2] / 2 for box in boxes])
     pixels, depth = project(
         ground, inverse(sight.frame.camera_to_world), continuous_intrinsics(sight.frame, sight.size)
     )
-    return np.where(depth[:, None] > IN_FRONT, pixels, np.nan)
+    pixels[depth <= IN_FRONT] = np.nan
+    gaps = np.flatnonzero(np.linalg.norm(np.diff(ground, axis=0), axis=1) > 2 * STEP)
+    return np.insert(pixels, gaps + 1, np.nan, axis=0)

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 from skimage.color import rgb2gray
 from skimage.filters import sobel
 
-from drivesplat.actors.ghosts import ghosts_of
+from drivesplat.actors.ghosts import COVERING, ghosts_of
 from drivesplat.actors.sight import Drive, Sight, colors_of
 from drivesplat.actors.subject import Subject, choose_subject, described
 from drivesplat.evaluation.metrics import psnr_record
@@ -31,8 +31,8 @@ EDGE_BAND = 2.0
 @dataclass(frozen=True)
 class RemovalPair:
     """One view with and without the vehicle: images (h, w, 3) in [0, 1], opacities (h, w), `footprint` (h, w) bool the
-    pixels that the removed Gaussians reach, `inside` (h, w) bool those of the box; `outline` (n, 2) of the box in
-    continuous pixels, empty without a vehicle."""
+    pixels that the removed Gaussians reach, `inside` and `outside` those of the box and the others, without the own
+    car's body; `outline` (n, 2) of the box in continuous pixels, empty without a vehicle."""
 
     with_car: np.ndarray
     without_car: np.ndarray
@@ -40,6 +40,7 @@ class RemovalPair:
     alpha_without: np.ndarray
     footprint: np.ndarray
     inside: np.ndarray
+    outside: np.ndarray
     outline: np.ndarray
 
 
@@ -49,14 +50,14 @@ def remove_actor(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict[str, 
     Where no vehicle moves before the camera, both pictures are the middle key frame's and the figures are None, with
     the reason.
     """
-    subject = choose_subject(drive.scene, drive.parser, job.eval_camera, job.subject)
+    subject = choose_subject(drive.recording, job.eval_camera, job.subject)
     if subject is None:
         return _nothing_to_remove(drive, job)
     sight = Sight(drive, subject.index)
     removal = removal_of(drive.model, sight.gaussians, subject.box, job.removal.margin)
     pair = _pair(sight, subject, removal)
     count = int(removal.removed.sum())
-    log.info("%s: %d Gaussians removed by %s", drive.scene.name, count, removal.by)
+    log.info("%s: %d Gaussians removed by %s", drive.recording.scene.name, count, removal.by)
     if removal.by == "box":
         log.info(
             "what the box held is gone; the vehicle's shadow, and its ghosts along its way, stay. A learned "
@@ -65,9 +66,9 @@ def remove_actor(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict[str, 
         )
     return pair, {
         "schema": SCHEMA,
-        "scene": drive.scene.name,
+        "scene": drive.recording.scene.name,
         "key_frame": sight.frame.sample_index,
-        "subject": described(subject, drive.scene, drive.parser),
+        "subject": described(subject, drive.recording),
         "why_null": None,
         "removed_by": removal.by,
         "margin_m": job.removal.margin,
@@ -79,13 +80,15 @@ def remove_actor(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict[str, 
 
 def _pair(sight: Sight, subject: Subject, removal: Removal) -> RemovalPair:
     before, after, alone = sight.of(), sight.of(~removal.removed), sight.of(removal.removed)
+    hull, seen = fill(subject.hull.polygon, sight.size), ~sight.drive.recording.own_car(sight.index)
     return RemovalPair(
         with_car=colors_of(before.image),
         without_car=colors_of(after.image),
         alpha_with=colors_of(before.alpha),
         alpha_without=colors_of(after.alpha),
         footprint=colors_of(alone.alpha) > 0.0,
-        inside=fill(subject.hull.polygon, sight.size),
+        inside=hull & seen,
+        outside=~hull & seen,
         outline=subject.hull.polygon,
     )
 
@@ -94,16 +97,15 @@ def figures(pair: RemovalPair) -> dict[str, Any]:
     """What the removal changed: nothing here is a gate, all of it is to be known.
 
     `box`: pixels of the hull, the share that changed, and how much of what they show is the sky behind all Gaussians,
-    where a learned sky may have kept the vehicle. `holes`: pixels that lost their surface. `edge`: mean gradient of
-    the luminance along the hull, with and without. `outside`: PSNR between both pictures off the hull, the share that
-    changed there and how far (pixels) from the hull the change reaches. `outside_footprint`: the same PSNR where no
-    removed Gaussian reaches, which is to be infinite.
+    where a learned sky may have kept the vehicle. `holes`: pixels of the image that lost their surface, and the share
+    of the box that did. `edge`: mean gradient of the luminance along the hull, with and without. `outside`: PSNR
+    between both pictures off the hull, the share that changed there and how far (pixels) from the hull the change
+    reaches. `outside_footprint`: the same PSNR where no removed Gaussian reaches, which is to be infinite.
     """
     changed = (np.abs(pair.with_car - pair.without_car) > CHANGED).any(axis=2)
     holes = (pair.alpha_without < HOLE) & (pair.alpha_with >= HOLE)
-    outside = ~pair.inside
-    distance = distance_transform_edt(outside)
-    leaked = distance[outside & changed]
+    distance = distance_transform_edt(~pair.inside)
+    leaked = distance[pair.outside & changed]
     return {
         "box": {
             "pixels": int(pair.inside.sum()),
@@ -114,8 +116,8 @@ def figures(pair: RemovalPair) -> dict[str, Any]:
         "holes": {"pixels": int(holes.sum()), "share_of_box": _share(holes, pair.inside)},
         "edge": _edge(pair, distance),
         "outside": {
-            **(psnr_record(pair.without_car, pair.with_car, outside) or {"psnr": None, "pixels": 0}),
-            "changed_share": _share(changed, outside),
+            **(psnr_record(pair.without_car, pair.with_car, pair.outside) or {"psnr": None, "pixels": 0}),
+            "changed_share": _share(changed, pair.outside),
             "reach_px": float(leaked.max()) if len(leaked) else 0.0,
         },
         "outside_footprint": psnr_record(pair.without_car, pair.with_car, ~pair.footprint),
@@ -123,14 +125,19 @@ def figures(pair: RemovalPair) -> dict[str, Any]:
 
 
 def _edge(pair: RemovalPair, distance_outside: np.ndarray) -> dict[str, float | None]:
-    """The mean gradient along the hull in both pictures, and their ratio: above 1, the removal draws an
-    outline. None where the hull has no edge in the image."""
+    """The mean gradient along the hull in both pictures, and their ratio: above 1, the removal draws an outline.
+
+    None where the hull has no edge in the image. Where the own car cuts the hull is no edge.
+    """
+    nothing = {"with_car": None, "without_car": None, "ratio": None}
     if pair.inside.all() or not pair.inside.any():
-        return {"with_car": None, "without_car": None, "ratio": None}
-    band = (distance_outside <= EDGE_BAND) & (distance_transform_edt(pair.inside) <= EDGE_BAND)
-    before, after = (
-        float(sobel(rgb2gray(image))[band].mean()) if band.any() else 0.0 for image in (pair.with_car, pair.without_car)
-    )
+        return nothing
+    seen = pair.inside | pair.outside
+    clear = seen if seen.all() else distance_transform_edt(seen) > EDGE_BAND + 1.0
+    band = clear & (distance_outside <= EDGE_BAND) & (distance_transform_edt(pair.inside) <= EDGE_BAND)
+    if not band.any():
+        return nothing
+    before, after = (float(sobel(rgb2gray(image))[band].mean()) for image in (pair.with_car, pair.without_car))
     return {"with_car": before, "without_car": after, "ratio": after / before if before > 0 else None}
 
 
@@ -138,25 +145,25 @@ def _ghost_figures(sight: Sight, subject: Subject, pair: RemovalPair, job: Remov
     """The ghosts that stay, and whether they are seen outside the box."""
     ghosts = ghosts_of(sight, subject.box, job.ghosts)
     opacity = colors_of(sight.of(ghosts.rows).alpha)
-    covered = (opacity >= CHANGED) & ~pair.inside
+    covered = (opacity >= COVERING) & pair.outside
     return {
         **ghosts.figures(sight.gaussians),
-        "covered_share_outside": _share(covered, ~pair.inside),
+        "covered_share_outside": _share(covered, pair.outside),
         "reach_outside_box": bool(covered.any()),
     }
 
 
 def _nothing_to_remove(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
-    sight = Sight(drive, drive.scene.middle_key_frame(job.eval_camera))
+    sight = Sight(drive, drive.recording.scene.middle_key_frame(job.eval_camera))
     picture = sight.of()
     image, alpha = colors_of(picture.image), colors_of(picture.alpha)
     nowhere = np.zeros(alpha.shape, dtype=bool)
     nulls = ("subject", "removed_by", "box", "holes", "edge", "outside", "outside_footprint", "ghosts")
     reason = f"no vehicle moves before {job.eval_camera} in this scene"
-    log.warning("%s: nothing to remove: %s", drive.scene.name, reason)
-    return RemovalPair(image, image, alpha, alpha, nowhere, nowhere, np.zeros((0, 2))), {
+    log.warning("%s: nothing to remove: %s", drive.recording.scene.name, reason)
+    return RemovalPair(image, image, alpha, alpha, nowhere, nowhere, ~nowhere, np.zeros((0, 2))), {
         "schema": SCHEMA,
-        "scene": drive.scene.name,
+        "scene": drive.recording.scene.name,
         "key_frame": sight.frame.sample_index,
         "why_null": reason,
         "margin_m": job.removal.margin,

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from drivesplat.device import choose_device
+from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel, View
-from drivesplat.parser import image_size
-from drivesplat.scene import Frame, Scene
+from drivesplat.recording import Recording
+from drivesplat.scene import Frame
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training.run import trained_model
 from drivesplat.training.views import view_of
@@ -22,21 +22,19 @@ from drivesplat.training.views import view_of
 
 @dataclass(frozen=True)
 class Drive:
-    """A trained model with its drive: `parser` is the record it was trained on, made of `scene`."""
+    """A trained model with the recording it was trained on."""
 
     model: SplatModel
-    scene: Scene
-    parser: dict[str, Any]
+    recording: Recording
     device: torch.device
 
 
-def open_drive(
-    checkpoint: dict[str, Any], scene: Scene, parser: dict[str, Any], device_settings: DeviceSettings
-) -> Drive:
-    """The model of a checkpoint's content on the device, with its drive."""
+def open_drive(checkpoint: dict[str, Any], recording: Recording, device_settings: DeviceSettings) -> Drive:
+    """The model of a checkpoint's content on the device, with its recording."""
     device = choose_device(device_settings, min_free_gb=0.0)
     model, _ = trained_model(checkpoint)
-    return Drive(model.to(device).requires_grad_(False), scene, parser, device)
+    with telling_out_of_memory(lambda: len(model)):
+        return Drive(model.to(device).requires_grad_(False), recording, device)
 
 
 @dataclass(frozen=True)
@@ -48,16 +46,16 @@ class Sight:
 
     @cached_property
     def view(self) -> View:
-        return view_of(self.drive.parser, self.index, self.drive.device)
+        return view_of(self.drive.recording.parser, self.index, self.drive.device)
 
     @property
     def frame(self) -> Frame:
-        return self.drive.scene.frames[self.index]
+        return self.drive.recording.frame(self.index)
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
-        return image_size(self.drive.parser, self.index)
+        return self.drive.recording.size(self.index)
 
     @cached_property
     def gaussians(self) -> Gaussians:
@@ -69,15 +67,16 @@ class Sight:
     def of(self, rows: Bool[Tensor, " n"] | None = None) -> Picture:
         """The picture, of some of `gaussians` alone where `rows` says which.
 
-        Raises ResultError where it is not finite.
+        Raises ResultError where it is not finite, DeviceError where the card is full.
         """
         shown = self.gaussians if rows is None else self.gaussians[rows]
-        picture = self.drive.model.render(self.view, gaussians=shown)
+        with telling_out_of_memory(lambda: len(shown)):
+            picture = self.drive.model.render(self.view, gaussians=shown)
         if not bool(torch.isfinite(picture.image).all()):
             raise ResultError("the model shows no numbers; delete its checkpoint.pt and rerun")
         return picture
 
 
 def colors_of(image: Tensor) -> np.ndarray:
-    """A picture's colours (h, w, 3) as float64 in [0, 1], on the CPU."""
+    """A picture's colours (h, w, 3) or opacities (h, w) as float64 in [0, 1], on the CPU."""
     return image.double().clamp(0.0, 1.0).cpu().numpy()

@@ -12,12 +12,10 @@ from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.holdout import HELD_OUT_GROUPS
-from drivesplat.images import read_image
-from drivesplat.masks import read_labels
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size
+from drivesplat.recording import Recording
 from drivesplat.regions import region_masks
-from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.training.run import trained_model
@@ -30,15 +28,13 @@ VEHICLE_FINDING_DB = 18.0
 
 @dataclass(frozen=True)
 class EvaluationInputs:
-    """What an evaluation reads: the contents of checkpoint.pt, train.json, parser.pkl, scene.json, masks.json and of
-    LPIPS's backbone.json (None where LPIPS is not wanted), the folder `masks`, and the path `truth` of a synthetic
-    world's truth.json (None for a recorded drive)."""
+    """What an evaluation reads: the contents of checkpoint.pt, train.json, masks.json and LPIPS's backbone.json (None
+    where LPIPS is not wanted), the recording, and the path `truth` of a synthetic world's truth.json (None for a
+    recorded drive)."""
 
     checkpoint: dict[str, Any]
     summary: dict[str, Any]
-    parser: dict[str, Any]
-    scene: Scene
-    masks: Path
+    recording: Recording
     masks_record: dict[str, Any]
     lpips_record: dict[str, Any] | None
     truth: Path | None
@@ -49,16 +45,16 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     device = choose_device(device_settings, min_free_gb=0.0)
     model, _ = trained_model(inputs.checkpoint)
     unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
-    summary = inputs.summary
+    parser, summary = inputs.recording.parser, inputs.summary
     with telling_out_of_memory(lambda: len(model)):
         model = model.to(device)
-        groups = evaluate_groups(model, inputs.parser, inputs.masks, job.eval_camera, lpips_map, device)
+        groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device)
         against = against_truth(model, inputs, job, lpips_map, device)
     return {
         "schema": 1,
-        "scene": inputs.parser["scene"]["name"],
-        "dataset": inputs.parser["scene"]["dataset"],
-        "protocol": protocol(inputs.parser, inputs.masks_record, job),
+        "scene": parser["scene"]["name"],
+        "dataset": parser["scene"]["dataset"],
+        "protocol": protocol(parser, inputs.masks_record, job),
         "result": {
             **groups,
             **against,
@@ -78,9 +74,9 @@ def against_truth(
     model: SplatModel, inputs: EvaluationInputs, job: EvaluateJob, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any]:
     """`lateral` and `removal`, where truth for them exists: for a synthetic world, not for a recorded drive."""
-    if inputs.truth is None:
+    if inputs.truth is None or job.removal is None:
         return {}
-    known = KnownTruth(read_truth(inputs.truth), inputs.truth, inputs.scene, inputs.parser, inputs.masks)
+    known = KnownTruth(read_truth(inputs.truth), inputs.truth, inputs.recording)
     lateral = lateral_metrics(model, known, job.eval_camera, lpips_map, device)
     removal = removal_metrics(model, known, job.eval_camera, job.removal.margin, lpips_map, device)
     return {**({"lateral": lateral} if lateral else {}), **({"removal": removal} if removal else {})}
@@ -138,21 +134,14 @@ def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int
 
 
 def evaluate_groups(
-    model: SplatModel,
-    parser: dict[str, Any],
-    masks: Path,
-    camera: str,
-    lpips_map: LpipsMap | None,
-    device: torch.device,
+    model: SplatModel, recording: Recording, camera: str, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, dict[str, Any]]:
-    """The metrics of every held-out group, by region. `masks` is the folder of the stage `masks`."""
+    """The metrics of every held-out group, by region."""
     groups = {}
     for group in HELD_OUT_GROUPS:
         metrics = RegionMetrics(lpips_map)
-        for index in held_out_images(parser, group, camera):
-            size = image_size(parser, index)
-            truth = read_image(parser["image_paths"][index], size) / 255.0
-            labels = read_labels(masks, camera, int(parser["timestamps"][index]), size)
-            metrics.add(rendered(model, view_of(parser, index, device)), truth, region_masks(labels))
+        for index in held_out_images(recording.parser, group, camera):
+            image = rendered(model, view_of(recording.parser, index, device))
+            metrics.add(image, recording.image(index), region_masks(recording.labels(index)))
         groups[group] = with_gap(metrics.summary())
     return groups

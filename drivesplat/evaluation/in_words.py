@@ -7,6 +7,7 @@ from typing import Any
 from drivesplat.errors import DriveSplatError
 from drivesplat.storage import read_json
 
+LOOKS = ("original.mp4", "lateral_2m.mp4", "ghost_panel.png", "removal.png", "viewer.html")
 BETWEEN = {"interpolation": "between training frames", "extrapolation": "beyond the last training frame"}
 
 
@@ -21,15 +22,21 @@ def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
         for metres, regions in method.get("lateral", {}).items():
             if (static := _psnr(regions, "static")) is not None:
                 lines.append(f"{name}, from {float(metres):g} m to the left, against truth: static {static:.1f} dB")
-        box, outside = (_psnr(method.get("removal", {}), region) for region in ("box", "outside"))
-        if box is not None and outside is not None:
+        removal = method.get("removal", {})
+        removed, before = (_psnr(regions, "box") for regions in (removal, removal.get("not_removed", {})))
+        if removed is not None and before is not None:
             lines.append(
-                f"{name}, the car ahead removed, against truth: {box:.1f} dB in its box, {outside:.1f} dB elsewhere"
+                f"{name}, the car ahead removed, against the empty street: {removed:.1f} dB in its box "
+                f"({before:.1f} dB before)"
             )
         seconds, device = method["train_seconds"], method["device"]
         lines.append(f"{name}: {method['gaussians']:,} Gaussians, trained in {seconds:.0f} s on {device}")
     folder = Path(path).parent
     lines.append(f"All figures: {path}; training curves and pictures: tensorboard --logdir {folder}")
+    for name in metrics["methods"]:
+        there = [look for look in LOOKS if (folder / name / look).is_file()]
+        if there:
+            lines.append(f"To look at, in {folder / name}: {', '.join(there)}")
     return lines
 
 

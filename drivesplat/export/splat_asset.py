@@ -10,6 +10,7 @@ from drivesplat.export.trained_parts import digests, trained_parts
 from drivesplat.model.gaussians import concatenate
 from drivesplat.scene import Scene
 from drivesplat.storage import write_json
+from drivesplat.training.run import trained_model
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +27,8 @@ def export_splat(
 
     The header of `splat` has only the digests of `provenance`; all of it, in `cameras`, is too long for viewers.
     """
-    gaussians = concatenate(list(trained_parts(checkpoint, scene).values()))
+    model, _ = trained_model(checkpoint)
+    gaussians = concatenate(list(trained_parts(model, scene).values()))
     write_splat_ply(splat, gaussians, {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)})
     write_json(cameras, {**cameras_record(scene, parser), "provenance": provenance})
     log.info("%d Gaussians, %d images", len(gaussians), len(scene.frames))

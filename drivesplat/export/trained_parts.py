@@ -7,19 +7,18 @@ import numpy as np
 import torch
 
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene import Scene
-from drivesplat.training.run import trained_model
 
 log = logging.getLogger(__name__)
 
 
 @torch.no_grad()
-def trained_parts(checkpoint: dict[str, Any], scene: Scene) -> dict[str, Gaussians]:
-    """The Gaussians of a checkpoint's parts by their names, on the CPU, at the time of the scene's middle image.
+def trained_parts(model: SplatModel, scene: Scene) -> dict[str, Gaussians]:
+    """The Gaussians of a model's parts by their names, at the time of the scene's middle image.
 
     Those with a value that is not finite are left out: every program makes something else of them.
     """
-    model, _ = trained_model(checkpoint)
     middle = np.sort([frame.timestamp for frame in scene.frames])[len(scene.frames) // 2]
     return {part.name: _finite(part.at(scene.seconds(middle)), part.name) for part in model.parts}
 

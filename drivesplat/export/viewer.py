@@ -24,6 +24,7 @@ from torch import Tensor
 from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_parts
 from drivesplat.export.viewer_page import filled_page
+from drivesplat.images import continuous_intrinsics
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Sky
 from drivesplat.scene import Frame, Scene
@@ -51,7 +52,7 @@ def export_viewer(
     """
     start = scene.frames[scene.middle_key_frame(job.eval_camera)]
     model, _ = trained_model(checkpoint)
-    gaussians = concatenate(list(trained_parts(checkpoint, scene).values()))
+    gaussians = concatenate(list(trained_parts(model, scene).values()))
     kept = thinned(gaussians, job.gaussians)
     page = viewer_page(kept, model.sky, model.antialiased, start, f"{scene.name} · {method}", provenance)
     with atomic_write(path) as file:
@@ -122,12 +123,10 @@ def cube_rays(size: int) -> Float[Tensor, "6 size size 3"]:
 
 def start_pose(frame: Frame) -> dict[str, Any]:
     """The camera of a recorded frame: `K` in continuous pixels of width x height, OpenCV `camera_to_world` (4, 4)."""
-    K = frame.intrinsics.copy()
-    K[:2, 2] += 0.5  # OpenCV counts from the first pixel's centre
     return {
         "width": frame.width,
         "height": frame.height,
-        "K": K.tolist(),
+        "K": continuous_intrinsics(frame, (frame.width, frame.height)).tolist(),
         "camera_to_world": frame.camera_to_world.tolist(),
     }
 

@@ -5,7 +5,6 @@ Each part owns its parameters, their learning rates and its densification. A met
 
 from abc import ABC, abstractmethod
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
@@ -19,19 +18,24 @@ class Part(nn.Module, ABC):
     """
 
     name: str
+    moves = False
+    """Whether its Gaussians are objects that are elsewhere at another time."""
     params: nn.ParameterDict
 
     @abstractmethod
     def at(self, time: float) -> Gaussians:
-        """Its Gaussians in world coordinates at a time in seconds since the first key frame."""
+        """Its Gaussians in world coordinates at a time in seconds since the first image.
+
+        Always `len(self)` rows in one order; one that is absent then has opacity 0.
+        """
 
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every entry of `params`."""
 
-    def of_track(self, track_id: str) -> Bool[Tensor, " n"]:
-        """Which of its Gaussians are a track's own: none, where a part does not take objects apart."""
-        return torch.zeros(len(self), dtype=torch.bool, device=self.params["means"].device)
+    def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
+        """Which of its rows are a track's own; None where this part does not know the track as an object."""
+        return None
 
     def __len__(self) -> int:
         return len(self.params["means"])

@@ -23,11 +23,11 @@ class Removal:
 def removal_of(model: SplatModel, gaussians: Gaussians, box: Box, margin: float) -> Removal:
     """What is to be removed of `gaussians` (the model's at the time of `box`) so that the box's object goes.
 
-    A model that takes the object apart gives its Gaussians; of any other, those go whose centres lie in the box, grown
+    A model that knows the object gives its Gaussians; of any other, those go whose centres lie in the box, grown
     by `margin` metres at its sides and roof.
     """
     own = model.of_track(box.track_id)
-    if bool(own.any()):
+    if own is not None:
         return Removal(own, "actor")
     inside = box.holds(gaussians.means.detach().cpu().double().numpy(), margin)
-    return Removal(torch.from_numpy(inside).to(own.device), "box")
+    return Removal(torch.from_numpy(inside).to(gaussians.means.device), "box")

@@ -66,9 +66,18 @@ class SplatModel(nn.Module):
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
         return concatenate([part.at(time) for part in self.parts])
 
-    def of_track(self, track_id: str) -> Bool[Tensor, " n"]:
-        """Which of `gaussians_at`'s rows are a track's own; none where no part takes that track apart."""
-        return torch.cat([part.of_track(track_id) for part in self.parts])
+    def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
+        """Which of `gaussians_at`'s rows are a track's own; None where no part knows the track as an object."""
+        found = [part.of_track(track_id) for part in self.parts]
+        if all(rows is None for rows in found):
+            return None
+        nothing = (torch.zeros(len(part), dtype=torch.bool, device=part.params["means"].device) for part in self.parts)
+        return torch.cat([none if rows is None else rows for rows, none in zip(found, nothing, strict=True)])
+
+    def moving(self) -> Bool[Tensor, " n"]:
+        """Which of `gaussians_at`'s rows belong to parts that move."""
+        device = self.parts[0].params["means"].device
+        return torch.cat([torch.full((len(part),), part.moves, device=device) for part in self.parts])
 
     def render(
         self,

@@ -31,4 +31,5 @@ class EvaluateJob(Settings):
     sweeps: bool
     holdout: HoldoutSettings
     lpips: bool
-    removal: RemovalSettings
+    removal: RemovalSettings | None
+    """For synthetic worlds: recorded drives have no truth that a removal could be held to."""
