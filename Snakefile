@@ -47,6 +47,7 @@ rule films:
 
 rule looks:
     input:
+        expand("<results>/{scene}/tracks.png", scene=plan.config.batch_scenes),
         expand("{folder}/{look}", folder=of_methods, look=["ghost_panel.png", "removal.png"]),
 
 

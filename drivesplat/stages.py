@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from drivesplat.config import Config, DatasetSettings, for_scene
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings
-from drivesplat.settings.actor import PanelJob, RemovalJob, SubjectSettings
+from drivesplat.settings.actor import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
@@ -137,6 +137,7 @@ _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "train": _train,
     "evaluate": _evaluate,
     "scene_metrics": lambda _: Settings(),
+    "tracks": lambda at: TracksJob(eval_camera=at.config.eval_camera),
     "film": _film,
     "ghost_panel": _ghost_panel,
     "remove_actor": _remove_actor,

@@ -1,8 +1,43 @@
 # A trained method as a person sees it: films, the ghosts of what moved, the drive without a car.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, scene.json, parser.pkl, masks/.
-# OUTPUTS: <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json; ghost_panel.png and .json;
+# OUTPUTS: <results>/{scene}/tracks.csv and tracks.png;
+# <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json; ghost_panel.png and .json;
 # with_car.png, without_car.png, removal.png and removal.json.
+
+
+rule tracks:
+    """
+    Lists every annotated object that can move, with its class, speed and time in sight, and shows the movers with the
+    ids by which settings name them.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+        parser="<results>/{scene}/parser.pkl",
+        masks="<results>/{scene}/masks/masks.json",
+    output:
+        table="<results>/{scene}/tracks.csv",
+        picture=report(
+            "<results>/{scene}/tracks.png",
+            caption="../report/tracks.rst",
+            category="Scene {scene}",
+            subcategory="figures",
+            labels={"what": "what moves, with ids"},
+        ),
+    log:
+        "<logs>/{scene}/tracks.log",
+    benchmark:
+        "<benchmarks>/{scene}/tracks.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=10,
+    params:
+        settings=plan.settings("tracks"),
+        code=plan.code("tracks"),
+    script:
+        "../workflow_scripts/tracks.py"
 
 
 rule film:

@@ -15,7 +15,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.stages import SCENE_STAGES, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
-LOOKS = ("film", "ghost_panel", "remove_actor", "export", "export_usd", "export_viewer")
+LOOKS = ("tracks", "film", "ghost_panel", "remove_actor", "export", "export_usd", "export_viewer")
 STAGES = (*SCENE_STAGES, "train", "evaluate", *LOOKS)
 
 
@@ -23,7 +23,7 @@ def spelled(values: dict[str, Any] | Config, stage: str, scene: str = "0061", me
     """What a stage is told, of a film the one called `original`."""
     config = values if isinstance(values, Config) else load(values)
     film = "original" if stage == "film" else None
-    return stage_settings(config, stage, scene, None if stage in SCENE_STAGES else method, film)
+    return stage_settings(config, stage, scene, None if stage in (*SCENE_STAGES, "tracks") else method, film)
 
 
 @pytest.fixture(scope="module")
@@ -318,7 +318,7 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
         (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract evaluate"),
         (
             {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
-            "extract evaluate film ghost_panel remove_actor export_usd export_viewer",
+            "extract evaluate tracks film ghost_panel remove_actor export_usd export_viewer",
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks"),

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
-from drivesplat.actors.drawing import draw_panel, draw_removal, save_figure
+from drivesplat.actors.drawing import draw_panel, draw_removal
 from drivesplat.actors.panel import Panel, ghost_panel
 from drivesplat.actors.remove import RemovalPair, remove_actor
+from drivesplat.actors.sheet import save_figure
 from drivesplat.actors.sight import Drive, Sight
 from drivesplat.errors import DeviceError, ResultError
 from drivesplat.model.part import Part

@@ -120,7 +120,7 @@ ONE_TRAINING_AND_AFTER = {
     "train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1, "film": 2, "ghost_panel": 1, "remove_actor": 1,
     "export": 1, "export_usd": 1, "export_viewer": 1,
 }  # fmt: skip
-EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, **TRAINING_AND_AFTER}
+EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_AND_AFTER}
 
 
 @pytest.mark.parametrize(
@@ -130,10 +130,10 @@ EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, **TRAINING
         ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
         ({"methods": {"plain": {"overrides": {"sky": "mask", "train": {"strategy": "default"}}}}},
          ONE_TRAINING_AND_AFTER),
-        ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, **TRAINING_AND_AFTER}),
+        ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
-         {"masks": 1, **TRAINING_AND_AFTER}),
-        ({"holdout": {"last_block": 3}}, {"lidar_seed": 1, "parser": 1, **TRAINING_AND_AFTER}),
+         {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
+        ({"holdout": {"last_block": 3}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ({"extract": {"on_missing": "warn"}}, EVERYTHING),
         ({"render": {"fps": 5}}, {"film": 4}),
         ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2}),
@@ -183,7 +183,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/evaluation/metrics.py", "LEAST_FRAME_PIXELS = 100", "LEAST_FRAME_PIXELS = 90",
          {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2, "remove_actor": 2}),
         ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
-        ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71", {"masks": 1, **TRAINING_AND_AFTER}),
+        ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71", {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
         ("drivesplat/training/floaters.py", "FADED = 1e-4", "FADED = 2e-4", TRAINING_AND_AFTER),
         ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),

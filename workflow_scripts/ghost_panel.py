@@ -1,7 +1,8 @@
 """checkpoint.pt before a moving vehicle, into ghost_panel.png and ghost_panel.json."""
 
-from drivesplat.actors.drawing import draw_panel, save_figure
+from drivesplat.actors.drawing import draw_panel
 from drivesplat.actors.panel import ghost_panel
+from drivesplat.actors.sheet import save_figure
 from drivesplat.actors.sight import open_drive
 from drivesplat.job import job
 from drivesplat.recording import read_recording

@@ -1,6 +1,5 @@
-"""Panels as pictures: titled, labelled, 1600 pixels wide."""
+"""The ghost panel and the removal as pictures."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,13 +9,9 @@ from matplotlib.patches import Polygon
 
 from drivesplat.actors.panel import Panel
 from drivesplat.actors.remove import RemovalPair
-from drivesplat.storage import atomic_write
+from drivesplat.actors.sheet import BOX, sheet, show
 
-DPI = 100
-WIDTH = 16.0
-"""Inches."""
 LARGEST_ERROR = 0.5
-BOX = "#ffd166"
 WAY = "#4cc9f0"
 
 
@@ -29,13 +24,11 @@ def draw_panel(panel: Panel, record: dict[str, Any], method: str) -> Figure:
     else:
         seen = "training image" if subject["split"] == "train" else f"held out: {subject['split']}"
         title += f" ({seen})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m away"
-    figure, axes = _figure(panel.truth.shape, rows=2, columns=2, title=title)
-    _show(axes[0], panel.truth, "Ground truth")
-    _show(
-        axes[1], panel.render, f"Render: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}"
-    )
+    figure, axes = sheet(panel.truth.shape, rows=2, columns=2, title=title)
+    show(axes[0], panel.truth, "Ground truth")
+    show(axes[1], panel.render, f"Render: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}")
     _show_error(axes[2], panel.render, panel.truth, "Absolute error, mean over the channels")
-    _show(axes[3], panel.haunted, _ghosts_in_words(record["ghosts"]))
+    show(axes[3], panel.haunted, _ghosts_in_words(record["ghosts"]))
     if len(panel.way) > 1:
         axes[3].plot(*_clipped(panel.way, panel.truth.shape).T, color=WAY, linewidth=2.0, alpha=0.9)
     _outline(axes, panel.outline)
@@ -61,35 +54,12 @@ def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figu
     else:
         changed = record["box"]["changed_share"] or 0.0
         title += f"\n{record['gaussians_removed']:,} Gaussians removed, which changes {changed:.0%} of its box's pixels"
-    figure, axes = _figure(pair.with_car.shape, rows=1, columns=3, title=title)
-    _show(axes[0], pair.with_car, "Render")
-    _show(axes[1], pair.without_car, without)
+    figure, axes = sheet(pair.with_car.shape, rows=1, columns=3, title=title)
+    show(axes[0], pair.with_car, "Render")
+    show(axes[1], pair.without_car, without)
     _show_error(axes[2], pair.without_car, pair.with_car, "Difference, mean over the channels")
     _outline(axes, pair.outline)
     return figure
-
-
-def save_figure(path: str | Path, figure: Figure) -> None:
-    """Writes a PNG. Raises ResultError naming `path` where that fails."""
-    with atomic_write(path) as file:
-        figure.savefig(file, format="png", dpi=DPI, facecolor="white")
-
-
-def _figure(shape: tuple[int, ...], rows: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
-    """A landscape figure with room for pictures of `shape` (h, w, ...), and its axes."""
-    picture_height = WIDTH / columns * shape[0] / shape[1]
-    figure = Figure(figsize=(WIDTH, rows * (picture_height + 0.35) + 0.85), dpi=DPI, layout="constrained")
-    figure.suptitle(title, fontsize=18, x=0.01, ha="left")
-    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(rows * columns)]
-    for axis in axes:
-        axis.set_axis_off()
-    return figure, axes
-
-
-def _show(axis: Axes, image: np.ndarray, title: str) -> None:
-    axis.imshow(image)
-    axis.set_autoscale_on(False)  # what is drawn over a picture may reach beyond it
-    axis.set_title(title, loc="left", fontsize=15)
 
 
 def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) -> None:

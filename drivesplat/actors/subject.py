@@ -51,22 +51,28 @@ def choose_subject(recording: Recording, camera: str, settings: SubjectSettings)
     return best
 
 
+def seen_in(recording: Recording, index: int) -> list[Subject]:
+    """Everything in an image that is annotated, can move and is to be seen, farthest first."""
+    frame, size = recording.frame(index), recording.size(index)
+    hulls = hulls_in(recording.scene, frame, size)
+    owners, covered = owner_image(hulls, size)
+    owners[recording.own_car(index)] = -1
+    labels = (label_of(hull, pixels) for hull, pixels in zip(hulls, covered, strict=True))
+    subjects = (
+        Subject(index, frame, hull, label, owners == position)
+        for position, (hull, label) in enumerate(zip(hulls, labels, strict=True))
+    )
+    return [subject for subject in subjects if subject.visible.any()]
+
+
 def _candidates(recording: Recording, camera: str, settings: SubjectSettings) -> Iterator[Subject]:
     """Everything in the key frames asked for that may be looked at: what moves, or the track asked for."""
-    for index, frame in enumerate(recording.scene.frames):
-        if frame.camera != camera or not frame.is_key_frame:
+    for index in recording.key_frames(camera):
+        if settings.key_frame not in (None, recording.frame(index).sample_index):
             continue
-        if settings.key_frame is not None and frame.sample_index != settings.key_frame:
-            continue
-        hulls = hulls_in(recording.scene, frame, recording.size(index))
-        owners, covered = owner_image(hulls, recording.size(index))
-        owners[recording.own_car(index)] = -1
-        for position, (hull, pixels) in enumerate(zip(hulls, covered, strict=True)):
-            label = label_of(hull, pixels)
-            wanted = label in MOVERS if settings.track is None else hull.box.track_id == settings.track
-            visible = owners == position
-            if wanted and visible.any():
-                yield Subject(index, frame, hull, label, visible)
+        for subject in seen_in(recording, index):
+            if subject.label in MOVERS if settings.track is None else subject.box.track_id == settings.track:
+                yield subject
 
 
 def _nothing_there(recording: Recording, camera: str, settings: SubjectSettings) -> str:

@@ -29,6 +29,12 @@ class RemovalSettings(Settings):
     stays where it is, since below it is road."""
 
 
+class TracksJob(Settings):
+    """Everything that decides the content of one tracks.csv, its inputs aside."""
+
+    eval_camera: str
+
+
 class PanelJob(Settings):
     """Everything that decides the content of one ghost panel, its inputs aside."""
 

@@ -1,0 +1,15 @@
+"""scene.json as tracks.csv and tracks.png: what moves, and by which id."""
+
+from drivesplat.actors.listing import draw_tracks, sightings_of, track_rows, write_tracks
+from drivesplat.actors.sheet import save_figure
+from drivesplat.job import job
+from drivesplat.recording import read_recording
+from drivesplat.settings.actor import TracksJob
+
+with job(snakemake) as current:
+    files, camera = current.input, current.settings(TracksJob).eval_camera
+    recording, _ = read_recording(files.scene, files.parser, files.masks)
+    sightings = sightings_of(recording, camera)
+    rows = track_rows(recording, sightings)
+    write_tracks(current.output.table, rows)
+    save_figure(current.output.picture, draw_tracks(recording, sightings, rows, camera))
