@@ -25,11 +25,6 @@ class Recording:
     def frame(self, index: int) -> Frame:
         return self.scene.frames[index]
 
-    def key_frames(self, camera: str) -> list[int]:
-        """The images of `camera` that are key frames."""
-        frames = enumerate(self.scene.frames)
-        return [index for index, frame in frames if frame.camera == camera and frame.is_key_frame]
-
     def size(self, index: int) -> tuple[int, int]:
         """Width and height in pixels at which an image is trained and measured."""
         return image_size(self.parser, index)

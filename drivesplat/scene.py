@@ -99,12 +99,20 @@ class Scene:
         """A timestamp (microseconds) as seconds since the first image, the time that models know."""
         return float(timestamp - min(frame.timestamp for frame in self.frames)) * 1e-6
 
+    def track(self, track_id: str) -> Track | None:
+        """The track of that id, None where there is none."""
+        return next((track for track in self.tracks if track.id == track_id), None)
+
+    def key_frames(self, camera: str) -> list[int]:
+        """Which of `frames` are key frames of `camera`."""
+        return [i for i, frame in enumerate(self.frames) if frame.camera == camera and frame.is_key_frame]
+
     def middle_key_frame(self, camera: str) -> int:
         """Which of `frames` is the key frame of `camera` in the middle of the drive.
 
         Raises DatasetError where it has none, naming the cameras that do.
         """
-        found = [i for i, frame in enumerate(self.frames) if frame.camera == camera and frame.is_key_frame]
+        found = self.key_frames(camera)
         if not found:
             known = ", ".join(dict.fromkeys(frame.camera for frame in self.frames if frame.is_key_frame))
             raise DatasetError(

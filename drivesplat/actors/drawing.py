@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 
 from drivesplat.actors.panel import Panel
 from drivesplat.actors.remove import RemovalPair
-from drivesplat.actors.sheet import BOX, sheet, show
+from drivesplat.actors.sheet import draw_outline, sheet, show
 
 LARGEST_ERROR = 0.5
 WAY = "#4cc9f0"
@@ -74,7 +73,7 @@ def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) ->
 def _outline(axes: list[Axes], outline: np.ndarray) -> None:
     """Draws the box (n, 2) in continuous pixels into every picture, where there is one."""
     for axis in axes if len(outline) else ():
-        axis.add_patch(Polygon(outline - 0.5, fill=False, edgecolor=BOX, linewidth=1.2))
+        draw_outline(axis, outline)
 
 
 def _clipped(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

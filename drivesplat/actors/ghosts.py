@@ -76,7 +76,7 @@ def ghosts_of(sight: Sight, box: Box, settings: GhostSettings) -> Ghosts:
     """The ghosts of what is at `box` now: Gaussians in the volume that its box swept over the scene, but outside the
     box. Those of parts that move are none: they go where their objects go."""
     scene, gaussians = sight.drive.recording.scene, sight.gaussians
-    track = next(track for track in scene.tracks if track.id == box.track_id)
+    track = scene.track(box.track_id)
     points = gaussians.means.cpu().double().numpy()
     rows = swept(track, scene.key_frame_interval, points, settings.clearance) & ~box.holds(points)
     moving = sight.drive.model.moving()

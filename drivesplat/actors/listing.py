@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 
-from drivesplat.actors.sheet import BOX, sheet, show
+from drivesplat.actors.sheet import BOX, draw_outline, sheet, show
 from drivesplat.actors.subject import Subject, seen_in
 from drivesplat.recording import Recording
 from drivesplat.regions import LEAST_PIXELS, is_dynamic
@@ -55,7 +54,7 @@ Sightings = Mapping[int, Sequence[Subject]]
 
 def sightings_of(recording: Recording, camera: str) -> Sightings:
     """Everything that can move in the key frames of `camera`."""
-    return {index: seen_in(recording, index) for index in recording.key_frames(camera)}
+    return {index: seen_in(recording, index) for index in recording.scene.key_frames(camera)}
 
 
 def track_rows(recording: Recording, sightings: Sightings) -> list[TrackRow]:
@@ -143,8 +142,7 @@ def beginnings(ids: Sequence[str]) -> dict[str, str]:
 
 
 def _label(axis: Axes, subject: Subject, name: str, shape: tuple[int, ...]) -> None:
-    outline = subject.hull.polygon - 0.5
-    axis.add_patch(Polygon(outline, fill=False, edgecolor=BOX, linewidth=1.5))
+    outline = draw_outline(axis, subject.hull.polygon)
     x, y = np.clip(outline.min(axis=0), 0, [shape[1] * 0.9, shape[0] * 0.97])
     box = {"facecolor": BOX, "edgecolor": "none", "pad": 1.5}
     narrow = np.ptp(outline[:, 0]) < NARROW * shape[1]  # its neighbours' labels would cover each other

@@ -85,8 +85,8 @@ def _haunting(
 def _way(sight: Sight, subject: Subject) -> np.ndarray:
     """Where the vehicle's way over the ground lies in the image: (m, 2) continuous pixels, NaN behind the camera and
     where the annotation has a gap."""
-    track = next(track for track in sight.drive.recording.scene.tracks if track.id == subject.box.track_id)
-    boxes = boxes_along(track, sight.drive.recording.scene.key_frame_interval)
+    scene = sight.drive.recording.scene
+    boxes = boxes_along(scene.track(subject.box.track_id), scene.key_frame_interval)
     ground = np.array([box.object_to_world[:3, 3] - box.object_to_world[:3, 2] * box.size[2] / 2 for box in boxes])
     pixels, depth = project(
         ground, inverse(sight.frame.camera_to_world), continuous_intrinsics(sight.frame, sight.size)

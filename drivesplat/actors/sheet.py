@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 
 from drivesplat.storage import atomic_write
 
@@ -12,6 +13,7 @@ DPI = 100
 WIDTH = 16.0
 """Inches."""
 BOX = "#ffd166"
+"""The colour of boxes."""
 
 
 def save_figure(path: str | Path, figure: Figure) -> None:
@@ -36,3 +38,10 @@ def show(axis: Axes, image: np.ndarray, title: str) -> None:
     axis.imshow(image)
     axis.set_autoscale_on(False)  # what is drawn over a picture may reach beyond it
     axis.set_title(title, loc="left", fontsize=15)
+
+
+def draw_outline(axis: Axes, polygon: np.ndarray) -> np.ndarray:
+    """Draws a box's outline (n, 2), continuous pixels, over an image; returns it in the image's coordinates."""
+    outline = polygon - 0.5
+    axis.add_patch(Polygon(outline, fill=False, edgecolor=BOX, linewidth=1.5))
+    return outline

@@ -67,7 +67,7 @@ def seen_in(recording: Recording, index: int) -> list[Subject]:
 
 def _candidates(recording: Recording, camera: str, settings: SubjectSettings) -> Iterator[Subject]:
     """Everything in the key frames asked for that may be looked at: what moves, or the track asked for."""
-    for index in recording.key_frames(camera):
+    for index in recording.scene.key_frames(camera):
         if settings.key_frame not in (None, recording.frame(index).sample_index):
             continue
         for subject in seen_in(recording, index):

@@ -49,8 +49,8 @@ class KnownTruth:
         """The car that `without_leading` lacks in an image, and the pixels (h, w) bool of its hull; None where it is
         not to be seen."""
         scene, frame, size = self.recording.scene, self.recording.frame(index), self.recording.size(index)
-        leading = (track for track in scene.tracks if track.id == self.truth.leading)
-        box = next((box_at(track, frame.timestamp, scene.key_frame_interval) for track in leading), None)
+        leading = scene.track(self.truth.leading) if self.truth.leading else None
+        box = box_at(leading, frame.timestamp, scene.key_frame_interval) if leading else None
         if box is None:
             return None
         hull = hull_of(box, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
