@@ -59,7 +59,7 @@ def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
     an `interval` (microseconds, the scene's key-frame interval) beyond an end, the end segment's motion continues; a
     single box holds still. Where the annotation has a gap, the track ends before it and begins anew after it.
     """
-    for first, last in _runs(track.sample_indices):
+    for first, last in runs(track.sample_indices):
         times = track.timestamps[first : last + 1]
         reach = interval / 2.0
         if not times[0] - reach <= timestamp <= times[-1] + reach:
@@ -86,13 +86,13 @@ def boxes_at(scene: Scene, timestamp: int) -> list[Box]:
 def moves_at_all(track: Track) -> bool:
     """Whether a vehicle or person ever moves in this scene, by the same thresholds."""
     times = track.timestamps
-    for first, last in _runs(track.sample_indices):
+    for first, last in runs(track.sample_indices):
         if any(box_at(track, int(time), 0.0).moves for time in times[first:last]):
             return True
     return False
 
 
-def _runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
+def runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
     """First and last position of every run of consecutive key frames."""
     breaks = np.flatnonzero(np.diff(sample_indices) != 1).tolist()
     return list(zip([0, *(i + 1 for i in breaks)], [*breaks, len(sample_indices) - 1], strict=True))

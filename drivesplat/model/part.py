@@ -4,11 +4,22 @@ Each part owns its parameters, their learning rates and its densification. A met
 """
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.motion import Motion
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Gaussians that move as one: in world coordinates where `motion` is None, else in the frame of the object that
+    moves so (spherical harmonics, too)."""
+
+    gaussians: Gaussians
+    motion: Motion | None
 
 
 class Part(nn.Module, ABC):
@@ -32,6 +43,11 @@ class Part(nn.Module, ABC):
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every entry of `params`."""
+
+    def pieces(self, time: float) -> dict[str, Piece]:
+        """What it consists of, by names unique in a model, with the colours of a time: a set that stands still, or one
+        for every track."""
+        return {self.name: Piece(self.at(time), None)}
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """Which of its rows are a track's own; None where this part does not know the track as an object."""

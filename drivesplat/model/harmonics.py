@@ -1,0 +1,44 @@
+"""Spherical harmonics that turn with an object.
+
+A colour function given in an object's frame is again one of the same degree in the world's frame: a linear map of its
+coefficients, block by block of a degree. Rotated coefficients go through the rasterizer like any others, and give the
+colours that evaluation along directions in the object's frame gives.
+"""
+
+from functools import cache
+
+import torch
+from gsplat.cuda._torch_impl import _eval_sh_bases_fast
+from jaxtyping import Float
+from torch import Tensor
+
+
+def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) -> Float[Tensor, "a k k"]:
+    """The maps of k `coefficients` under `rotations` (object to world): sh_world = map @ sh_object.
+
+    Exact for every degree, from as many directions as determine it: with Y(d) the basis along directions d (rows),
+    Y(d) sh_world = Y(R^T d) sh_object for all d.
+    """
+    directions, inverse = _directions(coefficients)
+    directions, inverse = directions.to(rotations), inverse.to(rotations)
+    turned = directions @ rotations  # rows are R^T d
+    return inverse @ _eval_sh_bases_fast(coefficients, turned)
+
+
+def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
+    """Coefficients of an object's frame as those of the world's."""
+    if sh.shape[1] == 1:
+        return sh
+    return rotation_of_harmonics(object_to_world[None].to(sh), sh.shape[1])[0] @ sh
+
+
+@cache
+def _directions(coefficients: int) -> tuple[Tensor, Tensor]:
+    """Directions (m, 3) spread over the sphere (a Fibonacci lattice), and the pseudo-inverse (k, m) of their basis."""
+    count = 4 * coefficients
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1.0 - 2.0 * index / count
+    angle = index * (torch.pi * (3.0 - 5.0**0.5))
+    ring = torch.sqrt(1.0 - z**2)
+    directions = torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=-1)
+    return directions, torch.linalg.pinv(_eval_sh_bases_fast(coefficients, directions))
