@@ -2,7 +2,7 @@
 #
 #   snakemake --cores 1 results/0103/metrics.json     one scene, every configured method
 #   snakemake --cores 4                               all scenes: metrics, films, panels, exports, and the report
-#   snakemake --cores 4 metrics                       the figures alone; `films`, `looks`, `exports` likewise
+#   snakemake --cores 4 metrics                       the figures alone; `films`, `edits`, `looks`, `exports` likewise
 #   snakemake --cores 1 gap_report                    the report over what has been measured
 #   snakemake --report report.zip                     all there is to look at, as a page that opens offline
 #
@@ -28,6 +28,7 @@ include: "rules/scene.smk"
 include: "rules/train.smk"
 include: "rules/measure.smk"
 include: "rules/look.smk"
+include: "rules/edit.smk"
 include: "rules/export.smk"
 include: "rules/report.smk"
 
@@ -45,6 +46,11 @@ rule films:
         plan.films(plan.config.batch_scenes),
 
 
+rule edits:
+    input:
+        plan.edits(plan.config.batch_scenes),
+
+
 rule looks:
     input:
         expand("<results>/{scene}/tracks.png", scene=plan.config.batch_scenes),
@@ -53,7 +59,11 @@ rule looks:
 
 rule exports:
     input:
-        expand("{folder}/{asset}", folder=of_methods, asset=["splat.ply", "scene.usdz", "viewer.html"]),
+        expand(
+            "{folder}/{asset}",
+            folder=of_methods,
+            asset=["splat.ply", "parts/parts.json", "scene.usdz", "viewer.html"],
+        ),
 
 
 rule all:
@@ -61,6 +71,7 @@ rule all:
     input:
         rules.metrics.input,
         rules.films.input,
+        rules.edits.input,
         rules.looks.input,
         rules.exports.input,
         rules.gap_report.output,

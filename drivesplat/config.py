@@ -14,6 +14,7 @@ from pydantic import Field, field_validator, model_validator
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
 from drivesplat.settings.actor import GhostSettings, RemovalSettings, SubjectSettings
+from drivesplat.settings.actor_seed import ActorSeedSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
@@ -29,8 +30,8 @@ from drivesplat.settings.world import WorldSettings
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 DATASET_OVERRIDES = (
-    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "masks", "sky", "train", "render",
-    "ghosts", "removal", "export", "device",
+    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "actors", "masks", "sky", "train",
+    "render", "ghosts", "removal", "export", "device",
 )  # fmt: skip
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
@@ -56,6 +57,8 @@ class DatasetSettings(Settings):
 
     Others are used whole.
     """
+    edits: dict[str, str] = Field(default_factory=dict)
+    """Per scene the file of its edits (docs/editing.md)."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings of this file that differ for this dataset, as a tree: {images: {width: 800}}."""
     batch: bool = True
@@ -95,6 +98,13 @@ class DatasetSettings(Settings):
                 raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
         return self
 
+    @model_validator(mode="after")
+    def _edits_are_of_its_scenes(self) -> "DatasetSettings":
+        for scene in self.edits:
+            if scene not in self.scenes:
+                raise ValueError(f"edits names scene {scene!r}, which is not in scenes")
+        return self
+
 
 class MethodSettings(Settings):
     parts: tuple[PartName, ...] = Field(("background",), min_length=1)
@@ -105,15 +115,25 @@ class MethodSettings(Settings):
 
 def _default_datasets() -> dict[str, DatasetSettings]:
     demo = DatasetSettings(
-        dataroot="resources/demo", scenes=("demo",), batch=False, world=WorldSettings(), overrides=DEMO_OVERRIDES
+        dataroot="resources/demo",
+        scenes=("demo",),
+        edits={"demo": "presets/edits/demo.yaml"},
+        batch=False,
+        world=WorldSettings(),
+        overrides=DEMO_OVERRIDES,
     )
     return {"nuscenes": DatasetSettings(), "demo": demo}
+
+
+def _default_methods() -> dict[str, MethodSettings]:
+    held = {"train": {"sky_bce_weight": 0.05, "depth_weight": 0.01}}
+    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=held)}
 
 
 class Config(Settings):
     datasets: dict[str, DatasetSettings] = Field(default_factory=_default_datasets, min_length=1)
     """Recorded drives, each under a name of your choice."""
-    methods: dict[str, MethodSettings] = Field(default_factory=lambda: {"vanilla": MethodSettings()}, min_length=1)
+    methods: dict[str, MethodSettings] = Field(default_factory=_default_methods, min_length=1)
     """Methods to train and compare, each under a name of your choice; a result folder each."""
     cameras: tuple[str, ...] = Field(("CAM_FRONT",), min_length=1)
     """Cameras to train on."""
@@ -125,6 +145,7 @@ class Config(Settings):
     holdout: HoldoutSettings = HoldoutSettings()
     extract: ExtractSettings = ExtractSettings()
     lidar_seed: LidarSeedSettings = LidarSeedSettings()
+    actors: ActorSeedSettings = ActorSeedSettings()
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
     """Behind the Gaussians: 'cubemap' (learned, by direction), 'mask' (one learned colour, Gaussians kept out of sky

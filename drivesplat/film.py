@@ -1,9 +1,12 @@
-"""The stage `film`: a trained model along a trajectory, as a film and the cameras that it was seen from."""
+"""The stages `film` and `film_parts`: a trained model along a trajectory, as a film and the cameras that it was seen
+from; and taken apart into what stands still and what moves."""
 
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,83 +14,138 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from drivesplat.device import choose_device, telling_out_of_memory
-from drivesplat.errors import ResultError
+from drivesplat.device import telling_out_of_memory
+from drivesplat.errors import ConfigError, ResultError
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel, View
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.render import FilmJob
-from drivesplat.training.run import trained_model
+from drivesplat.settings.render import FilmFormat, FilmJob, TrajectorySettings
+from drivesplat.training.run import open_model
 from drivesplat.trajectory import CameraPath, film_intrinsics, film_path, recorded_frames
 from drivesplat.video import write_video
 
 log = logging.getLogger(__name__)
 
+BACKDROP = 0.35
+"""Grey behind objects that are shown by themselves."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A camera along a path through a scene, with a lens; `size` is width and height in pixels."""
+
+    scene: Scene
+    cameras: CameraPath
+    format: FilmFormat
+    size: tuple[int, int]
+
+    @cached_property
+    def K(self) -> np.ndarray:
+        """Intrinsics (3, 3) in continuous pixels at `size`."""
+        frame = recorded_frames(self.scene, self.format.camera)[0]
+        return film_intrinsics(frame, *self.size, self.format.horizontal_fov)
+
+    def views(self, device: torch.device) -> Iterator[View]:
+        """The cameras one by one, on the device."""
+        intrinsics = torch.from_numpy(self.K).float().to(device)
+        for timestamp, camera_to_world in zip(self.cameras.timestamps, self.cameras.camera_to_world, strict=True):
+            pose = torch.from_numpy(camera_to_world).float().to(device)
+            yield View(intrinsics, pose, *self.size, time=self.scene.seconds(timestamp))
+
+    def record(self) -> dict[str, Any]:
+        """What another program needs to see what the film sees.
+
+        `K` in continuous pixels; `timestamps` microseconds; `camera_to_world` OpenCV cameras in world metres, z up;
+        global = world + `origin`.
+        """
+        return {
+            "schema": 1,
+            "camera": self.format.camera,
+            "fps": self.format.fps,
+            "width": self.size[0],
+            "height": self.size[1],
+            "frames": len(self.cameras),
+            "duration_s": len(self.cameras) / self.format.fps,
+            "K": self.K.tolist(),
+            "timestamps": self.cameras.timestamps.tolist(),
+            "camera_to_world": self.cameras.camera_to_world.tolist(),
+            "origin": self.scene.origin.tolist(),
+        }
+
 
 def render_film(
     scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
-    """Writes the MP4 `path`; returns the content of the record of its cameras, provenance aside.
+    """Writes the MP4 `path`; returns the content of the record of its cameras, provenance aside: the shot's, and
+    `offset`, in metres and degrees from the recorded path.
 
     `checkpoint` is the content of checkpoint.pt. Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or the model renders no numbers.
     """
-    began = time.perf_counter()
-    cameras = film_path(scene, job.camera, job.fps, job.trajectory)
-    frame = recorded_frames(scene, job.camera)[0]
-    K = film_intrinsics(frame, job.width, job.height, job.horizontal_fov)
-    device = choose_device(device_settings, min_free_gb=0.0)
-    model, _ = trained_model(checkpoint)
-    log.info("%s: %d frames of %dx%d on %s", path.name, len(cameras), job.width, job.height, device)
-    views = film_views(scene, cameras, K, (job.width, job.height), device)
-    shown = tqdm(
-        views, total=len(cameras), desc=path.stem, unit="frame", disable=not sys.stderr.isatty(), mininterval=1.0
-    )
-    with telling_out_of_memory(lambda: len(model)):
-        model.to(device)
-        pictures = (film_frame(model, view) for view in shown)
-        write_video(path, pictures, (job.width, job.height), job.fps, job.crf, threads=torch.get_num_threads())
-    seconds = time.perf_counter() - began
-    log.info("%s: %.1f s, %.3f s a frame", path.name, seconds, seconds / len(cameras))
-    return {**film_record(scene, cameras, K, job), "render_seconds": seconds, "bytes": path.stat().st_size}
+    shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
+    model, device = open_model(checkpoint, device_settings)
+    seconds = write_film(path, (film_frame(model, view) for view in shot.views(device)), shot, len(model))
+    record = {**shot.record(), "offset": job.trajectory.model_dump()}
+    return {**record, "render_seconds": seconds, "bytes": path.stat().st_size}
 
 
-def film_record(scene: Scene, cameras: CameraPath, K: np.ndarray, job: FilmJob) -> dict[str, Any]:
-    """What another program needs to see what the film sees.
+def render_parts(
+    scene: Scene, checkpoint: dict[str, Any], job: FilmFormat, device_settings: DeviceSettings, path: Path
+) -> dict[str, Any]:
+    """Writes the MP4 `path` of three pictures side by side along the recorded path: everything, what stands still, and
+    what moves before plain grey. Returns the record of its cameras, as `render_film` does.
 
-    `K` in continuous pixels; `timestamps` microseconds; `camera_to_world` OpenCV cameras in world metres, z up;
-    global = world + `origin`; `offset` in metres and degrees from the recorded path.
+    Raises ConfigError where the model has no parts that move; else as `render_film`.
     """
-    return {
-        "schema": 1,
-        "camera": job.camera,
-        "fps": job.fps,
-        "width": job.width,
-        "height": job.height,
-        "frames": len(cameras),
-        "duration_s": len(cameras) / job.fps,
-        "K": K.tolist(),
-        "timestamps": cameras.timestamps.tolist(),
-        "camera_to_world": cameras.camera_to_world.tolist(),
-        "origin": scene.origin.tolist(),
-        "offset": job.trajectory.model_dump(),
-    }
+    shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
+    model, device = open_model(checkpoint, device_settings)
+    moving = model.moving()
+    if not moving.any():
+        raise ConfigError(f"scene {scene.name}: nothing in this method's model moves; its one part is its film")
+
+    def apart(view: View) -> np.ndarray:
+        gaussians = model.gaussians_at(view.time)
+        still = film_frame(model, view, gaussians[~moving])
+        return np.hstack([film_frame(model, view, gaussians), still, _by_themselves(model, view, gaussians[moving])])
+
+    seconds = write_film(path, (apart(view) for view in shot.views(device)), shot, len(model), columns=3)
+    return {**shot.record(), "shows": ["all", "still", "moving"], "render_seconds": seconds}
 
 
-def film_views(
-    scene: Scene, cameras: CameraPath, K: np.ndarray, size: tuple[int, int], device: torch.device
-) -> Iterator[View]:
-    """The cameras one by one, on the device; `K` (3, 3) continuous pixels at `size` (width, height)."""
-    intrinsics = torch.from_numpy(K).float().to(device)
-    for timestamp, camera_to_world in zip(cameras.timestamps, cameras.camera_to_world, strict=True):
-        pose = torch.from_numpy(camera_to_world).float().to(device)
-        yield View(intrinsics, pose, *size, time=scene.seconds(timestamp))
+def write_film(path: Path, pictures: Iterable[np.ndarray], shot: Shot, gaussians: int, columns: int = 1) -> float:
+    """Writes an MP4 of one picture (h, w, 3) uint8 a camera of `shot`, `columns` times as wide as a view of it; returns
+    the seconds it took.
+
+    `gaussians` is how many a model has whose memory may not suffice. Raises DeviceError, and ResultError where the film
+    cannot be written.
+    """
+    began, count = time.perf_counter(), len(shot.cameras)
+    shown = tqdm(pictures, total=count, desc=path.stem, unit="frame", disable=not sys.stderr.isatty(), mininterval=1.0)
+    with telling_out_of_memory(lambda: gaussians):
+        size = (columns * shot.size[0], shot.size[1])
+        write_video(path, shown, size, shot.format.fps, shot.format.crf, threads=torch.get_num_threads())
+    seconds = time.perf_counter() - began
+    log.info("%s: %d frames, %.1f s, %.3f s a frame", path.name, count, seconds, seconds / count)
+    return seconds
 
 
 @torch.no_grad()
-def film_frame(model: SplatModel, view: View) -> np.ndarray:
-    """What a view shows, (h, w, 3) uint8 RGB. Raises ResultError where that is not finite."""
-    image = model.render(view).image
+def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
+    """What a view shows of `gaussians` (None: all at its time), (h, w, 3) uint8 RGB.
+
+    Raises ResultError where that is not finite.
+    """
+    return _bytes(model.render(view, gaussians=gaussians).image)
+
+
+@torch.no_grad()
+def _by_themselves(model: SplatModel, view: View, gaussians: Gaussians) -> np.ndarray:
+    picture = model.render(view, gaussians=gaussians)
+    return _bytes(picture.splats + BACKDROP * (1.0 - picture.alpha[..., None]))
+
+
+def _bytes(image: torch.Tensor) -> np.ndarray:
     finite = torch.isfinite(image).all()
     pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
     if not finite:  # asked after the copy, which has waited for the device anyway

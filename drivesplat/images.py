@@ -48,8 +48,13 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
 
 def write_image(path: str | Path, colors: np.ndarray) -> None:
     """Writes colours (h, w, 3) in [0, 1] as a PNG. Raises ResultError naming the path where that fails."""
+    write_png(path, (colors.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
+
+
+def write_png(path: str | Path, pixels: np.ndarray) -> None:
+    """Writes bytes (h, w) or (h, w, 3) as a PNG. Raises ResultError naming the path where that fails."""
     with atomic_write(path) as file:
-        Image.fromarray((colors.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)).save(file, format="PNG")
+        Image.fromarray(pixels).save(file, format="PNG")
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:

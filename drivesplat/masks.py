@@ -11,19 +11,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from PIL import Image
 
 from drivesplat.errors import DatasetError
-from drivesplat.images import continuous_intrinsics, read_image, read_mask, target_size
-from drivesplat.regions import LABELS, label_image
+from drivesplat.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
+from drivesplat.regions import LABELS, label_image, own_car_pixels
 from drivesplat.rigid import apply
 from drivesplat.scene import Frame, Scene
 from drivesplat.seeding.sweeps import read_sweep
 from drivesplat.settings.masks import MaskJob
 from drivesplat.sky_mask import sky_mask
-from drivesplat.storage import atomic_write, read_json, unreadable
+from drivesplat.storage import read_json, unreadable
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +35,8 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
     def one(frame: Frame) -> float:
         size = target_size(frame, job.images)
         sky = _sky(frame, job, size, _nearest_returns(scene, frame))
-        _write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
-        _write_png(folder / mask_name("regions", frame.camera, frame.timestamp), _regions(scene, frame, job, size))
+        write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
+        write_png(folder / mask_name("regions", frame.camera, frame.timestamp), _regions(scene, frame, job, size))
         return float(sky.mean())
 
     with ThreadPoolExecutor() as pool:
@@ -116,17 +114,9 @@ def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) ->
             )
     else:
         labels = label_image(scene, frame, size)
-    polygon = job.masks.own_car_polygons.get(frame.camera)
-    if polygon:
-        corners = np.round(np.array(polygon) * size).astype(np.int32)
-        cv2.fillPoly(labels, [corners], LABELS["own_car"])
+    labels[own_car_pixels(job.masks.own_car_polygons.get(frame.camera), size)] = LABELS["own_car"]
     return labels
 
 
 def _users_mask(folder: str, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     return read_mask(Path(folder).expanduser() / frame.camera / f"{Path(frame.image_path).stem}.png", size)
-
-
-def _write_png(path: Path, labels: np.ndarray) -> None:
-    with atomic_write(path) as file:
-        Image.fromarray(labels).save(file, format="PNG")

@@ -22,13 +22,15 @@ class Motion:
 
     Within each of `runs` (first and last index of consecutive annotations) position and rotation are twice continuously
     differentiable; up to `reach` seconds beyond a run's ends its velocity there continues; elsewhere the object is
-    absent.
+    absent. `turns` (k,) are corrections of the heading: radians about the object's vertical axis, interpolated as
+    positions are.
     """
 
     times: np.ndarray
     object_to_world: np.ndarray
     runs: tuple[tuple[int, int], ...]
     reach: float
+    turns: np.ndarray | None = None
 
     @classmethod
     def of_track(cls, scene: Scene, track: Track) -> "Motion":
@@ -50,10 +52,13 @@ class Motion:
     def poses(self, at: np.ndarray) -> np.ndarray:
         """The poses (n, 4, 4) at the seconds `at` (n,); where the object is absent, those of its nearest run."""
         at = np.asarray(at, dtype=np.float64)
-        poses = np.tile(np.eye(4), (len(at), 1, 1))
-        poses[:, :3, 3] = self.weights(at) @ self.object_to_world[:, :3, 3]
+        poses, weights = np.tile(np.eye(4), (len(at), 1, 1)), self.weights(at)
+        poses[:, :3, 3] = weights @ self.object_to_world[:, :3, 3]
         for run, chosen in self._chosen(at):
             poses[chosen, :3, :3] = self._rotations(run, at[chosen])
+        if self.turns is not None:
+            about_vertical = Rotation.from_rotvec((weights @ self.turns)[:, None] * [0.0, 0.0, 1.0])
+            poses[:, :3, :3] = poses[:, :3, :3] @ about_vertical.as_matrix()
         return poses
 
     def weights(self, at: np.ndarray) -> np.ndarray:
@@ -65,7 +70,7 @@ class Motion:
         at = np.asarray(at, dtype=np.float64)
         weights = np.zeros((len(at), len(self.times)))
         for (first, last), chosen in self._chosen(at):
-            weights[chosen, first : last + 1] = _spline_weights(self.times[first : last + 1], at[chosen])
+            weights[chosen, first : last + 1] = self._run_weights((first, last), at[chosen])
         return weights
 
     def _chosen(self, at: np.ndarray) -> list[tuple[tuple[int, int], np.ndarray]]:
@@ -80,13 +85,13 @@ class Motion:
         first, last = run
         if first == last:
             return np.tile(self.object_to_world[first, :3, :3], (len(at), 1, 1))
-        spline = self._splines[run]
+        spline = self._turns[run]
         within = at.clip(self.times[first], self.times[last])
         turning = spline(within, order=1) * (at - within)[:, None]
         return (spline(within) * Rotation.from_rotvec(turning)).as_matrix()
 
     @cached_property
-    def _splines(self) -> dict[tuple[int, int], RotationSpline]:
+    def _turns(self) -> dict[tuple[int, int], RotationSpline]:
         return {
             (first, last): RotationSpline(
                 self.times[first : last + 1], Rotation.from_matrix(self.object_to_world[first : last + 1, :3, :3])
@@ -95,11 +100,20 @@ class Motion:
             if first < last
         }
 
+    def _run_weights(self, run: tuple[int, int], at: np.ndarray) -> np.ndarray:
+        """The weights (n, k) of a run's k annotations in a natural cubic spline, straight on beyond its ends."""
+        first, last = run
+        if first == last:
+            return np.ones((len(at), 1))
+        spline = self._bases[run]
+        within = at.clip(self.times[first], self.times[last])
+        return spline(within) + (at - within)[:, None] * spline(within, 1)
 
-def _spline_weights(times: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The weights (n, k) of k values in a natural cubic spline through them, straight on beyond its ends."""
-    if len(times) == 1:
-        return np.ones((len(at), 1))
-    spline = CubicSpline(times, np.eye(len(times)), bc_type="natural")
-    within = at.clip(times[0], times[-1])
-    return spline(within) + (at - within)[:, None] * spline(within, 1)
+    @cached_property
+    def _bases(self) -> dict[tuple[int, int], CubicSpline]:
+        """Per run the splines that are 1 at one annotation and 0 at the others."""
+        lengths = {(first, last): last + 1 - first for first, last in self.runs if first < last}
+        return {
+            (first, last): CubicSpline(self.times[first : last + 1], np.eye(length), bc_type="natural")
+            for (first, last), length in lengths.items()
+        }

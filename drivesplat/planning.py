@@ -18,11 +18,23 @@ from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.readers import layout
 from drivesplat.rerun import code_digest
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
-from drivesplat.stages import METHOD_STAGES, SCENE_STAGES, no_such_film, stage_settings
+from drivesplat.settings.train import MOVING_PARTS
+from drivesplat.stages import (
+    METHOD_STAGES,
+    SCENE_STAGES,
+    TRAINING_INPUTS,
+    no_such_edit,
+    no_such_film,
+    scene_edits,
+    stage_settings,
+    training_inputs,
+)
 from drivesplat.storage import canonical_json
 from drivesplat.truth import TRUTH_FILE
 
 SCRIPTS = "workflow_scripts"
+PARTS_FILM = "parts"
+"""The film of a method's parts."""
 
 
 def let_scripts_import(folder: str) -> None:
@@ -43,8 +55,8 @@ class Plan:
         """The function of wildcards that gives a stage's settings as canonical JSON."""
 
         def settings_of(wildcards: Any) -> str:
-            method, trajectory = (getattr(wildcards, name, None) for name in ("method", "trajectory"))
-            return stage_settings(self.config, stage, wildcards.scene, method, trajectory)
+            method, trajectory, edit = (getattr(wildcards, name, None) for name in ("method", "trajectory", "edit"))
+            return stage_settings(self.config, stage, wildcards.scene, method, trajectory or edit)
 
         return settings_of
 
@@ -89,6 +101,18 @@ class Plan:
         path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
         return [str(Path(path).expanduser())] if path else []
 
+    def actors(self, wildcards: Any) -> list[str]:
+        """What the actors of a training are made of, where its method has any."""
+        return self._training_input("actors", wildcards)
+
+    def lidar_depth(self, wildcards: Any) -> list[str]:
+        """LiDAR's depth in the training images, where a training is held to it."""
+        return self._training_input("lidar_depth", wildcards)
+
+    def _training_input(self, stage: str, wildcards: Any) -> list[str]:
+        taken = training_inputs(self.config, wildcards.scene, wildcards.method)
+        return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.pkl"] if stage in taken else []
+
     def lpips_record(self, _: Any) -> list[str]:
         """The record of LPIPS's backbone, where LPIPS is wanted."""
         return [BACKBONE_RECORD] if self.config.lpips.enabled else []
@@ -120,23 +144,42 @@ class Plan:
         films = (for_scene(self.config, scene).render.trajectories for scene in self.config.scenes)
         return list(dict.fromkeys(name for trajectories in films for name in trajectories))
 
+    @property
+    def methods_with_actors(self) -> list[str]:
+        """The methods whose models know objects that move: those that can be taken apart and edited."""
+        return [name for name, method in self.config.methods.items() if set(method.parts) & MOVING_PARTS]
+
     def films(self, scenes: list[str]) -> list[str]:
-        """The films of every method of `scenes`."""
+        """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
         return [
-            f"{self.config.results_dir}/{scene}/{method}/{trajectory}.mp4"
+            f"{self.config.results_dir}/{scene}/{method}/{film}.mp4"
             for scene in scenes
             for method in self.config.methods
-            for trajectory in for_scene(self.config, scene).render.trajectories
+            for film in self._films_of(scene, method)
+        ]
+
+    def _films_of(self, scene: str, method: str) -> list[str]:
+        parts = [PARTS_FILM] if method in self.methods_with_actors else []
+        return [*for_scene(self.config, scene).render.trajectories, *parts]
+
+    def edits(self, scenes: list[str]) -> list[str]:
+        """The films of every edit of `scenes`, by every method that can be edited."""
+        return [
+            f"{self.config.results_dir}/{scene}/{method}/edits/{edit}.mp4"
+            for scene in scenes
+            for method in self.methods_with_actors
+            for edit in scene_edits(self.config, scene)
         ]
 
     def expected_stages(self) -> str:
         """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what
         else is stale."""
-        codes = {stage: self.code(stage) for stage in (*SCENE_STAGES, *METHOD_STAGES)}
+        codes = {stage: self.code(stage) for stage in (*SCENE_STAGES, *TRAINING_INPUTS, *METHOD_STAGES)}
         return canonical_json({scene: self._stages(scene, codes) for scene in self.config.batch_scenes})
 
     def _stages(self, scene: str, codes: Mapping[str, str]) -> dict[str, Any]:
-        stages = {stage: (stage, None) for stage in SCENE_STAGES}
+        taken = {stage for method in self.config.methods for stage in training_inputs(self.config, scene, method)}
+        stages = {stage: (stage, None) for stage in (*SCENE_STAGES, *taken)}
         stages |= {f"{method}/{stage}": (stage, method) for method in self.config.methods for stage in METHOD_STAGES}
         return {
             name: {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": codes[stage]}
@@ -154,10 +197,22 @@ class Plan:
                 raise ConfigError(
                     f"method {rest[0]!r} is not in the config; there are: {', '.join(self.config.methods)}"
                 )
-            film = rest[1].removesuffix(".mp4").removesuffix(".cameras.json") if len(rest) == 2 else ""
-            config = for_scene(self.config, scene)
-            if film not in (rest[-1], "", *config.render.trajectories):
-                raise ConfigError(no_such_film(config, scene, film))
+            if len(rest) > 1:
+                self._refuse_unknown_film(scene, rest[0], rest[1:])
+
+    def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
+        """Raises ConfigError where `path` below a method's folder is a film or an edit that there is none of."""
+        edit = Path(path[-1]).stem if len(path) == 2 and path[0] == "edits" else None
+        film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
+        if (edit is not None or film == PARTS_FILM) and method not in self.methods_with_actors:
+            able = ", ".join(self.methods_with_actors) or "none"
+            raise ConfigError(
+                f"method {method!r} knows no actors that could be edited or shown apart; those do: {able}"
+            )
+        if edit is not None and edit not in scene_edits(self.config, scene):
+            raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
+        if film not in (path[-1], *self._films_of(scene, method)):
+            raise ConfigError(no_such_film(for_scene(self.config, scene), scene, film))
 
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""

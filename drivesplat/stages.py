@@ -3,37 +3,46 @@
 A stage is a rule; its record holds everything that decides its result, its inputs aside.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from drivesplat.config import Config, DatasetSettings, for_scene
+from drivesplat.editing.edits_file import read_edits
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings
 from drivesplat.settings.actor import PanelJob, RemovalJob, SubjectSettings, TracksJob
+from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.parser import ParserJob
-from drivesplat.settings.render import FilmJob
-from drivesplat.settings.train import TrainJob
+from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
+from drivesplat.settings.train import MOVING_PARTS, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.storage import canonical_json
 
 SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
-"""The stages behind a metrics.json, of a scene and of each of its methods."""
+"""The stages behind every metrics.json, of a scene and of each of its methods."""
+TRAINING_INPUTS = ("actors", "lidar_depth")
+"""Stages of a scene that only some methods train on."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """What a job is about; `config` as it holds there. A stage of a scene has no method, one of a method no film."""
+    """What a job is about; `config` as it holds there. A stage of a scene has no method, one of a method no film: the
+    name of a trajectory or of an edit."""
 
     config: Config
     scene: str
     method: str
-    trajectory: str
+    film: str
 
     @property
     def dataset(self) -> DatasetSettings:
@@ -45,17 +54,22 @@ class Place:
         return self.config.subjects.get(self.scene, SubjectSettings())
 
 
-def stage_settings(
-    config: Config, stage: str, scene: str, method: str | None = None, trajectory: str | None = None
-) -> str:
+def stage_settings(config: Config, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:
     """The canonical JSON of everything a stage of a scene (and method, and film) may know.
 
     Raises ValueError for a stage that there is none of, ConfigError for an unknown scene.
     """
     if stage not in _RECORDS:
         raise ValueError(f"no stage is called {stage!r}")
-    place = Place(for_scene(config, scene, method), scene, method or "", trajectory or "")
+    place = Place(for_scene(config, scene, method), scene, method or "", film or "")
     return canonical_json(_RECORDS[stage](place).model_dump(mode="json"))
+
+
+def training_inputs(config: Config, scene: str, method: str) -> list[str]:
+    """Which of TRAINING_INPUTS a method's training on a scene takes."""
+    train = for_scene(config, scene, method).train
+    taken = {"actors": "actors" in config.methods[method].parts, "lidar_depth": train.depth_weight > 0}
+    return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
 
 def _extract(place: Place) -> SceneSource:
@@ -79,11 +93,33 @@ def _lidar_seed(place: Place) -> SeedJob:
     )
 
 
-def _train(place: Place) -> TrainJob:
+def _actors(place: Place) -> ActorSeedJob:
     config = place.config
-    return TrainJob(
-        parts=config.methods[place.method].parts, sky=config.sky, train=config.train, random_seed=config.random_seed
+    return ActorSeedJob(
+        actors=config.actors,
+        holdout=config.holdout,
+        images=config.images,
+        own_car_radius=config.lidar_seed.own_car_radius,
+        own_car_polygons=config.masks.own_car_polygons,
+        random_seed=config.random_seed,
     )
+
+
+def _lidar_depth(place: Place) -> LidarDepthJob:
+    config = place.config
+    return LidarDepthJob(
+        holdout=config.holdout,
+        images=config.images,
+        own_car_radius=config.lidar_seed.own_car_radius,
+        own_car_polygons=config.masks.own_car_polygons,
+        box_margin=config.lidar_seed.box_margin,
+    )
+
+
+def _train(place: Place) -> TrainJob:
+    config, parts = place.config, place.config.methods[place.method].parts
+    train = config.train if set(parts) & MOVING_PARTS else config.train.of_what_stands_still()
+    return TrainJob(parts=parts, sky=config.sky, train=train, random_seed=config.random_seed)
 
 
 def _evaluate(place: Place) -> EvaluateJob:
@@ -98,15 +134,36 @@ def _evaluate(place: Place) -> EvaluateJob:
     )
 
 
+def _format(place: Place) -> dict[str, Any]:
+    """The fields of a `FilmFormat`."""
+    fields = ("fps", "width", "height", "horizontal_fov", "crf")
+    return {"camera": place.config.eval_camera, **{name: getattr(place.config.render, name) for name in fields}}
+
+
 def _film(place: Place) -> FilmJob:
-    render = place.config.render
-    if place.trajectory not in render.trajectories:
-        raise ConfigError(no_such_film(place.config, place.scene, place.trajectory))
-    return FilmJob(
-        camera=place.config.eval_camera,
-        trajectory=render.trajectories[place.trajectory],
-        **{name: getattr(render, name) for name in ("fps", "width", "height", "horizontal_fov", "crf")},
-    )
+    trajectories = place.config.render.trajectories
+    if place.film not in trajectories:
+        raise ConfigError(no_such_film(place.config, place.scene, place.film))
+    return FilmJob(trajectory=trajectories[place.film], **_format(place))
+
+
+def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
+    """The edits of a scene by their names, none where it has no edits file. Raises ConfigError where that is wrong."""
+    path = config.datasets[config.dataset_of(scene)].edits.get(scene)
+    return read_edits(Path(path).expanduser()) if path else {}
+
+
+def _edit(place: Place) -> EditJob:
+    edits = scene_edits(place.config, place.scene)
+    if place.film not in edits:
+        raise ConfigError(no_such_edit(place.scene, place.film, edits))
+    return EditJob(edit=edits[place.film], frames=place.config.render.edited_frames, **_format(place))
+
+
+def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:
+    """What to tell who asks for an edit that there is none of."""
+    known = ", ".join(edits) or "none"
+    return f"scene {scene} has no edit called {name!r}; there are: {known} (datasets.<name>.edits names its edits file)"
 
 
 def no_such_film(config: Config, scene: str, name: str) -> str:
@@ -134,11 +191,15 @@ _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "lidar_seed": _lidar_seed,
     "parser": lambda at: ParserJob(holdout=at.config.holdout, images=at.config.images),
     "masks": lambda at: MaskJob(masks=at.config.masks, images=at.config.images),
+    "actors": _actors,
+    "lidar_depth": _lidar_depth,
     "train": _train,
     "evaluate": _evaluate,
     "scene_metrics": lambda _: Settings(),
     "tracks": lambda at: TracksJob(eval_camera=at.config.eval_camera),
     "film": _film,
+    "film_parts": lambda at: FilmFormat(**_format(at)),
+    "edit": _edit,
     "ghost_panel": _ghost_panel,
     "remove_actor": _remove_actor,
     "export": lambda _: Settings(),

@@ -33,14 +33,7 @@ class Box:
     def holds(self, points: np.ndarray, margin: float = 0.0, floor: float = 0.0) -> np.ndarray:
         """Which world points (n, 3) lie in the box grown by `margin` metres at its sides and roof, its floor raised by
         `floor` metres: (n,) bool."""
-        inside = np.zeros(len(points), dtype=bool)
-        reach = np.linalg.norm(self.size) / 2 + 2 * max(margin, -floor, 0.0)
-        near = np.flatnonzero(np.linalg.norm(points - self.object_to_world[:3, 3], axis=1) < reach)
-        in_box = apply(inverse(self.object_to_world), points[near])
-        above_floor = in_box[:, 2] > floor - self.size[2] / 2
-        inside[near] = (np.abs(in_box[:, :2]) < self.size[:2] / 2 + margin).all(axis=1) & above_floor
-        inside[near] &= in_box[:, 2] < self.size[2] / 2 + margin
-        return inside
+        return in_box(points, self.object_to_world, self.size, margin, floor)
 
     @property
     def moves(self) -> bool:
@@ -50,6 +43,20 @@ class Box:
         if self.category.startswith("human."):
             return self.speed > MOVING_HUMAN
         return False
+
+
+def in_box(
+    points: np.ndarray, object_to_world: np.ndarray, size: np.ndarray, margin: float = 0.0, floor: float = 0.0
+) -> np.ndarray:
+    """Which world points (n, 3) lie in a box of `size` (3,) at a pose (4, 4), grown by `margin` metres at its sides and
+    roof, its floor raised by `floor` metres: (n,) bool."""
+    inside = np.zeros(len(points), dtype=bool)
+    reach = np.linalg.norm(size) / 2 + 2 * max(margin, -floor, 0.0)
+    near = np.flatnonzero(np.linalg.norm(points - object_to_world[:3, 3], axis=1) < reach)
+    in_object = apply(inverse(object_to_world), points[near])
+    inside[near] = (np.abs(in_object[:, :2]) < size[:2] / 2 + margin).all(axis=1)
+    inside[near] &= (in_object[:, 2] > floor - size[2] / 2) & (in_object[:, 2] < size[2] / 2 + margin)
+    return inside
 
 
 def box_at(track: Track, timestamp: int, interval: float) -> Box | None:

@@ -26,6 +26,10 @@ class CameraPath:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def __getitem__(self, chosen: slice) -> "CameraPath":
+        """A stretch of it."""
+        return CameraPath(self.timestamps[chosen], self.camera_to_world[chosen])
+
 
 def film_path(scene: Scene, camera: str, fps: int, offset: TrajectorySettings) -> CameraPath:
     """Where a film of the drive, `fps` frames a second at the drive's own speed, is looked at from.

@@ -37,6 +37,7 @@ wildcard_constraints:
     scene=plan.known(plan.config.scenes),
     method=plan.known(plan.config.methods),
     trajectory=plan.known(plan.all_trajectories),
+    edit="[A-Za-z0-9_][A-Za-z0-9_.-]*",
 
 
 onstart:

@@ -1,12 +1,14 @@
 # What leaves the workflow: the splat for other programs, with the trajectory it was recorded along.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, scene.json, parser.pkl.
-# OUTPUTS: <results>/{scene}/{method}/splat.ply and cameras.json; scene.usdz; viewer.html.
+# OUTPUTS: <results>/{scene}/{method}/splat.ply, cameras.json, parts/parts.json (and the PLYs beside it); scene.usdz;
+# viewer.html.
 
 
 rule export:
     """
-    The Gaussians as splat viewers read them (3DGS's PLY), and every camera of the drive with its split.
+    The Gaussians as splat viewers read them (3DGS's PLY), together and a file for the background and every object, with
+    every camera of the drive and how the objects move.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
@@ -15,6 +17,7 @@ rule export:
     output:
         splat="<results>/{scene}/{method}/splat.ply",
         cameras="<results>/{scene}/{method}/cameras.json",
+        parts="<results>/{scene}/{method}/parts/parts.json",
     log:
         "<logs>/{scene}/{method}/export.log",
     benchmark:
@@ -33,7 +36,8 @@ rule export:
 
 rule export_usd:
     """
-    The Gaussians in OpenUSD's Gaussian splat schema with the recording camera, for Omniverse and Isaac Sim.
+    The Gaussians in OpenUSD's Gaussian splat schema, objects moving, with the recording camera: the drive as Omniverse
+    and Isaac Sim play it.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",

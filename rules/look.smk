@@ -2,7 +2,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, scene.json, parser.pkl, masks/.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png;
-# <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json; ghost_panel.png and .json;
+# <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
+# ghost_panel.png and .json;
 # with_car.png, without_car.png, removal.png and removal.json.
 
 
@@ -73,6 +74,43 @@ rule film:
         code=plan.code("film"),
     script:
         "../workflow_scripts/film.py"
+
+
+rule film_parts:
+    """
+    The recorded drive three times side by side: everything, what stands still, and what moves.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        scene="<results>/{scene}/scene.json",
+    output:
+        film=report(
+            "<results>/{scene}/{method}/parts.mp4",
+            caption="../report/parts.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "film: the parts"},
+        ),
+        cameras="<results>/{scene}/{method}/parts.cameras.json",
+    log:
+        "<logs>/{scene}/{method}/film_parts.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/film_parts.tsv"
+    wildcard_constraints:
+        method=plan.known(plan.methods_with_actors),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 8
+    resources:
+        gpu=1,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("film_parts"),
+        code=plan.code("film_parts"),
+    script:
+        "../workflow_scripts/film_parts.py"
 
 
 rule ghost_panel:

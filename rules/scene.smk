@@ -1,7 +1,8 @@
 # From a dataset's tables to what a training needs.
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
-# OUTPUTS: <results>/{scene}/scene.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it).
+# OUTPUTS: <results>/{scene}/scene.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it); where a method
+# asks for them, actors.pkl and lidar_depth.pkl.
 
 
 rule extract:
@@ -102,3 +103,52 @@ rule masks:
         code=plan.code("masks"),
     script:
         "../workflow_scripts/masks.py"
+
+
+rule actors:
+    """
+    Gathers LiDAR of every vehicle that moves and is seen in that vehicle's own frame, coloured from training images,
+    with random points in its box where LiDAR is thin.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+    output:
+        actors="<results>/{scene}/actors.pkl",
+    log:
+        "<logs>/{scene}/actors.log",
+    benchmark:
+        "<benchmarks>/{scene}/actors.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("actors"),
+        code=plan.code("actors"),
+    script:
+        "../workflow_scripts/actors.py"
+
+
+rule lidar_depth:
+    """
+    Projects the LiDAR sweep nearest in time into every training image, what moves carried along to the image's moment.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+    output:
+        depth="<results>/{scene}/lidar_depth.pkl",
+    log:
+        "<logs>/{scene}/lidar_depth.log",
+    benchmark:
+        "<benchmarks>/{scene}/lidar_depth.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("lidar_depth"),
+        code=plan.code("lidar_depth"),
+    script:
+        "../workflow_scripts/lidar_depth.py"

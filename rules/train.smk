@@ -1,6 +1,7 @@
 # The training of one method on one scene.
 #
-# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json.
+# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.pkl and lidar_depth.pkl where the method
+# has actors, and where it is held to LiDAR's depth.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.pt and train.json; tensorboard/ beside them. While it runs,
 # resume/ holds what a killed training goes on from; no rule declares it, so that Snakemake leaves it alone.
 
@@ -12,6 +13,8 @@ rule train:
     input:
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
+        actors=plan.actors,
+        lidar_depth=plan.lidar_depth,
     output:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
         summary="<results>/{scene}/{method}/train.json",

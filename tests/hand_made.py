@@ -8,13 +8,20 @@ import torch
 from PIL import Image
 
 from drivesplat.masks import mask_name
-from drivesplat.model.background import SH_C0, Background
+from drivesplat.model.actors import Actors
+from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.parameters import SH_C0
 from drivesplat.model.part import Part
+from drivesplat.model.splat_model import View
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.motion import Motion
 from drivesplat.parser import parser_dict
 from drivesplat.point_cloud import PointCloud
 from drivesplat.recording import Recording
+from drivesplat.rigid import rigid
 from drivesplat.scene import Scene
+from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
@@ -56,8 +63,61 @@ class Own(Part):
     def learning_rates(self) -> dict[str, float]:
         return self._still.learning_rates()
 
+    def definition(self) -> dict[str, Any]:
+        return {}
+
     def of_track(self, track_id: str) -> torch.Tensor | None:
         return torch.ones(len(self), dtype=torch.bool) if track_id == self._track_id else None
+
+
+def about_z(angle: float) -> np.ndarray:
+    """The rotation (3, 3) by an angle (radians) about z."""
+    return np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+
+
+def motion_through(
+    times: Any, places: Any, headings: Any = 0.0, runs: tuple[tuple[int, int], ...] | None = None, reach: float = 0.25
+) -> Motion:
+    """The motion through world `places` (k, 3) at `times` (k,), seconds, with `headings` about z (radians, one or k);
+    a single run where `runs` does not say otherwise."""
+    times, places = np.asarray(times, dtype=float), np.asarray(places, dtype=float)
+    headings = np.broadcast_to(np.asarray(headings, dtype=float), times.shape)
+    poses = np.stack([rigid(about_z(angle), place) for angle, place in zip(headings, places, strict=True)])
+    return Motion(times, poses, runs or ((0, len(times) - 1),), reach)
+
+
+def track_of(motion: Motion, name: str = "it", size: Any = (4.0, 2.0, 1.6)) -> ActorTrack:
+    return ActorTrack(name, np.asarray(size, dtype=float), motion)
+
+
+def actors_of(
+    *tracks: ActorTrack, count: int = 6, settings: ActorSettings | None = None, seed: int = 0, shaken: bool = True
+) -> Actors:
+    """Actors of `count` Gaussians each within their boxes. `shaken`: every parameter is random, corrections of the
+    tracks (0.1 m, 0.1 rad) and all coefficients of the colours included, as after a training."""
+    rng = np.random.default_rng(seed)
+    points = [rng.uniform(-0.5, 0.5, (count, 3)) * track.size for track in tracks]
+    colors = [rng.uniform(0.0, 1.0, (count, 3)) for _ in tracks]
+    settings = ActorSettings() if settings is None else settings
+    actors = Actors.from_points(tracks, points, colors, settings, GaussianSettings(init_opacity=0.6))
+    if shaken:
+        with torch.no_grad():
+            for name, value in (*actors.params.items(), *actors.shared.items()):
+                size = {"translation": 0.1, "yaw": 0.1, "quats": 1.0}.get(name, 0.3)
+                if value.is_floating_point() and name != "means":
+                    value += size * torch.from_numpy(rng.normal(size=value.shape)).float()
+    return actors
+
+
+def looking_at(target: Any, place: Any, time: float = 0.0, width: int = 48, height: int = 32) -> View:
+    """The view of a camera at world `place` that looks at `target` with its right side level."""
+    forward = np.asarray(target, dtype=float) - np.asarray(place, dtype=float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = rigid(np.stack([right, np.cross(forward, right), forward], axis=1), np.asarray(place, dtype=float))
+    intrinsics = torch.tensor([[float(width), 0.0, width / 2], [0.0, float(width), height / 2], [0.0, 0.0, 1.0]])
+    return View(intrinsics, torch.from_numpy(pose).float(), width, height, time)
 
 
 def recording_of(scene: Scene, masks: Path | None = None, width: int | None = None, **holdout: int) -> Recording:

@@ -12,18 +12,19 @@ import yaml
 from drivesplat.config import Config, for_scene, load, merged
 from drivesplat.config_document import config_schema, config_yaml
 from drivesplat.errors import ConfigError
-from drivesplat.stages import SCENE_STAGES, stage_settings
+from drivesplat.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 LOOKS = ("tracks", "film", "ghost_panel", "remove_actor", "export", "export_usd", "export_viewer")
-STAGES = (*SCENE_STAGES, "train", "evaluate", *LOOKS)
+OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "tracks")
+STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "train", "evaluate", *LOOKS)
 
 
 def spelled(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> str:
     """What a stage is told, of a film the one called `original`."""
     config = values if isinstance(values, Config) else load(values)
     film = "original" if stage == "film" else None
-    return stage_settings(config, stage, scene, None if stage in (*SCENE_STAGES, "tracks") else method, film)
+    return stage_settings(config, stage, scene, None if stage in OF_SCENES else method, film)
 
 
 @pytest.fixture(scope="module")
@@ -321,23 +322,27 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
             "extract evaluate tracks film ghost_panel remove_actor export_usd export_viewer",
         ),
         (at("sweeps", True), "extract evaluate"),
-        (at("images.width", 320), "lidar_seed parser masks"),
-        (at("holdout.every_nth", 5), "lidar_seed parser evaluate"),
-        (at("holdout.offset", 3), "lidar_seed parser evaluate"),
-        (at("holdout.last_block", 0), "lidar_seed parser evaluate"),
+        (at("images.width", 320), "lidar_seed parser masks actors lidar_depth"),
+        (at("holdout.every_nth", 5), "lidar_seed parser actors lidar_depth evaluate"),
+        (at("holdout.offset", 3), "lidar_seed parser actors lidar_depth evaluate"),
+        (at("holdout.last_block", 0), "lidar_seed parser actors lidar_depth evaluate"),
         (at("extract.on_missing", "warn"), "extract"),
         (at("lidar_seed.on_missing", "warn"), "lidar_seed"),
         (at("lidar_seed.points_file", "a.ply"), "lidar_seed"),
         (at("lidar_seed.voxel_size", 0.2), "lidar_seed"),
+        (at("lidar_seed.own_car_radius", 3), "lidar_seed actors lidar_depth"),
+        (at("lidar_seed.box_margin", 0.3), "lidar_seed lidar_depth"),
+        (at("actors.humans", True), "actors"),
+        (at("datasets.nuscenes.overrides", {"actors": {"max_points": 9}}), "actors"),
         (at("masks.sky_folder", "sky"), "masks"),
-        (at("masks.own_car_polygons", {"CAM_FRONT": [[0, 0], [1, 1], [0, 1]]}), "masks"),
+        (at("masks.own_car_polygons", {"CAM_FRONT": [[0, 0], [1, 1], [0, 1]]}), "masks actors lidar_depth"),
         (at("sky", "none"), "train"),
         (at("train.iterations", 9), "train"),
         (at("train.mcmc.noise_lr", 9), "train"),
         (at("train.gaussians.sh_degree", 1), "train"),
         (at("methods.vanilla.overrides", {"train": {"iterations": 9}}), "train"),
         (at("methods.another.overrides", {"train": {"iterations": 9}}), ""),
-        (at("random_seed", 1), "lidar_seed train"),
+        (at("random_seed", 1), "lidar_seed actors train"),
         (at("lpips.enabled", False), "evaluate"),
         (at("lpips.timeout_s", 5), ""),
         (at("render.fps", 60), "film"),

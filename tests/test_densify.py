@@ -8,17 +8,23 @@ import pytest
 import torch
 from gsplat import MCMCStrategy
 from gsplat.strategy import ops
+from hand_made import actors_of, motion_through, round_gaussians, track_of
 
+from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import Picture, SplatModel, View
+from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
 from drivesplat.training.densify import Densifier, Optimizers
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.strategies import relocation, torch_twins
+from drivesplat.training.train import Trainer
 
 BINOMS = MCMCStrategy().initialize_state()["binoms"]
 N_MAX = len(BINOMS)
+ALL = slice(None)
+"""The rows of a lone part."""
 
 
 def relocated(opacity: float, ratio: int, scale: float = 1.0) -> tuple[float, float]:
@@ -110,19 +116,19 @@ def train_step(model: SplatModel, densifier: Densifier, step: int, optimizers: O
     """An iteration towards a random image, as the trainer makes it."""
     target = torch.from_numpy(np.random.default_rng(1).uniform(0, 1, (24, 32, 3))).float()
     picture = model.render(a_view(), 1)
-    densifier.before_backward(step, optimizers, picture.info)
+    picture.info["means2d"].retain_grad()
     (picture.image - target).abs().mean().backward()
     for optimizer in optimizers.values():
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
-    densifier.after_step(step, optimizers, picture.info)
+    densifier.after_step(step, optimizers, picture.info, model.rows[0])
 
 
 def densified(strategy: str, steps: int, count: int = 100, size: float = 0.05, **changes: Any) -> list[int]:
     """The number of Gaussians after every iteration."""
     torch.manual_seed(0)
     model, settings = a_model(count, size), settings_of(strategy, **changes)
-    densifier, (optimizers,) = Densifier(model.parts[0], settings, 1.0), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
     counts = []
     for step in range(steps):
         train_step(model, densifier, step, optimizers)
@@ -142,12 +148,12 @@ def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
 def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
     model, settings = a_model(), settings_of("mcmc", cap_max=100)
     part = model.parts[0]
-    densifier, (optimizers,) = Densifier(part, settings, 1.0), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
     with torch.no_grad():
         part.params["opacities"][:30] = -9.0
     living = part.params["means"].detach()[30:].clone()
     torch.manual_seed(0)
-    densifier.after_step(2, optimizers, {})
+    densifier.after_step(2, optimizers, {}, ALL)
     assert len(model) == 100
     moved = part.params["means"].detach()[:30]
     assert ((moved[:, None] - living).abs().amax(dim=2).amin(dim=1) == 0).all()
@@ -157,11 +163,11 @@ def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
 def test_relocation_hardly_changes_what_is_seen():
     """Copies of a Gaussian look like the one that was there, which the formula is made for."""
     model, settings = a_model(size=0.12), settings_of("mcmc", cap_max=105)
-    densifier, (optimizers,) = Densifier(model.parts[0], settings, 1.0), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
     with torch.no_grad():
         before = model.render(a_view(), 0).image
         torch.manual_seed(0)
-        densifier.after_step(2, optimizers, {})
+        densifier.after_step(2, optimizers, {}, ALL)
         after = model.render(a_view(), 0).image
     assert len(model) == 105
     change = (after - before).abs()
@@ -174,9 +180,9 @@ def test_mcmc_noise_moves_faint_gaussians_more_than_opaque_ones():
     with torch.no_grad():
         part.params["opacities"][:50], part.params["opacities"][50:] = -5.2, 6.0
     before = part.params["means"].detach().clone()
-    densifier, (optimizers,) = Densifier(part, settings, 1.0), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
     torch.manual_seed(0)
-    densifier.after_step(1, optimizers, {})
+    densifier.after_step(1, optimizers, {}, ALL)
     moved = (part.params["means"].detach() - before).norm(dim=1)
     assert float(moved[:50].mean()) > 1e-2 and float(moved[50:].max()) < 1e-6
 
@@ -204,7 +210,7 @@ def test_the_default_strategy_never_exceeds_the_cap(cap_max, size):
 def test_at_the_cap_the_default_strategy_prefers_the_largest_gradients():
     model = a_model(size=0.005)
     part, settings = model.parts[0], settings_of("default", cap_max=110)
-    densifier, (optimizers,) = Densifier(part, settings, 1.0), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
     strength = torch.from_numpy(np.random.default_rng(2).permutation(100)).float() + 1.0
     centers = torch.zeros(1, 100, 2, requires_grad=True)
     centers.grad = torch.stack([strength, torch.zeros(100)], dim=1)[None]
@@ -213,7 +219,7 @@ def test_at_the_cap_the_default_strategy_prefers_the_largest_gradients():
         "n_cameras": 1, "gaussian_ids": None,
     }  # fmt: skip
     before = part.params["means"].detach().clone()
-    densifier.after_step(2, optimizers, info)
+    densifier.after_step(2, optimizers, info, ALL)
     assert len(part) == 110
     copies = torch.cdist(part.params["means"].detach()[100:], before).argmin(dim=1)
     assert set(copies.tolist()) == set(strength.topk(10).indices.tolist())
@@ -224,7 +230,7 @@ def test_the_default_strategy_removes_what_is_too_faint():
     with torch.no_grad():
         model.parts[0].params["opacities"][:25] = math.log(0.004 / 0.996)
     settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=0.005))
-    densifier, (optimizers,) = Densifier(model.parts[0], settings, 1.0), make_optimizers(model).parts
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
     for optimizer in optimizers.values():
         optimizer.param_groups[0]["lr"] = 0.0
     for step in (1, 2):
@@ -235,7 +241,7 @@ def test_the_default_strategy_removes_what_is_too_faint():
 def test_the_default_strategy_resets_opacities_every_so_many_iterations():
     model = a_model()
     default = DefaultSettings(refine_every=1000, reset_every=3, prune_opacity=0.005)
-    densifier = Densifier(model.parts[0], settings_of("default", default=default), 1.0)
+    densifier = Densifier(model.parts[0], settings_of("default", default=default))
     (optimizers,) = make_optimizers(model).parts
     brightest = []
     for step in range(1, 4):
@@ -255,8 +261,97 @@ def test_nothing_is_densified_outside_its_span_of_iterations(strategy, start, st
     assert counts == [100] * 8
 
 
-def test_absolute_gradients_are_asked_for_by_the_default_strategy_alone():
-    part = a_model().parts[0]
-    for strategy, wanted in (("mcmc", False), ("default", True)):
-        assert Densifier(part, settings_of(strategy, default=DefaultSettings(absgrad=True)), 1.0).absgrad is wanted
-    assert Densifier(part, settings_of("default"), 1.0).absgrad is False
+# ---- a model of several parts
+
+
+def two_cars(count: int = 40, size: float = 0.05) -> Actors:
+    """Two actors before the camera of `a_view`; each Gaussian's place within its box tells whose it is: those of the
+    first are all behind their box's middle, those of the second all before it."""
+    places = ([-1.0, 0.0, 4.0], [1.0, 0.0, 4.0])
+    tracks = [track_of(motion_through([0.0, 0.5], [p, p]), str(i), (2.0, 2.0, 2.0)) for i, p in enumerate(places)]
+    actors = actors_of(*tracks, count=count, settings=ActorSettings(cap_max=1000), shaken=False)
+    with torch.no_grad():
+        means = actors.params["means"]
+        means[:, 0] = (0.2 + means[:, 0].abs()) * (2.0 * actors.params["owner"] - 1.0)
+        actors.params["scales"].fill_(math.log(size))
+    return actors
+
+
+def owners_fit(actors: Actors) -> bool:
+    """Whether every Gaussian is where its owner's are."""
+    return torch.equal(actors.params["owner"], (actors.params["means"][:, 0] > 0).long())
+
+
+def test_mcmc_gives_what_it_adds_and_moves_the_owner_of_where_it_goes():
+    actors, settings = two_cars(), settings_of("mcmc")
+    densifier, (optimizers,) = Densifier(actors, settings), make_optimizers(SplatModel([actors], None)).parts
+    with torch.no_grad():
+        actors.params["opacities"][:36] = -9.0  # all but four of the first car's
+    torch.manual_seed(0)
+    densifier.after_step(2, optimizers, {}, ALL)
+    counts = actors.params["owner"].bincount().tolist()
+    assert sum(counts) == len(actors) == 84 and counts[1] > 60, "most of the dead went over to the second car"
+    assert owners_fit(actors)
+    assert actors.params["owner"].dtype == torch.int64 and not actors.params["owner"].requires_grad
+
+
+def screen_gradients(strengths: torch.Tensor) -> dict[str, Any]:
+    """What a rendering would tell of Gaussians that pull so strongly across the screen."""
+    centers = torch.zeros(1, len(strengths), 2, requires_grad=True)
+    centers.grad = torch.stack([strengths, torch.zeros(len(strengths))], dim=1)[None]
+    radii = torch.ones(1, len(strengths), 2, dtype=torch.int32)
+    return {"means2d": centers, "radii": radii, "width": 32, "height": 24, "n_cameras": 1, "gaussian_ids": None}
+
+
+@pytest.mark.parametrize("size", [pytest.param(0.005, id="duplicated"), pytest.param(0.1, id="split")])
+def test_the_default_strategy_gives_what_it_grows_its_parents_owner(size):
+    actors = two_cars(size=size)
+    growing = DefaultSettings(refine_every=2, grow_grad2d=1.0, prune_opacity=1e-3)
+    densifier = Densifier(actors, settings_of("default", default=growing))
+    (optimizers,) = make_optimizers(SplatModel([actors], None)).parts
+    strengths = torch.zeros(80)
+    strengths[30:50] = 1.0
+    with torch.no_grad():
+        actors.params["opacities"][:5] = -9.0
+    torch.manual_seed(0)
+    densifier.after_step(2, optimizers, screen_gradients(strengths), ALL)
+    assert actors.params["owner"].bincount().tolist() == [45, 50], "ten of each grew, and five of the first were pruned"
+    assert owners_fit(actors)
+
+
+@pytest.mark.parametrize("wanting", [[3, 17, 29], [30, 44, 69], [0, 28, 31, 32, 60]])
+def test_each_part_grows_by_the_gradients_of_its_own_rows(wanting):
+    """The part that grows first must not shift whose gradients the second one's are."""
+    model = SplatModel([round_gaussians(np.arange(90.0).reshape(30, 3), 0.001), two_cars(20, 0.001)], None)
+    settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1.0, prune_opacity=1e-3))
+    trainer = Trainer.begin(model, [], settings, 0, torch.device("cpu"))
+    trainer.step = 2
+    strengths, nothing = torch.zeros(70), torch.zeros(24, 32, 3)
+    strengths[wanting] = 1.0
+    before, together = [len(part) for part in model.parts], model.gaussians_at(0.0)
+    trainer.densify(Picture(together, nothing, nothing, nothing[..., 0], None, screen_gradients(strengths)))
+    grown = [part.at(0.0)[count:] for part, count in zip(model.parts, before, strict=True)]
+    assert torch.equal(torch.cat([new.means for new in grown]), together.means[wanting])
+    assert len(grown[0]) == sum(row < 30 for row in wanting)
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_each_part_has_a_cap_of_its_own(strategy):
+    greedy = DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3)
+    settings = settings_of(strategy, cap_max=104, default=greedy)
+    actors = two_cars()
+    actors.cap_max = 82
+    model = SplatModel([a_model().parts[0], actors], None)
+    densifiers, optimizers = [Densifier(part, settings) for part in model.parts], make_optimizers(model).parts
+    torch.manual_seed(0)
+    for densifier, own, of_part in zip(densifiers, optimizers, model.rows, strict=True):
+        densifier.after_step(2, own, screen_gradients(torch.ones(180)), of_part)
+    assert [len(part) for part in model.parts] == [104, 82]
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_part_without_gaussians_is_left_alone(strategy):
+    model = SplatModel([round_gaussians([]), two_cars()], None)
+    densifier, optimizers = Densifier(model.parts[0], settings_of(strategy)), make_optimizers(model).parts
+    densifier.after_step(2, optimizers[0], screen_gradients(torch.ones(80)), model.rows[0])
+    assert len(model.parts[0]) == 0 and not densifier.any_alive()

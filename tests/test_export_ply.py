@@ -1,4 +1,4 @@
-"""splat.ply: the layout that viewers expect, Gaussians that return, foreign files refused; thinning."""
+"""splat.ply: the layout that viewers expect, Gaussians that return, foreign files refused."""
 
 import dataclasses
 import json
@@ -9,11 +9,11 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import ResultError
-from drivesplat.export.splat_asset import export_splat
-from drivesplat.export.splat_ply import read_splat_ply, write_splat_ply
-from drivesplat.export.thinning import thinned, thinned_parts
-from drivesplat.export.trained_parts import trained_parts
+from drivesplat.export.splat_asset import SplatFiles, export_splat
+from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
+from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.model.background import Background
+from drivesplat.model.build import definitions
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import parser_dict
@@ -48,7 +48,7 @@ def checkpoint_of(params: dict[str, torch.Tensor], settings: TrainSettings) -> d
     model = SplatModel([Background(params, settings.gaussians, 1.0)], None)
     job = TrainJob(parts=("background",), sky="none", train=settings, random_seed=0)
     state = {key: value.detach() for key, value in model.state_dict().items()}
-    return {"model": state, "job": job.model_dump_json(), "scene_scale": 1.0, "provenance": PROVENANCE}
+    return {"model": state, "job": job.model_dump_json(), "parts": definitions(model), "provenance": PROVENANCE}
 
 
 def trained_params(count: int, sh_degree: int) -> dict[str, torch.Tensor]:
@@ -85,6 +85,16 @@ def test_the_header_is_one_that_viewers_with_simple_parsers_understand(tmp_path)
     notes = [line.removeprefix("comment drivesplat ") for line in lines if line.startswith("comment")]
     assert [json.loads(note) for note in notes] == [{"scene": "ä"}]
     assert len(content) == content.index(b"end_header\n") + len(b"end_header\n") + 7 * 62 * 4
+
+
+def test_the_note_returns_and_other_files_have_none(tmp_path):
+    note = {"scene": "ä", "origin": [1.0, 2.5]}
+    write_splat_ply(tmp_path / "splat.ply", some_gaussians(2), note)
+    assert note_of(tmp_path / "splat.ply") == note
+    assert note_of(tmp_path / "absent.ply") == {} and note_of(tmp_path) == {}
+    for content in (b"", b"\xff\x00", b"ply\ncomment mine\nend_header\n", b"comment drivesplat 7\nend_header\n"):
+        (tmp_path / "other.ply").write_bytes(content)
+        assert note_of(tmp_path / "other.ply") == {}
 
 
 def test_values_are_those_before_the_activations(tmp_path):
@@ -214,70 +224,20 @@ def test_a_splat_that_cannot_be_written_is_named(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def gaussians_of(scales: list[list[float]], opacities: list[float]) -> Gaussians:
-    count = len(scales)
-    means = torch.arange(float(count))[:, None].repeat(1, 3)
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
-    return Gaussians(means, quats, torch.tensor(scales), torch.tensor(opacities), torch.zeros(count, 1, 3))
-
-
-def places(gaussians: Gaussians) -> list[int]:
-    """Which of `gaussians_of` these are."""
-    return gaussians.means[:, 0].int().tolist()
-
-
-@pytest.mark.parametrize(
-    ("scales", "opacities", "kept"),
-    [
-        pytest.param([[1, 1, 1]] * 4, [0.2, 0.9, 0.1, 0.8], [1, 3], id="the opaque, in their order"),
-        pytest.param([[0.5] * 3, [0.4] * 3, [0.6] * 3, [0.7] * 3], [0.5] * 4, [2, 3], id="the large"),
-        pytest.param([[1, 1, 0.1], [3, 0.2, 0.2], [0.9] * 3, [0.1, 1.2, 1]], [0.5] * 4, [0, 3], id="by cross-section"),
-        pytest.param([[1, 1, 1]] * 4, [0.5] * 4, [0, 1], id="the first among equals"),
-    ],
-)
-def test_those_stay_that_cover_most(scales, opacities, kept):
-    assert places(thinned(gaussians_of([[float(s) for s in row] for row in scales], opacities), 2)) == kept
-
-
-def test_faint_giants_do_not_crowd_out_what_is_sharp():
-    """40 giants of 100 m and an opacity of 0.05 among 60 opaque Gaussians of 5 cm."""
-    crowd = gaussians_of([[100.0] * 3] * 40 + [[0.05] * 3] * 60, [0.05] * 40 + [0.9] * 60)
-    assert places(thinned(crowd, 60)) == list(range(40, 100))
-
-
-def test_an_opaque_giant_stays():
-    assert places(thinned(gaussians_of([[0.05] * 3] * 9 + [[5.0] * 3], [0.9] * 10), 1)) == [9]
-
-
-@pytest.mark.parametrize("count", [30, 31, 10_000])
-def test_enough_room_changes_nothing(count):
-    shown = some_gaussians(30)
-    for field in dataclasses.fields(Gaussians):
-        assert torch.equal(getattr(thinned(shown, count), field.name), getattr(shown, field.name))
-
-
-def test_parts_share_the_room_by_what_covers_most():
-    parts = {"a": gaussians_of([[1.0] * 3] * 3, [0.9, 0.1, 0.8]), "b": gaussians_of([[1.0] * 3] * 3, [0.2, 0.7, 0.3])}
-    kept = thinned_parts(parts, 3)
-    assert {name: places(part) for name, part in kept.items()} == {"a": [0, 2], "b": [1]}
-    nothing = {"a": parts["a"][torch.zeros(3, dtype=torch.bool)]}
-    assert len(thinned_parts(nothing, 3)["a"]) == 0
-
-
 def test_the_stage_exports_every_gaussian_of_the_checkpoint(tmp_path, tiny_scene):
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2))
     params = trained_params(50, sh_degree=2)
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
     parser = parser_dict(tiny_scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings()))
-    splat, cameras = tmp_path / "splat.ply", tmp_path / "cameras.json"
-    export_splat(splat, cameras, checkpoint_of(params, settings), parser, tiny_scene, PROVENANCE)
+    files = SplatFiles(tmp_path / "splat.ply", tmp_path / "cameras.json", tmp_path / "parts/parts.json")
+    export_splat(files, checkpoint_of(params, settings), parser, tiny_scene, PROVENANCE)
+    splat, cameras = files.splat, files.cameras
     vertices = PlyData.read(str(splat))["vertex"]
     np.testing.assert_array_equal(vertices["y"], params["means"][:, 1])
     np.testing.assert_allclose(vertices["opacity"], params["opacities"], atol=1e-5)
     np.testing.assert_allclose(vertices["scale_2"], params["scales"][:, 2], atol=1e-5)
     np.testing.assert_array_equal(vertices["f_rest_9"], params["shN"][:, 1, 1])
-    note = json.loads(vertices.comments[0].removeprefix("drivesplat "))
-    assert note == {"scene": "0001", "origin": tiny_scene.origin.tolist(), **DIGESTS}
+    assert note_of(splat) == {"scene": "0001", "origin": tiny_scene.origin.tolist(), **DIGESTS}
     assert splat.read_bytes().index(b"end_header\n") < 8_000
     assert json.loads(cameras.read_text())["provenance"] == PROVENANCE
 
@@ -288,5 +248,5 @@ def test_gaussians_that_are_not_finite_stay_behind(tiny_scene, name):
     params[name][4] = torch.nan
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1))
     model, _ = trained_model(checkpoint_of(params, settings))
-    kept = trained_parts(model, tiny_scene)["background"]
+    kept = trained_gaussians(model, tiny_scene)
     assert torch.equal(kept.means, torch.cat([params["means"][:4], params["means"][5:]]))

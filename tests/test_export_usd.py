@@ -11,9 +11,11 @@ from pxr import Gf, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError, ResultError
+from drivesplat.export.trained_parts import SampledPiece
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
 from drivesplat.export.usd_asset import export_usd, recorded_cameras
 from drivesplat.model.background import Background
+from drivesplat.model.build import definitions
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rigid import rigid
@@ -51,7 +53,7 @@ def checkpoint():
     model = SplatModel([Background(params, settings.gaussians, 1.0)], None)
     job = TrainJob(parts=("background",), sky="none", train=settings, random_seed=0)
     state = {key: value.detach() for key, value in model.state_dict().items()}
-    return {"model": state, "job": job.model_dump_json(), "scene_scale": 1.0, "provenance": PROVENANCE}
+    return {"model": state, "job": job.model_dump_json(), "parts": definitions(model), "provenance": PROVENANCE}
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +121,7 @@ def test_coefficients_of_a_gaussian_stand_together(tmp_path, degree):
     size = (degree + 1) ** 2
     g, i, c = torch.meshgrid(torch.arange(3.0), torch.arange(float(size)), torch.arange(3.0), indexing="ij")
     splats = dataclasses.replace(random_splats(3), sh=1000 * g + 10 * i + c)
-    write_usdz(tmp_path / "a.usdz", splat_stage({"background": splats}, [(0.0, Gf.Camera())], {}))
+    write_usdz(tmp_path / "a.usdz", splat_stage({"background": SampledPiece(splats)}, [(0.0, Gf.Camera())], {}))
     again = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     splat = splat_at(again)
     assert splat.GetRadianceSphericalHarmonicsDegreeAttr().Get() == degree
@@ -136,18 +138,6 @@ def test_the_extent_holds_three_sigmas_of_every_gaussian(stage):
     positions = np.array(splat.GetPositionsAttr().Get())
     assert (low <= positions - reach + 1e-5).all() and (high >= positions + reach - 1e-5).all()
     assert (high - low < 30.0).all()
-
-
-def test_every_part_is_a_prim(tmp_path):
-    parts = {"background": random_splats(4), "car 7/x": random_splats(2, seed=1), "empty": random_splats(0)}
-    write_usdz(tmp_path / "a.usdz", splat_stage(parts, [(0.0, Gf.Camera())], {}))
-    again = Usd.Stage.Open(str(tmp_path / "a.usdz"))
-    counts = {
-        prim.GetName(): len(splat_at(again, prim.GetPath()).GetPositionsAttr().Get())
-        for prim in again.Traverse()
-        if prim.IsA(UsdVol.ParticleField)
-    }
-    assert counts == {"background": 4, "car_7_x": 2, "empty": 0}
 
 
 def test_the_camera_is_where_and_when_it_recorded(stage, tiny_scene):
@@ -265,6 +255,14 @@ def test_openusds_own_validators_find_nothing(stage):
     assert [error.GetErrorAsString() for error in errors] == []
 
 
+def test_a_scene_without_objects_has_no_actors(stage):
+    """Nor anything else but what stands still and the camera."""
+    world = stage.GetPrimAtPath("/World")
+    assert {prim.GetName() for prim in world.GetAllChildren()} == {"background", "camera"}
+    background = UsdGeom.Xformable(stage.GetPrimAtPath("/World/background"))
+    assert not background.GetOrderedXformOps() and not background.GetVisibilityAttr().IsAuthored()
+
+
 def test_a_package_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ResultError, match=r"file/scene\.usdz: cannot be written"):
@@ -283,8 +281,9 @@ def little_room():
 
 def test_a_disk_that_is_full_is_told_and_the_package_before_stays(tmp_path, little_room):
     (tmp_path / "scene.usdz").write_text("the one before")
+    many = {"background": SampledPiece(random_splats(3000))}
     with pytest.raises(ResultError, match=r"scene\.usdz: cannot be written .*File too large.*; free space"):
-        write_usdz(tmp_path / "scene.usdz", splat_stage({"background": random_splats(3000)}, [(0.0, Gf.Camera())], {}))
+        write_usdz(tmp_path / "scene.usdz", splat_stage(many, [(0.0, Gf.Camera())], {}))
     assert [path.name for path in tmp_path.iterdir()] == ["scene.usdz"]
     assert (tmp_path / "scene.usdz").read_text() == "the one before"
 

@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 import torch
 from chromium import CHROMIUM, chromium
+from hand_made import round_gaussians
+from hand_made_traffic import COURSES, TURNING, Traffic, own_gaussians, placed
 from scipy.spatial.transform import Rotation
 from torch import nn
 
+from drivesplat.export import viewer
 from drivesplat.export.viewer import export_viewer, packed, sky_faces, viewer_page
 from drivesplat.model.background import Background
+from drivesplat.model.build import definitions
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
 from drivesplat.model.sky import CubemapSky
@@ -81,7 +85,7 @@ def checkpoint():
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2), sky_resolution=8)
     job = TrainJob(parts=("background",), sky="cubemap", train=settings, random_seed=0)
     state = {key: value.detach() for key, value in model.state_dict().items()}
-    return {"model": state, "job": job.model_dump_json(), "scene_scale": 1.0, "provenance": PROVENANCE}
+    return {"model": state, "job": job.model_dump_json(), "parts": definitions(model), "provenance": PROVENANCE}
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +133,19 @@ def test_the_payload_holds_the_gaussians_that_cover_most(page):
     np.testing.assert_allclose(arrays["sh0"].reshape(-1, 3), expected.sh[:, 0], rtol=1e-3, atol=1e-6)
     root = arrays["shN"].astype(float).reshape(-1, 8, 3) / 127.0
     np.testing.assert_allclose(scene["sh_range"] * root * abs(root), expected.sh[:, 1:], atol=scene["sh_range"] / 120)
+
+
+def test_objects_are_where_they_are_at_the_middle_image_and_only_if_they_are_there(tmp_path, tiny_scene, monkeypatch):
+    """Two vehicles, of which one is absent then; beside a background without view dependence."""
+    model = SplatModel([round_gaussians([[1.0, 2.0, 3.0]]), Traffic()], None)
+    monkeypatch.setattr(viewer, "trained_model", lambda _: (model, None))
+    job = ViewerJob(eval_camera="CAM_FRONT", gaussians=1000)
+    export_viewer(tmp_path / "viewer.html", {}, tiny_scene, job, "street", PROVENANCE)
+    scene, arrays = decoded((tmp_path / "viewer.html").read_text(encoding="utf-8"))
+    there = placed(own_gaussians(TURNING, 2.25), COURSES[TURNING].pose(2.25))
+    assert (scene["count"], scene["coefficients"]) == (1 + len(there), 4)
+    np.testing.assert_allclose(arrays["means"].reshape(-1, 3), [[1.0, 2.0, 3.0], *there.means.tolist()], atol=1e-5)
+    np.testing.assert_allclose(arrays["sh0"].reshape(-1, 3)[1:], there.sh[:, 0], atol=1e-3)
 
 
 def test_a_splat_without_view_dependence_is_written():

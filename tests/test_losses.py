@@ -1,10 +1,12 @@
 """The training loss: its terms, their sum, and which way each pushes."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
+from hand_made import actors_of, looking_at, motion_through, track_of
 from skimage.metrics import structural_similarity
 
 from drivesplat.model.background import Background
@@ -12,8 +14,16 @@ from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import Picture, SplatModel, View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.losses import loss_terms, sky_alpha_loss, ssim
-from drivesplat.training.views import TrainingView
+from drivesplat.training.losses import (
+    depth_loss,
+    entropy,
+    loss_terms,
+    masked_l1,
+    sky_alpha_loss,
+    sky_cross_entropy,
+    ssim,
+)
+from drivesplat.training.views import LidarDepth, TrainingView
 
 WIDTH, HEIGHT = 20, 14
 
@@ -36,14 +46,19 @@ def a_view(pixels: torch.Tensor, sky: torch.Tensor | None) -> TrainingView:
     return TrainingView(View(torch.eye(3), torch.eye(4), WIDTH, HEIGHT, 0.0), pixels, sky)
 
 
-def a_case(sky_known: bool = True) -> tuple[Picture, TrainingView]:
-    """A random picture and a random recording of which the upper third is sky."""
+def a_case(model: SplatModel, sky_known: bool = True) -> tuple[Picture, TrainingView]:
+    """A random picture of a model's Gaussians and a random recording of which the upper third is sky."""
     pixels = (random_image(1) * 255).to(torch.uint8)
     alpha = torch.from_numpy(np.random.default_rng(2).uniform(0.05, 0.95, (HEIGHT, WIDTH))).float()
     sky = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     sky[: HEIGHT // 3] = True
-    image = random_image(3)
-    return Picture(image, image, alpha, None, {}), a_view(pixels, sky if sky_known else None)
+    return picture_of(model, random_image(3), alpha), a_view(pixels, sky if sky_known else None)
+
+
+def picture_of(
+    model: SplatModel, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None = None
+) -> Picture:
+    return Picture(model.gaussians_at(0.0), image, image, alpha, depth, {})
 
 
 def zero_padded_ssim(image: np.ndarray, target: np.ndarray) -> float:
@@ -84,9 +99,8 @@ def test_ssim_has_the_gradient_of_finite_differences():
 
 
 def test_colour_terms_are_weighted_l1_and_ssim():
-    picture, view = a_case()
-    settings = TrainSettings(ssim_weight=0.3)
-    terms = loss_terms(picture, view, a_model(), settings)
+    picture, view = a_case(model := a_model())
+    terms = loss_terms(picture, view, model, TrainSettings(ssim_weight=0.3))
     recorded = view.pixels.numpy() / 255.0
     assert float(terms["l1"]) == pytest.approx(0.7 * np.abs(picture.image.numpy() - recorded).mean(), rel=1e-5)
     similarity = zero_padded_ssim(picture.image.numpy(), recorded)
@@ -94,8 +108,7 @@ def test_colour_terms_are_weighted_l1_and_ssim():
 
 
 def test_regularisers_are_weighted_means_over_all_gaussians():
-    picture, view = a_case()
-    model = a_model()
+    picture, view = a_case(model := a_model())
     terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=0.03, scale_reg=0.07))
     gaussians = model.parts[0].at(0.0)
     torch.testing.assert_close(terms["opacity_reg"], 0.03 * gaussians.opacities.mean())
@@ -103,9 +116,9 @@ def test_regularisers_are_weighted_means_over_all_gaussians():
 
 
 def test_regularisers_of_several_parts_weigh_every_gaussian_alike():
-    picture, view = a_case()
     parts = [a_model(gaussians=n).parts[0] for n in (3, 9)]
-    terms = loss_terms(picture, view, SplatModel(parts, None), TrainSettings(opacity_reg=1.0))
+    picture, view = a_case(model := SplatModel(parts, None))
+    terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=1.0))
     opacities = torch.cat([part.at(0.0).opacities for part in parts])
     torch.testing.assert_close(terms["opacity_reg"], opacities.mean())
 
@@ -118,10 +131,10 @@ def test_regularisers_of_several_parts_weigh_every_gaussian_alike():
     ],
 )
 def test_a_weight_of_zero_leaves_a_term_out(changed, absent):
-    picture, view = a_case()
+    picture, view = a_case(model := a_model())
     everything = {"l1", "ssim", "opacity_reg", "scale_reg", "sky_alpha"}
-    assert loss_terms(picture, view, a_model(), TrainSettings()).keys() == everything
-    assert loss_terms(picture, view, a_model(), TrainSettings(**changed)).keys() == everything - {absent}
+    assert loss_terms(picture, view, model, TrainSettings()).keys() == everything
+    assert loss_terms(picture, view, model, TrainSettings(**changed)).keys() == everything - {absent}
 
 
 @pytest.mark.parametrize(
@@ -134,8 +147,8 @@ def test_a_weight_of_zero_leaves_a_term_out(changed, absent):
     ],
 )
 def test_gaussians_are_kept_out_of_a_masked_sky_of_one_colour_alone(sky, sky_known, expected):
-    picture, view = a_case(sky_known)
     model = SplatModel(list(a_model().parts), sky)
+    picture, view = a_case(model, sky_known)
     terms = loss_terms(picture, view, model, TrainSettings(sky_alpha_weight=0.5))
     assert ("sky_alpha" in terms) is expected
     if expected:
@@ -167,8 +180,7 @@ def test_sky_term_is_finite_where_alpha_is_full(alpha):
 
 @pytest.mark.parametrize(("term", "parameter"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
 def test_a_regulariser_makes_its_parameter_smaller_and_no_other(term, parameter):
-    picture, view = a_case()
-    model = a_model()
+    picture, view = a_case(model := a_model())
     loss_terms(picture, view, model, TrainSettings())[term].backward()
     params = model.parts[0].params
     assert (params[parameter].grad > 0).all()
@@ -177,21 +189,180 @@ def test_a_regulariser_makes_its_parameter_smaller_and_no_other(term, parameter)
 
 @pytest.mark.parametrize("term", ["l1", "ssim"])
 def test_a_colour_term_pulls_the_image_towards_the_recording(term):
-    picture, view = a_case()
+    picture, view = a_case(model := a_model())
     image = picture.image.clone().requires_grad_()
-    seen = Picture(image, image, picture.alpha, None, {})
-    before = loss_terms(seen, view, a_model(), TrainSettings())[term]
+    before = loss_terms(picture_of(model, image, picture.alpha), view, model, TrainSettings())[term]
     before.backward()
     colors = (image - 1e-2 * image.grad / image.grad.norm()).detach()
-    stepped = Picture(colors, colors, picture.alpha, None, {})
-    assert float(loss_terms(stepped, view, a_model(), TrainSettings())[term]) < float(before.detach())
+    stepped = picture_of(model, colors, picture.alpha)
+    assert float(loss_terms(stepped, view, model, TrainSettings())[term]) < float(before.detach())
     assert float((image.grad * (image - view.target())).sum().detach()) > 0
 
 
 def test_a_perfect_picture_costs_nothing():
-    _, view = a_case()
+    _, view = a_case(model := a_model())
     settings = TrainSettings(opacity_reg=0, scale_reg=0)
-    terms = loss_terms(
-        Picture(view.target(), view.target(), torch.zeros(HEIGHT, WIDTH), None, {}), view, a_model(), settings
-    )
+    terms = loss_terms(picture_of(model, view.target(), torch.zeros(HEIGHT, WIDTH)), view, model, settings)
     assert float(sum(terms.values()).detach()) == pytest.approx(0.0, abs=1e-5)
+
+
+# ---- the terms of models that move
+
+
+def test_the_cross_entropy_of_the_sky_is_closed_form_and_finite():
+    """-ln (1 - alpha) on the sky, -ln alpha elsewhere; alphas of 0 and 1 count as 1e-4 from them."""
+    alpha = torch.tensor([[0.2, 0.7, 0.0], [0.9, 1.0, 1.0]], requires_grad=True)
+    sky = torch.tensor([[True, False, True], [True, False, True]])
+    loss = sky_cross_entropy(alpha, sky)
+    terms = [0.8, 0.7, 1.0 - 1e-4, 0.1, 1.0 - 1e-4, 1e-4]
+    assert float(loss.detach()) == pytest.approx(-np.log(terms).mean(), rel=1e-3)
+    loss.backward()
+    assert torch.isfinite(alpha.grad).all()
+    np.testing.assert_allclose(alpha.grad[0, :2], [1 / 0.8 / 6, -1 / 0.7 / 6], rtol=1e-4)
+
+
+def a_lidar(count: int, seed: int = 0) -> tuple[torch.Tensor, LidarDepth, np.ndarray]:
+    """A random depth image, what LiDAR measured at some of its pixels, and by how much it is off there."""
+    rng = np.random.default_rng(seed)
+    depth, pixels = rng.uniform(2, 60, (HEIGHT, WIDTH)), rng.permutation(HEIGHT * WIDTH)[:count]
+    off = rng.normal(size=count) * 3.0
+    measured = depth[pixels // WIDTH, pixels % WIDTH] + off
+    lidar = LidarDepth(torch.from_numpy(pixels), torch.from_numpy(measured).float())
+    return torch.from_numpy(depth).float(), lidar, np.abs(off)
+
+
+@pytest.mark.parametrize(("count", "kept"), [(100, 95), (200, 190), (19, 18), (1, 1)])
+def test_depth_is_compared_where_lidar_measured_and_the_worst_twentieth_left_out(count, kept):
+    depth, lidar, off = a_lidar(count)
+    assert float(depth_loss(depth, lidar)) == pytest.approx(np.sort(off)[:kept].mean(), rel=1e-4)
+
+
+def test_depths_left_out_pull_on_nothing():
+    depth, lidar, off = a_lidar(100)
+    depth.requires_grad_()
+    depth_loss(depth, lidar).backward()
+    gradient = depth.grad.reshape(-1)
+    worst = set(lidar.pixels[np.argsort(off)[-5:]].tolist())
+    pulled = set(gradient.nonzero()[:, 0].tolist())
+    assert pulled == set(lidar.pixels.tolist()) - worst
+    assert all(abs(float(value)) == pytest.approx(1 / 95) for value in gradient[list(pulled)])
+
+
+def test_entropy_is_that_of_a_coin():
+    alpha = torch.tensor([[0.5, 0.1], [0.9, 0.3]])
+    expected = np.mean([-(o * np.log(o) + (1 - o) * np.log(1 - o)) for o in (0.5, 0.1, 0.9, 0.3)])
+    assert float(entropy(alpha)) == pytest.approx(expected, rel=1e-5)
+    assert float(entropy(torch.full((2, 2), 0.5))) == pytest.approx(math.log(2.0))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_entropy_is_least_and_finite_where_it_is_sure(alpha):
+    sure = torch.full((2, 2), alpha, requires_grad=True)
+    loss = entropy(sure)
+    loss.backward()
+    assert float(loss.detach()) == pytest.approx(0.0, abs=2e-3) and torch.isfinite(sure.grad).all()
+
+
+def test_entropy_pushes_away_from_even():
+    alpha = torch.tensor([[0.4, 0.6]], requires_grad=True)
+    entropy(alpha).backward()
+    assert float(alpha.grad[0, 0]) > 0.0 > float(alpha.grad[0, 1])
+
+
+def test_a_masked_difference_is_the_mean_over_the_mask():
+    image, target = random_image(11), random_image(12)
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[2:5, 3:9] = True
+    expected = np.abs(image.numpy() - target.numpy())[2:5, 3:9].mean()
+    assert float(masked_l1(image, target, mask)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_an_empty_mask_costs_nothing():
+    image = random_image(11).requires_grad_()
+    loss = masked_l1(image, random_image(12), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool))
+    loss.backward()
+    assert float(loss.detach()) == 0.0 and not image.grad.any()
+
+
+def street() -> tuple[SplatModel, Picture, TrainingView]:
+    """A picture of background and two actors, one of them absent, by a view of which all is known."""
+    there = track_of(motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 0.0]] * 3, 0.3), "there", (1.0, 1.0, 1.0))
+    later = track_of(motion_through([3.0, 3.5, 4.0], [[0.0, 0.0, 0.0]] * 3), "later", (1.0, 1.0, 1.0))
+    background = a_model(gaussians=8).parts[0]
+    model = SplatModel([background, actors_of(there, later)], ConstantSky(torch.full((3,), 0.5), 1e-2))
+    view = looking_at([0.0, 0.0, 0.0], [0.0, -3.0, 0.5], time=0.5, width=WIDTH, height=HEIGHT)
+    moving, (_, lidar, _) = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), a_lidar(40)
+    moving[4:9, 6:14] = True
+    _, seen = a_case(model)
+    recorded = dataclasses.replace(seen, view=view, moving=moving, lidar=lidar)
+    return model, model.render(view, with_depth=True), recorded
+
+
+WEIGHTS = {
+    "opacity_reg": "opacity_reg",
+    "scale_reg": "scale_reg",
+    "sky_alpha": "sky_alpha_weight",
+    "sky_bce": "sky_bce_weight",
+    "depth": "depth_weight",
+    "entropy": "entropy_weight",
+    "dynamic": "dynamic_weight",
+}
+"""Terms of the loss, and the settings that weigh them."""
+
+
+@pytest.mark.parametrize("term", WEIGHTS)
+def test_every_term_has_its_weight(term):
+    model, picture, view = street()
+    once, thrice = (
+        loss_terms(
+            picture, view, model, TrainSettings(**dict.fromkeys(WEIGHTS.values(), 0.2) | {WEIGHTS[term]: weight})
+        )
+        for weight in (0.2, 0.6)
+    )
+    assert once.keys() == {"l1", "ssim", "track_size", "track_bend", *WEIGHTS}
+    for name in once:
+        torch.testing.assert_close(thrice[name], (3.0 if name == term else 1.0) * once[name])
+        assert float(once[name].detach()) > 0.0
+
+
+def test_terms_are_what_they_are_called():
+    model, picture, view = street()
+    settings = TrainSettings(sky_bce_weight=0.3, depth_weight=0.4, entropy_weight=0.5, dynamic_weight=0.6)
+    terms = loss_terms(picture, view, model, settings)
+    torch.testing.assert_close(terms["sky_bce"], 0.3 * sky_cross_entropy(picture.alpha, view.sky))
+    torch.testing.assert_close(terms["depth"], 0.4 * depth_loss(picture.depth, view.lidar))
+    alone = SplatModel([model.parts[1]], None).render(view.view).alpha
+    torch.testing.assert_close(terms["entropy"], 0.5 * entropy(alone))
+    torch.testing.assert_close(terms["dynamic"], 0.6 * masked_l1(picture.image, view.target(), view.moving))
+    penalties = model.parts[1].penalties()
+    assert penalties.keys() == {"track_size", "track_bend"}
+    for name, value in penalties.items():
+        torch.testing.assert_close(terms[name], value)
+
+
+def test_a_model_that_stands_still_has_no_terms_of_what_moves():
+    _, _, view = street()
+    model = SplatModel([a_model().parts[0]], None)
+    picture = model.render(view.view)
+    unguided = dataclasses.replace(view, sky=None, moving=None, lidar=None)
+    everything = TrainSettings(sky_bce_weight=1.0, depth_weight=1.0, entropy_weight=1.0, dynamic_weight=1.0)
+    assert loss_terms(picture, unguided, model, everything).keys() == {"l1", "ssim", "opacity_reg", "scale_reg"}
+
+
+@pytest.mark.parametrize("term", ["opacity_reg", "scale_reg"])
+def test_what_is_absent_is_not_regularised(term):
+    """Nothing in the picture could hold against it: an actor would fade while it is away."""
+    model, picture, view = street()
+    loss_terms(picture, view, model, TrainSettings())[term].backward()
+    actors = model.parts[1].params
+    gradient = actors["opacities" if term == "opacity_reg" else "scales"].grad
+    there = actors["owner"] == 0
+    assert (gradient[there] > 0).all() and not gradient[~there].any()
+
+
+def test_only_what_moves_is_made_sure_of():
+    model, picture, view = street()
+    loss_terms(picture, view, model, TrainSettings())["entropy"].backward()
+    still, actors = (part.params for part in model.parts)
+    assert all(value.grad is None or not value.grad.any() for value in still.values())
+    assert actors["opacities"].grad[actors["owner"] == 0].any()

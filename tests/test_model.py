@@ -11,7 +11,7 @@ from torch import nn
 
 from drivesplat.images import pixel_rays
 from drivesplat.model.background import Background
-from drivesplat.model.build import build_model, gaussian_cap, rebuild_model
+from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -20,6 +20,7 @@ from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
 
 SH_C0 = 0.5 / np.sqrt(np.pi)
+SKY_COLOR = np.array([0.2, 0.4, 0.8])
 
 
 def a_view(width: int = 24, height: int = 16) -> View:
@@ -46,6 +47,10 @@ def parser_record(count: int) -> dict[str, Any]:
         "image_sizes": np.array([[100, 50], [100, 50], [40, 30]]),
         "splits": {"train": np.array([0, 2]), "interpolation": np.array([1])},
     }
+
+
+def beginnings(parser: dict[str, Any], *actors: dict[str, Any]) -> Beginnings:
+    return Beginnings(parser, list(actors), SKY_COLOR)
 
 
 def shaken(model: nn.Module) -> nn.Module:
@@ -172,6 +177,9 @@ class Riding(Part):
     def learning_rates(self) -> dict[str, float]:
         return self._still.learning_rates()
 
+    def definition(self) -> dict[str, Any]:
+        return {}
+
 
 def test_a_model_shows_all_its_parts_at_the_views_time():
     first = Background.from_points(*seed_points(20, seed=1), GaussianSettings(), 1.0)
@@ -206,8 +214,8 @@ def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, sh_de
     settings = TrainSettings(
         antialiased=antialiased, sky_resolution=4, gaussians=GaussianSettings(sh_degree=sh_degree, init_scale=0.5)
     )
-    model = shaken(build_model(parser_record(40), ("background",), sky, settings, np.array([0.2, 0.4, 0.8])))
-    rebuilt = rebuild_model(model.state_dict(), ("background",), sky, settings, 3.0)
+    model = shaken(build_model(beginnings(parser_record(40)), ("background",), sky, settings))
+    rebuilt = rebuild_model(model.state_dict(), definitions(model), sky, settings)
     picture, again = (m.render(a_view(), sh_degree, with_depth=True) for m in (model, rebuilt))
     assert float(picture.alpha.detach().max()) > 0.3
     assert torch.equal(again.image, picture.image) and torch.equal(again.depth, picture.depth)
@@ -216,16 +224,15 @@ def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, sh_de
 
 @pytest.mark.parametrize(("sky", "kind"), [("none", type(None)), ("mask", ConstantSky), ("cubemap", CubemapSky)])
 def test_the_sky_setting_names_the_sky(sky, kind):
-    color = np.array([0.2, 0.4, 0.8])
-    model = build_model(parser_record(5), ("background",), sky, TrainSettings(sky_resolution=4), color)
+    model = build_model(beginnings(parser_record(5)), ("background",), sky, TrainSettings(sky_resolution=4))
     assert isinstance(model.sky, kind)
     if model.sky is not None:
-        np.testing.assert_allclose(model.sky.colors(a_view().rays())[3, 4].detach(), color, atol=1e-5)
+        np.testing.assert_allclose(model.sky.colors(a_view().rays())[3, 4].detach(), SKY_COLOR, atol=1e-5)
 
 
 def test_a_model_starts_with_no_more_points_than_its_cap():
     record = parser_record(300)
-    model = build_model(record, ("background",), "none", TrainSettings(cap_max=120), np.full(3, 0.5))
+    model = build_model(beginnings(record), ("background",), "none", TrainSettings(cap_max=120))
     means = model.parts[0].params["means"].detach().numpy()
     assert len(model) == 120
     rows = {tuple(row) for row in record["points"]}

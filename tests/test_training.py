@@ -31,12 +31,20 @@ from drivesplat.settings.train import DefaultSettings, FloaterSettings, McmcSett
 from drivesplat.training import checkpoint
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import make_optimizers, schedule
-from drivesplat.training.run import TrainingFiles, mean_sky_color, read_checkpoint, run_training, trained_model
+from drivesplat.training.run import (
+    TrainingFiles,
+    TrainingInputs,
+    mean_sky_color,
+    read_checkpoint,
+    run_training,
+    trained_model,
+)
 from drivesplat.training.train import Trainer, TrainingSummary, Workspace, train
-from drivesplat.training.views import TrainingView, load_views, order, view_of
+from drivesplat.training.views import Guides, TrainingView, load_views, order, view_of
 
 REPOSITORY = Path(__file__).parent.parent
 CPU = torch.device("cpu")
+NO_GUIDES = Guides(sky={}, moving={}, lidar={})
 WIDTH, HEIGHT = 32, 24
 ITERATIONS, CHECKPOINT_AT, ENDED_AT = 60, 30, 43
 
@@ -101,7 +109,7 @@ def trained(
     """The model after `train`, and its summary."""
     model = untrained(settings) if model is None else model
     views = recorded_views(device=device) if views is None else views
-    return model, train(model, views, settings, seed, 1.0, device, workspace_of(folder, fingerprint))
+    return model, train(model, views, settings, seed, device, workspace_of(folder, fingerprint))
 
 
 @torch.no_grad()
@@ -220,7 +228,7 @@ def test_positions_learn_ever_more_slowly(step, factor):
 @pytest.mark.parametrize(("step", "degree"), [(0, 0), (9, 0), (10, 1), (25, 2), (35, 3), (99, 3)])
 def test_spherical_harmonics_gain_a_degree_at_a_time(step, degree):
     settings = settings_of(iterations=100, sh_every=0.1, gaussians=GaussianSettings(sh_degree=3))
-    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, 1.0, CPU)
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU)
     trainer.step = step
     assert trainer.sh_degree() == degree
 
@@ -265,7 +273,7 @@ def parser_record(folder: Path, views: list[TrainingView]) -> dict[str, Any]:
 
 def test_views_are_the_training_images_and_no_others(tmp_path):
     recorded = recorded_views()
-    loaded = load_views(parser_record(tmp_path, recorded), None, CPU)
+    loaded = load_views(parser_record(tmp_path, recorded), NO_GUIDES, CPU)
     assert len(loaded) == 4
     for view, expected in zip(loaded, [recorded[i] for i in (0, 1, 3, 4)], strict=True):
         assert torch.equal(view.pixels, expected.pixels) and view.sky is None
@@ -556,6 +564,18 @@ def test_views_that_show_no_gaussian_are_no_error(tmp_path):
     assert summary.iterations == 10
 
 
+@pytest.mark.parametrize(
+    ("strategy", "absgrad", "asked"), [("mcmc", True, False), ("default", True, True), ("default", False, False)]
+)
+def test_absolute_gradients_are_asked_for_by_the_default_strategy_alone(monkeypatch, strategy, absgrad, asked):
+    settings = settings_of(strategy, default=DefaultSettings(absgrad=absgrad))
+    trainer = Trainer.begin(untrained(settings), recorded_views(1), settings, 0, CPU)
+    render, rendered = trainer.model.render, []
+    monkeypatch.setattr(trainer.model, "render", lambda *a, **k: rendered.append(k["absgrad"]) or render(*a, **k))
+    trainer.fit_one()
+    assert rendered == [asked]
+
+
 def test_absolute_gradients_grow_gaussians_on_the_cpu(tmp_path):
     settings = settings_of("default", default=DefaultSettings(absgrad=True, grow_grad2d=1e-3, refine_every=5))
     _, summary = trained(tmp_path, settings)
@@ -600,13 +620,13 @@ def job_of(**changes: Any) -> TrainJob:
 
 
 def files_in(folder: Path) -> TrainingFiles:
-    return TrainingFiles(folder / "checkpoint.pt", folder / "train.json", folder / "masks")
+    return TrainingFiles(folder / "checkpoint.pt", folder / "train.json")
 
 
 def run(folder: Path, job: TrainJob, device: str = "cpu") -> TrainingFiles:
     files = files_in(folder / "vanilla")
-    record = parser_record(folder / "images", recorded_views())
-    run_training(record, job, DeviceSettings(kind=device), files, PROVENANCE, "train")
+    inputs = TrainingInputs(parser_record(folder / "images", recorded_views()), folder / "masks", [], [])
+    run_training(inputs, job, DeviceSettings(kind=device), files, PROVENANCE, "train")
     return files
 
 

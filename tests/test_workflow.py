@@ -185,7 +185,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
         ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71", {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
-        ("drivesplat/training/floaters.py", "FADED = 1e-4", "FADED = 2e-4", TRAINING_AND_AFTER),
+        ("drivesplat/training/floaters.py", "LARGEST_STEP = 15.0", "LARGEST_STEP = 14.0", TRAINING_AND_AFTER),
         ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
         ("drivesplat/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING | {"extract": 0}),
         ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),

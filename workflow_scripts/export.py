@@ -1,6 +1,6 @@
-"""checkpoint.pt as splat.ply, in the convention of splat viewers, and cameras.json."""
+"""checkpoint.pt as splat.ply, in the convention of splat viewers, its parts likewise, cameras.json and parts.json."""
 
-from drivesplat.export.splat_asset import export_splat
+from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.job import job
 from drivesplat.parser import read_parser
 from drivesplat.scene import read_scene
@@ -10,4 +10,5 @@ with job(snakemake) as current:
     scene, parser = read_scene(current.input.scene), read_parser(current.input.parser)
     checkpoint = read_checkpoint(current.input.checkpoint)
     provenance = current.provenance(scene.provenance, parser["provenance"], checkpoint["provenance"])
-    export_splat(current.output.splat, current.output.cameras, checkpoint, parser, scene, provenance)
+    files = SplatFiles(current.output.splat, current.output.cameras, current.output.parts)
+    export_splat(files, checkpoint, parser, scene, provenance)

@@ -1,16 +1,14 @@
-"""parser.pkl and masks/ into checkpoint.pt and train.json."""
+"""parser.pkl, masks/ and what the method needs of actors.pkl and lidar_depth.pkl into checkpoint.pt and train.json."""
 
 from pathlib import Path
 
 from drivesplat.job import job
-from drivesplat.masks import read_masks_record
-from drivesplat.parser import read_parser
 from drivesplat.settings.train import TrainJob
-from drivesplat.training.run import TrainingFiles, run_training
+from drivesplat.training.run import TrainingFiles, read_inputs, run_training
 
 with job(snakemake) as current:
-    parser = read_parser(current.input.parser)
-    masks = Path(current.input.masks).parent
-    provenance = current.provenance(parser["provenance"], read_masks_record(masks)["provenance"])
-    files = TrainingFiles(Path(current.output.checkpoint), Path(current.output.summary), masks)
-    run_training(parser, current.settings(TrainJob), current.device(), files, provenance, current.name)
+    files = current.input
+    inputs, upstream = read_inputs(files.parser, files.masks, [*files.actors], [*files.lidar_depth])
+    made = TrainingFiles(Path(current.output.checkpoint), Path(current.output.summary))
+    provenance = current.provenance(*upstream)
+    run_training(inputs, current.settings(TrainJob), current.device(), made, provenance, current.name)

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from drivesplat.device import choose_device, telling_out_of_memory
+from drivesplat.device import telling_out_of_memory
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel, View
 from drivesplat.recording import Recording
 from drivesplat.scene import Frame
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.training.run import trained_model
+from drivesplat.training.run import open_model
 from drivesplat.training.views import view_of
 
 
@@ -31,10 +31,8 @@ class Drive:
 
 def open_drive(checkpoint: dict[str, Any], recording: Recording, device_settings: DeviceSettings) -> Drive:
     """The model of a checkpoint's content on the device, with its recording."""
-    device = choose_device(device_settings, min_free_gb=0.0)
-    model, _ = trained_model(checkpoint)
-    with telling_out_of_memory(lambda: len(model)):
-        return Drive(model.to(device).requires_grad_(False), recording, device)
+    model, device = open_model(checkpoint, device_settings)
+    return Drive(model, recording, device)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from drivesplat.device import choose_device, telling_out_of_memory
+from drivesplat.device import telling_out_of_memory
 from drivesplat.errors import DatasetError
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
@@ -18,7 +18,7 @@ from drivesplat.recording import Recording
 from drivesplat.regions import region_masks
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.training.run import trained_model
+from drivesplat.training.run import open_model
 from drivesplat.training.views import view_of
 from drivesplat.truth import read_truth
 
@@ -42,12 +42,10 @@ class EvaluationInputs:
 
 def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings: DeviceSettings) -> dict[str, Any]:
     """The content of one method's eval.json, provenance aside."""
-    device = choose_device(device_settings, min_free_gb=0.0)
-    model, _ = trained_model(inputs.checkpoint)
+    model, device = open_model(inputs.checkpoint, device_settings)
     unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
     parser, summary = inputs.recording.parser, inputs.summary
     with telling_out_of_memory(lambda: len(model)):
-        model = model.to(device)
         groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device)
         against = against_truth(model, inputs, job, lpips_map, device)
     return {

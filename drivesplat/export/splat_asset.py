@@ -1,13 +1,17 @@
-"""The stage `export`: a trained model as splat.ply, with the trajectory in cameras.json."""
+"""The stage `export`: a trained model as splat.ply and, part by part, as PLYs of their own; cameras.json and parts.json
+have the trajectory it was recorded along and the motion of its objects."""
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivesplat.export.cameras_json import cameras_record
+from drivesplat.export.parts_json import write_parts
 from drivesplat.export.splat_ply import write_splat_ply
-from drivesplat.export.trained_parts import digests, trained_parts
-from drivesplat.model.gaussians import concatenate
+from drivesplat.export.trained_parts import digests, trained_gaussians, trained_pieces
 from drivesplat.scene import Scene
 from drivesplat.storage import write_json
 from drivesplat.training.run import trained_model
@@ -15,20 +19,28 @@ from drivesplat.training.run import trained_model
 log = logging.getLogger(__name__)
 
 
-def export_splat(
-    splat: str | Path,
-    cameras: str | Path,
-    checkpoint: dict[str, Any],
-    parser: dict[str, Any],
-    scene: Scene,
-    provenance: dict[str, Any],
-) -> None:
-    """Writes all Gaussians of a checkpoint's content to `splat` and the recorded cameras to `cameras`.
+@dataclass(frozen=True)
+class SplatFiles:
+    """What the stage writes; the PLYs of the parts lie beside `parts`."""
 
-    The header of `splat` has only the digests of `provenance`; all of it, in `cameras`, is too long for viewers.
+    splat: str | Path
+    cameras: str | Path
+    parts: str | Path
+
+
+def export_splat(
+    files: SplatFiles, checkpoint: dict[str, Any], parser: dict[str, Any], scene: Scene, provenance: dict[str, Any]
+) -> None:
+    """Writes all Gaussians of a checkpoint's content: together as they stand when the middle image was taken, and part
+    by part; with the recorded cameras.
+
+    The headers of PLYs have only the digests of `provenance`; all of it, in the JSON files, is too long for viewers.
     """
     model, _ = trained_model(checkpoint)
-    gaussians = concatenate(list(trained_parts(model, scene).values()))
-    write_splat_ply(splat, gaussians, {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)})
-    write_json(cameras, {**cameras_record(scene, parser), "provenance": provenance})
-    log.info("%d Gaussians, %d images", len(gaussians), len(scene.frames))
+    gaussians = trained_gaussians(model, scene)
+    pieces = trained_pieces(model, scene, np.array([frame.timestamp for frame in scene.frames]))
+    note = {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)}
+    write_splat_ply(files.splat, gaussians, note)
+    write_json(files.cameras, {**cameras_record(scene, parser), "provenance": provenance})
+    write_parts(files.parts, pieces, scene, provenance)
+    log.info("%d Gaussians, %d pieces, %d images", len(gaussians), len(pieces), len(scene.frames))

@@ -6,7 +6,9 @@ quaternion w x y z. gsplat's exporter is not used: it leaves out the normals, wi
 three floats off, has no place for a note, and one bad opacity makes it drop every Gaussian.
 """
 
+import json
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.storage import atomic_write, canonical_json, unreadable
 
 _NOTE = "drivesplat "
+_LONGEST_HEADER = 10_000
+"""Bytes."""
 _TINY = torch.finfo(torch.float32).tiny
 _ALMOST_ONE = 1.0 - 2.0**-24
 """The float32 before 1: the largest opacity with a finite logit."""
@@ -35,6 +39,17 @@ def write_splat_ply(path: str | Path, gaussians: Gaussians, note: dict[str, Any]
     element = PlyElement.describe(_vertices(gaussians), "vertex", comments=[_NOTE + canonical_json(note)])
     with atomic_write(path) as file:
         PlyData([element], byte_order="<").write(file)
+
+
+def note_of(path: str | Path) -> dict[str, Any]:
+    """The note of a file that `write_splat_ply` wrote; an empty one for any other."""
+    with suppress(OSError, ValueError), open(path, "rb") as file:
+        header = file.read(_LONGEST_HEADER).partition(b"end_header")[0].decode("ascii", "replace")
+        for line in header.splitlines():
+            if line.startswith(f"comment {_NOTE}"):
+                note = json.loads(line.removeprefix(f"comment {_NOTE}"))
+                return note if isinstance(note, dict) else {}
+    return {}
 
 
 def read_splat_ply(path: str | Path) -> Gaussians:

@@ -9,11 +9,13 @@ more than a tenth are huge.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from drivesplat.export.trained_parts import SampledPiece
 from drivesplat.model.gaussians import Gaussians, concatenate
 
 LARGEST_AREA = 10.0
@@ -39,7 +41,11 @@ def thinned(gaussians: Gaussians, count: int) -> Gaussians:
     return gaussians[covering_most(gaussians, count)]
 
 
-def thinned_parts(parts: Mapping[str, Gaussians], count: int) -> dict[str, Gaussians]:
-    """The `count` Gaussians that cover most among all parts together, in their parts."""
-    kept = covering_most(concatenate(list(parts.values())), count).split([len(part) for part in parts.values()])
-    return {name: part[chosen] for (name, part), chosen in zip(parts.items(), kept, strict=True)}
+def thinned_pieces(pieces: Mapping[str, SampledPiece], count: int) -> dict[str, SampledPiece]:
+    """The `count` Gaussians that cover most among all pieces together, absent objects included, in their pieces."""
+    sets = [piece.gaussians for piece in pieces.values()]
+    kept = covering_most(concatenate(sets), count).split([len(gaussians) for gaussians in sets])
+    return {
+        name: replace(piece, gaussians=piece.gaussians[chosen])
+        for (name, piece), chosen in zip(pieces.items(), kept, strict=True)
+    }

@@ -1,31 +1,75 @@
-"""What of a training leaves the workflow: its Gaussians at one time, and where they come from in short."""
+"""What of a training leaves the workflow: its Gaussians as they stand at one time, or piece by piece with the motion of
+each; and where they come from in short.
+
+Colours that vary with time are those of the drive's middle image. Gaussians with a value that is not finite are left
+out: every program makes something else of them.
+"""
 
 import logging
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
+from drivesplat.export.sampled_motion import SampledMotion, sampled
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.part import Piece
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene import Scene
+from drivesplat.scene import Scene, Track
 
 log = logging.getLogger(__name__)
 
 
-@torch.no_grad()
-def trained_parts(model: SplatModel, scene: Scene) -> dict[str, Gaussians]:
-    """The Gaussians of a model's parts by their names, at the time of the scene's middle image.
+@dataclass(frozen=True)
+class SampledPiece:
+    """Gaussians in world coordinates, or, where there is a `motion`, in the frame of the object that moves so.
 
-    Those with a value that is not finite are left out: every program makes something else of them.
+    `track` is what the scene knows of that object, if it does.
     """
-    middle = np.sort([frame.timestamp for frame in scene.frames])[len(scene.frames) // 2]
-    return {part.name: _finite(part.at(scene.seconds(middle)), part.name) for part in model.parts}
+
+    gaussians: Gaussians
+    motion: SampledMotion | None = None
+    track: Track | None = None
+
+
+def middle_timestamp(scene: Scene) -> int:
+    """When (microseconds) the middle one of all images was taken: the time of exports that know none."""
+    return int(np.sort([frame.timestamp for frame in scene.frames])[len(scene.frames) // 2])
+
+
+@torch.no_grad()
+def trained_gaussians(model: SplatModel, scene: Scene) -> Gaussians:
+    """All Gaussians of a model in world coordinates at the time of the middle image, but those of absent objects."""
+    gaussians = model.gaussians_at(scene.seconds(middle_timestamp(scene)))
+    return _finite(gaussians[(gaussians.opacities != 0) | ~model.moving()], "all parts together")
+
+
+@torch.no_grad()
+def trained_pieces(model: SplatModel, scene: Scene, timestamps: np.ndarray) -> dict[str, SampledPiece]:
+    """The pieces of a model by their names, objects in their own frames, whether they are there then or not.
+
+    Their motions are sampled at the `timestamps` (m,) of images (microseconds), among others.
+    """
+    middle = scene.seconds(middle_timestamp(scene))
+    recorded = (timestamps - min(frame.timestamp for frame in scene.frames)) * 1e-6
+    found: dict[str, SampledPiece] = {}
+    for name, piece in _pieces(model, middle):
+        if name in found:
+            raise ValueError(f"two pieces of the model are called {name!r}")
+        motion = None if piece.motion is None else sampled(piece.motion, recorded, middle)
+        track = None if piece.motion is None else scene.track(name)
+        found[name] = SampledPiece(_finite(piece.gaussians, name), motion, track)
+    return found
 
 
 def digests(provenance: dict[str, Any]) -> dict[str, str]:
     """Of a provenance what fits where there is little room."""
     return {name: provenance[name] for name in ("settings_sha256", "code_sha256", "inputs_sha256")}
+
+
+def _pieces(model: SplatModel, time: float) -> list[tuple[str, Piece]]:
+    return [named for part in model.parts for named in part.pieces(time).items()]
 
 
 def _finite(gaussians: Gaussians, name: str) -> Gaussians:

@@ -1,10 +1,14 @@
-"""Gaussians and the recording camera as scene.usdz, in OpenUSD's own schema for Gaussian splats (usd-core 26.11).
+"""Gaussians that move and the recording camera as scene.usdz: a drive that plays in programs with OpenUSD.
 
-The stage: metres, z up, the world of `Scene` with its origin in customLayerData. /World holds one
-ParticleField3DGaussianSplat a part of the model, and /World/camera as it was recorded. The schema wants linear values:
-opacities in [0, 1], scales in metres, unit quaternions, and for every Gaussian its RGB coefficients of spherical
-harmonics in the order of 3D Gaussian Splatting. Moving parts stand where they are at the one time they are given for.
-The sky is not a Gaussian and is not in here, nor can the schema say that a model was trained antialiased.
+The stage: metres, z up, the world of `Scene` with its origin in customLayerData, thirty time codes a second since the
+first image. Below /World lie
+
+- a prim for every piece that stands still: /World/background
+- /World/actors/{track} for every object, its Gaussians in the object's frame, its transform and visibility over time
+- /World/camera as it was recorded
+
+Colours do not change in time: they are those of the drive's middle image. The sky is not a Gaussian and is not in here,
+nor can the schema say that a model was trained antialiased.
 """
 
 import tempfile
@@ -13,37 +17,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
-from torch import Tensor
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from drivesplat.errors import ResultError
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.export.spelling import distinct
+from drivesplat.export.trained_parts import SampledPiece
+from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_piece, usd_matrix
 from drivesplat.storage import atomic_path
 
-TIME_CODES_PER_SECOND = 30.0
 APERTURE_WIDTH = 0.36
 """A sensor 36 mm wide in the unit that UsdGeom.Camera has for lenses: a tenth of the scene's unit, here 10 cm."""
 CLIPPING_RANGE = (0.1, 10_000.0)
 """Metres."""
-EXTENT_SIGMAS = 3.0
-"""How far a Gaussian reaches for the extent, in its largest scale: the support that the schema gives the kernel."""
+_ACTORS, _CAMERA = "/World/actors", "/World/camera"
 _OPENCV_TO_USD = np.diag([1.0, -1.0, -1.0, 1.0])
 """A USD camera looks along -z with y up, an OpenCV camera along z with y down."""
 
 
 def splat_stage(
-    parts: Mapping[str, Gaussians], cameras: Sequence[tuple[float, Gf.Camera]], note: Mapping[str, Any]
+    pieces: Mapping[str, SampledPiece], cameras: Sequence[tuple[float, Gf.Camera]], note: Mapping[str, Any]
 ) -> Usd.Stage:
-    """A stage in memory with the parts by name, the camera at its times (seconds) and `note` in customLayerData."""
+    """A stage in memory with the pieces by name, the camera at its times (seconds) and `note` in customLayerData."""
     stage = Usd.Stage.CreateInMemory("scene.usdc")
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
+    world = UsdGeom.Xform.Define(stage, "/World")
+    Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
+    stage.SetDefaultPrim(world.GetPrim())
     stage.GetRootLayer().customLayerData = {"drivesplat": dict(note)}
-    for name, gaussians in parts.items():
-        _define_splat(stage, f"/World/{Tf.MakeValidIdentifier(name)}", gaussians)
+    _define_pieces(stage, pieces)
     _define_camera(stage, cameras)
     return stage
 
@@ -56,7 +58,7 @@ def usd_camera(K: np.ndarray, size: tuple[int, int], camera_to_world: np.ndarray
     width, height = size
     focal_length = APERTURE_WIDTH * K[0, 0] / width
     return Gf.Camera(
-        transform=Gf.Matrix4d((camera_to_world @ _OPENCV_TO_USD).T.tolist()),  # USD multiplies row vectors
+        transform=usd_matrix(camera_to_world @ _OPENCV_TO_USD),
         horizontalAperture=APERTURE_WIDTH,
         verticalAperture=focal_length * height / K[1, 1],
         horizontalApertureOffset=focal_length * (width / 2 - K[0, 2]) / K[0, 0],
@@ -87,31 +89,25 @@ def _unwritable(path: Path, why: str) -> ResultError:
     return ResultError(f"{path}: cannot be written ({why}); free space or fix its permissions")
 
 
-def _define_splat(stage: Usd.Stage, prim_path: str, gaussians: Gaussians) -> None:
-    splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, prim_path)
-    quats = torch.nn.functional.normalize(gaussians.quats, dim=-1)
-    splat.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.means)))
-    # the memory of Gf.Quatf is x, y, z, w
-    splat.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(_numpy(quats.roll(-1, dims=-1))))
-    splat.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.scales)))
-    splat.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(_numpy(gaussians.opacities)))
-    splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
-    splat.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.sh.reshape(-1, 3))))
-    # how gsplat rendered them in training
-    splat.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
-    splat.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)
-    if len(gaussians):
-        splat.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_numpy(_extent(gaussians))))
+def _define_pieces(stage: Usd.Stage, pieces: Mapping[str, SampledPiece]) -> None:
+    still = [name for name, piece in pieces.items() if piece.motion is None]
+    objects = [name for name in pieces if name not in still]
+    if objects:
+        Usd.ModelAPI(UsdGeom.Xform.Define(stage, _ACTORS)).SetKind(Kind.Tokens.group)
+    taken = [path.rpartition("/")[2] for path in (_ACTORS, _CAMERA)]
+    paths = {name: f"/World/{word}" for name, word in distinct(still, _identifier, taken).items()}
+    paths |= {name: f"{_ACTORS}/{word}" for name, word in distinct(objects, _identifier).items()}
+    for name, piece in pieces.items():
+        define_piece(stage, paths[name], name, piece)
 
 
-def _extent(gaussians: Gaussians) -> Float[Tensor, "2 3"]:
-    """The corners of a box around the Gaussians; usd-core computes none for this schema."""
-    reach = EXTENT_SIGMAS * gaussians.scales.amax(dim=-1, keepdim=True)
-    return torch.stack([(gaussians.means - reach).amin(dim=0), (gaussians.means + reach).amax(dim=0)])
+def _identifier(name: str) -> str:
+    """A name as USD allows it. A leading digit, of which OpenUSD would make an underscore, gets one before it."""
+    return Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
 
 
 def _define_camera(stage: Usd.Stage, cameras: Sequence[tuple[float, Gf.Camera]]) -> None:
-    camera = UsdGeom.Camera.Define(stage, "/World/camera")
+    camera = UsdGeom.Camera.Define(stage, _CAMERA)
     stage.SetTimeCodesPerSecond(TIME_CODES_PER_SECOND)
     stage.SetFramesPerSecond(TIME_CODES_PER_SECOND)
     codes = [seconds * TIME_CODES_PER_SECOND for seconds, _ in cameras]
@@ -119,7 +115,3 @@ def _define_camera(stage: Usd.Stage, cameras: Sequence[tuple[float, Gf.Camera]])
     stage.SetEndTimeCode(max(codes))
     for code, (_, recorded) in zip(codes, cameras, strict=True):
         camera.SetFromCamera(recorded, code)
-
-
-def _numpy(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().float().contiguous().numpy()

@@ -1,4 +1,4 @@
-"""The stage `export_usd`: a trained model and the camera that recorded it as scene.usdz."""
+"""The stage `export_usd`: a trained model, what moves in it, and the camera that recorded it as scene.usdz."""
 
 import logging
 from pathlib import Path
@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from pxr import Gf
 
-from drivesplat.export.thinning import thinned_parts
-from drivesplat.export.trained_parts import digests, trained_parts
-from drivesplat.export.usd import TIME_CODES_PER_SECOND, splat_stage, usd_camera, write_usdz
+from drivesplat.export.thinning import thinned_pieces
+from drivesplat.export.trained_parts import digests, trained_pieces
+from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
+from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND
 from drivesplat.images import continuous_intrinsics
 from drivesplat.scene import Scene
 from drivesplat.settings.export import UsdJob
@@ -27,13 +28,13 @@ def export_usd(
     Raises DatasetError where the scene does not hold that camera.
     """
     model, _ = trained_model(checkpoint)
-    parts = trained_parts(model, scene)
-    kept = thinned_parts(parts, job.gaussians)
     cameras = recorded_cameras(scene, job.eval_camera)
+    pieces = trained_pieces(model, scene, recorded_timestamps(scene, job.eval_camera))
+    kept = thinned_pieces(pieces, job.gaussians)
     note = {"scene": scene.name, "dataset": scene.dataset, "origin": Gf.Vec3d(*scene.origin), **digests(provenance)}
     write_usdz(path, splat_stage(kept, cameras, note))
-    before, after = (sum(map(len, of.values())) for of in (parts, kept))
-    log.info("%d of %d Gaussians, %d poses of %s", after, before, len(cameras), job.eval_camera)
+    before, after = (sum(len(piece.gaussians) for piece in of.values()) for of in (pieces, kept))
+    log.info("%d of %d Gaussians, %d pieces, %d poses of %s", after, before, len(kept), len(cameras), job.eval_camera)
 
 
 def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]:
@@ -43,10 +44,15 @@ def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]
     interpolates matrices entry by entry, does not shear the camera. Raises DatasetError where there are no images.
     """
     frames = recorded_frames(scene, camera)
-    recorded = np.array([frame.timestamp for frame in frames], dtype=np.int64)
+    recorded = recorded_timestamps(scene, camera)
     between = film_timestamps(frames[0].timestamp, frames[-1].timestamp, int(TIME_CODES_PER_SECOND))
     times = np.union1d(recorded, between)
     poses = smooth_poses(recorded, np.stack([frame.camera_to_world for frame in frames]), times)
     size = (frames[0].width, frames[0].height)
     K = continuous_intrinsics(frames[0], size)
     return [(scene.seconds(time), usd_camera(K, size, pose)) for time, pose in zip(times, poses, strict=True)]
+
+
+def recorded_timestamps(scene: Scene, camera: str) -> np.ndarray:
+    """When (microseconds) a camera's images were taken: (n,) int64, increasing."""
+    return np.array([frame.timestamp for frame in recorded_frames(scene, camera)], dtype=np.int64)

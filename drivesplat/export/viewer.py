@@ -22,10 +22,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.export.thinning import thinned
-from drivesplat.export.trained_parts import trained_parts
+from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.export.viewer_page import filled_page
 from drivesplat.images import continuous_intrinsics
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
 from drivesplat.scene import Frame, Scene
 from drivesplat.settings.export import ViewerJob
@@ -48,11 +48,12 @@ def export_viewer(
 ) -> None:
     """Writes the page with the `job.gaussians` of a checkpoint's content that cover most, seen from `job.eval_camera`.
 
+    The world stands as at the time of the drive's middle image, without objects that are absent then.
     Raises DatasetError where the scene has no key frame of that camera.
     """
     start = scene.frames[scene.middle_key_frame(job.eval_camera)]
     model, _ = trained_model(checkpoint)
-    gaussians = concatenate(list(trained_parts(model, scene).values()))
+    gaussians = trained_gaussians(model, scene)
     kept = thinned(gaussians, job.gaussians)
     page = viewer_page(kept, model.sky, model.antialiased, start, f"{scene.name} · {method}", provenance)
     with atomic_write(path) as file:

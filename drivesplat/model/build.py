@@ -1,15 +1,30 @@
 """A method's settings into a model: the only place that knows parts and skies by name."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
+from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.part import Part, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.seeding.actors import motion_of
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
+
+
+@dataclass(frozen=True)
+class Beginnings:
+    """What a model starts from: the scene's parser record, the records of its `actors` (empty where none are wanted),
+    and the mean colour (3,) in [0, 1] of its sky."""
+
+    parser: dict[str, Any]
+    actors: list[dict[str, Any]]
+    sky_color: np.ndarray
 
 
 def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
@@ -21,40 +36,78 @@ def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
 
 
 def build_model(
-    parser: dict[str, Any], parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings, sky_color: np.ndarray
+    beginnings: Beginnings, parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings
 ) -> SplatModel:
-    """An untrained model of a parser record. `sky_color` (3,) in [0, 1] starts the sky."""
-    makers = {"background": _background}
+    """An untrained model. A part that has nothing to consist of (actors where nothing moves) is left out."""
+    makers = {"background": _background, "actors": _actors}
+    made = (makers[name](beginnings, settings) for name in parts)
     return SplatModel(
-        [makers[name](parser, settings) for name in parts], _sky(sky, settings, sky_color), settings.antialiased
+        [part for part in made if part is not None], _sky(sky, settings, beginnings.sky_color), settings.antialiased
     )
 
 
+def definitions(model: SplatModel) -> list[dict[str, Any]]:
+    """What `rebuild_model` needs of a model's parts, beside parameters: plain data and tensors."""
+    return [{"part": part.name, **part.definition()} for part in model.parts]
+
+
 def rebuild_model(
-    state: dict[str, torch.Tensor],
-    parts: tuple[PartName, ...],
-    sky: SkyKind,
-    settings: TrainSettings,
-    scene_scale: float,
+    state: Mapping[str, torch.Tensor], parts: list[dict[str, Any]], sky: SkyKind, settings: TrainSettings
 ) -> SplatModel:
-    """The model whose `state_dict` is `state`."""
-    makers = {"background": Background}
+    """The model whose `state_dict` is `state` and whose `definitions` are `parts`."""
+    makers = {"background": _background_again, "actors": _actors_again}
     made = []
-    for i, name in enumerate(parts):
+    for i, definition in enumerate(parts):
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-        made.append(makers[name](params, settings.gaussians, scene_scale))
+        made.append(makers[definition["part"]](params, definition, settings))
     model = SplatModel(made, _sky(sky, settings, np.full(3, 0.5)), settings.antialiased)
     model.load_state_dict(state)
     return model
 
 
-def _background(parser: dict[str, Any], settings: TrainSettings) -> Part:
-    positions, colors = parser["points"], parser["points_rgb"] / 255.0
-    kept = slice(None)
-    if len(positions) > settings.cap_max:
-        kept = np.random.default_rng(0).choice(len(positions), settings.cap_max, replace=False)
-    return Background.from_points(positions[kept], colors[kept], settings.gaussians, parser["scene_scale"])
+def _background(beginnings: Beginnings, settings: TrainSettings) -> Part:
+    parser = beginnings.parser
+    kept = _some(len(parser["points"]), settings.cap_max)
+    positions, colors = parser["points"][kept], parser["points_rgb"][kept] / 255.0
+    return Background.from_points(positions, colors, settings.gaussians, parser["scene_scale"])
+
+
+def _background_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
+    return Background(params, settings.gaussians, definition["extent"])
+
+
+def _actors(beginnings: Beginnings, settings: TrainSettings) -> Part | None:
+    actors = [actor for actor in beginnings.actors if len(actor["points"])]
+    if not actors:
+        return None
+    tracks = [ActorTrack(actor["id"], actor["size"], motion_of(actor)) for actor in actors]
+    limits = [actor_cap(actor, settings) for actor in actors]
+    kept = [_some(len(actor["points"]), limit) for actor, limit in zip(actors, limits, strict=True)]
+    points, colors = (
+        [actor[key][chosen] for actor, chosen in zip(actors, kept, strict=True)] for key in ("points", "points_rgb")
+    )
+    capped = settings.actors.model_copy(update={"cap_max": min(settings.actors.cap_max, sum(limits))})
+    return Actors.from_points(tracks, points, [c / 255.0 for c in colors], capped, settings.gaussians)
+
+
+def actor_cap(actor: dict[str, Any], settings: TrainSettings) -> int:
+    """The most Gaussians that the training pixels in an actor's box can hold."""
+    if not settings.pixels_per_gaussian:
+        return settings.actors.cap_max
+    return max(settings.actors.least, int(actor["pixels"] / settings.pixels_per_gaussian))
+
+
+def _some(count: int, limit: int) -> np.ndarray:
+    """Indices of at most `limit` of `count`, in order."""
+    if count <= limit:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
+
+
+def _actors_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
+    tracks = [ActorTrack.from_plain(plain) for plain in definition["tracks"]]
+    return Actors(params, tracks, settings.actors, settings.gaussians)
 
 
 def _sky(kind: SkyKind, settings: TrainSettings, color: np.ndarray) -> Sky | None:

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -22,8 +23,8 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def __getitem__(self, chosen: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> "Gaussians":
-        """Those that a mask or indices choose."""
+    def __getitem__(self, chosen: Bool[Tensor, " n"] | Int[Tensor, " m"] | slice) -> "Gaussians":
+        """Those that a mask, indices or a slice choose."""
         return Gaussians(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
     @property
@@ -33,7 +34,10 @@ class Gaussians:
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
-    """Several sets as one, in order; a single set is returned as it is."""
+    """Several sets as one, in order, all with as many SH coefficients as the richest; a single set is returned as it
+    is."""
     if len(sets) == 1:
         return sets[0]
+    coefficients = max(s.sh.shape[1] for s in sets)
+    sets = [replace(s, sh=F.pad(s.sh, (0, 0, 0, coefficients - s.sh.shape[1]))) for s in sets]
     return Gaussians(**{f.name: torch.cat([getattr(s, f.name) for s in sets]) for f in fields(Gaussians)})

@@ -19,8 +19,7 @@ def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) 
     Exact for every degree, from as many directions as determine it: with Y(d) the basis along directions d (rows),
     Y(d) sh_world = Y(R^T d) sh_object for all d.
     """
-    directions, inverse = _directions(coefficients)
-    directions, inverse = directions.to(rotations), inverse.to(rotations)
+    directions, inverse = _directions(coefficients, rotations.dtype, rotations.device)
     turned = directions @ rotations  # rows are R^T d
     return inverse @ _eval_sh_bases_fast(coefficients, turned)
 
@@ -33,7 +32,7 @@ def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -
 
 
 @cache
-def _directions(coefficients: int) -> tuple[Tensor, Tensor]:
+def _directions(coefficients: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Directions (m, 3) spread over the sphere (a Fibonacci lattice), and the pseudo-inverse (k, m) of their basis."""
     count = 4 * coefficients
     index = torch.arange(count, dtype=torch.float64) + 0.5
@@ -41,4 +40,5 @@ def _directions(coefficients: int) -> tuple[Tensor, Tensor]:
     angle = index * (torch.pi * (3.0 - 5.0**0.5))
     ring = torch.sqrt(1.0 - z**2)
     directions = torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=-1)
-    return directions, torch.linalg.pinv(_eval_sh_bases_fast(coefficients, directions))
+    inverse = torch.linalg.pinv(_eval_sh_bases_fast(coefficients, directions))
+    return directions.to(device, dtype), inverse.to(device, dtype)

@@ -4,13 +4,30 @@ Each part owns its parameters, their learning rates and its densification. A met
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.motion import Motion
+
+FADED = 1e-4
+"""Opacity of a faded Gaussian: under every strategy's threshold, so that the strategy removes or relocates it."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """An object as an edit wants to see it at one time: with the Gaussians of the track `source`, enlarged by `scale`
+    about its box's centre, at `object_to_world` (4, 4) in world metres; None: where it was recorded."""
+
+    source: str
+    object_to_world: np.ndarray | None = None
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -23,15 +40,24 @@ class Piece:
 
 
 class Part(nn.Module, ABC):
-    """A set of Gaussians: the world's static background, a moving actor, ...
+    """A set of Gaussians: the world's static background, the moving actors, ...
 
-    `params` holds what is optimised, under gsplat's names where a gsplat strategy densifies it.
+    `params` holds what every Gaussian has of its own, a row each, under gsplat's names (`drivesplat.model.parameters`),
+    so that gsplat's strategies densify it; `shared` what many have in common.
     """
 
     name: str
     moves = False
     """Whether its Gaussians are objects that are elsewhere at another time."""
+    extent: float
+    """Over how many metres its Gaussians spread: densification and learning rates of positions go by it."""
+    cap_max: int | None = None
+    """The most Gaussians that densification may make of it; None: as many as the training's settings say."""
     params: nn.ParameterDict
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shared = nn.ParameterDict()
 
     @abstractmethod
     def at(self, time: float) -> Gaussians:
@@ -40,14 +66,36 @@ class Part(nn.Module, ABC):
         Always `len(self)` rows in one order; one that is absent then has opacity 0.
         """
 
+    def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
+        """As `at`, with these of its objects and no others: an object that does not appear is absent, a second
+        appearance of one follows in rows of its own."""
+        return self.at(time)
+
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:
-        """The initial learning rate of every entry of `params`."""
+        """The initial learning rate of every entry of `params` and `shared` that is learned."""
+
+    @abstractmethod
+    def definition(self) -> dict[str, Any]:
+        """What, beside its parameters and settings, makes it what it is: plain data, for the checkpoint."""
 
     def pieces(self, time: float) -> dict[str, Piece]:
         """What it consists of, by names unique in a model, with the colours of a time: a set that stands still, or one
         for every track."""
         return {self.name: Piece(self.at(time), None)}
+
+    def penalties(self) -> dict[str, Float[Tensor, ""]]:
+        """Weighted terms for the training loss about itself, by name."""
+        return {}
+
+    def confine(self) -> None:
+        """Fades Gaussians that have gone where this part must not have any."""
+
+    @torch.no_grad()
+    def fade(self, rows: Bool[Tensor, " n"]) -> None:
+        """Makes Gaussians invisible."""
+        opacities, faded = self.params["opacities"], torch.logit(torch.tensor(FADED)).item()
+        opacities.masked_fill_(rows & (opacities > faded), faded)
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """Which of its rows are a track's own; None where this part does not know the track as an object."""
@@ -67,6 +115,11 @@ class Sky(nn.Module, ABC):
     @abstractmethod
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """RGB in [0, 1] seen along unit world directions."""
+
+    def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
+        """As `at`, with these of its objects and no others: an object that does not appear is absent, a second
+        appearance of one follows in rows of its own."""
+        return self.at(time)
 
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.part import Part, Sky
+from drivesplat.model.part import Appearance, Part, Piece, Sky
 from drivesplat.rasterize import rasterize
 
 
@@ -40,8 +41,10 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view shows: `image` with the sky behind, `splats` without it (premultiplied by their `alpha`), `depth` in
-    metres or None."""
+    """What a view shows of `gaussians`: `image` with the sky behind, `splats` without it (premultiplied by their
+    `alpha`), `depth` in metres or None."""
+
+    gaussians: Gaussians
 
     image: Float[Tensor, "h w 3"]
     splats: Float[Tensor, "h w 3"]
@@ -66,6 +69,14 @@ class SplatModel(nn.Module):
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
         return concatenate([part.at(time) for part in self.parts])
 
+    def staged_at(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
+        """As `gaussians_at`, with the objects that appear and no others: see `Part.staged`."""
+        return concatenate([part.staged(time, appearances) for part in self.parts])
+
+    def pieces(self, time: float) -> dict[str, Piece]:
+        """What all parts consist of: see `Part.pieces`."""
+        return {name: piece for part in self.parts for name, piece in part.pieces(time).items()}
+
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """Which of `gaussians_at`'s rows are a track's own; None where no part knows the track as an object."""
         found = [part.of_track(track_id) for part in self.parts]
@@ -73,6 +84,12 @@ class SplatModel(nn.Module):
             return None
         nothing = (torch.zeros(len(part), dtype=torch.bool, device=part.params["means"].device) for part in self.parts)
         return torch.cat([none if rows is None else rows for rows, none in zip(found, nothing, strict=True)])
+
+    @property
+    def rows(self) -> list[slice]:
+        """Which of `gaussians_at`'s rows are each part's."""
+        ends = [*accumulate(len(part) for part in self.parts)]
+        return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
     def moving(self) -> Bool[Tensor, " n"]:
         """Which of `gaussians_at`'s rows belong to parts that move."""
@@ -105,4 +122,16 @@ class SplatModel(nn.Module):
         if self.sky is not None:
             image = splats + (1.0 - alpha) * self.sky.colors(view.rays() if rays is None else rays)
         depth = rendering.depth[0, ..., 0] if rendering.depth is not None else None
-        return Picture(image, splats, alpha[..., 0], depth, rendering.info)
+        return Picture(shown, image, splats, alpha[..., 0], depth, rendering.info)
+
+    def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
+        """How opaque the parts that move are by themselves in a picture of this model; None without such parts."""
+        moving = [picture.gaussians[rows] for part, rows in zip(self.parts, self.rows, strict=True) if part.moves]
+        if not moving:
+            return None
+        alone = concatenate(moving)
+        rendering = rasterize(
+            alone.means, alone.quats, alone.scales, alone.opacities, torch.ones_like(alone.means),
+            view.viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
+        )  # fmt: skip
+        return rendering.alpha[0, ..., 0]

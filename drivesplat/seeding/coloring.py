@@ -21,6 +21,8 @@ class ColorView:
 
 CELL = 4
 """Edge in pixels of the cells of the depth buffer that decides occlusion: LiDAR is sparser than the image."""
+NEAREST = 0.5
+"""Depth in metres up to which nothing is seen."""
 OCCLUSION = 1.05
 """A point is hidden where something in its cell is nearer by this factor and half a metre."""
 
@@ -37,7 +39,7 @@ def color_by_visibility(
     best = np.full(len(points), np.inf)
     seen = np.zeros(len(points), dtype=np.int64)
     for view in views:
-        index, rows, columns = visible(points, view.world_to_camera, view.intrinsics, view.pixels.shape[:2])
+        index, rows, columns, _ = visible(points, view.world_to_camera, view.intrinsics, view.pixels.shape[:2])
         usable = view.usable[rows, columns]
         index, rows, columns = index[usable], rows[usable], columns[usable]
         seen[index] += 1
@@ -51,20 +53,31 @@ def color_by_visibility(
 
 def visible(
     points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, shape: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (m,), pixel rows (m,) and columns (m,) of the points (n, 3) that an image of `shape` (h, w) sees.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (m,), pixel rows (m,) and columns (m,), and depths (m,) along the axis in metres, of the points (n, 3)
+    that an image of `shape` (h, w) sees.
 
     A point is hidden where another of the points, in the same cell of CELL pixels, stands clearly before it.
     """
+    index, rows, columns, depth = in_image(points, world_to_camera, intrinsics, shape)
+    height, width = shape
+    cells = (rows // CELL) * (width // CELL + 1) + columns // CELL
+    nearest = np.full((height // CELL + 1) * (width // CELL + 1), np.inf)
+    np.minimum.at(nearest, cells, depth)
+    front = depth <= nearest[cells] * OCCLUSION + 0.5
+    return index[front], rows[front], columns[front], depth[front]
+
+
+def in_image(
+    points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (m,), pixel rows (m,) and columns (m,) and depths (m,) along the axis, in metres, of the points (n, 3)
+    that lie in an image of `shape` (h, w), farther before it than NEAREST; whether anything hides them is not asked."""
     pixels, depth = project(points, world_to_camera, intrinsics)
     height, width = shape
     inside = (
-        (depth > 0.5) & (pixels[:, 0] >= 0) & (pixels[:, 0] < width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < height)
+        (depth > NEAREST) & (pixels[:, 0] >= 0) & (pixels[:, 0] < width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < height)
     )
     index = np.flatnonzero(inside)
     columns, rows = pixels[index].astype(np.int64).T
-    cells = (rows // CELL) * (width // CELL + 1) + columns // CELL
-    nearest = np.full((height // CELL + 1) * (width // CELL + 1), np.inf)
-    np.minimum.at(nearest, cells, depth[index])
-    front = depth[index] <= nearest[cells] * OCCLUSION + 0.5
-    return index[front], rows[front], columns[front]
+    return index, rows, columns, depth[index]

@@ -1,12 +1,16 @@
 """LiDAR sweeps in world coordinates, without the own car and without what moves."""
 
 import logging
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from drivesplat.errors import DatasetError
+from drivesplat.holdout import sweep_groups
+from drivesplat.rigid import apply
 from drivesplat.scene import Scene, Sweep
+from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.tracks import Box, box_at, moves_at_all
 
 log = logging.getLogger(__name__)
@@ -32,6 +36,18 @@ def read_sweep(sweep: Sweep) -> np.ndarray:
         )
     points = np.fromfile(path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
     return points[np.isfinite(points).all(axis=1)].astype(np.float64)
+
+
+def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
+    """The key-frame sweeps that a training may see, each with its returns (n, 3) in world coordinates, the own car's
+    left out. A sweep whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
+    found = []
+    for sweep, group in zip(scene.sweeps, sweep_groups(scene, holdout), strict=True):
+        if sweep.is_key_frame and group == "train":
+            with suppress(DatasetError):
+                points = without_own_car(read_sweep(sweep), own_car_radius)
+                found.append((sweep, apply(sweep.sensor_to_world, points)))
+    return found
 
 
 def without_own_car(points: np.ndarray, radius: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.edit import Edit
 
 
 class TrajectorySettings(Settings):
@@ -33,17 +34,36 @@ class RenderSettings(Settings):
     """Horizontal field of view in degrees. null = the evaluated camera's own."""
     crf: int = Field(18, ge=1, le=51)
     """H.264's constant rate factor: lower is better and larger, 18 is visually lossless."""
+    edited_frames: bool = False
+    """Write the frames of edits as PNG, too, at full size: images of what was never recorded, with labels beside."""
     trajectories: dict[str, TrajectorySettings] = Field(default_factory=_default_trajectories)
     """Films to make, each under a name of your choice."""
 
 
-class FilmJob(Settings):
-    """Everything that decides the content of one film, its inputs aside."""
+class FilmFormat(Settings):
+    """How a film looks, whatever it shows; of the film of a method's parts everything that decides its content."""
 
     camera: str
-    trajectory: TrajectorySettings
     fps: int
     width: int
     height: int
     horizontal_fov: float | None
     crf: int
+
+    def tile(self, columns: int) -> tuple[int, int]:
+        """Width and height in pixels, both even, of each of so many pictures side by side in a film of this width."""
+        width = self.width // columns // 2 * 2
+        return width, max(2, width * self.height // self.width // 2 * 2)
+
+
+class FilmJob(FilmFormat):
+    """Everything that decides the content of one film along a trajectory, its inputs aside."""
+
+    trajectory: TrajectorySettings
+
+
+class EditJob(FilmFormat):
+    """Everything that decides the content of one edit's film, its inputs aside."""
+
+    edit: Edit
+    frames: bool

@@ -5,9 +5,12 @@ from typing import Literal
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 
-PartName = Literal["background"]
+PartName = Literal["background", "actors"]
+MOVING_PARTS = frozenset({"actors"})
+"""Those whose Gaussians are objects that move."""
 SkyKind = Literal["none", "mask", "cubemap"]
 
 
@@ -57,6 +60,7 @@ class TrainSettings(Settings):
     """At most one Gaussian per so many training pixels (0 = no such limit): one of SH degree 3 has 59 parameters, 20
     pixels have 60 values. More Gaussians than that fit what no other view shows."""
     gaussians: GaussianSettings = GaussianSettings()
+    actors: ActorSettings = ActorSettings()
     mcmc: McmcSettings = McmcSettings()
     default: DefaultSettings = DefaultSettings()
     floaters: FloaterSettings = FloaterSettings()
@@ -75,6 +79,15 @@ class TrainSettings(Settings):
     sky_alpha_weight: float = Field(0.05, ge=0)
     """Weight of -log(1 - alpha) on sky pixels with `sky: mask`: no Gaussian in the sky. A cube map does without:
     it cost 0.5 dB of static PSNR on scene 0061, where masks and tree tops disagree."""
+    sky_bce_weight: float = Field(0.0, ge=0)
+    """Weight of the cross entropy between alpha and the absence of sky, whatever the sky is: no Gaussian in sky pixels,
+    and no sky in the others."""
+    depth_weight: float = Field(0.0, ge=0)
+    """Weight of the mean absolute difference (metres) from LiDAR's depth, the worst 5 % of pixels left out."""
+    entropy_weight: float = Field(0.1, ge=0)
+    """Weight of the entropy of the moving parts' own alpha: an object is there or it is not. Only with such parts."""
+    dynamic_weight: float = Field(0.1, ge=0)
+    """Weight of the mean absolute colour difference over the pixels of what moves. Only with moving parts."""
     sky_resolution: int = Field(128, ge=2, le=2048)
     """Texels along an edge of the sky's cube map."""
     lr_sky: float = Field(1e-2, gt=0)
@@ -87,6 +100,11 @@ class TrainSettings(Settings):
     """Iterations between TensorBoard scalars, and between checks that all losses and gradients are finite."""
     image_every: int = Field(5_000, ge=1)
     """Iterations between TensorBoard images."""
+
+    def of_what_stands_still(self) -> "TrainSettings":
+        """Itself with all that concerns moving parts at its default: a method without such parts does not know it."""
+        fields = ("actors", "entropy_weight", "dynamic_weight")
+        return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
 
 
 class TrainJob(Settings):

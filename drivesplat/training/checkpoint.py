@@ -101,7 +101,8 @@ def restore(
 ) -> None:
     """The inverse of `state_of`, in place."""
     restore_model(model, state["model"])
-    parameters = [*((part.params, group) for part, group in zip(model.parts, optimizers.parts, strict=True))]
+    parameters = [(part.params, group) for part, group in zip(model.parts, optimizers.parts, strict=True)]
+    parameters += [(part.shared, group) for part, group in zip(model.parts, optimizers.shared, strict=True)]
     if model.sky is not None:
         parameters.append((model.sky.params, optimizers.sky))
     for params, group in parameters:

@@ -1,6 +1,7 @@
 """The densification of a model's parts: each part its own gsplat strategy and state."""
 
 from contextlib import nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -11,19 +12,18 @@ from drivesplat.training.optimizers import Optimizers
 
 
 class Densifier:
-    """The densification of one part: call `before_backward` and `after_step` at every iteration."""
+    """The densification of one part: call `after_step` at every iteration."""
 
-    def __init__(self, part: Part, settings: TrainSettings, scene_scale: float):
+    def __init__(self, part: Part, settings: TrainSettings):
         from drivesplat.training import strategies  # gsplat; the stage says in a sentence where it is missing
 
         self._part = part
         self._by_gradient = settings.strategy == "default"
-        self._strategy = strategies.make_strategy(settings)
+        self._strategy = strategies.make_strategy(settings, part.cap_max or settings.cap_max)
         self._on_cpu = strategies.torch_twins
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
-        self.absgrad = self._by_gradient and settings.default.absgrad
-        scale = {"scene_scale": scene_scale} if self._by_gradient else {}
+        scale = {"scene_scale": part.extent} if self._by_gradient else {}
         self.state: dict[str, Any] = self._strategy.initialize_state(**scale)
 
     def due(self, step: int) -> bool:
@@ -35,16 +35,24 @@ class Densifier:
         opacities = self._part.params["opacities"]
         return bool(torch.sigmoid(opacities).gt(self._dead).any())
 
-    def before_backward(self, step: int, optimizers: Optimizers, info: dict[str, Any]) -> None:
-        if self._by_gradient:
-            self._strategy.step_pre_backward(self._part.params, optimizers, self.state, step, info)
-
-    def after_step(self, step: int, optimizers: Optimizers, info: dict[str, Any]) -> None:
-        """Grows, prunes and moves Gaussians after the optimizers have stepped.
+    def after_step(self, step: int, optimizers: Optimizers, info: dict[str, Any], rows: slice) -> None:
+        """Grows, prunes and moves Gaussians after the optimizers have stepped; `rows` of what was rendered are theirs.
 
         Draws from torch's global generator, as gsplat does.
         """
         params = self._part.params
+        if len(self._part) == 0:
+            return
+        if self._by_gradient:
+            info = _own(info, rows)
         extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}
         with nullcontext() if params["means"].is_cuda else self._on_cpu():
             self._strategy.step_post_backward(params, optimizers, self.state, step, info, **extra)
+
+
+def _own(info: dict[str, Any], rows: slice) -> dict[str, Any]:
+    """What a rendering tells gsplat's DefaultStrategy about some of its Gaussians."""
+    means2d = info["means2d"]
+    gradients = {name: getattr(means2d, name, None) for name in ("grad", "absgrad")}
+    own = {name: values[:, rows] for name, values in gradients.items() if values is not None}
+    return {**info, "means2d": SimpleNamespace(**own), "radii": info["radii"][:, rows]}

@@ -6,8 +6,6 @@ from torch import Tensor
 
 from drivesplat.model.part import Part
 
-FADED = 1e-4
-"""Opacity of a pruned Gaussian: under every strategy's threshold, so that the strategy removes or relocates it."""
 LARGEST_STEP = 15.0
 """Camera positions farther apart than this (metres) are not joined into a path."""
 
@@ -36,7 +34,5 @@ def near_path(
 
 @torch.no_grad()
 def fade_floaters(part: Part, starts: Float[Tensor, "m 3"], ends: Float[Tensor, "m 3"], radius: float) -> None:
-    """Makes the part's Gaussians within `radius` metres of the camera path invisible."""
-    opacities = part.params["opacities"]
-    faded = torch.logit(torch.tensor(FADED)).item()
-    opacities.masked_fill_(near_path(part.params["means"], starts, ends, radius) & (opacities > faded), faded)
+    """Fades the Gaussians of a part that stands still within `radius` metres of the camera path."""
+    part.fade(near_path(part.params["means"], starts, ends, radius))

@@ -2,35 +2,81 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.views import TrainingView
+from drivesplat.training.views import LidarDepth, TrainingView
 
 SSIM_TAPS = 11
 SSIM_SIGMA = 1.5
+WORST = 0.05
+"""The share of depths that the loss leaves out."""
 
 
 def loss_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The weighted terms whose sum is minimised."""
-    target = view.target()
+    """The weighted terms whose sum is minimised; what is absent from the picture is not regularised either, since
+    nothing in it could hold against that."""
+    target, shown = view.target(), picture.gaussians
     terms = {
         "l1": (1.0 - settings.ssim_weight) * F.l1_loss(picture.image, target),
         "ssim": settings.ssim_weight * (1.0 - ssim(picture.image, target)),
     }
     if settings.opacity_reg:
-        terms["opacity_reg"] = (
-            settings.opacity_reg * torch.cat([torch.sigmoid(p.params["opacities"]) for p in model.parts]).mean()
-        )
+        terms["opacity_reg"] = settings.opacity_reg * shown.opacities.mean()
     if settings.scale_reg:
-        terms["scale_reg"] = settings.scale_reg * torch.cat([torch.exp(p.params["scales"]) for p in model.parts]).mean()
+        there = shown.opacities.detach() > 0.0
+        terms["scale_reg"] = settings.scale_reg * (shown.scales * there[:, None]).mean()
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(picture.alpha, view.sky)
+    if view.sky is not None and settings.sky_bce_weight:
+        terms["sky_bce"] = settings.sky_bce_weight * sky_cross_entropy(picture.alpha, view.sky)
+    if view.lidar is not None and picture.depth is not None:
+        terms["depth"] = settings.depth_weight * depth_loss(picture.depth, view.lidar)
+    return {**terms, **_moving_terms(picture, view, model, settings)}
+
+
+def _moving_terms(
+    picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
+) -> dict[str, Float[Tensor, ""]]:
+    """The terms about parts that move; none for a model without."""
+    terms = {name: term for part in model.parts for name, term in part.penalties().items()}
+    alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
+    if alpha is not None:
+        terms["entropy"] = settings.entropy_weight * entropy(alpha)
+    if view.moving is not None and settings.dynamic_weight:
+        terms["dynamic"] = settings.dynamic_weight * masked_l1(picture.image, view.target(), view.moving)
     return terms
+
+
+def sky_cross_entropy(alpha: Float[Tensor, "h w"], sky: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean binary cross entropy between alpha and the absence of sky."""
+    return F.binary_cross_entropy(alpha.clamp(1e-4, 1.0 - 1e-4), 1.0 - sky.float())
+
+
+def depth_loss(depth: Float[Tensor, "h w"], lidar: LidarDepth) -> Float[Tensor, ""]:
+    """Mean absolute difference in metres where LiDAR measured, the worst 5 % left out (Street Gaussians, section 3.3):
+    returns from behind an edge, or from what the image does not see."""
+    errors = (depth.reshape(-1)[lidar.pixels] - lidar.depth).abs()
+    kept = max(1, int(len(errors) * (1.0 - WORST)))
+    return torch.topk(errors, kept, largest=False, sorted=False).values.mean()
+
+
+def entropy(alpha: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean of -o ln o - (1 - o) ln (1 - o): least where everything is there or not there."""
+    o = alpha.clamp(1e-4, 1.0 - 1e-4)
+    return -(o * torch.log(o) + (1.0 - o) * torch.log1p(-o)).mean()
+
+
+def masked_l1(
+    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference over a mask; 0 for an empty one."""
+    difference = (image - target).abs().mean(dim=-1) * mask
+    return difference.sum() / mask.sum().clamp(min=1)
 
 
 def sky_alpha_loss(alpha: Float[Tensor, "h w"], sky: Tensor) -> Float[Tensor, ""]:

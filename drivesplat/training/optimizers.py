@@ -15,14 +15,16 @@ MEANS_DECAY = 0.01
 
 @dataclass
 class ModelOptimizers:
-    """`parts[i]` belongs to part i of the model, `sky` to its sky."""
+    """`parts[i]` belongs to the Gaussians of part i of the model, `shared[i]` to what they share, `sky` to its sky."""
 
     parts: list[Optimizers]
+    shared: list[Optimizers]
     sky: Optimizers
 
     def all(self) -> list[tuple[str, torch.optim.Optimizer]]:
         return [
             *((f"{i}.{k}", o) for i, group in enumerate(self.parts) for k, o in group.items()),
+            *((f"{i}.shared.{k}", o) for i, group in enumerate(self.shared) for k, o in group.items()),
             *((f"sky.{k}", o) for k, o in self.sky.items()),
         ]
 
@@ -35,6 +37,7 @@ class ModelOptimizers:
 def make_optimizers(model: SplatModel) -> ModelOptimizers:
     return ModelOptimizers(
         parts=[_adams(part.params, part.learning_rates()) for part in model.parts],
+        shared=[_adams(part.shared, part.learning_rates()) for part in model.parts],
         sky=_adams(model.sky.params, model.sky.learning_rates()) if model.sky is not None else {},
     )
 
@@ -43,7 +46,7 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     return {
         name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15, fused=True)
         for name, rate in rates.items()
-        if params[name].requires_grad
+        if name in params and params[name].requires_grad
     }
 
 

@@ -2,32 +2,86 @@
 
 import dataclasses
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from drivesplat.device import choose_device, telling_out_of_memory
-from drivesplat.masks import read_sky_mask
-from drivesplat.model.build import build_model, gaussian_cap, rebuild_model
+from drivesplat.masks import read_labels, read_masks_record, read_sky_mask
+from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import image_size
+from drivesplat.parser import image_size, read_parser
+from drivesplat.regions import region_mask
+from drivesplat.seeding.actors import read_actors
+from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
 from drivesplat.training.train import Workspace, train
-from drivesplat.training.views import TrainingView, load_views
+from drivesplat.training.views import Guides, TrainingView, load_views
+
+
+@dataclass(frozen=True)
+class TrainingInputs:
+    """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
+    has no use for them), and the folder of masks."""
+
+    parser: dict[str, Any]
+    masks: Path
+    actors: list[dict[str, Any]]
+    lidar_depth: list[dict[str, np.ndarray]]
+
+    def guides(self, job: TrainJob) -> Guides:
+        """What `job` wants to know of the training images."""
+        images = [int(i) for i in self.parser["splits"]["train"]]
+        return Guides(
+            sky={i: self._sky(i) for i in images} if job.sky != "none" or job.train.sky_bce_weight else {},
+            moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
+            lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
+        )
+
+    def _sky(self, index: int) -> np.ndarray:
+        return read_sky_mask(self.masks, *self._image(index))
+
+    def _moving(self, index: int) -> np.ndarray:
+        labels = read_labels(self.masks, *self._image(index))
+        return region_mask(labels, "moving_vehicle") | region_mask(labels, "moving_human")
+
+    def _image(self, index: int) -> tuple[str, int, tuple[int, int]]:
+        """Camera, timestamp and size of an image."""
+        camera = self.parser["camera_names"][self.parser["camera_indices"][index]]
+        return camera, int(self.parser["timestamps"][index]), image_size(self.parser, index)
+
+
+def read_inputs(
+    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str]
+) -> tuple[TrainingInputs, list[dict[str, Any]]]:
+    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl and lidar_depth.pkl,
+    with the provenances of these files."""
+    folder = Path(masks).parent
+    packed, moving = read_parser(parser), [read_actors(path) for path in actors]
+    depths = [read_lidar_depth(path) for path in lidar_depth]
+    inputs = TrainingInputs(
+        packed,
+        folder,
+        [actor for record in moving for actor in record["actors"]],
+        [image for record in depths for image in record["images"]],
+    )
+    records = [packed, read_masks_record(folder), *moving, *depths]
+    return inputs, [record["provenance"] for record in records]
 
 
 @dataclass(frozen=True)
 class TrainingFiles:
-    """What a training writes (`checkpoint`, `summary`) and the folder of `masks` it reads."""
+    """What a training writes."""
 
     checkpoint: Path
     summary: Path
-    masks: Path
 
     @property
     def resume(self) -> Path:
@@ -36,7 +90,7 @@ class TrainingFiles:
 
 
 def run_training(
-    parser: dict[str, Any],
+    inputs: TrainingInputs,
     job: TrainJob,
     device_settings: DeviceSettings,
     files: TrainingFiles,
@@ -46,20 +100,20 @@ def run_training(
     """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure."""
     with checkpoint.sole_trainer(files.resume):
         device = choose_device(device_settings)
-        sky_masks = sky_masks_of(parser, files.masks) if job.sky != "none" else None
         with telling_out_of_memory(lambda: 0):
-            views = load_views(parser, sky_masks, device)
-        settings = job.train.model_copy(update={"cap_max": gaussian_cap(parser, job.train)})
-        model = build_model(parser, job.parts, job.sky, settings, mean_sky_color(views))
+            views = load_views(inputs.parser, inputs.guides(job), device)
+        settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
+        beginnings = Beginnings(inputs.parser, inputs.actors, mean_sky_color(views))
+        model = build_model(beginnings, job.parts, job.sky, settings)
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
         workspace = Workspace(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
-        summary = train(model, views, settings, job.random_seed, parser["scene_scale"], device, workspace)
+        summary = train(model, views, settings, job.random_seed, device, workspace)
         content = {
             "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
             "job": job.model_dump_json(),
-            "scene_scale": parser["scene_scale"],
+            "parts": definitions(model),
             "provenance": provenance,
         }
         checkpoint.save(files.checkpoint, content)
@@ -70,7 +124,7 @@ def run_training(
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """Reads `checkpoint.pt`. Raises ResultError where it is not one, or holds anything but tensors and plain data."""
     content = checkpoint.load(Path(path), rule="train")
-    if not {"model", "job", "scene_scale", "provenance"} <= content.keys():
+    if not {"model", "job", "parts", "provenance"} <= content.keys():
         raise unreadable(path, "train", "not a checkpoint of a finished training")
     return content
 
@@ -78,17 +132,18 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 def trained_model(content: dict[str, Any]) -> tuple[SplatModel, TrainJob]:
     """The model of a checkpoint's content, on the CPU, and the settings it was trained with."""
     job = TrainJob.model_validate_json(content["job"])
-    return rebuild_model(content["model"], job.parts, job.sky, job.train, content["scene_scale"]), job
+    return rebuild_model(content["model"], content["parts"], job.sky, job.train), job
 
 
-def sky_masks_of(parser: dict[str, Any], masks: Path) -> dict[str, np.ndarray]:
-    """The sky (h, w) bool of every training image, by image path."""
-    found = {}
-    for i in parser["splits"]["train"]:
-        camera = parser["camera_names"][parser["camera_indices"][i]]
-        size = image_size(parser, i)
-        found[parser["image_paths"][i]] = read_sky_mask(masks, camera, int(parser["timestamps"][i]), size)
-    return found
+def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> tuple[SplatModel, torch.device]:
+    """The model of a checkpoint's content, to be looked at, on the device that the settings choose.
+
+    Raises DeviceError where there is none, or its memory is exhausted.
+    """
+    device = choose_device(device_settings, min_free_gb=0.0)
+    model, _ = trained_model(checkpoint)
+    with telling_out_of_memory(lambda: len(model)):
+        return model.to(device).requires_grad_(False), device
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:

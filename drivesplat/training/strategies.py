@@ -43,11 +43,12 @@ class CappedDefaultStrategy(DefaultStrategy):
         return super()._grow_gs(params, optimizers, state, step)
 
 
-def make_strategy(settings: TrainSettings) -> DefaultStrategy | MCMCStrategy:
+def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MCMCStrategy:
+    """The strategy that the settings name, for at most `cap_max` Gaussians."""
     start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
     if settings.strategy == "mcmc":
         return MCMCStrategy(
-            cap_max=settings.cap_max,
+            cap_max=cap_max,
             noise_lr=settings.mcmc.noise_lr,
             min_opacity=settings.mcmc.min_opacity,
             refine_start_iter=start,
@@ -63,7 +64,7 @@ def make_strategy(settings: TrainSettings) -> DefaultStrategy | MCMCStrategy:
         refine_every=settings.default.refine_every,
         reset_every=settings.default.reset_every,
     )
-    strategy.cap_max = settings.cap_max
+    strategy.cap_max = cap_max
     return strategy
 
 

@@ -61,21 +61,26 @@ class Trainer:
         views: list[TrainingView],
         settings: TrainSettings,
         seed: int,
-        scene_scale: float,
         device: torch.device,
     ) -> "Trainer":
         torch.manual_seed(seed)
-        densifiers = [Densifier(part, settings, scene_scale) for part in model.parts]
+        densifiers = [Densifier(part, settings) for part in model.parts]
         return cls(model, views, settings, seed, device, make_optimizers(model), densifiers, FiniteGuard(device))
 
     def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
         """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
         view = self.views[order(len(self.views), self.step, self.seed)]
         schedule(self.model, self.optimizers, self.step, self.settings.iterations)
-        picture = self.model.render(view.view, self.sh_degree(), absgrad=self.densifiers[0].absgrad)
+        by_gradient = self.settings.strategy == "default"
+        picture = self.model.render(
+            view.view,
+            self.sh_degree(),
+            absgrad=by_gradient and self.settings.default.absgrad,
+            with_depth=view.lidar is not None,
+        )
         terms = loss_terms(picture, view, self.model, self.settings)
-        for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
-            densifier.before_backward(self.step, optimizers, picture.info)
+        if by_gradient:
+            picture.info["means2d"].retain_grad()
         torch.stack(list(terms.values())).sum().backward()
         self.guard.watch(
             self.step, {**{f"loss {name}": value for name, value in terms.items()}, **self._gradient_norms()}
@@ -89,8 +94,8 @@ class Trainer:
 
     def densify(self, picture: Picture) -> None:
         """The second half: each part grows, prunes and moves its Gaussians."""
-        for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
-            densifier.after_step(self.step, optimizers, picture.info)
+        for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
+            densifier.after_step(self.step, optimizers, picture.info, rows)
         self.step += 1
 
     def sh_degree(self) -> int:
@@ -100,7 +105,12 @@ class Trainer:
     def _gradient_norms(self) -> dict[str, torch.Tensor]:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
         norms = torch._foreach_norm([gradient for _, gradient in named])
-        return {f"gradient of {name.rpartition('.')[2]}": norm for (name, _), norm in zip(named, norms, strict=True)}
+        return {f"gradient of {self._spoken(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}
+
+    def _spoken(self, parameter: str) -> str:
+        """What a parameter of the model is called in a message: 'background means', 'sky texels'."""
+        owner, *place, name = parameter.split(".")
+        return f"{self.model.parts[int(place[0])].name if owner == 'parts' else owner} {name}"
 
 
 @dataclass(frozen=True)
@@ -124,7 +134,6 @@ def train(
     views: list[TrainingView],
     settings: TrainSettings,
     seed: int,
-    scene_scale: float,
     device: torch.device,
     workspace: Workspace,
 ) -> TrainingSummary:
@@ -134,7 +143,7 @@ def train(
     memory is exhausted. The last good checkpoint survives both.
     """
     with telling_out_of_memory(lambda: len(model)):
-        trainer = Trainer.begin(model.to(device), views, settings, seed, scene_scale, device)
+        trainer = Trainer.begin(model.to(device), views, settings, seed, device)
         run = Run.begin(trainer, workspace)
         monitor = Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label)
         try:
@@ -210,11 +219,13 @@ def _iterate(run: Run, monitor: Monitor) -> None:
         terms, picture, view = trainer.fit_one()
         if trainer.densifies():
             run.check()  # a strategy fed with what is no number ends in an assertion on the GPU, beyond rescue
+            for part in trainer.model.parts:
+                part.confine()
         trainer.densify(picture)
         if len(trainer.model) == 0:
             run.check()
         if settings.floaters.radius and trainer.step % settings.floaters.every == 0:
-            for part in trainer.model.parts:
+            for part in (part for part in trainer.model.parts if not part.moves):
                 fade_floaters(part, starts, ends, settings.floaters.radius)
         if trainer.step % settings.log_every == 0:
             run.check()

@@ -1,11 +1,12 @@
 """The training images on the device, as bytes, with their cameras."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from drivesplat.images import read_image
@@ -14,12 +15,23 @@ from drivesplat.parser import image_size
 
 
 @dataclass(frozen=True)
+class LidarDepth:
+    """What LiDAR measured in an image: at `pixels` (m,), counted row by row, `depth` (m,) metres along the axis."""
+
+    pixels: Int[Tensor, " m"]
+    depth: Float[Tensor, " m"]
+
+
+@dataclass(frozen=True)
 class TrainingView:
-    """A camera and what it recorded; `sky` is True where the sky is, None where that is unknown."""
+    """A camera and what it recorded; `sky` and `moving` are True where the sky is and where something moves, None where
+    that is unknown or not wanted; so is `lidar`."""
 
     view: View
     pixels: UInt8[Tensor, "h w 3"]
-    sky: Bool[Tensor, "h w"] | None
+    sky: Bool[Tensor, "h w"] | None = None
+    moving: Bool[Tensor, "h w"] | None = None
+    lidar: LidarDepth | None = None
 
     def target(self) -> Float[Tensor, "h w 3"]:
         """The recorded colours in [0, 1]."""
@@ -39,17 +51,36 @@ def view_of(parser: dict[str, Any], index: int, device: torch.device) -> View:
     )
 
 
-def load_views(
-    parser: dict[str, Any], sky_masks: dict[str, np.ndarray] | None, device: torch.device
-) -> list[TrainingView]:
-    """The training images of a parser record. `sky_masks` (h, w) bool by image path, at training resolution."""
+@dataclass(frozen=True)
+class Guides:
+    """What is known of training images beside their pixels, by their number: masks (h, w) bool of the `sky` and of what
+    is `moving`, and the records of `lidar` (rows, columns, depth); an empty mapping where a guide is not wanted."""
+
+    sky: Mapping[int, np.ndarray]
+    moving: Mapping[int, np.ndarray]
+    lidar: Mapping[int, dict[str, np.ndarray]]
+
+
+def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> list[TrainingView]:
+    """The training images of a parser record, with all masks at training resolution."""
     views = []
-    for index in parser["splits"]["train"]:
-        path = parser["image_paths"][index]
-        pixels = torch.from_numpy(read_image(path, image_size(parser, index)).copy()).to(device)
-        sky = torch.from_numpy(sky_masks[path]).to(device) if sky_masks else None
-        views.append(TrainingView(view_of(parser, int(index), device), pixels, sky))
+    for index in map(int, parser["splits"]["train"]):
+        size = image_size(parser, index)
+        pixels = torch.from_numpy(read_image(parser["image_paths"][index], size).copy()).to(device)
+        sky, moving = (
+            torch.from_numpy(masks[index]).to(device) if index in masks else None
+            for masks in (guides.sky, guides.moving)
+        )
+        lidar = _lidar_depth(guides.lidar[index], size[0], device) if index in guides.lidar else None
+        views.append(TrainingView(view_of(parser, index, device), pixels, sky, moving, lidar))
     return views
+
+
+def _lidar_depth(record: dict[str, np.ndarray], width: int, device: torch.device) -> LidarDepth | None:
+    if len(record["depth"]) == 0:
+        return None
+    pixels = record["rows"].astype(np.int64) * width + record["columns"]
+    return LidarDepth(torch.from_numpy(pixels).to(device), torch.from_numpy(record["depth"]).float().to(device))
 
 
 def order(count: int, step: int, seed: int) -> int:

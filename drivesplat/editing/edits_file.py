@@ -1,0 +1,124 @@
+"""The edits of a scene, as a YAML file: named edits, each a list of steps. docs/editing.md describes it.
+
+Importing this module is cheap: the Snakefile does. What only the scene knows, `edited_cast` checks.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from drivesplat.config import NAME
+from drivesplat.errors import ConfigError
+from drivesplat.settings.edit import Edit, Step
+
+RESERVED = ("ego",)
+"""Names that nothing else may have: it is the camera's car."""
+
+
+def read_edits(path: str | Path) -> dict[str, Edit]:
+    """The edits of a file by their names, in its order.
+
+    Raises ConfigError, one line with the file, the edit and the step, where it is missing or not what it should be.
+    """
+    content = _content(path)
+    if not isinstance(content, dict) or set(content) != {"edits"}:
+        raise ConfigError(f"{path}: an edits file holds the one key 'edits', under it a list of steps per name")
+    edits = {} if content["edits"] is None else content["edits"]
+    if not isinstance(edits, dict):
+        raise ConfigError(f"{path}: 'edits' is {_shown(edits)}; it holds a list of steps per name")
+    return {_name(name, f"{path}: edit"): _edit(steps, f"{path}: edit {name!r}") for name, steps in edits.items()}
+
+
+def _content(path: str | Path) -> Any:
+    try:
+        return yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_EveryKeyOnce)  # a SafeLoader
+    except OSError as error:
+        raise ConfigError(f"{path}: the edits file cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: the edits file is not UTF-8 text ({error.reason})") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not YAML: {error}") from None
+
+
+def _edit(steps: Any, where: str) -> Edit:
+    if not isinstance(steps, list) or not steps:
+        raise ConfigError(f"{where} is {_shown(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}")
+    return Edit(steps=tuple(_step(step, f"{where}, step {number}") for number, step in enumerate(steps, start=1)))
+
+
+def _step(step: Any, where: str) -> Step:
+    kinds = ", ".join(Step.model_fields)
+    if not isinstance(step, dict) or len(step) != 1:
+        raise ConfigError(f"{where} is {_shown(step)}; a step has one key, one of {kinds}")
+    (kind, fields), *_ = step.items()
+    if kind not in Step.model_fields:
+        raise ConfigError(f"{where}: there is no step {kind!r}; there are: {kinds}")
+    where = f"{where} ({kind})"
+    if not isinstance(fields, dict):
+        raise ConfigError(f"{where} is {_shown(fields)}; it is a mapping: {kind}: {{{_example(kind)}}}")
+    try:
+        checked = Step.model_validate({kind: fields})
+    except ValidationError as error:
+        raise ConfigError(f"{where}: " + "; ".join(_sentence(item, kind) for item in error.errors())) from None
+    if checked.duplicate is not None:
+        _name(checked.duplicate.name, f"{where}: 'as'")
+    return checked
+
+
+def _name(name: Any, what: str) -> str:
+    if not isinstance(name, str):
+        raise ConfigError(f"{what} {name!r} is not text: put the name in quotes")
+    if not re.fullmatch(NAME, name):
+        raise ConfigError(f"{what} {name!r} cannot name a file: use letters, digits, '_', '-' and '.'")
+    if name in RESERVED:
+        raise ConfigError(f"{what} {name!r} is a name kept for the camera's car; choose another")
+    return name
+
+
+def _keys(kind: str) -> list[str]:
+    """The keys of a step as they stand in the file."""
+    record = Step.model_fields[kind].annotation.__args__[0]
+    return [field.alias or name for name, field in record.model_fields.items()]
+
+
+def _example(kind: str) -> str:
+    return "lateral: 2.0" if kind == "ego" else "track: 6e5c, ..."
+
+
+def _sentence(item: Any, kind: str) -> str:
+    """What pydantic found wrong with a step of a kind."""
+    key = ".".join(str(part) for part in item["loc"][1:])
+    message = item["msg"].removeprefix("Value error, ")
+    if not key:
+        return message
+    if item["type"] == "extra_forbidden":
+        return f"unknown key {key!r}; there are: {', '.join(_keys(kind))}"
+    if item["type"] == "missing":
+        return f"{key!r} is missing; there are: {', '.join(_keys(kind))}"
+    return f"{key!r} is {_shown(item['input'])}: {message[:1].lower()}{message[1:]}"
+
+
+def _shown(value: Any) -> str:
+    """A value of the file, not too long for a line."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+class _EveryKeyOnce(yaml.SafeLoader):
+    """A safe loader that refuses a key which stands twice in a mapping: plain YAML drops the first in silence."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        known: list[Any] = []
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            key = self.construct_object(key_node, deep=True)
+            if key in known:
+                raise yaml.constructor.ConstructorError(
+                    problem=f"the key {key!r} stands twice", problem_mark=key_node.start_mark
+                )
+            known.append(key)
+        return super().construct_mapping(node, deep)

@@ -1,0 +1,103 @@
+"""The pieces of a model as PLYs of their own, with parts.json to say what each is and how it moves.
+
+With them a drive can be put together again at any time, or otherwise: without a vehicle, with it elsewhere.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.export.cameras_json import CONVENTIONS as CAMERA_CONVENTIONS
+from drivesplat.export.sampled_motion import SampledMotion
+from drivesplat.export.spelling import distinct
+from drivesplat.export.splat_ply import note_of, write_splat_ply
+from drivesplat.export.trained_parts import SampledPiece, digests, middle_timestamp
+from drivesplat.scene import Scene
+from drivesplat.storage import write_json
+
+SCHEMA = 1
+CONVENTIONS = {
+    "world": "Metres, z up, the axes of the dataset's global frame; files of frame 'world' are in these coordinates.",
+    "global": CAMERA_CONVENTIONS["global"],
+    "object": "Metres, x forward, y left, z up, the origin in the middle of the object's box; files of frame 'object' "
+    "are in these coordinates, and their spherical harmonics want directions in them.",
+    "transforms": "Matrices 4x4, row by row, applied to column vectors: world = object_to_world object.",
+    "seconds": "Since the first image of any camera, whose timestamp is first_image.",
+    "timestamps": "Microseconds of the dataset's clock: first_image plus the seconds.",
+    "present": "From when to when the object is there, in seconds; at all other times it is absent.",
+    "samples": "Thirty a second, at every image of cameras.json and at the annotations, while the object is there.",
+    "colors": "Where colours vary with time they are those at colors_timestamp, the middle image's, "
+    "which is also the time of splat.ply.",
+    "size": "Length, width, height of the annotated box in metres; null, like category, where the scene "
+    "knows no such track.",
+}
+
+
+def write_parts(path: str | Path, pieces: Mapping[str, SampledPiece], scene: Scene, provenance: dict[str, Any]) -> None:
+    """Writes every piece as a PLY beside `path` and, once all are there, what they are to `path`.
+
+    PLYs of pieces that an earlier call left there and this one does not write are removed; other files stay.
+    """
+    folder = Path(path).parent
+    files = {name: f"{stem}.ply" for name, stem in distinct(pieces, _stem).items()}
+    for name, piece in pieces.items():
+        note = {"scene": scene.name, "piece": name, "frame": _frame(piece), **digests(provenance)}
+        write_splat_ply(folder / files[name], piece.gaussians, note)
+    _remove_others(folder, set(files.values()))
+    write_json(path, {**_record(pieces, files, scene), "provenance": provenance})
+
+
+def _record(pieces: Mapping[str, SampledPiece], files: Mapping[str, str], scene: Scene) -> dict[str, Any]:
+    first_image = min(frame.timestamp for frame in scene.frames)
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "dataset": scene.dataset,
+        "version": scene.version,
+        "poses": scene.poses,
+        "conventions": CONVENTIONS,
+        "origin": scene.origin.tolist(),
+        "first_image": first_image,
+        "colors_timestamp": middle_timestamp(scene),
+        "parts": [
+            {
+                "name": name,
+                "file": files[name],
+                "gaussians": len(piece.gaussians),
+                "sh_degree": piece.gaussians.sh_degree,
+                "frame": _frame(piece),
+                "category": piece.track.category if piece.track else None,
+                "size": piece.track.size.tolist() if piece.track else None,
+                "motion": _motion(piece.motion, first_image) if piece.motion else None,
+            }
+            for name, piece in pieces.items()
+        ],
+    }
+
+
+def _motion(motion: SampledMotion, first_image: int) -> dict[str, Any]:
+    return {
+        "present": [list(span) for span in motion.spans],
+        "seconds": motion.seconds.tolist(),
+        "timestamps": (first_image + np.rint(motion.seconds * 1e6).astype(np.int64)).tolist(),
+        "object_to_world": motion.object_to_world.tolist(),
+    }
+
+
+def _frame(piece: SampledPiece) -> str:
+    return "object" if piece.motion else "world"
+
+
+def _stem(name: str) -> str:
+    """A name as that of a file, on any system."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name) or "_"
+
+
+def _remove_others(folder: Path, kept: set[str]) -> None:
+    """Removes PLYs of pieces that are not among the names `kept`."""
+    for file in folder.glob("*.ply"):
+        if file.name not in kept and "piece" in note_of(file):
+            file.unlink()

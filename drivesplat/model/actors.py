@@ -1,0 +1,219 @@
+"""The moving actors: for every track a set of Gaussians in its own box's frame, all of them moved in one batch.
+
+After Street Gaussians (Yan et al. 2024, arXiv 2401.01339): the boxes carry the Gaussians, small corrections of the
+boxes are learned, and colours vary with time as a Fourier series over the actor's life. Colours are functions of the
+direction in the object's frame: their spherical harmonics turn with it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch.nn.functional import normalize, one_hot
+
+from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.harmonics import rotation_of_harmonics
+from drivesplat.model.parameters import learning_rates, optimised, started_at
+from drivesplat.model.part import Appearance, Part, Piece
+from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
+from drivesplat.model.timeline import ActorTrack, Timeline
+from drivesplat.motion import Motion
+from drivesplat.settings.actors import ActorSettings, TrackSettings
+from drivesplat.settings.gaussians import GaussianSettings
+
+
+@dataclass(frozen=True)
+class Placements:
+    """Where a actors are at one time: object to world as `quats` w, x, y, z and `translations` in metres; whether they
+    are `present`; `scales`, by how much they are enlarged."""
+
+    quats: Float[Tensor, "a 4"]
+    translations: Float[Tensor, "a 3"]
+    present: Bool[Tensor, " a"]
+    scales: Float[Tensor, " a"]
+
+    def staged(self, ids: Sequence[str], appearances: Sequence[Appearance]) -> "Placements":
+        """These placements of the actors `ids` changed as each one's appearance says; who has none is absent."""
+        quats, translations, scales = self.quats.clone(), self.translations.clone(), self.scales.clone()
+        present = torch.zeros_like(self.present)
+        for appearance in appearances:
+            i, pose = ids.index(appearance.source), appearance.object_to_world
+            present[i], scales[i] = self.present[i], appearance.scale
+            if pose is not None:
+                present[i] = True
+                turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+                quats[i] = torch.from_numpy(turned).to(quats)
+                translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
+        return Placements(quats, translations, present, scales)
+
+
+class Actors(Part):
+    """The Gaussians of a tracks, n in all; `params["owner"]` (n,) says whose each is.
+
+    `sh0` (n, f, 1, 3) and `shN` (n, f, k - 1, 3) hold f Fourier coefficients of every coefficient of the colours.
+    `shared` holds the corrections at all m annotations, one track after the other: `translation` (m, 3) metres along
+    the world's axes, `yaw` (m,) radians about the object's vertical axis.
+    """
+
+    name = "actors"
+    moves = True
+
+    def __init__(
+        self,
+        params: dict[str, Tensor],
+        tracks: Sequence[ActorTrack],
+        settings: ActorSettings,
+        gaussians: GaussianSettings,
+    ):
+        super().__init__()
+        self.timeline = Timeline(tracks, settings.fourier)
+        self.params = optimised(params)
+        annotations = sum(len(track.motion.times) for track in tracks)
+        corrections = {"translation": torch.zeros(annotations, 3), "yaw": torch.zeros(annotations)}
+        self.shared = optimised(corrections).requires_grad_(settings.tracks.corrected)
+        self.extent = float(np.median([np.linalg.norm(track.size) for track in tracks]))
+        self.cap_max = max(settings.cap_max, len(self))
+        self._settings = settings
+        self._gaussians = gaussians
+        sizes = torch.from_numpy(np.stack([track.size for track in tracks])).float()
+        self.register_buffer("_reach", 0.5 * sizes + settings.box_margin, persistent=False)
+        self.register_buffer("_neighbours", self.timeline.neighbours, persistent=False)
+
+    @classmethod
+    def from_points(
+        cls,
+        tracks: Sequence[ActorTrack],
+        points: Sequence[np.ndarray],
+        colors: Sequence[np.ndarray],
+        settings: ActorSettings,
+        gaussians: GaussianSettings,
+    ) -> "Actors":
+        """Started from every track's points (p, 3) in its object's frame and their colours (p, 3) in [0, 1]."""
+        own = gaussians.model_copy(update={"sh_degree": settings.sh_degree})
+        sets = [started_at(p, c, own) for p, c in zip(points, colors, strict=True)]
+        params = {key: torch.cat([s[key] for s in sets]) for key in sets[0]}
+        for key in ("sh0", "shN"):
+            constant = params[key][:, None]
+            varying = constant.new_zeros(len(constant), settings.fourier - 1, *constant.shape[2:])
+            params[key] = torch.cat([constant, varying], dim=1)
+        params["owner"] = torch.repeat_interleave(torch.arange(len(sets)), torch.tensor([len(p) for p in points]))
+        return cls(params, tracks, settings, gaussians)
+
+    def at(self, time: float) -> Gaussians:
+        return self.placed(time, self.placements(time))
+
+    def placements(self, time: float) -> Placements:
+        """Where the actors are at a time, by their annotations and the learned corrections."""
+        moment = self.timeline.at(time, self.params["means"].device)
+        turns = about_vertical(moment.weights @ self.shared["yaw"])
+        return Placements(
+            (left_factor(moment.quats) @ turns[..., None])[..., 0],
+            moment.translations + moment.weights @ self.shared["translation"],
+            moment.present,
+            torch.ones_like(moment.translations[:, 0]),
+        )
+
+    def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
+        own, known = self.placements(time), [track.id for track in self.timeline.tracks]
+        first, again = [], []
+        for appearance in (appearance for appearance in appearances if appearance.source in known):
+            twice = appearance.source in {other.source for other in first}
+            (again if twice else first).append(appearance)
+        sets = [self.placed(time, own.staged(known, first))]
+        for appearance in again:  # all are placed for the sake of one: copies are few
+            placed = self.placed(time, own.staged(known, [appearance]))
+            sets.append(placed[self.params["owner"] == known.index(appearance.source)])
+        return concatenate(sets)
+
+    def placed(self, time: float, placements: Placements) -> Gaussians:
+        """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time."""
+        p = self.params
+        rotations = rotation_matrix(placements.quats)
+        scales = self._of_owners(placements.scales)[:, None]
+        sh = self.harmonics(time)
+        if sh.shape[1] > 1:  # colours turn by degrees at most: no gradient of theirs is worth its noise to the track
+            sh = self._of_owners(rotation_of_harmonics(rotations.detach(), sh.shape[1])) @ sh
+        turned = (self._of_owners(rotations) @ (scales * p["means"])[..., None])[..., 0]
+        return Gaussians(
+            turned + self._of_owners(placements.translations),
+            (self._of_owners(left_factor(placements.quats)) @ normalize(p["quats"], dim=-1)[..., None])[..., 0],
+            scales * torch.exp(p["scales"]),
+            torch.sigmoid(p["opacities"]) * self._of_owners(placements.present.to(scales.dtype)),
+            sh,
+        )
+
+    def _of_owners(self, values: Float[Tensor, "a *v"]) -> Float[Tensor, "n *v"]:
+        """For every Gaussian its actor's value: a product with the matrix of who owns what, exact, and with a gradient
+        that is a product as well, where that of indexing adds up row by row."""
+        owns = one_hot(self.params["owner"], len(values)).to(values.dtype)
+        return (owns @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
+
+    def harmonics(self, time: float) -> Float[Tensor, "n k 3"]:
+        """The coefficients of the colours at a time, in the object's frame: the sum over i of f_i cos(i pi t / T), t
+        running from 0 to T over the actor's annotations (equation 5 of the paper)."""
+        coefficients = torch.cat([self.params["sh0"], self.params["shN"]], dim=2)
+        if coefficients.shape[1] == 1:
+            return coefficients[:, 0]
+        series = self._of_owners(self.timeline.at(time, coefficients.device).series)
+        return (series[:, :, None, None] * coefficients).sum(dim=1)
+
+    def learning_rates(self) -> dict[str, float]:
+        tracks = self._settings.tracks
+        own = learning_rates(self._gaussians, self.extent)
+        return {**own, "translation": tracks.lr_translation, "yaw": tracks.lr_yaw}
+
+    def definition(self) -> dict[str, Any]:
+        return {"tracks": [track.plain() for track in self.timeline.tracks]}
+
+    def penalties(self) -> dict[str, Float[Tensor, ""]]:
+        tracks = self._settings.tracks
+        if not tracks.corrected:
+            return {}
+        return track_penalties(self.shared["translation"], self.shared["yaw"], self._neighbours, tracks)
+
+    @torch.no_grad()
+    def confine(self) -> None:
+        self.fade((self.params["means"].abs() > self._of_owners(self._reach)).any(dim=1))
+
+    def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
+        known = [track.id for track in self.timeline.tracks]
+        return self.params["owner"] == known.index(track_id) if track_id in known else None
+
+    @torch.no_grad()
+    def pieces(self, time: float) -> dict[str, Piece]:
+        p = self.params
+        scales, opacities = torch.exp(p["scales"]), torch.sigmoid(p["opacities"])
+        local = Gaussians(p["means"], p["quats"], scales, opacities, self.harmonics(time))
+        return {
+            track.id: Piece(local[p["owner"] == i], motion)
+            for i, (track, motion) in enumerate(zip(self.timeline.tracks, self.motions(), strict=True))
+        }
+
+    @torch.no_grad()
+    def motions(self) -> list[Motion]:
+        """Every track's motion with its learned corrections."""
+        shifts, turns = (self.shared[key].double().cpu().numpy() for key in ("translation", "yaw"))
+        motions = []
+        for track, own in zip(self.timeline.tracks, self.timeline.owned, strict=True):
+            poses = track.motion.object_to_world.copy()
+            poses[:, :3, 3] += shifts[own]
+            motions.append(replace(track.motion, object_to_world=poses, turns=turns[own]))
+        return motions
+
+
+def track_penalties(
+    translation: Float[Tensor, "m 3"], yaw: Float[Tensor, " m"], neighbours: Int[Tensor, "q 3"], settings: TrackSettings
+) -> dict[str, Float[Tensor, ""]]:
+    """What corrections cost: their mean square, and that of their second differences along the tracks, both in units of
+    what annotations are expected to be off. `neighbours` are every three annotations that follow one another."""
+    off = torch.cat([translation / settings.sigma_translation, yaw[:, None] / settings.sigma_yaw], dim=1)
+    penalties = {"track_size": settings.size_weight * off.square().sum(dim=1).mean()}
+    if len(neighbours):
+        before, here, after = off[neighbours].unbind(dim=1)
+        penalties["track_bend"] = settings.bend_weight * (before - 2.0 * here + after).square().sum(dim=1).mean()
+    return penalties

@@ -1,0 +1,104 @@
+"""What annotations say of all actors at one time, as tensors."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from drivesplat.motion import Motion
+
+REMEMBERED = 1024
+"""Times that are kept: those of a training's images come again and again."""
+
+
+@dataclass(frozen=True)
+class ActorTrack:
+    """Whom a set of Gaussians belongs to: `size` (3,) length, width, height in metres, and the annotated motion."""
+
+    id: str
+    size: np.ndarray
+    motion: Motion
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data and tensors, for a checkpoint."""
+        return {
+            "id": self.id,
+            "size": torch.from_numpy(self.size),
+            "times": torch.from_numpy(self.motion.times),
+            "object_to_world": torch.from_numpy(self.motion.object_to_world),
+            "runs": [list(run) for run in self.motion.runs],
+            "reach": self.motion.reach,
+        }
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> "ActorTrack":
+        """The inverse of `plain`."""
+        runs = tuple((first, last) for first, last in plain["runs"])
+        motion = Motion(plain["times"].numpy(), plain["object_to_world"].numpy(), runs, plain["reach"])
+        return cls(plain["id"], plain["size"].numpy(), motion)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """a actors with m annotations together, at one time.
+
+    `quats` (w, x, y, z) and `translations` (metres) are the annotated object to world; `weights` how much each
+    annotation has in the position; `series` cos(i pi t / T), t running from 0 to T over an actor's annotations.
+    """
+
+    quats: Float[Tensor, "a 4"]
+    translations: Float[Tensor, "a 3"]
+    present: Bool[Tensor, " a"]
+    weights: Float[Tensor, "a m"]
+    series: Float[Tensor, "a f"]
+
+
+class Timeline:
+    """The annotations of all actors, one track after the other; `terms` is the length of `Moment.series`."""
+
+    def __init__(self, tracks: Sequence[ActorTrack], terms: int):
+        self.tracks = tuple(tracks)
+        self._terms = terms
+        self.at = lru_cache(REMEMBERED)(self._at)
+
+    @property
+    def owned(self) -> list[slice]:
+        """Which of the m annotations are each track's."""
+        ends = np.cumsum([len(track.motion.times) for track in self.tracks]).tolist()
+        return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
+
+    @property
+    def neighbours(self) -> Int[Tensor, "q 3"]:
+        """Every three annotations that follow one another without a gap."""
+        triples = [
+            [own.start + i - 1, own.start + i, own.start + i + 1]
+            for track, own in zip(self.tracks, self.owned, strict=True)
+            for first, last in track.motion.runs
+            for i in range(first + 1, last)
+        ]
+        return torch.tensor(triples, dtype=torch.long).reshape(-1, 3)
+
+    def _at(self, time: float, device: torch.device) -> Moment:
+        count, owned = len(self.tracks), self.owned
+        weights, poses = np.zeros((count, owned[-1].stop)), np.tile(np.eye(4), (count, 1, 1))
+        present, progress = np.zeros(count, dtype=bool), np.zeros(count)
+        moment = np.array([time])
+        for i, (track, own) in enumerate(zip(self.tracks, owned, strict=True)):
+            motion = track.motion
+            present[i] = motion.present(moment)[0]
+            if present[i]:
+                weights[i, own], poses[i] = motion.weights(moment)[0], motion.poses(moment)[0]
+            progress[i] = np.clip((time - motion.times[0]) / (np.ptp(motion.times) or np.inf), 0.0, 1.0)
+        series = np.cos(np.pi * progress[:, None] * np.arange(self._terms))
+        quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+        return Moment(
+            *(torch.from_numpy(values).float().to(device) for values in (quats, poses[:, :3, 3])),
+            torch.from_numpy(present).to(device),
+            *(torch.from_numpy(values).float().to(device) for values in (weights, series)),
+        )

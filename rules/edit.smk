@@ -1,0 +1,50 @@
+# A drive that was never driven: cars gone, moved, slower, larger, the camera's car elsewhere.
+#
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt of a method with actors, scene.json; the scene's edits file,
+# named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not.
+# OUTPUTS: <results>/{scene}/{method}/edits/{edit}.mp4, {edit}.png and {edit}.json; {edit}/ with frames, where wanted.
+
+
+rule edit:
+    """
+    Films an edit with the recorded drive beside it, and states where everything then is, frame by frame: labels of
+    images that were never recorded.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        scene="<results>/{scene}/scene.json",
+    output:
+        film=report(
+            "<results>/{scene}/{method}/edits/{edit}.mp4",
+            caption="../report/edit.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "edit: {edit} (film)"},
+        ),
+        still=report(
+            "<results>/{scene}/{method}/edits/{edit}.png",
+            caption="../report/edit.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "edit: {edit} (still)"},
+        ),
+        labels="<results>/{scene}/{method}/edits/{edit}.json",
+    log:
+        "<logs>/{scene}/{method}/edit_{edit}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/edit_{edit}.tsv"
+    wildcard_constraints:
+        method=plan.known(plan.methods_with_actors),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 8
+    resources:
+        gpu=1,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("edit"),
+        code=plan.code("edit"),
+    script:
+        "../workflow_scripts/edit.py"

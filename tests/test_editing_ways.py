@@ -1,0 +1,415 @@
+"""How actors move in an edited drive, against closed forms on straight and circular ways."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivesplat.editing.cast import Actor, Role, edited_cast
+from drivesplat.motion import Motion
+from drivesplat.rigid import rigid
+from drivesplat.settings.edit import Edit
+
+SPEED, RADIUS, END = 10.0, 20.0, 10.0
+FILM = np.arange(0.0, END, 1 / 30)
+SIZE = np.array([4.0, 2.0, 1.5])
+DIRECTION = np.array([np.cos(0.6), np.sin(0.6), 0.0])
+"""Where the straight way leads."""
+LEFT = np.array([-np.sin(0.6), np.cos(0.6), 0.0])
+
+
+def driver(pose_at, key_frames=range(21), name="car", size=SIZE, category="vehicle.car") -> Actor:
+    """An object annotated at `key_frames`, half a second apart, where `pose_at` says."""
+    indices = np.array(key_frames)
+    ends = np.flatnonzero(np.diff(indices) != 1)
+    runs = zip([0, *(ends + 1).tolist()], [*ends.tolist(), len(indices) - 1], strict=True)
+    poses = np.stack([pose_at(0.5 * i) for i in key_frames])
+    return Actor(name, category, size, Motion(0.5 * indices, poses, tuple(runs), 0.25))
+
+
+def facing(yaw: float, place, pitch: float = 0.0) -> np.ndarray:
+    return rigid(Rotation.from_euler("ZY", [yaw, pitch]).as_matrix(), np.asarray(place, dtype=float))
+
+
+def straight(seconds: float) -> np.ndarray:
+    return facing(0.6, SPEED * seconds * DIRECTION + [0, 0, 0.75])
+
+
+def circle(seconds: float) -> np.ndarray:
+    """A left turn about the origin."""
+    turn = SPEED / RADIUS * seconds
+    return facing(turn, [RADIUS * np.sin(turn), -RADIUS * np.cos(turn), 0.75])
+
+
+def waiting(seconds: float) -> np.ndarray:
+    """Drives, brakes, waits from second 3 to 6, while its annotated heading trembles, and drives on."""
+    moved = np.interp(seconds, [0, 2, 3, 6, 7, 20], [0, 20, 25, 25, 30, 160])
+    trembling = 0.01 * np.sin(17.0 * seconds) if 3 <= seconds <= 6 else 0.0
+    return facing(0.6 + trembling, moved * DIRECTION + [0, 0, 0.75])
+
+
+def parked(seconds: float) -> np.ndarray:
+    return facing(0.6, [3.0, 4.0, 0.75])
+
+
+def roles(actors: list[Actor], *steps: dict) -> dict[str, Role]:
+    cast = edited_cast(actors, Edit.model_validate({"steps": steps}), "edits.yaml: edit 'it'")
+    return {role.id: role for role in cast}
+
+
+def edited(pose_at, *steps: dict, **actor) -> Role:
+    """A lone car's role; `steps` without its name."""
+    named = [{kind: {"track": "car", **fields} for kind, fields in step.items()} for step in steps]
+    return roles([driver(pose_at, **actor)], *named)["car"]
+
+
+def moved(role: Role, at) -> np.ndarray:
+    """How far along the straight way a role is."""
+    return (role.poses(np.atleast_1d(at))[:, :3, 3] - straight(0.0)[:3, 3]) @ DIRECTION
+
+
+def yaws(poses: np.ndarray) -> np.ndarray:
+    return np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+
+
+def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2)[..., :3, :3] @ b[..., :3, :3]).magnitude())
+
+
+def directions(role: Role, at: np.ndarray, step: float = 1e-3) -> np.ndarray:
+    """Where the box centre moves (n,) in radians, from its places shortly before and after."""
+    velocity = (role.poses(at + step) - role.poses(at - step))[:, :2, 3]
+    return np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
+
+
+def speeds(role: Role, at: np.ndarray, step: float = 1e-3) -> np.ndarray:
+    return np.linalg.norm((role.poses(at + step) - role.poses(at - step))[:, :3, 3], axis=1) / (2 * step)
+
+
+def rise(x) -> np.ndarray:
+    """The quintic from 0 to 1 with two vanishing derivatives at both ends."""
+    x = np.clip(x, 0.0, 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+LATER = [
+    {"speed": {"factor": 1.7, "start": 4.0}},
+    {"speed": {"to": 3.0, "start": 4.0, "duration": 2.0}},
+    {"stop": {"at": 4.0}},
+    {"shift": {"lateral": 3.5, "longitudinal": 4.0, "yaw": 20.0, "start": 4.0}},
+]
+
+
+@pytest.mark.parametrize("pose_at", [straight, circle, waiting, parked])
+@pytest.mark.parametrize("step", LATER)
+def test_until_an_edit_begins_an_actor_is_where_it_was_recorded(pose_at, step):
+    role, at = edited(pose_at, step), np.arange(0.0, 4.0, 0.01)
+    recorded = driver(pose_at).motion.poses(at)
+    assert np.linalg.norm((role.poses(at) - recorded)[:, :3, 3], axis=1).max() < 1e-9
+    assert degrees_between(role.poses(at), recorded).max() < 1e-6
+    assert role.edited and role.present(at).all()
+
+
+def test_who_no_step_names_is_exactly_as_recorded():
+    cast = roles([driver(circle), driver(straight, name="other")], {"stop": {"track": "other", "at": 2.0}})
+    assert not cast["car"].edited and cast["other"].edited
+    np.testing.assert_array_equal(cast["car"].poses(FILM), driver(circle).motion.poses(FILM))
+    np.testing.assert_array_equal(cast["car"].present(FILM), driver(circle).motion.present(FILM))
+
+
+def test_a_factor_from_the_beginning_multiplies_the_way_driven():
+    role = edited(straight, {"speed": {"factor": 1.5}})
+    np.testing.assert_allclose(moved(role, FILM), 1.5 * SPEED * FILM, atol=1e-9)
+
+
+def test_past_the_end_of_its_track_an_actor_drives_straight_on_as_long_as_it_was_recorded():
+    role = edited(circle, {"speed": {"factor": 1.5}})
+    at = np.array([8.0, 9.0, 10.0])
+    end = driver(circle).motion.poses(np.array([9.999, 10.0]))
+    velocity = (end[1] - end[0])[:3, 3] / 0.001
+    expected = end[1, :3, 3] + (1.5 * at - 10.0)[:, None] * velocity
+    np.testing.assert_allclose(role.poses(at)[:, :3, 3], expected, atol=1e-4)
+    assert role.present(np.array([0.0, 10.2])).all() and not role.present(np.array([10.3])).any()
+    heading = np.arctan2(velocity[1], velocity[0])
+    assert np.ptp(yaws(role.poses(at))) < 1e-9, "it no longer turns"
+    np.testing.assert_allclose(yaws(role.poses(at)), heading, atol=np.radians(5))
+
+
+def test_a_factor_comes_in_over_its_duration():
+    role = edited(straight, {"speed": {"factor": 1.5, "start": 2.0, "duration": 3.0}})
+    at = np.linspace(0.1, 9.0, 400)
+    np.testing.assert_allclose(speeds(role, at), SPEED * (1 + 0.5 * rise((at - 2.0) / 3.0)), atol=1e-4)
+    np.testing.assert_allclose(moved(role, 8.0), SPEED * (2.0 + 1.25 * 3.0 + 1.5 * 3.0), atol=1e-9)
+
+
+@pytest.mark.parametrize("target", [3.0, 14.0])
+def test_a_speed_of_its_own_is_reached_over_the_duration_and_kept(target):
+    role = edited(straight, {"speed": {"to": target, "start": 2.0, "duration": 3.0}})
+    at = np.linspace(0.1, 9.0, 400)
+    share = rise((at - 2.0) / 3.0)
+    np.testing.assert_allclose(speeds(role, at), SPEED * (1 - share) + target * share, atol=1e-3)
+    np.testing.assert_allclose(moved(role, 8.0), SPEED * 2 + (SPEED + target) / 2 * 3 + target * 3, atol=1e-4)
+
+
+def test_a_speed_of_its_own_from_the_beginning():
+    role = edited(straight, {"speed": {"to": 4.0}})
+    np.testing.assert_allclose(moved(role, FILM), 4.0 * FILM, atol=1e-6)
+    assert role.present(np.array([20.0])).all(), "it is still on its recorded way"
+
+
+def test_a_change_without_duration_jumps():
+    role = edited(straight, {"speed": {"to": 4.0, "start": 2.0, "duration": 0.0}})
+    np.testing.assert_allclose(moved(role, [1.0, 2.0, 8.0]), [10.0, 20.0, 20.0 + 4.0 * 6.0], atol=1e-6)
+    role = edited(straight, {"stop": {"at": 2.0, "duration": 0.0}})
+    np.testing.assert_allclose(moved(role, [1.0, 2.0, 8.0]), [10.0, 20.0, 20.0], atol=1e-6)
+
+
+def test_on_a_circle_a_speed_of_its_own_keeps_the_way_and_the_heading():
+    role, at = edited(circle, {"speed": {"to": 6.0, "start": 1.0, "duration": 1.0}}), np.linspace(3.0, 9.0, 200)
+    poses = role.poses(at)
+    np.testing.assert_allclose(np.linalg.norm(poses[:, :2, 3], axis=1), RADIUS, atol=0.003)
+    np.testing.assert_allclose(speeds(role, at), 6.0, atol=0.01)
+    tangent = np.arctan2(poses[:, 0, 3], -poses[:, 1, 3])
+    assert np.abs(np.angle(np.exp(1j * (yaws(poses) - tangent)))).max() < np.radians(0.1)
+
+
+def test_a_stop_brakes_over_its_duration_and_stays():
+    role = edited(straight, {"stop": {"at": 4.0, "duration": 2.0}})
+    at = np.linspace(0.1, 9.0, 400)
+    np.testing.assert_allclose(speeds(role, at), SPEED * (1 - rise((at - 4.0) / 2.0)), atol=1e-4)
+    np.testing.assert_allclose(moved(role, [6.0, 7.0, 60.0]), SPEED * 4.0 + SPEED * 2.0 / 2, atol=1e-9)
+    assert role.present(np.array([60.0])).all(), "what rests in sight does not vanish"
+
+
+def test_a_stop_after_an_acceleration_brakes_from_the_edited_speed():
+    role = edited(
+        straight,
+        {"speed": {"factor": 1.5, "start": 1.0, "duration": 2.0}},
+        {"stop": {"at": 5.0, "duration": 2.0}},
+    )
+    at = np.linspace(0.1, 9.0, 400)
+    expected = SPEED * (1 + 0.5 * rise((at - 1.0) / 2.0)) * (1 - rise((at - 5.0) / 2.0))
+    np.testing.assert_allclose(speeds(role, at), expected, atol=1e-4)
+    np.testing.assert_allclose(moved(role, 9.0), SPEED * (1 + 1.25 * 2 + 1.5 * 2 + 1.5 * 2 / 2), atol=1e-9)
+
+
+def test_who_stopped_can_drive_on():
+    role = edited(
+        straight, {"stop": {"at": 1.0, "duration": 2.0}}, {"speed": {"to": 6.0, "start": 5.0, "duration": 2.0}}
+    )
+    np.testing.assert_allclose(moved(role, 9.0), SPEED * 2.0 + 6.0 * 1.0 + 6.0 * 2.0, atol=1e-4)
+    np.testing.assert_allclose(speeds(role, np.array([4.0, 8.0])), [0.0, 6.0], atol=1e-3)
+
+
+def test_a_later_factor_multiplies_an_earlier_one():
+    role = edited(straight, {"speed": {"factor": 2.0}}, {"speed": {"factor": 0.5, "start": 4.0, "duration": 2.0}})
+    np.testing.assert_allclose(speeds(role, np.array([2.0, 8.0])), [20.0, 10.0], atol=1e-6)
+
+
+def test_who_waits_is_as_recorded_while_it_waits_however_fast_it_drives():
+    role, motion = edited(waiting, {"speed": {"factor": 2.0}}), driver(waiting).motion
+    at = np.arange(0.0, 4.9, 0.01)
+    np.testing.assert_allclose(role.poses(at), motion.poses(2.0 * at), atol=1e-9)
+
+
+def test_a_speed_of_its_own_does_not_wait_where_the_recording_did():
+    role = edited(waiting, {"speed": {"to": 8.0, "start": 0.5, "duration": 1.0}})
+    at = np.arange(1.6, 7.0, 0.01)
+    np.testing.assert_allclose(speeds(role, at), 8.0, atol=0.1)
+    assert np.degrees(np.ptp(yaws(role.poses(at)))) < 1.0
+
+
+def test_something_parked_can_be_driven_off_where_it_points():
+    role = edited(parked, {"speed": {"to": 5.0, "start": 2.0, "duration": 2.0}})
+    expected = parked(0)[:3, 3] + (5.0 * 1.0 + 5.0 * 3.0) * DIRECTION
+    np.testing.assert_allclose(role.poses(np.array([7.0]))[0, :3, 3], expected, atol=1e-6)
+    np.testing.assert_allclose(role.poses(np.array([7.0]))[0, :3, :3], parked(0)[:3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("lateral", [3.5, -2.0])
+def test_a_shift_from_the_beginning_is_a_way_beside_the_recorded_one(lateral):
+    role, motion = edited(circle, {"shift": {"lateral": lateral}}), driver(circle).motion
+    poses, recorded = role.poses(FILM), motion.poses(FILM)
+    np.testing.assert_allclose(poses[:, :3, :3], recorded[:, :3, :3], atol=1e-12)
+    middle = (FILM > 2) & (FILM < 8)
+    np.testing.assert_allclose(np.linalg.norm(poses[middle, :2, 3], axis=1), RADIUS - lateral, atol=0.01)
+
+
+@pytest.mark.parametrize("lateral", [3.5, -3.5])
+def test_a_lane_change_is_smooth_and_points_where_it_drives(lateral):
+    role, at = edited(straight, {"shift": {"lateral": lateral, "start": 2.0, "duration": 3.0}}), np.arange(0.5, 9, 0.01)
+    aside = (role.poses(at)[:, :3, 3] - straight(0.0)[:3, 3]) @ LEFT
+    np.testing.assert_allclose(aside, lateral * rise((at - 2.0) / 3.0), atol=1e-9)
+    np.testing.assert_allclose(yaws(role.poses(at)), directions(role, at), atol=np.radians(0.01))
+    assert np.degrees(np.abs(yaws(role.poses(at)) - 0.6)).max() == pytest.approx(
+        np.degrees(np.arctan(1.875 * 3.5 / 3.0 / SPEED)), abs=0.05
+    )
+
+
+@pytest.mark.parametrize("lateral", [3.5, -3.5])
+def test_in_a_bend_a_lane_change_points_where_it_drives(lateral):
+    """There the inner lane is shorter than the way."""
+    role, at = edited(circle, {"shift": {"lateral": lateral, "start": 3.0, "duration": 3.0}}), np.arange(2.5, 7, 0.01)
+    np.testing.assert_allclose(yaws(role.poses(at)), directions(role, at), atol=np.radians(0.1))
+
+
+def test_what_stands_slides_aside_without_turning():
+    role = edited(parked, {"shift": {"lateral": 2.0, "start": 2.0, "duration": 3.0}})
+    np.testing.assert_allclose(role.poses(FILM)[:, :3, :3], np.tile(parked(0)[:3, :3], (len(FILM), 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(role.poses(np.array([6.0]))[0, :3, 3], parked(0)[:3, 3] + 2.0 * LEFT, atol=1e-9)
+
+
+def test_a_yaw_turns_an_actor_to_the_left_on_the_spot():
+    role = edited(straight, {"shift": {"yaw": 30.0, "start": 2.0, "duration": 1.0}})
+    np.testing.assert_allclose(moved(role, FILM), SPEED * FILM, atol=1e-9)
+    np.testing.assert_allclose(yaws(role.poses(np.array([1.0, 2.5, 4.0]))), 0.6 + np.radians([0, 15, 30]), atol=1e-9)
+
+
+def test_further_along_the_way_means_along_its_bends():
+    role, at = edited(circle, {"shift": {"longitudinal": -12.0}}), np.arange(3.0, 8.0, 0.05)
+    expected = np.stack([circle(t - 12.0 / SPEED) for t in at])
+    np.testing.assert_allclose(role.poses(at)[:, :3, 3], expected[:, :3, 3], atol=0.01)
+    assert degrees_between(role.poses(at), expected).max() < 0.1
+
+
+def test_further_along_the_way_who_waits_still_waits():
+    """On a straight way, 12 m further on, it moves as it was recorded; its heading trembles by 0.6 degrees there."""
+    role, recorded = edited(waiting, {"shift": {"longitudinal": 12.0}}), driver(waiting).motion.poses(FILM)
+    np.testing.assert_allclose(role.poses(FILM)[:, :3, 3], recorded[:, :3, 3] + 12.0 * DIRECTION, atol=0.01)
+    assert degrees_between(role.poses(FILM), recorded).max() < 0.6
+
+
+def test_a_shift_stays_at_its_second_of_the_film_whatever_the_speed_becomes():
+    shift = {"shift": {"lateral": 3.0, "start": 2.0, "duration": 2.0}}
+    for steps in ([shift, {"speed": {"factor": 2.0}}], [{"speed": {"factor": 2.0}}, shift]):
+        aside = (edited(straight, *steps).poses(np.array([1.9, 3.0, 4.1]))[:, :3, 3] - straight(0.0)[:3, 3]) @ LEFT
+        np.testing.assert_allclose(aside, [0.0, 1.5, 3.0], atol=1e-9)
+
+
+def test_a_stop_in_a_lane_change_leaves_it_unfinished():
+    role = edited(
+        straight, {"shift": {"lateral": 3.0, "start": 2.0, "duration": 4.0}}, {"stop": {"at": 3.0, "duration": 2.0}}
+    )
+    rest = role.poses(np.array([5.0, 6.0, 9.0]))
+    np.testing.assert_allclose((rest[:, :3, 3] - straight(0.0)[:3, 3]) @ LEFT, 3.0 * rise(0.5), atol=1e-9)
+    np.testing.assert_allclose(rest[1:], rest[:1].repeat(2, axis=0), atol=1e-9)
+    braking = np.arange(3.0, 4.2, 0.01)
+    np.testing.assert_allclose(yaws(role.poses(braking)), directions(role, braking), atol=np.radians(0.01))
+
+
+@pytest.mark.parametrize("pose_at", [straight, circle, waiting])
+def test_reversed_an_actor_is_at_each_second_where_it_was_as_long_before_its_end(pose_at):
+    role, motion = edited(pose_at, {"reverse": {}}), driver(pose_at).motion
+    np.testing.assert_allclose(role.poses(FILM), motion.poses(END - FILM), atol=1e-9)
+    turned = edited(pose_at, {"reverse": {"turn": True}}).poses(FILM)
+    np.testing.assert_allclose(turned[:, :3, 3], role.poses(FILM)[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(turned[:, :3, :2], -role.poses(FILM)[:, :3, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize(("turn", "side"), [(False, 1.0), (True, -1.0)])
+def test_after_a_reversal_left_and_further_on_are_those_of_what_drives_there(turn, side):
+    role = edited(straight, {"reverse": {"turn": turn}}, {"shift": {"lateral": 2.0, "longitudinal": 5.0}})
+    place = role.poses(np.array([4.0]))[0, :3, 3] - straight(0.0)[:3, 3]
+    np.testing.assert_allclose(place, (SPEED * 6.0 - 5.0) * DIRECTION + side * 2.0 * LEFT, atol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [False, True])
+def test_a_reversed_lane_change_keeps_the_wheels_rolling(turn):
+    role = edited(straight, {"reverse": {"turn": turn}}, {"shift": {"lateral": 3.0, "start": 3.0}})
+    at = np.arange(2.5, 7.0, 0.01)
+    across = yaws(role.poses(at)) - directions(role, at) - (0.0 if turn else np.pi)
+    assert np.abs(np.angle(np.exp(1j * across))).max() < np.radians(0.01)
+
+
+def test_a_reversed_actor_gets_a_speed_of_its_own_backwards():
+    role = edited(straight, {"reverse": {}}, {"speed": {"to": 4.0, "start": 2.0, "duration": 2.0}})
+    np.testing.assert_allclose(moved(role, 6.0), 100.0 - 10.0 * 2 - 7.0 * 2 - 4.0 * 2, atol=1e-4)
+
+
+def test_an_enlarged_actor_stays_on_its_ground():
+    def uphill(seconds: float) -> np.ndarray:
+        return facing(0.6, [8.0 * seconds, 0.0, 1.0], pitch=-0.2)
+
+    role, recorded = edited(uphill, {"rescale": {"factor": 1.3}}), driver(uphill).motion.poses(FILM)
+    assert role.scale == pytest.approx(1.3) and role.source == "car"
+    np.testing.assert_allclose(role.size, 1.3 * SIZE)
+    ground = [0.0, 0.0, -SIZE[2] / 2, 1.0]
+    np.testing.assert_allclose(role.poses(FILM) @ [0, 0, 1.3 * ground[2], 1.0], recorded @ ground, atol=1e-9)
+    np.testing.assert_allclose(role.poses(FILM)[:, :3, :3], recorded[:, :3, :3], atol=1e-9)
+    twice = edited(uphill, {"rescale": {"factor": 1.3}}, {"rescale": {"factor": 2.0}})
+    assert twice.scale == pytest.approx(2.6)
+
+
+def test_swapped_actors_drive_each_others_way_on_the_same_ground():
+    tall = driver(circle, range(4, 12), name="truck", size=np.array([8.0, 2.5, 3.5]), category="vehicle.truck")
+    cast = roles([driver(straight), tall], {"swap": {"track": "car", "with": "truck"}})
+    car, truck = cast["car"], cast["truck"]
+    at = np.arange(2.0, 5.0, 0.1)
+    np.testing.assert_allclose(car.poses(at) @ [0, 0, -0.75, 1], tall.motion.poses(at) @ [0, 0, -1.75, 1], atol=1e-9)
+    straight_on = driver(straight).motion.poses(at)
+    np.testing.assert_allclose(truck.poses(at) @ [0, 0, -1.75, 1], straight_on @ [0, 0, -0.75, 1], atol=1e-9)
+    np.testing.assert_array_equal(car.present(FILM), tall.motion.present(FILM))
+    assert truck.present(FILM).all()
+    assert (car.source, car.category, car.scale) == ("car", "vehicle.car", 1.0)
+    np.testing.assert_array_equal(truck.size, tall.size)
+
+
+def test_a_duplicate_follows_its_original_and_later_steps_move_it_alone():
+    cast = roles(
+        [driver(circle)],
+        {"duplicate": {"track": "car", "as": "twin", "longitudinal": -12.0, "lateral": 1.0}},
+        {"stop": {"track": "twin", "at": 6.0, "duration": 1.0}},
+    )
+    twin, at = cast["twin"], np.arange(3.0, 6.0, 0.1)
+    assert (twin.id, twin.source, twin.edited, cast["car"].edited) == ("twin", "car", True, False)
+    behind = np.stack([circle(t - 1.2) for t in at]) @ [0, 1.0, 0, 1]
+    np.testing.assert_allclose(twin.poses(at)[:, :3, 3], behind[:, :3], atol=0.01)
+    np.testing.assert_allclose(speeds(twin, np.array([8.0])), 0.0, atol=1e-6)
+    assert list(cast) == ["car", "twin"]
+
+
+def test_a_delayed_duplicate_does_everything_later():
+    steps = [
+        {"shift": {"track": "car", "lateral": 3.0, "start": 2.0}},
+        {"stop": {"track": "car", "at": 5.0}},
+        {"duplicate": {"track": "car", "as": "twin", "delay": 1.5}},
+    ]
+    cast, at = roles([driver(straight)], *steps), np.arange(2.0, 9.0, 0.05)
+    np.testing.assert_allclose(cast["twin"].poses(at), cast["car"].poses(at - 1.5), atol=1e-9)
+    assert cast["twin"].present(FILM).all()
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        {"speed": {"factor": 1.5}},
+        {"speed": {"to": 7.0, "start": 1.0}},
+        {"shift": {"longitudinal": 6.0}},
+        {"reverse": {}},
+    ],
+)
+def test_across_a_gap_of_its_track_an_actor_does_not_jump(step):
+    """Not annotated from 4 to 6 s; the recording shows nothing there."""
+    key_frames = [i for i in range(21) if not 8 < i < 12]
+    role = edited(circle, step, key_frames=key_frames)
+    at = np.arange(0.0, 10.0, 0.002)
+    at = at[role.present(at)]
+    together = np.diff(at) < 0.003
+    poses = role.poses(at)
+    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[together].max() < 0.002 * 1.7 * SPEED
+    assert degrees_between(poses[1:], poses[:-1])[together].max() < np.degrees(0.002 * 1.7 * SPEED / RADIUS)
+
+
+def test_who_is_faster_is_there_while_it_was_and_where_it_was():
+    """Recorded from 0 to 4 and from 6 to 10 s: twice as fast, on recorded stretches until 2 and from 3 to 5."""
+    role = edited(straight, {"speed": {"factor": 2.0}}, key_frames=[i for i in range(21) if not 8 < i < 12])
+    at = np.array([1.0, 2.5, 3.5, 4.5, 5.5, 7.0, 10.3])
+    np.testing.assert_array_equal(role.present(at), [True, True, True, True, False, True, False])
+
+
+@pytest.mark.parametrize("pose_at", [straight, circle])
+@pytest.mark.parametrize("step", [*LATER[:3], {"shift": {"lateral": 3.5, "longitudinal": 4.0, "start": 4.0}}])
+def test_speeds_do_not_jump(pose_at, step):
+    role, at = edited(pose_at, step), np.arange(1.0, 8.5, 0.002)
+    assert np.abs(np.diff(speeds(role, at))).max() < 0.002 * 25.0
+    poses = role.poses(at)
+    assert degrees_between(poses[1:], poses[:-1]).max() < 0.002 * 90.0

@@ -1,0 +1,95 @@
+"""What rules ask of the plan: inputs that only some methods take, and what a report may expect."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from drivesplat.config import load
+from drivesplat.planning import Plan
+from drivesplat.stages import SCENE_STAGES, stage_settings
+
+REPOSITORY = Path(__file__).parent.parent
+ACTORS = ["background", "actors"]
+HELD = {"train": {"depth_weight": 0.01}}
+
+
+def plan(**values: Any) -> Plan:
+    datasets = {"a": {"scenes": ["a1", "a2"]}, "b": {"scenes": ["b1"], "overrides": values.pop("b", {})}}
+    return Plan({"datasets": datasets, "results_dir": "elsewhere", **values}, str(REPOSITORY))
+
+
+def taken(made: Plan, scene: str, method: str) -> list[str]:
+    at = SimpleNamespace(scene=scene, method=method)
+    return [*made.actors(at), *made.lidar_depth(at)]
+
+
+def test_actors_are_an_input_of_methods_with_that_part_alone():
+    made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
+    assert taken(made, "a1", "mine") == ["elsewhere/a1/actors.pkl"]
+    assert taken(made, "b1", "mine") == ["elsewhere/b1/actors.pkl"]
+    assert taken(made, "a1", "vanilla") == []
+
+
+def test_depth_is_an_input_where_a_training_is_held_to_it():
+    made = plan(methods={"vanilla": {}, "held": {"overrides": HELD}})
+    assert taken(made, "a1", "held") == ["elsewhere/a1/lidar_depth.pkl"]
+    assert taken(made, "a1", "vanilla") == []
+
+
+def test_depth_follows_the_overrides_of_dataset_and_method():
+    free = {"overrides": {"train": {"depth_weight": 0.0}}}
+    made = plan(methods={"vanilla": {}, "free": free}, b=HELD)
+    assert [bool(taken(made, scene, "vanilla")) for scene in ("a1", "b1")] == [False, True]
+    assert [bool(taken(made, scene, "free")) for scene in ("a1", "b1")] == [False, False]
+    everywhere = plan(methods={"vanilla": {}, "free": free}, train={"depth_weight": 0.1})
+    assert [bool(taken(everywhere, scene, "vanilla")) for scene in ("a1", "b1")] == [True, True]
+    assert taken(everywhere, "a1", "free") == []
+
+
+@pytest.mark.parametrize(
+    ("methods", "more"),
+    [
+        ({"vanilla": {}}, {"a1": set(), "b1": {"lidar_depth"}}),
+        ({"vanilla": {}, "mine": {"parts": ACTORS}}, {"a1": {"actors"}, "b1": {"actors", "lidar_depth"}}),
+        ({"vanilla": {}, "held": {"overrides": HELD}}, {"a1": {"lidar_depth"}, "b1": {"lidar_depth"}}),
+        (
+            {"mine": {"parts": ACTORS, "overrides": {"train": {"depth_weight": 0}}}},
+            {"a1": {"actors"}, "b1": {"actors"}},
+        ),
+    ],
+)
+def test_a_report_expects_them_where_a_method_of_the_scene_takes_them(methods, more):
+    made = plan(methods=methods, b=HELD)
+    expected = json.loads(made.expected_stages())
+    assert expected.keys() == {"a1", "a2", "b1"}
+    for scene, stages in more.items():
+        assert {name for name in expected[scene] if "/" not in name} == {*SCENE_STAGES, *stages}
+        for stage in stages:
+            assert expected[scene][stage]["code"] == made.code(stage)
+            assert expected[scene][stage]["settings"] == json.loads(stage_settings(made.config, stage, scene))
+
+
+def told(stage: str, **values: Any) -> dict[str, Any]:
+    return json.loads(stage_settings(load(values), stage, "0061"))
+
+
+def test_each_is_told_what_decides_it():
+    outline = {"CAM_FRONT": [[0, 0.9], [1, 0.9], [1, 1]]}
+    values = {
+        "actors": {"humans": True}, "holdout": {"last_block": 2}, "images": {"width": 320}, "random_seed": 7,
+        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3}, "masks": {"own_car_polygons": outline},
+    }  # fmt: skip
+    actors, depth = told("actors", **values), told("lidar_depth", **values)
+    for record in (actors, depth):
+        assert (record["holdout"]["last_block"], record["images"]["width"], record["own_car_radius"]) == (2, 320, 3.0)
+        assert record["own_car_polygons"] == outline
+    assert (actors["actors"]["humans"], actors["random_seed"]) == (True, 7)
+    assert depth["box_margin"] == 0.3 and "actors" not in depth and "random_seed" not in depth
+
+
+def test_a_dataset_may_set_its_actors_for_itself():
+    overrides = {"datasets": {"nuscenes": {"overrides": {"actors": {"min_points": 9}}}}}
+    assert told("actors", **overrides)["actors"]["min_points"] == 9

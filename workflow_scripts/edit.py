@@ -1,0 +1,18 @@
+"""checkpoint.pt with its actors in other roles, into a film, a still and labels."""
+
+from pathlib import Path
+
+from drivesplat.editing.film import EditFiles, render_edit
+from drivesplat.job import job
+from drivesplat.scene import read_scene
+from drivesplat.settings.render import EditJob
+from drivesplat.storage import write_json
+from drivesplat.training.run import read_checkpoint
+
+with job(snakemake) as current:
+    scene = read_scene(current.input.scene)
+    checkpoint = read_checkpoint(current.input.checkpoint)
+    provenance = current.provenance(scene.provenance, checkpoint["provenance"])
+    files = EditFiles(Path(current.output.film), Path(current.output.still))
+    record = render_edit(scene, checkpoint, current.settings(EditJob), current.device(), files)
+    write_json(current.output.labels, {**record, "provenance": provenance})
