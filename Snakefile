@@ -4,6 +4,7 @@
 #   snakemake --cores 4                               all scenes: metrics, films, panels, exports, and the report
 #   snakemake --cores 4 metrics                       the figures alone; `films`, `edits`, `looks`, `exports` likewise
 #   snakemake --cores 1 gap_report                    the report over what has been measured
+#   snakemake --cores 1 results/0061/ablation.csv     what each thing in the method `street` is worth, over three seeds
 #   snakemake --report report.zip                     all there is to look at, as a page that opens offline
 #
 # The demo world needs no dataset and no GPU:
@@ -31,6 +32,7 @@ include: "rules/look.smk"
 include: "rules/edit.smk"
 include: "rules/export.smk"
 include: "rules/report.smk"
+include: "rules/ablation.smk"
 
 
 of_methods = expand("<results>/{scene}/{method}", scene=plan.config.batch_scenes, method=plan.config.methods)
@@ -48,7 +50,7 @@ rule films:
 
 rule edits:
     input:
-        plan.edits(plan.config.batch_scenes),
+        edited,
 
 
 rule looks:

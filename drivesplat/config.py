@@ -13,6 +13,7 @@ from pydantic import Field, field_validator, model_validator
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
+from drivesplat.settings.ablation import AblationSettings
 from drivesplat.settings.actor import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.actor_seed import ActorSeedSettings
 from drivesplat.settings.device import DeviceSettings
@@ -23,8 +24,10 @@ from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
+from drivesplat.settings.method import MethodSettings
+from drivesplat.settings.overrides import merged
 from drivesplat.settings.render import RenderSettings
-from drivesplat.settings.train import PartName, SkyKind, TrainSettings
+from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.world import WorldSettings
 
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
@@ -40,7 +43,8 @@ DEMO_OVERRIDES = {
     "device": {"min_free_gb": 1.0},
 }
 """What makes the demo world train, and its films render, in minutes on a CPU."""
-METHOD_OVERRIDES = ("sky", "train")
+METHOD_OVERRIDES = ("sky", "train", "random_seed")
+VARIANT_OVERRIDES = ("sky", "train")
 
 
 class DatasetSettings(Settings):
@@ -106,13 +110,6 @@ class DatasetSettings(Settings):
         return self
 
 
-class MethodSettings(Settings):
-    parts: tuple[PartName, ...] = Field(("background",), min_length=1)
-    """What the model is made of."""
-    overrides: dict[str, Any] = Field(default_factory=dict)
-    """Settings of this file that differ for this method, as a tree; `sky` and `train` may."""
-
-
 def _default_datasets() -> dict[str, DatasetSettings]:
     demo = DatasetSettings(
         dataroot="resources/demo",
@@ -126,7 +123,7 @@ def _default_datasets() -> dict[str, DatasetSettings]:
 
 
 def _default_methods() -> dict[str, MethodSettings]:
-    held = {"train": {"sky_bce_weight": 0.05, "depth_weight": 0.01}}
+    held = {"train": {"sky_bce_weight": 0.05, "depth_weight": 0.01, "semantic_weight": 0.1}}
     return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=held)}
 
 
@@ -135,6 +132,8 @@ class Config(Settings):
     """Recorded drives, each under a name of your choice."""
     methods: dict[str, MethodSettings] = Field(default_factory=_default_methods, min_length=1)
     """Methods to train and compare, each under a name of your choice; a result folder each."""
+    ablation: AblationSettings = AblationSettings()
+    """What each thing in a method is worth; trained for `snakemake results/{scene}/ablation.csv` alone."""
     cameras: tuple[str, ...] = Field(("CAM_FRONT",), min_length=1)
     """Cameras to train on."""
     eval_camera: str = "CAM_FRONT"
@@ -191,6 +190,26 @@ class Config(Settings):
             raise ValueError(f"eval_camera {self.eval_camera} is not among cameras ({', '.join(self.cameras)})")
         return self
 
+    @model_validator(mode="after")
+    def _variants_have_names_of_their_own(self) -> "Config":
+        for name in self.ablation.without:
+            _require_name(name, "variant")
+        for name in self.ablated:
+            if name in self.methods:
+                raise ValueError(f"method {name!r} is called like a variant of the ablation; rename it")
+        return self
+
+    @property
+    def ablated(self) -> dict[str, MethodSettings]:
+        """The methods of the ablation, by name; none where the method that it takes apart is not configured."""
+        whole = self.methods.get(self.ablation.of)
+        return self.ablation.methods(whole) if whole else {}
+
+    @property
+    def all_methods(self) -> dict[str, MethodSettings]:
+        """The methods to compare, and those of the ablation."""
+        return {**self.methods, **self.ablated}
+
     @property
     def scenes(self) -> list[str]:
         """All configured scenes, in order."""
@@ -220,12 +239,15 @@ def _require_name(name: str, kind: str) -> None:
 def load(values: Mapping[str, Any]) -> Config:
     """The validated config, overrides included. Raises ConfigError: one line, the key, its value, what is allowed."""
     config = validated(Config, dict(values), "")
-    for name, dataset in config.datasets.items():
-        _require_known(dataset.overrides, DATASET_OVERRIDES, f"datasets.{name}.overrides")
-        _overridden(config, dataset.overrides, f"datasets.{name}.overrides")
-    for name, method in config.methods.items():
-        _require_known(method.overrides, METHOD_OVERRIDES, f"methods.{name}.overrides")
-        _overridden(config, method.overrides, f"methods.{name}.overrides")
+    variants = {name: variant for name, variant in config.ablation.without.items() if variant is not None}
+    for kind, named, allowed in (
+        ("datasets", config.datasets, DATASET_OVERRIDES),
+        ("methods", config.methods, METHOD_OVERRIDES),
+        ("ablation.without", variants, VARIANT_OVERRIDES),
+    ):
+        for name, item in named.items():
+            _require_known(item.overrides, allowed, f"{kind}.{name}.overrides")
+            _overridden(config, item.overrides, f"{kind}.{name}.overrides")
     return config
 
 
@@ -233,22 +255,13 @@ def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
     """The config as it holds for one scene, and one method where given. Raises ConfigError for an unknown scene."""
     dataset = config.dataset_of(scene)
     config = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
-    return _overridden(config, config.methods[method].overrides, f"methods.{method}.overrides") if method else config
+    return _overridden(config, config.all_methods[method].overrides, f"the overrides of {method}") if method else config
 
 
 def _overridden(config: Config, overrides: Mapping[str, Any], where: str) -> Config:
     if not overrides:
         return config
     return validated(Config, merged(config.model_dump(), overrides), f"(with {where}) ")
-
-
-def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with `overrides` laid over it, mappings merged key by key."""
-    result = dict(base)
-    for key, value in overrides.items():
-        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
-        result[key] = merged(result[key], value) if both else value
-    return result
 
 
 def _require_known(overrides: Mapping[str, Any], allowed: tuple[str, ...], where: str) -> None:

@@ -77,57 +77,54 @@ class Shot:
 def render_film(
     scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
-    """Writes the MP4 `path`; returns the content of the record of its cameras, provenance aside: the shot's, and
-    `offset`, in metres and degrees from the recorded path.
+    """Writes the MP4 `path`; returns the content of the record of its cameras, provenance aside: the shot's, `offset`,
+    in metres and degrees from the recorded path, and what writing took.
 
     `checkpoint` is the content of checkpoint.pt. Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or the model renders no numbers.
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)
-    seconds = write_film(path, (film_frame(model, view) for view in shot.views(device)), shot, len(model))
-    record = {**shot.record(), "offset": job.trajectory.model_dump()}
-    return {**record, "render_seconds": seconds, "bytes": path.stat().st_size}
+    taken = write_film(path, (film_frame(model, view) for view in shot.views(device)), shot, model)
+    return {**shot.record(), "offset": job.trajectory.model_dump(), **taken}
 
 
 def render_parts(
     scene: Scene, checkpoint: dict[str, Any], job: FilmFormat, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
     """Writes the MP4 `path` of three pictures side by side along the recorded path: everything, what stands still, and
-    what moves before plain grey. Returns the record of its cameras, as `render_film` does.
+    what moves before plain grey. Returns the record of its cameras, as `render_film` does; its size is one picture's.
 
     Raises ConfigError where the model has no parts that move; else as `render_film`.
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
     model, device = open_model(checkpoint, device_settings)
-    moving = model.moving()
-    if not moving.any():
-        raise ConfigError(f"scene {scene.name}: nothing in this method's model moves; its one part is its film")
-
-    def apart(view: View) -> np.ndarray:
-        gaussians = model.gaussians_at(view.time)
-        still = film_frame(model, view, gaussians[~moving])
-        return np.hstack([film_frame(model, view, gaussians), still, _by_themselves(model, view, gaussians[moving])])
-
-    seconds = write_film(path, (apart(view) for view in shot.views(device)), shot, len(model), columns=3)
-    return {**shot.record(), "shows": ["all", "still", "moving"], "render_seconds": seconds}
+    if not model.moving().any():
+        raise ConfigError(
+            f"scene {scene.name}: nothing in this method's model moves that could be shown apart; "
+            "its films show all of it"
+        )
+    taken = write_film(path, (_apart(model, view) for view in shot.views(device)), shot, model, columns=3)
+    return {**shot.record(), "shows": ["all", "still", "moving"], **taken}
 
 
-def write_film(path: Path, pictures: Iterable[np.ndarray], shot: Shot, gaussians: int, columns: int = 1) -> float:
+def write_film(
+    path: Path, pictures: Iterable[np.ndarray], shot: Shot, model: SplatModel, columns: int = 1
+) -> dict[str, Any]:
     """Writes an MP4 of one picture (h, w, 3) uint8 a camera of `shot`, `columns` times as wide as a view of it; returns
-    the seconds it took.
+    what that took, `render_seconds` and `bytes`.
 
-    `gaussians` is how many a model has whose memory may not suffice. Raises DeviceError, and ResultError where the film
-    cannot be written.
+    `model` is the one shown, to be named where memory does not suffice. Raises DeviceError then, and ResultError where
+    the film cannot be written.
     """
     began, count = time.perf_counter(), len(shot.cameras)
     shown = tqdm(pictures, total=count, desc=path.stem, unit="frame", disable=not sys.stderr.isatty(), mininterval=1.0)
-    with telling_out_of_memory(lambda: gaussians):
-        size = (columns * shot.size[0], shot.size[1])
-        write_video(path, shown, size, shot.format.fps, shot.format.crf, threads=torch.get_num_threads())
+    size = (columns * shot.size[0], shot.size[1])
+    with telling_out_of_memory(lambda: len(model)):
+        write_video(path, iter(shown), size, shot.format.fps, shot.format.crf, threads=torch.get_num_threads())
     seconds = time.perf_counter() - began
     log.info("%s: %d frames, %.1f s, %.3f s a frame", path.name, count, seconds, seconds / count)
-    return seconds
+    return {"render_seconds": seconds, "bytes": path.stat().st_size}
 
 
 @torch.no_grad()
@@ -140,9 +137,13 @@ def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None
 
 
 @torch.no_grad()
-def _by_themselves(model: SplatModel, view: View, gaussians: Gaussians) -> np.ndarray:
-    picture = model.render(view, gaussians=gaussians)
-    return _bytes(picture.splats + BACKDROP * (1.0 - picture.alpha[..., None]))
+def _apart(model: SplatModel, view: View) -> np.ndarray:
+    """Everything, what stands still, and what moves by itself, side by side: (h, 3 w, 3) uint8."""
+    gaussians, moving = model.gaussians_at(view.time), model.moving()
+    objects = model.render(view, gaussians=gaussians[moving])
+    before_grey = objects.splats + BACKDROP * (1.0 - objects.alpha[..., None])
+    everything, still = (film_frame(model, view, shown) for shown in (gaussians, gaussians[~moving]))
+    return np.hstack([everything, still, _bytes(before_grey)])
 
 
 def _bytes(image: torch.Tensor) -> np.ndarray:

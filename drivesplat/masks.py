@@ -3,6 +3,7 @@
 - masks/masks.json: what was made, from what
 - masks/regions/{camera}/{timestamp}.png: labels of `drivesplat.regions.LABELS`
 - masks/sky/{camera}/{timestamp}.png: 255 where the sky is
+- masks/semantic/{camera}/{timestamp}.png: the user's classes, where there are any
 """
 
 import logging
@@ -25,6 +26,9 @@ from drivesplat.storage import read_json, unreadable
 
 log = logging.getLogger(__name__)
 
+UNLABELLED = 255
+"""The value of pixels that a user's map of classes says nothing of."""
+
 
 def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
     """Writes the masks of every image below `folder`; returns the record for masks.json.
@@ -32,21 +36,22 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
 
-    def one(frame: Frame) -> float:
+    def one(frame: Frame) -> tuple[float, int]:
         size = target_size(frame, job.images)
         sky = _sky(frame, job, size, _nearest_returns(scene, frame))
         write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
         write_png(folder / mask_name("regions", frame.camera, frame.timestamp), _regions(scene, frame, job, size))
-        return float(sky.mean())
+        return float(sky.mean()), _semantic(frame, job, size, folder)
 
     with ThreadPoolExecutor() as pool:
-        sky_shares = list(pool.map(one, scene.frames))
+        sky_shares, classes = zip(*pool.map(one, scene.frames), strict=True)
     return {
         "labels": LABELS,
         "images": len(scene.frames),
         "regions": "masks" if job.masks.regions_folder else "boxes",
         "sky": "masks" if job.masks.sky_folder else "heuristic",
         "sky_share": float(np.mean(sky_shares)),
+        "semantic_classes": max(classes),
     }
 
 
@@ -61,7 +66,7 @@ def _nearest_returns(scene: Scene, frame: Frame) -> np.ndarray | None:
 
 
 def mask_name(kind: str, camera: str, timestamp: int) -> str:
-    """The path of a mask below the masks folder; `kind` is 'regions' or 'sky'."""
+    """The path of a mask below the masks folder; `kind` is 'regions', 'sky' or 'semantic'."""
     return f"{kind}/{camera}/{timestamp}.png"
 
 
@@ -86,6 +91,23 @@ def read_labels(folder: Path, camera: str, timestamp: int, size: tuple[int, int]
     Raises ResultError where it is missing or unreadable.
     """
     return _made_mask(folder, "regions", camera, timestamp, size)
+
+
+def read_classes(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    """The user's classes (h, w) of an image at `size` (width, height), UNLABELLED where there is none.
+
+    Raises ResultError where they are missing or unreadable.
+    """
+    return _made_mask(folder, "semantic", camera, timestamp, size)
+
+
+def _semantic(frame: Frame, job: MaskJob, size: tuple[int, int], folder: Path) -> int:
+    """Writes the user's classes of an image, where there are any; returns how many there are at least."""
+    if not job.masks.semantic_folder:
+        return 0
+    classes = _users_mask(job.masks.semantic_folder, frame, size)
+    write_png(folder / mask_name("semantic", frame.camera, frame.timestamp), classes)
+    return int(classes[classes != UNLABELLED].max(initial=-1)) + 1
 
 
 def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:

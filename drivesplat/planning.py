@@ -35,6 +35,7 @@ from drivesplat.truth import TRUTH_FILE
 SCRIPTS = "workflow_scripts"
 PARTS_FILM = "parts"
 """The film of a method's parts."""
+ABLATION_FILES = ("ablation.json", "ablation.csv")
 
 
 def let_scripts_import(folder: str) -> None:
@@ -147,7 +148,7 @@ class Plan:
     @property
     def methods_with_actors(self) -> list[str]:
         """The methods whose models know objects that move: those that can be taken apart and edited."""
-        return [name for name, method in self.config.methods.items() if set(method.parts) & MOVING_PARTS]
+        return [name for name, method in self.config.all_methods.items() if set(method.parts) & MOVING_PARTS]
 
     def films(self, scenes: list[str]) -> list[str]:
         """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
@@ -167,7 +168,8 @@ class Plan:
         return [
             f"{self.config.results_dir}/{scene}/{method}/edits/{edit}.mp4"
             for scene in scenes
-            for method in self.methods_with_actors
+            for method in self.config.methods
+            if method in self.methods_with_actors
             for edit in scene_edits(self.config, scene)
         ]
 
@@ -193,19 +195,27 @@ class Plan:
             if not rest:
                 continue
             self.config.dataset_of(scene)
-            if len(rest) > 1 and rest[0] not in (*self.config.methods, "masks"):
-                raise ConfigError(
-                    f"method {rest[0]!r} is not in the config; there are: {', '.join(self.config.methods)}"
-                )
+            self._refuse_unknown_method(rest)
             if len(rest) > 1:
                 self._refuse_unknown_film(scene, rest[0], rest[1:])
+
+    def _refuse_unknown_method(self, path: list[str]) -> None:
+        """Raises ConfigError where `path` below a scene's folder is about a method that there is none of."""
+        ablation, known = self.config.ablation, ", ".join(self.config.methods)
+        if path[0] in ABLATION_FILES and not self.config.ablated:
+            raise ConfigError(
+                f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: {known}"
+            )
+        if len(path) > 1 and path[0] not in (*self.config.all_methods, "masks"):
+            more = f"; for the ablation: {ablation.job.spelled}" if self.config.ablated else ""
+            raise ConfigError(f"method {path[0]!r} is not in the config; there are: {known}{more}")
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError where `path` below a method's folder is a film or an edit that there is none of."""
         edit = Path(path[-1]).stem if len(path) == 2 and path[0] == "edits" else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         if (edit is not None or film == PARTS_FILM) and method not in self.methods_with_actors:
-            able = ", ".join(self.methods_with_actors) or "none"
+            able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
             raise ConfigError(
                 f"method {method!r} knows no actors that could be edited or shown apart; those do: {able}"
             )

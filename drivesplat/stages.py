@@ -68,7 +68,7 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     """Which of TRAINING_INPUTS a method's training on a scene takes."""
     train = for_scene(config, scene, method).train
-    taken = {"actors": "actors" in config.methods[method].parts, "lidar_depth": train.depth_weight > 0}
+    taken = {"actors": "actors" in config.all_methods[method].parts, "lidar_depth": train.depth_weight > 0}
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
 
@@ -117,7 +117,7 @@ def _lidar_depth(place: Place) -> LidarDepthJob:
 
 
 def _train(place: Place) -> TrainJob:
-    config, parts = place.config, place.config.methods[place.method].parts
+    config, parts = place.config, place.config.all_methods[place.method].parts
     train = config.train if set(parts) & MOVING_PARTS else config.train.of_what_stands_still()
     return TrainJob(parts=parts, sky=config.sky, train=train, random_seed=config.random_seed)
 
@@ -196,6 +196,7 @@ _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "train": _train,
     "evaluate": _evaluate,
     "scene_metrics": lambda _: Settings(),
+    "ablation": lambda at: at.config.ablation.job,
     "tracks": lambda at: TracksJob(eval_camera=at.config.eval_camera),
     "film": _film,
     "film_parts": lambda at: FilmFormat(**_format(at)),

@@ -18,6 +18,7 @@ asked = get_argument_parser().parse_known_args()[0]
 
 try:
     plan = Plan(config, workflow.basedir)
+    edited = plan.edits(plan.config.batch_scenes)
     if workflow.is_main_process and not asked.lint:
         plan.refuse_unknown(asked.targets)
         plan.refuse_absent_data(asked.targets)
@@ -35,7 +36,7 @@ pathvars:
 
 wildcard_constraints:
     scene=plan.known(plan.config.scenes),
-    method=plan.known(plan.config.methods),
+    method=plan.known(plan.config.all_methods),
     trajectory=plan.known(plan.all_trajectories),
     edit="[A-Za-z0-9_][A-Za-z0-9_.-]*",
 

@@ -109,6 +109,19 @@ def actors_of(
     return actors
 
 
+def actor_record(track: ActorTrack, count: int = 10, seed: int = 0, pixels: int = 1000) -> dict[str, Any]:
+    """What actors.pkl would hold of an actor that starts from `count` points in its box, which shows so many pixels."""
+    rng = np.random.default_rng(seed)
+    motion = track.motion
+    return {
+        "id": track.id, "category": "vehicle.car", "size": track.size, "times": motion.times,
+        "object_to_world": motion.object_to_world, "runs": [list(run) for run in motion.runs], "reach": motion.reach,
+        "points": (rng.uniform(-0.5, 0.5, (count, 3)) * track.size).astype(np.float32),
+        "points_rgb": rng.integers(0, 256, (count, 3)).astype(np.uint8), "lidar_points": count,
+        "pixels": pixels,
+    }  # fmt: skip
+
+
 def looking_at(target: Any, place: Any, time: float = 0.0, width: int = 48, height: int = 32) -> View:
     """The view of a camera at world `place` that looks at `target` with its right side level."""
     forward = np.asarray(target, dtype=float) - np.asarray(place, dtype=float)

@@ -125,7 +125,6 @@ def films() -> Plan:
     [
         pytest.param("a/vanilla/nowhere", ["original", "lateral_2m", "aside"], id="of no scene"),
         pytest.param("b/vanilla/aside", ["original", "lateral_2m"], id="of another scene"),
-        pytest.param("b/vanilla/parts", ["original", "lateral_2m"], id="of the parts"),
         pytest.param("./b//vanilla/../vanilla/aside", ["original", "lateral_2m"], id="spelled otherwise"),
     ],
 )

@@ -24,9 +24,22 @@ def told(done: subprocess.CompletedProcess) -> str:
     return lines.pop()
 
 
+VANILLA = {"vanilla": {}}
+TWO_METHODS = {**VANILLA, "street": {"parts": ["background", "actors"]}}
+
+
 @pytest.fixture
 def copy(tmp_path) -> WorkflowCopy:
-    return WorkflowCopy.make(tmp_path / "workflow")
+    return WorkflowCopy.make(tmp_path / "workflow", methods=VANILLA)
+
+
+def with_edits(copy: WorkflowCopy, text: str) -> WorkflowCopy:
+    """With a second method, which knows actors, and this edits file for its scene."""
+    copy.config["methods"] = TWO_METHODS
+    copy.config["datasets"]["nuscenes"]["edits"] = {"0001": "edits.yaml"}
+    copy.write_config()
+    (copy.folder / "edits.yaml").write_text(text)
+    return copy
 
 
 @pytest.mark.parametrize(
@@ -68,6 +81,45 @@ def test_an_unknown_method_lists_those_there_are(copy):
 def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy, target):
     line = told(copy.run(f"results/0001/vanilla/{target}"))
     assert f"'{target.split('.')[0]}'" in line and "original, lateral_2m" in line and "render.trajectories" in line
+    assert not (copy.folder / "results/0001").exists()
+
+
+EDITS = (
+    "edits:\n  stop:\n    - stop: {track: 0001 instance 0, at: 2}\n  gone:\n    - remove: {track: 0001 instance 0}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("vanilla/edits/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
+        ("vanilla/parts.mp4", ["'vanilla' knows no actors", "those do: street"]),
+        ("street/edits/halt.mp4", ["no edit called 'halt'", "there are: stop, gone", "datasets.<name>.edits"]),
+        ("street/edits/halt.json", ["no edit called 'halt'", "there are: stop, gone"]),
+    ],
+)
+def test_an_edit_that_there_is_none_of_stops_before_any_job(copy, target, words):
+    line = told(with_edits(copy, EDITS).run(f"results/0001/{target}"))
+    assert all(word in line for word in words), line
+    assert not (copy.folder / "results/0001").exists()
+
+
+@pytest.mark.parametrize(
+    ("broken", "target", "words"),
+    [
+        (EDITS.replace("at: 2", "at: soon"), (), ["edit 'stop', step 1 (stop)", "'at' is 'soon'"]),
+        (EDITS.replace("- remove", "- vanish"), ("edits/stop.mp4",), ["edit 'gone', step 1", "no step 'vanish'"]),
+        (EDITS.replace("edits:", "edits"), ("train.json",), ["not YAML"]),
+        (None, ("edits/stop.mp4",), ["cannot be read"]),
+    ],
+    ids=["a value", "a step", "no YAML", "no file"],
+)
+def test_a_broken_edits_file_stops_before_any_job(copy, broken, target, words):
+    with_edits(copy, broken or "")
+    if broken is None:
+        (copy.folder / "edits.yaml").unlink()
+    line = told(copy.run(*(f"results/0001/street/{name}" for name in target)))
+    assert all(word in line for word in ["edits.yaml", *words]), line
     assert not (copy.folder / "results/0001").exists()
 
 
@@ -147,19 +199,22 @@ def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
 
 
 def test_a_scene_without_vehicles_gets_nulls(tmp_path):
-    copy = WorkflowCopy.make(tmp_path / "workflow", World(things=[]), train=TINY_TRAINING | {"iterations": 20})
+    """By a method with actors, too, of whose model there is then nothing to show apart."""
+    training = TINY_TRAINING | {"iterations": 20}
+    copy = WorkflowCopy.make(tmp_path / "workflow", World(things=[]), methods=TWO_METHODS, train=training)
     done = copy.run("results/0001/metrics.json", "looks")
     assert done.returncode == 0, done.stdout
-    result = copy.read("results/0001/metrics.json")["methods"]["vanilla"]["extrapolation"]
-    assert result["vehicle"] is None and result["moving_vehicle"] is None and result["gap_db"] is None
-    assert result["static"]["psnr"] == result["all"]["psnr"]
     assert "NaN" not in (copy.folder / "results/0001/metrics.json").read_text()
-    for name in ("ghost_panel", "removal"):
-        figures = copy.read(f"results/0001/vanilla/{name}.json")
-        assert figures["subject"] is figures["ghosts"] is None and "no vehicle moves" in figures["why_null"]
-        assert "NaN" not in (copy.folder / f"results/0001/vanilla/{name}.json").read_text()
-    with_car, without_car = (copy.folder / f"results/0001/vanilla/{name}_car.png" for name in ("with", "without"))
-    assert with_car.read_bytes() == without_car.read_bytes()
+    for method, metrics in copy.read("results/0001/metrics.json")["methods"].items():
+        result, folder = metrics["extrapolation"], copy.folder / f"results/0001/{method}"
+        assert result["vehicle"] is None and result["moving_vehicle"] is None and result["gap_db"] is None
+        assert result["static"]["psnr"] == result["all"]["psnr"]
+        for name in ("ghost_panel", "removal"):
+            figures = copy.read(f"results/0001/{method}/{name}.json")
+            assert figures["subject"] is figures["ghosts"] is None and "no vehicle moves" in figures["why_null"]
+            assert "NaN" not in (folder / f"{name}.json").read_text()
+        assert (folder / "with_car.png").read_bytes() == (folder / "without_car.png").read_bytes()
+    assert "scene 0001: nothing in this method's model moves" in told(copy.run("results/0001/street/parts.mp4"))
 
 
 FFMPEG_THAT_DIES = "#!/bin/sh\nhead -c 10000 > /dev/null\necho 'x264: no space for a reference frame' >&2\nexit 3\n"
@@ -167,9 +222,10 @@ FFMPEG_THAT_DIES = "#!/bin/sh\nhead -c 10000 > /dev/null\necho 'x264: no space f
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> WorkflowCopy:
-    """A finished training, to be looked at."""
-    copy = WorkflowCopy.make(tmp_path_factory.mktemp("trained"), train=TINY_TRAINING | {"iterations": 20})
-    done = copy.run("results/0001/vanilla/train.json")
+    """Two finished trainings, to be looked at."""
+    training = TINY_TRAINING | {"iterations": 20}
+    copy = WorkflowCopy.make(tmp_path_factory.mktemp("trained"), methods=TWO_METHODS, train=training)
+    done = with_edits(copy, EDITS).run(*(f"results/0001/{method}/train.json" for method in TWO_METHODS))
     assert done.returncode == 0, done.stdout
     return copy
 
@@ -194,27 +250,29 @@ def test_an_ffmpeg_that_is_absent_or_dies_is_named_and_leaves_no_half_film(train
 @pytest.mark.parametrize(
     ("script", "name"),
     [
-        ("film", "original.mp4"),
-        ("ghost_panel", "ghost_panel.png"),
-        ("remove_actor", "with_car.png"),
-        ("export", "splat.ply"),
-        ("export_usd", "scene.usdz"),
-        ("export_viewer", "viewer.html"),
+        ("film", "vanilla/original.mp4"),
+        ("film_parts", "street/parts.mp4"),
+        ("edit", "street/edits/stop.mp4"),
+        ("ghost_panel", "vanilla/ghost_panel.png"),
+        ("remove_actor", "vanilla/with_car.png"),
+        ("export", "vanilla/splat.ply"),
+        ("export_usd", "vanilla/scene.usdz"),
+        ("export_viewer", "vanilla/viewer.html"),
     ],
 )
 def test_a_full_disk_stops_a_look_and_names_the_file(trained, script, name):
     """A limit on the size of the job's files stands in for a disk without room: the same write fails the same way."""
     path = trained.folder / f"workflow_scripts/{script}.py"
-    whole, folder = path.read_text(), trained.folder / "results/0001/vanilla"
-    before = {file.name for file in folder.iterdir()}
+    whole, folder = path.read_text(), trained.folder / "results/0001"
+    before = {file for file in folder.rglob("*") if file.is_file()}
     limit = f"import resource\n\nresource.setrlimit(resource.RLIMIT_FSIZE, ({LARGEST_FILE}, {LARGEST_FILE}))\n"
     path.write_text(limit + whole)
     try:
-        line = told(trained.run(f"results/0001/vanilla/{name}"))
+        line = told(trained.run(f"results/0001/{name}"))
     finally:
         path.write_text(whole)
-    assert f"results/0001/vanilla/{name}: " in line
-    assert {file.name for file in folder.iterdir()} == before
+    assert f"results/0001/{name}: " in line
+    assert {file for file in folder.rglob("*") if file.is_file()} == before
 
 
 LARGEST_FILE = 2500
@@ -258,8 +316,9 @@ def training_process(copy: WorkflowCopy) -> int | None:
 
 def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
     training = TINY_TRAINING | {"iterations": 240, "checkpoint_every": 10}
-    whole = WorkflowCopy.make(tmp_path / "whole", train=training)
-    killed = WorkflowCopy.make(tmp_path / "killed", train=training)
+    whole, killed = (
+        WorkflowCopy.make(tmp_path / name, methods=VANILLA, train=training) for name in ("whole", "killed")
+    )
     assert whole.run("results/0001/metrics.json").returncode == 0
     state = killed.folder / "results/0001/vanilla/resume/state.pt"
     running = subprocess.Popen(

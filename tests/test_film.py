@@ -16,10 +16,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from hand_made_street import checkpoint_of
 
 from drivesplat import video
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.film import film_frame, film_views, render_film
+from drivesplat.film import Shot, film_frame, render_film
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel, View
@@ -27,7 +28,7 @@ from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
-from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train import TrainSettings
 from drivesplat.trajectory import film_path
 from drivesplat.video import Footage, read_footage, write_video
 
@@ -317,9 +318,8 @@ def a_checkpoint(**changes: Any) -> dict[str, Any]:
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1, init_opacity=0.9))
     part = Background.from_points(BALL[None].astype(np.float32), np.ones((1, 3)), settings.gaussians, 1.0)
     part.params["scales"].data.fill_(np.log(0.4))
-    state = {key: value.detach() for key, value in SplatModel([part], None).state_dict().items()}
-    job = TrainJob(parts=("background",), sky="none", train=settings, random_seed=0)
-    return {"model": {**state, **changes}, "job": job.model_dump_json(), "scene_scale": 1.0, "provenance": {}}
+    content = checkpoint_of(SplatModel([part], None), settings)
+    return {**content, "model": {**content["model"], **changes}}
 
 
 def a_job(**changes: Any) -> FilmJob:
@@ -382,8 +382,8 @@ def test_a_film_lasts_as_long_as_the_drive_and_its_record_says_what_it_is(folder
 def test_a_model_is_asked_for_the_time_since_the_first_image_of_any_camera(tiny_scene):
     earlier = dataclasses.replace(tiny_scene.frames[0], camera="CAM_BACK", timestamp=tiny_scene.frames[0].timestamp - 7)
     scene = dataclasses.replace(tiny_scene, frames=(*tiny_scene.frames, earlier))
-    path = film_path(scene, "CAM_FRONT", 2, TrajectorySettings())
-    times = [view.time for view in film_views(scene, path, np.eye(3), SIZE, torch.device("cpu"))]
+    shot = Shot(scene, film_path(scene, "CAM_FRONT", 2, TrajectorySettings()), a_job(fps=2), SIZE)
+    times = [view.time for view in shot.views(torch.device("cpu"))]
     np.testing.assert_allclose(times, 7e-6 + 0.5 * np.arange(10), atol=1e-9)
 
 

@@ -3,6 +3,7 @@
 import math
 import re
 import signal
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,24 @@ from gsplat import MCMCStrategy
 from gsplat.relocation import compute_relocation
 from scipy.spatial.transform import Rotation
 from test_training import (
+    ALL_TERMS,
     EndedError,
     EndingViews,
+    guided_views,
     in_subprocess,
     mean_psnr,
     recorded_views,
     settings_of,
     trained,
     untrained,
+    untrained_street,
 )
 
 from drivesplat.device import choose_device
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
 from drivesplat.film import film_frame
 from drivesplat.model.background import Background
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel, View
 from drivesplat.rasterize import rasterize
@@ -150,6 +155,27 @@ def test_a_films_frame_and_a_removal_are_those_of_the_cpu():
     assert not torch.equal(before.image, after.image)
 
 
+def test_actors_are_on_the_card_where_they_are_on_the_cpu():
+    """Places, colours and presence of two cars, of which one comes later; what a view sees of them by themselves."""
+    model = untrained_street(settings_of())
+    with torch.no_grad():
+        for value in (value for value in model.parameters() if value.requires_grad):
+            value += 0.1 * torch.randn(value.shape, generator=torch.Generator().manual_seed(0))
+    view = recorded_views(1, width=96, height=64)[0].view
+    times = (0.0, 0.3, 1.1, 1.9, 5.0)
+    on_cpu = [model.gaussians_at(time) for time in times]
+    alone_on_cpu = model.objects_alpha(model.render(view), view).detach()
+    model, on_gpu = model.to(GPU), recorded_views(1, width=96, height=64, device=GPU)[0].view
+    for time, expected in zip(times, on_cpu, strict=True):
+        found = model.gaussians_at(time)
+        for field in fields(Gaussians):
+            torch.testing.assert_close(
+                getattr(found, field.name).cpu(), getattr(expected, field.name), rtol=1e-4, atol=1e-5
+            )
+    alone = model.objects_alpha(model.render(on_gpu), on_gpu).detach().cpu()
+    assert float(alone.max()) > 0.1 and float((alone - alone_on_cpu).abs().quantile(0.99)) < 1e-3
+
+
 def test_relocation_is_gsplats():
     generator = torch.Generator().manual_seed(0)
     ratios = torch.arange(1, 21).repeat(50)
@@ -205,6 +231,23 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(uninterrupted, strategy
     model, summary = trained(tmp_path, settings, gpu_views(), device=GPU)
     assert summary.resumed_at == [80] and summary.iterations == 200
     assert mean_psnr(model, gpu_views()) == pytest.approx(uninterrupted[strategy], abs=0.3)
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_training_of_actors_learns_and_resumes(strategy, tmp_path):
+    """With all terms of the loss, and corrections of tracks."""
+    settings = gpu_settings(strategy, **ALL_TERMS)
+    before = mean_psnr(untrained_street(settings).to(GPU), guided_views(GPU))
+    whole, _ = trained(tmp_path / "whole", settings, guided_views(GPU), device=GPU, model=untrained_street(settings))
+    with pytest.raises(EndedError):
+        views = EndingViews(guided_views(GPU), 120)
+        trained(tmp_path / "it", settings, views, device=GPU, model=untrained_street(settings))
+    resumed, summary = trained(
+        tmp_path / "it", settings, guided_views(GPU), device=GPU, model=untrained_street(settings)
+    )
+    assert summary.resumed_at == [80] and resumed.parts[1].shared["translation"].any()
+    found, expected = (mean_psnr(model, guided_views(GPU)) for model in (resumed, whole))
+    assert expected > before + 3.0 and found == pytest.approx(expected, abs=0.5)
 
 
 def train_until_killed(folder: str) -> None:

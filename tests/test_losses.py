@@ -15,6 +15,7 @@ from drivesplat.model.splat_model import Picture, SplatModel, View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.losses import (
+    class_cross_entropy,
     depth_loss,
     entropy,
     loss_terms,
@@ -282,6 +283,47 @@ def test_an_empty_mask_costs_nothing():
     loss = masked_l1(image, random_image(12), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool))
     loss.backward()
     assert float(loss.detach()) == 0.0 and not image.grad.any()
+
+
+def test_classes_cost_the_logarithm_of_their_softmax_where_they_are_labelled():
+    rng = np.random.default_rng(13)
+    logits, classes = rng.normal(size=(4, 5, 3)), rng.integers(0, 3, (4, 5))
+    classes[1, 2:], classes[3, 0] = 255, 255
+    shares = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
+    labelled = classes != 255
+    expected = -np.mean(np.log(np.take_along_axis(shares, classes.clip(max=2)[..., None], axis=-1)[..., 0])[labelled])
+    found = class_cross_entropy(torch.from_numpy(logits).float(), torch.from_numpy(classes.astype(np.uint8)))
+    assert float(found) == pytest.approx(expected, rel=1e-5)
+
+
+def test_without_labels_classes_cost_nothing():
+    logits = torch.rand(4, 5, 3, requires_grad=True)
+    loss = class_cross_entropy(logits, torch.full((4, 5), 255, dtype=torch.uint8))
+    loss.backward()
+    assert float(loss.detach()) == 0.0 and not logits.grad.any()
+
+
+def test_gaussians_learn_the_classes_of_their_pixels():
+    """Two Gaussians side by side, the left half of the image of class 1, the right half of class 2 of three."""
+    rng, settings = np.random.default_rng(14), GaussianSettings(init_opacity=0.9, init_scale=1.0)
+    places = np.array([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]])
+    part = Background.from_points(places, rng.uniform(size=(2, 3)), settings, 1.0, classes=3)
+    with torch.no_grad():
+        part.params["scales"].fill_(math.log(0.2))
+    model = SplatModel([part], None)
+    view = View(torch.tensor([[12.0, 0, 10], [0, 12, 7], [0, 0, 1]]), torch.eye(4), WIDTH, HEIGHT, 0.0)
+    classes = torch.full((HEIGHT, WIDTH), 1, dtype=torch.uint8)
+    classes[:, WIDTH // 2 :] = 2
+    told = dataclasses.replace(a_view((random_image(1) * 255).to(torch.uint8), None), view=view, classes=classes)
+    for weight in (0.5, 1.5):
+        picture = model.render(view)
+        terms = loss_terms(picture, told, model, TrainSettings(semantic_weight=weight))
+        assert float(terms["semantic"].detach()) == pytest.approx(weight * math.log(3.0)), "nothing is known as yet"
+    terms["semantic"].backward()
+    pulls = -part.params["classes"].grad
+    assert pulls.argmax(dim=1).tolist() == [1, 2] and (pulls[:, 0] < 0).all()
+    assert "semantic" not in loss_terms(picture, dataclasses.replace(told, classes=None), model, TrainSettings())
+    assert "semantic" not in loss_terms(picture, told, a_model(), TrainSettings())
 
 
 def street() -> tuple[SplatModel, Picture, TrainingView]:

@@ -6,18 +6,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hand_made import actor_record, actors_of, looking_at, motion_through, round_gaussians, track_of
 from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.images import pixel_rays
 from drivesplat.model.background import Background
-from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
+from drivesplat.model.build import Beginnings, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
+from drivesplat.training import checkpoint
 
 SH_C0 = 0.5 / np.sqrt(np.pi)
 SKY_COLOR = np.array([0.2, 0.4, 0.8])
@@ -54,10 +58,10 @@ def beginnings(parser: dict[str, Any], *actors: dict[str, Any]) -> Beginnings:
 
 
 def shaken(model: nn.Module) -> nn.Module:
-    """The model with every parameter moved, as after a training."""
+    """The model with every learned parameter moved, as after a training."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for value in model.parameters():
+        for value in (value for value in model.parameters() if value.requires_grad):
             value += 0.2 * torch.randn(value.shape, generator=generator)
     return model
 
@@ -126,9 +130,9 @@ def test_points_at_one_place_have_a_size():
 
 
 def test_positions_learn_in_proportion_to_the_scene():
-    rates = Background.from_points(*seed_points(5), GaussianSettings(lr_means=1e-4), 7.0).learning_rates()
-    assert rates["means"] == pytest.approx(7e-4)
-    assert rates.keys() == {"means", "scales", "quats", "opacities", "sh0", "shN"}
+    part = Background.from_points(*seed_points(5), GaussianSettings(lr_means=1e-4), 7.0)
+    assert part.learning_rates()["means"] == pytest.approx(7e-4)
+    assert part.learning_rates().keys() >= set(part.params)
 
 
 @pytest.mark.parametrize("sky", [ConstantSky, CubemapSky])
@@ -202,6 +206,26 @@ def test_concatenate_keeps_order_and_every_field():
         torch.testing.assert_close(getattr(joined, field.name)[3:], getattr(b, field.name))
 
 
+@pytest.mark.parametrize("degrees", [(0, 2), (2, 0), (1, 3), (1, 1)])
+def test_sets_with_fewer_coefficients_keep_their_colours_among_richer_ones(degrees):
+    parts = [
+        shaken(Background.from_points(*seed_points(n, seed=n), GaussianSettings(sh_degree=degree), 1.0))
+        for n, degree in zip((3, 4), degrees, strict=True)
+    ]
+    joined = concatenate([part.at(0.0) for part in parts])
+    assert joined.sh_degree == max(degrees)
+    directions = Rotation.random(20, random_state=0).as_matrix()[:, 0]
+    for part, rows in zip(parts, (slice(0, 3), slice(3, 7)), strict=True):
+        alone = part.at(0.0).sh
+        assert torch.equal(joined.sh[rows, : alone.shape[1]], alone) and not joined.sh[rows, alone.shape[1] :].any()
+    lookers = [looking_at([0.0, 0.0, 4.0], [0.0, 0.0, 4.0] + 9.0 * d) for d in directions[:3]]
+    for view in lookers:
+        alone = SplatModel([parts[1]], None).render(view).image
+        model = SplatModel(parts, None)
+        seen = model.render(view, gaussians=model.gaussians_at(0.0)[3:]).image
+        torch.testing.assert_close(seen, alone)
+
+
 def test_concatenating_one_set_copies_nothing():
     one = Background.from_points(*seed_points(3), GaussianSettings(), 1.0).at(0.0)
     assert concatenate([one]) is one
@@ -220,6 +244,116 @@ def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, sh_de
     assert float(picture.alpha.detach().max()) > 0.3
     assert torch.equal(again.image, picture.image) and torch.equal(again.depth, picture.depth)
     assert rebuilt.parts[0].learning_rates() == model.parts[0].learning_rates()
+
+
+def a_track(name: str = "it", start: float = 0.0) -> ActorTrack:
+    """Half a second a box, from 3 m before the camera of `a_view` on."""
+    times = start + 0.5 * np.arange(4)
+    return track_of(motion_through(times, [[0.5 * i, -0.2, 3.0 + i] for i in range(4)], 0.4 * times), name)
+
+
+def street(*, still: int = 12) -> SplatModel:
+    """Background, two actors, more background; of which the second actor comes at 1 second."""
+    first, second = (Background.from_points(*seed_points(n), GaussianSettings(), 1.0) for n in (still, 5))
+    return SplatModel([first, actors_of(a_track(), a_track("later", 1.0), count=4), second], None)
+
+
+def test_rows_say_which_gaussians_are_each_parts():
+    model = street()
+    together = model.gaussians_at(0.7)
+    assert model.rows == [slice(0, 12), slice(12, 20), slice(20, 25)]
+    for part, rows in zip(model.parts, model.rows, strict=True):
+        assert torch.equal(together[rows].means, part.at(0.7).means)
+    assert model.moving().tolist() == [False] * 12 + [True] * 8 + [False] * 5
+    assert model.of_track("later").tolist() == [False] * 16 + [True] * 4 + [False] * 5
+
+
+def test_what_moves_is_as_opaque_by_itself_as_it_is_rendered_alone():
+    """Whatever stands before or behind it in the picture."""
+    model = street()
+    picture = model.render(a_view())
+    found = model.objects_alpha(picture, a_view())
+    alone = SplatModel([model.parts[1]], None).render(a_view()).alpha
+    torch.testing.assert_close(found, alone)
+    assert float(found.detach().max()) > 0.05 and float((picture.alpha - found).detach().abs().max()) > 0.1
+
+
+def test_nothing_is_said_of_what_moves_where_nothing_does():
+    still = SplatModel([round_gaussians([[0.0, 0.0, 4.0]])], None)
+    assert still.objects_alpha(still.render(a_view()), a_view()) is None
+
+
+@pytest.mark.parametrize("sky", ["none", "cubemap"])
+def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
+    """Places, colours and presence at many times; learning rates and penalties, too. Of a training, in whose course
+    Gaussians came and went."""
+    settings = TrainSettings(sky_resolution=4, actors=ActorSettings(sh_degree=2, fourier=3, cap_max=50))
+    records = [actor_record(a_track(), 10), actor_record(a_track("later", 1.0), 7)]
+    parts = ("background", "actors")
+    model = shaken(build_model(beginnings(parser_record(20), *records), parts, sky, settings))
+    for value in model.parts[1].params.values():
+        value.data = value.data[3:]
+    checkpoint.save(tmp_path / "a.pt", {"model": model.state_dict(), "parts": definitions(model)})
+    content = checkpoint.load(tmp_path / "a.pt", "train")
+    rebuilt = rebuild_model(content["model"], content["parts"], sky, settings)
+    assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
+    for time in (-0.2, 0.0, 0.61, 1.0, 1.8, 2.7, 5.0):
+        ours, again = model.gaussians_at(time), rebuilt.gaussians_at(time)
+        assert all(torch.equal(getattr(ours, f.name), getattr(again, f.name)) for f in fields(Gaussians))
+    for part, again in zip(model.parts, rebuilt.parts, strict=True):
+        assert again.learning_rates() == part.learning_rates() and again.extent == part.extent
+        assert again.penalties().keys() == part.penalties().keys()
+        assert all(torch.equal(value, part.penalties()[name]) for name, value in again.penalties().items())
+    assert [value.requires_grad for value in rebuilt.parameters()] == [v.requires_grad for v in model.parameters()]
+
+
+def test_actors_start_from_their_records():
+    records = [actor_record(a_track(), 10, seed=1), actor_record(a_track("later", 1.0), 7, seed=2)]
+    model = build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
+    actors = model.parts[1]
+    assert actors.params["owner"].tolist() == [0] * 10 + [1] * 7
+    np.testing.assert_array_equal(actors.params["means"].detach(), np.concatenate([r["points"] for r in records]))
+    colors = np.concatenate([r["points_rgb"] for r in records]) / 255.0
+    np.testing.assert_allclose(0.5 + SH_C0 * actors.harmonics(0.3)[:, 0].detach(), colors, atol=1e-5)
+    at = np.linspace(-0.5, 3.0, 15)
+    for track, expected in zip(actors.timeline.tracks, (a_track(), a_track("later", 1.0)), strict=True):
+        assert track.id == expected.id
+        np.testing.assert_array_equal(track.motion.poses(at), expected.motion.poses(at))
+        np.testing.assert_array_equal(track.motion.present(at), expected.motion.present(at))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "changes", "expected"),
+    [
+        pytest.param(1000, {}, 50, id="the pixels in its box decide: 1000 / 20"),
+        pytest.param(100, {}, 8, id="never less than the least"),
+        pytest.param(1000, {"pixels_per_gaussian": 0.0}, 300, id="no limit by pixels"),
+    ],
+)
+def test_an_actors_gaussians_are_capped_by_its_training_pixels(pixels, changes, expected):
+    settings = TrainSettings(**{"pixels_per_gaussian": 20.0, "actors": ActorSettings(least=8, cap_max=300), **changes})
+    assert actor_cap(actor_record(a_track(), pixels=pixels), settings) == expected
+
+
+def test_each_actor_starts_with_no_more_points_than_its_cap():
+    """A twentieth of 400 and of 2000 pixels; together they may never have more than both."""
+    records = [actor_record(a_track(), 60, pixels=400), actor_record(a_track("later", 1.0), 60, pixels=2000)]
+    settings = TrainSettings(pixels_per_gaussian=20.0, actors=ActorSettings(least=8))
+    (actors,) = build_model(beginnings(parser_record(20), *records), ("actors",), "none", settings).parts
+    assert actors.params["owner"].tolist() == [0] * 20 + [1] * 60 and actors.cap_max == 120
+    kept = {tuple(row) for row in actors.params["means"].detach()[:20].numpy()}
+    assert len(kept & {tuple(row) for row in records[0]["points"]}) == 20
+    colors = dict(zip(map(tuple, records[0]["points"]), records[0]["points_rgb"], strict=True))
+    own = 255.0 * (0.5 + SH_C0 * actors.harmonics(0.0)[:20, 0].detach().numpy())
+    np.testing.assert_allclose(
+        own, [colors[tuple(row)] for row in actors.params["means"].detach()[:20].numpy()], atol=0.01
+    )
+
+
+@pytest.mark.parametrize("records", [[], [actor_record(track_of(motion_through([0.0], [[0.0, 0.0, 0.0]])), 0)]])
+def test_where_nothing_moves_a_street_is_its_background(records):
+    model = build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
+    assert [part.name for part in model.parts] == ["background"] and not model.moving().any()
 
 
 @pytest.mark.parametrize(("sky", "kind"), [("none", type(None)), ("mask", ConstantSky), ("cubemap", CubemapSky)])

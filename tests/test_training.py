@@ -1,5 +1,6 @@
 """A training from its first iteration to its files: what it learns, and what it survives."""
 
+import dataclasses
 import errno
 import json
 import logging
@@ -17,17 +18,30 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hand_made import actor_record, actors_of, motion_through, track_of
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
+from drivesplat.masks import mask_name
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.timeline import ActorTrack
 from drivesplat.rasterize import rasterize
+from drivesplat.regions import LABELS
+from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import DefaultSettings, FloaterSettings, McmcSettings, TrainJob, TrainSettings
+from drivesplat.settings.train import (
+    DefaultSettings,
+    FloaterSettings,
+    McmcSettings,
+    PartName,
+    SkyKind,
+    TrainJob,
+    TrainSettings,
+)
 from drivesplat.training import checkpoint
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import make_optimizers, schedule
@@ -40,7 +54,7 @@ from drivesplat.training.run import (
     trained_model,
 )
 from drivesplat.training.train import Trainer, TrainingSummary, Workspace, train
-from drivesplat.training.views import Guides, TrainingView, load_views, order, view_of
+from drivesplat.training.views import Guides, LidarDepth, TrainingView, load_views, order, view_of
 
 REPOSITORY = Path(__file__).parent.parent
 CPU = torch.device("cpu")
@@ -78,6 +92,35 @@ def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
 def untrained(settings: TrainSettings, sky: bool = False) -> SplatModel:
     part = Background.from_points(*seed_points(), settings.gaussians, 1.0)
     return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
+
+
+def cars() -> list[ActorTrack]:
+    """Two that cross what the cameras of `recorded_views` see; the second comes when half of them have looked."""
+    early, late = 0.5 * np.arange(5), 1.0 + 0.5 * np.arange(3)
+    size = (1.6, 0.8, 0.8)
+    return [
+        track_of(motion_through(early, [[t - 1.5, 0.3, 4.0] for t in early], 0.3 * early), "early", size),
+        track_of(motion_through(late, [[2.0 - t, -0.6, 4.5] for t in late], -0.4 * late), "late", size),
+    ]
+
+
+def untrained_street(settings: TrainSettings) -> SplatModel:
+    """Background, two cars and a sky."""
+    still = untrained(settings, sky=True)
+    return SplatModel([*still.parts, actors_of(*cars(), count=25, settings=settings.actors, shaken=False)], still.sky)
+
+
+def guided_views(device: torch.device = CPU) -> list[TrainingView]:
+    """Recorded views of which all is known that a training can be told."""
+    views = []
+    for view in recorded_views(device=device):
+        rows = torch.arange(HEIGHT, device=device)[:, None].expand(HEIGHT, WIDTH)
+        lidar = LidarDepth(torch.arange(200, 400).to(device), torch.linspace(3.0, 6.0, 200).to(device))
+        views.append(dataclasses.replace(view, sky=rows < 5, moving=(rows > 8) & (rows < 15), lidar=lidar))
+    return views
+
+
+ALL_TERMS = {"sky_bce_weight": 0.05, "depth_weight": 0.01, "entropy_weight": 0.1, "dynamic_weight": 0.1}
 
 
 def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:
@@ -214,6 +257,55 @@ def test_a_sky_learns_too(tmp_path):
     assert (torch.sigmoid(model.sky.params["color"]) < 0.48).all()
 
 
+def test_actors_learn_with_the_background_but_for_those_that_are_absent():
+    """Views at 0 and 0.5 s see the first car; the second comes at 0.75 s."""
+    settings = settings_of(refine_start=1.0, **ALL_TERMS)
+    model = untrained_street(settings)
+    trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU)
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
+    for _ in range(15):
+        trainer.fit_one()
+        trainer.step += 1
+    moved = {name: (value.detach() - before[name]).abs() for name, value in model.named_parameters()}
+    first, second = (model.parts[1].params["owner"] == i for i in (0, 1))
+    for name in ("means", "scales", "opacities", "sh0", "shN"):
+        assert moved[f"parts.0.params.{name}"].max() > 0.0
+        assert moved[f"parts.1.params.{name}"][first].max() > 0.0
+        assert not moved[f"parts.1.params.{name}"][second].any()
+    for name in ("translation", "yaw"):
+        assert moved[f"parts.1.shared.{name}"][:2].max() > 1e-4 and not moved[f"parts.1.shared.{name}"][5:].any()
+    assert not moved["parts.1.params.owner"].any()
+
+
+def test_gaussians_that_leave_their_actors_box_are_put_back_among_the_others(tmp_path):
+    settings = settings_of(iterations=7, refine_start=0.0, refine_stop=1.0, floaters=FloaterSettings(radius=0))
+    model = untrained_street(settings)
+    actors = model.parts[1]
+    with torch.no_grad():
+        actors.params["means"][:4] += 3.0
+        actors.params["opacities"].fill_(1.0)
+    trained(tmp_path, settings, model=model)
+    assert len(actors) >= 50 and float(actors.params["means"].detach().abs().max()) < 1.5
+
+
+def test_actors_are_no_floaters(tmp_path):
+    """Their places are their boxes', near zero as the cameras of these views are."""
+    settings = settings_of(iterations=7, refine_start=1.0, floaters=FloaterSettings(every=7, radius=3.5))
+    model = untrained_street(settings)
+    trained(tmp_path, settings, model=model)
+    still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
+    assert (still < 1e-3).any() and not (actors < 1e-3).any()
+
+
+def test_what_stands_still_knows_no_settings_of_what_moves():
+    """So that a change of these leaves trainings without moving parts as they are."""
+    changed = {"iterations": 70, "depth_weight": 0.2, "sky_bce_weight": 0.3, "opacity_reg": 0.5}
+    moving = {"actors": ActorSettings(fourier=2), "entropy_weight": 0.7, "dynamic_weight": 0.9}
+    settings = settings_of(**changed, **moving)
+    assert settings.of_what_stands_still() == settings_of(**changed)
+    assert {name for name, value in settings if getattr(settings.of_what_stands_still(), name) != value} == set(moving)
+
+
 @pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (50, 0.1), (100, 0.01)])
 def test_positions_learn_ever_more_slowly(step, factor):
     model = untrained(settings_of())
@@ -282,6 +374,24 @@ def test_views_are_the_training_images_and_no_others(tmp_path):
         assert view.target().dtype == torch.float32 and float(view.target().max()) <= 1.0
 
 
+def test_views_know_what_guides_say_of_their_image(tmp_path):
+    """By the image's number among all of the scene, of which the third is held out."""
+    masks = {i: np.zeros((HEIGHT, WIDTH), dtype=bool) for i in range(5)}
+    for i, mask in masks.items():
+        mask[i] = True
+    depths = {
+        3: {"rows": np.array([0, 2], np.int32), "columns": np.array([7, 1], np.int32), "depth": np.array([4.5, 9.0])}
+    }
+    none = {"rows": np.zeros(0, np.int32), "columns": np.zeros(0, np.int32), "depth": np.zeros(0, np.float32)}
+    guides = Guides(sky=masks, moving={i: masks[4 - i] for i in masks}, lidar={**depths, 4: none})
+    loaded = dict(zip((0, 1, 3, 4), load_views(parser_record(tmp_path, recorded_views()), guides, CPU), strict=True))
+    for i, view in loaded.items():
+        assert view.sky.nonzero()[:, 0].unique().tolist() == [i]
+        assert view.moving.nonzero()[:, 0].unique().tolist() == [4 - i]
+    assert loaded[3].lidar.pixels.tolist() == [7, 2 * WIDTH + 1] and loaded[3].lidar.depth.tolist() == [4.5, 9.0]
+    assert loaded[0].lidar is None and loaded[4].lidar is None, "not measured, and nothing measured"
+
+
 def test_the_time_of_a_view_counts_from_the_first_image(tmp_path):
     record = parser_record(tmp_path, recorded_views())
     assert [view_of(record, i, CPU).time for i in range(5)] == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])
@@ -329,6 +439,19 @@ def test_a_resumed_training_is_the_same_training_on_the_cpu(uninterrupted, strat
     resumed, summary = trained(tmp_path, settings_of(strategy))
     assert summary.resumed_at == [CHECKPOINT_AT]
     assert same_parameters(resumed, uninterrupted[strategy][0])
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_resumed_training_of_actors_is_the_same_training_on_the_cpu(strategy, tmp_path):
+    """With all terms of the loss, corrections of tracks, and Gaussians that come and go."""
+    settings = settings_of(strategy, iterations=30, checkpoint_every=12, refine_start=0.0, **ALL_TERMS)
+    whole, summary = trained(tmp_path / "whole", settings, guided_views(), model=untrained_street(settings))
+    with pytest.raises(EndedError):
+        trained(tmp_path / "it", settings, EndingViews(guided_views(), 20), model=untrained_street(settings))
+    resumed, resumed_summary = trained(tmp_path / "it", settings, guided_views(), model=untrained_street(settings))
+    assert (summary.resumed_at, resumed_summary.resumed_at) == ([], [12])
+    assert same_parameters(resumed, whole)
+    assert len(whole.parts[1]) != 50 and whole.parts[1].shared["yaw"].any()
 
 
 def test_a_training_ended_twice_resumes_twice_and_counts_all_its_time(uninterrupted, tmp_path):
@@ -493,7 +616,7 @@ def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoi
     with pytest.raises(TrainingError) as error:
         trained(tmp_path, settings)
     message = str(error.value)
-    assert message.startswith("iteration 2: ") and "loss ssim" in message
+    assert message.startswith("iteration 2: ") and "loss ssim" in message and "gradient of background" in message
     assert "opacity_reg" not in message and "scale_reg" not in message
     assert str(tmp_path / "resume/state.pt") in message
     assert checkpoint.load(tmp_path / "resume/state.pt", "train")["step"] == 1
@@ -614,18 +737,35 @@ def test_tensorboard_of_a_resumed_training_tells_every_iteration_once(tmp_path):
 PROVENANCE = {"settings_sha256": "a", "code_sha256": "b", "inputs_sha256": "c", "stages": {}, "inputs": {}}
 
 
-def job_of(**changes: Any) -> TrainJob:
+def job_of(parts: tuple[PartName, ...] = ("background",), sky: SkyKind = "none", **changes: Any) -> TrainJob:
     settings = settings_of(**{"iterations": 20, "checkpoint_every": 10, "pixels_per_gaussian": 0, **changes})
-    return TrainJob(parts=("background",), sky="none", train=settings, random_seed=3)
+    return TrainJob(parts=parts, sky=sky, train=settings, random_seed=3)
 
 
 def files_in(folder: Path) -> TrainingFiles:
     return TrainingFiles(folder / "checkpoint.pt", folder / "train.json")
 
 
-def run(folder: Path, job: TrainJob, device: str = "cpu") -> TrainingFiles:
+def inputs_in(folder: Path, actors: bool = False) -> TrainingInputs:
+    """Recorded views; with `actors` also two cars, the lower half of each image marked as them, and depths."""
+    record = parser_record(folder / "images", recorded_views())
+    if not actors:
+        return TrainingInputs(record, folder / "masks", [], [])
+    for i, time in enumerate(record["timestamps"]):
+        labels = np.full((HEIGHT, WIDTH), LABELS["static"], np.uint8)
+        labels[HEIGHT // 2 :, : WIDTH // 2], labels[HEIGHT // 2 :, WIDTH // 2 :] = LABELS["moving_car"], 8
+        for kind, mask in (("regions", labels), ("sky", np.eye(HEIGHT, WIDTH, i, dtype=np.uint8) * 255)):
+            path = folder / "masks" / mask_name(kind, "CAM_FRONT", int(time))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(mask).save(path)
+    depth = {"rows": np.arange(9, dtype=np.int32), "columns": np.arange(9, dtype=np.int32), "depth": np.full(9, 4.0)}
+    records = [actor_record(track, 25, seed) for seed, track in enumerate(cars())]
+    return TrainingInputs(record, folder / "masks", records, [depth] * 5)
+
+
+def run(folder: Path, job: TrainJob, device: str = "cpu", actors: bool = False) -> TrainingFiles:
     files = files_in(folder / "vanilla")
-    inputs = TrainingInputs(parser_record(folder / "images", recorded_views()), folder / "masks", [], [])
+    inputs = inputs_in(folder, actors)
     run_training(inputs, job, DeviceSettings(kind=device), files, PROVENANCE, "train")
     return files
 
@@ -642,6 +782,40 @@ def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
     assert summary["peak_gpu_memory_gb"] is None and summary["resumed_at"] == []
     views = recorded_views()
     assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
+
+
+def test_a_finished_training_of_actors_can_be_rendered_from_its_checkpoint_alone(tmp_path):
+    job = job_of(("background", "actors"), "cubemap", sky_resolution=4, **ALL_TERMS)
+    model, again = trained_model(read_checkpoint(run(tmp_path, job, actors=True).checkpoint))
+    assert again == job and [part.name for part in model.parts] == ["background", "actors"]
+    assert [track.id for track in model.parts[1].timeline.tracks] == ["early", "late"]
+    assert model.parts[1].shared["translation"].any(), "tracks were corrected"
+    views = recorded_views()
+    assert mean_psnr(model, views) > mean_psnr(untrained_street(job.train), views) + 1.0
+
+
+@pytest.mark.parametrize(
+    ("parts", "changes", "known"),
+    [
+        (("background",), {"dynamic_weight": 0.0}, {"lidar"}),
+        (("background", "actors"), {"dynamic_weight": 0.1}, {"lidar", "moving"}),
+        (("background", "actors"), {"dynamic_weight": 0.1, "sky_bce_weight": 0.1}, {"lidar", "moving", "sky"}),
+    ],
+)
+def test_only_what_a_training_asks_for_is_read(tmp_path, parts, changes, known):
+    """Masks are read by the training images; of people that move, too, is known that they do."""
+    guides = inputs_in(tmp_path, actors=True).guides(job_of(parts, **changes))
+    told = {name: getattr(guides, name) for name in ("sky", "moving", "lidar")}
+    assert {name for name, images in told.items() if images} == known
+    assert all(list(images) == [0, 1, 3, 4] for images in told.values() if images)
+    if "moving" in known:
+        assert guides.moving[3][HEIGHT // 2 :].all() and not guides.moving[3][: HEIGHT // 2].any()
+    if "sky" in known:
+        np.testing.assert_array_equal(guides.sky[3], np.eye(HEIGHT, WIDTH, 3, dtype=bool))
+
+
+def test_a_sky_that_is_modelled_is_read(tmp_path):
+    assert inputs_in(tmp_path, actors=True).guides(job_of(sky="cubemap")).sky
 
 
 def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):

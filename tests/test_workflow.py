@@ -7,18 +7,39 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from workflow_copy import WorkflowCopy
+
+from drivesplat.video import read_footage
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("workflow")]
 
 REGIONS = ("all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human")
 
 
+CAR = "0001 instance 0"
+"""The one vehicle that moves in the tiny world, 8 m ahead of the camera's car."""
+STREET = {"sky": "none", "train": {"strategy": "default", "depth_weight": 0.01}}
+EDITS = """\
+edits:
+  gone:
+    - remove: {track: 0001 instance 0}
+  stop:
+    - shift: {track: 0001 instance 0, lateral: 1.0}
+    - stop: {track: 0001 instance 0, at: 2}
+"""
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> WorkflowCopy:
-    """The workflow run to its end on one scene with two methods."""
-    methods = {"vanilla": {}, "plain": {"overrides": {"sky": "none", "train": {"strategy": "default"}}}}
-    copy = WorkflowCopy.make(tmp_path_factory.mktemp("finished"), methods=methods)
+    """The workflow run to its end on one scene with two methods and two edits."""
+    copy = WorkflowCopy.make(
+        tmp_path_factory.mktemp("finished"),
+        datasets={"nuscenes": {"dataroot": "data", "scenes": ["0001"], "edits": {"0001": "edits.yaml"}}},
+        methods={"vanilla": {}, "street": {"parts": ["background", "actors"], "overrides": STREET}},
+        actors={"random_points": 200},
+    )
+    (copy.folder / "edits.yaml").write_text(EDITS)
     done = copy.run()
     assert done.returncode == 0, done.stdout
     return copy
@@ -34,7 +55,7 @@ def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
         "regions": "boxes", "extra_points": None, "lidar_missing": 0,
     }  # fmt: skip
     assert {key: metrics["protocol"][key] for key in expected} == expected
-    assert set(metrics["methods"]) == {"vanilla", "plain"}
+    assert set(metrics["methods"]) == {"vanilla", "street"}
     assert {"settings_sha256", "code_sha256", "inputs_sha256", "versions"} <= metrics["provenance"].keys()
 
 
@@ -56,7 +77,7 @@ def test_every_method_is_measured_in_both_groups_and_all_regions(finished):
 
 def test_the_report_has_a_row_per_scene_and_method(finished):
     report = finished.read("results/gap_report.json")
-    assert [(row["scene"], row["method"]) for row in report["rows"]] == [("0001", "vanilla"), ("0001", "plain")]
+    assert [(row["scene"], row["method"]) for row in report["rows"]] == [("0001", "vanilla"), ("0001", "street")]
     assert report["left_out"] == [] and report["missing"] == []
     lines = (finished.folder / "results/gap_report.csv").read_text().splitlines()
     assert len(lines) == 3 and lines[0].startswith("scene,dataset,method")
@@ -67,9 +88,14 @@ def test_what_a_training_leaves_behind(finished):
     trained = {"checkpoint.pt", "train.json", "eval.json", "tensorboard"}
     films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
     looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
-    exports = {"splat.ply", "cameras.json", "scene.usdz", "viewer.html"}
-    assert trained | films | looks | exports == {path.name for path in folder.iterdir()}
+    exports = {"splat.ply", "cameras.json", "parts", "scene.usdz", "viewer.html"}
+    of_both = trained | films | looks | exports
+    assert of_both == {path.name for path in folder.iterdir()}
     assert list((folder / "tensorboard").glob("events.*"))
+    street = finished.folder / "results/0001/street"
+    assert of_both | {"parts.mp4", "parts.cameras.json", "edits"} == {path.name for path in street.iterdir()}
+    edits = {f"{edit}.{kind}" for edit in ("gone", "stop") for kind in ("mp4", "png", "json")}
+    assert edits == {path.name for path in (street / "edits").iterdir()}
 
 
 def test_a_film_lasts_as_long_as_the_drive_and_runs_beside_it(finished):
@@ -85,18 +111,48 @@ def test_a_film_lasts_as_long_as_the_drive_and_runs_beside_it(finished):
     np.testing.assert_allclose(centers[1] - centers[0], np.tile(2.0 * left, (recorded["frames"], 1)), atol=1e-6)
 
 
-def test_the_vehicle_looked_at_is_the_one_removed(finished):
-    panel, removal = (finished.read(f"results/0001/vanilla/{name}.json") for name in ("ghost_panel", "removal"))
+@pytest.mark.parametrize(("method", "by"), [("vanilla", "box"), ("street", "actor")])
+def test_the_vehicle_looked_at_is_the_one_removed(finished, method, by):
+    panel, removal = (finished.read(f"results/0001/{method}/{name}.json") for name in ("ghost_panel", "removal"))
     assert panel["subject"] == removal["subject"] and panel["subject"]["category"] == "vehicle.car"
-    assert removal["removed_by"] == "box"
+    assert removal["removed_by"] == by
     kept = removal["outside_footprint"]
     assert kept.get("identical") or kept["psnr"] >= 90.0
+
+
+def test_an_edit_becomes_a_film_a_still_and_labels(finished):
+    """The car stands a metre beside its way in the end: braking takes two seconds, in which it comes as far as in one
+    at its 4.2 m/s."""
+    folder = finished.folder / "results/0001/street/edits"
+    labels, drive = finished.read("results/0001/street/edits/stop.json"), finished.read("results/0001/scene.json")
+    (car,) = (track for track in labels["tracks"] if track["editable"])
+    assert (car["id"], car["edited"], labels["frames"]) == (CAR, True, 19)
+    recorded = next(track for track in drive["tracks"] if track["id"] == CAR)["object_to_world"]
+    place = [pose[3] for pose in car["object_to_world"][-1][:2]]
+    np.testing.assert_allclose(place, [recorded[0][0][3] + 4.2 * (3.0 - 0.035), 1.0], atol=0.3)
+    footage = read_footage(folder / "stop.mp4")
+    assert (footage.frames, footage.width, footage.height) == (19, 64, 18)
+    assert Image.open(folder / "stop.png").size == (64, 18)
+    assert [step.keys() for step in labels["edit"]["steps"]] == [{"shift"}, {"stop"}]
+    gone = finished.read("results/0001/street/edits/gone.json")
+    assert not any(track["editable"] for track in gone["tracks"])
+    assert gone["camera_to_world"] == labels["camera_to_world"]
+
+
+def test_the_film_of_parts_is_as_long_as_the_others(finished):
+    parts, film = (finished.read(f"results/0001/street/{name}.cameras.json") for name in ("parts", "original"))
+    assert parts["timestamps"] == film["timestamps"] and parts["camera_to_world"] == film["camera_to_world"]
+    footage = read_footage(finished.folder / "results/0001/street/parts.mp4")
+    assert (footage.frames, footage.width, footage.height) == (film["frames"], 60, 10)
 
 
 def test_every_result_remembers_where_it_came_from(finished):
     for name in ("original.cameras.json", "ghost_panel.json", "removal.json", "cameras.json", "eval.json"):
         stages = finished.read(f"results/0001/vanilla/{name}")["provenance"]["stages"]
         assert {"extract", "vanilla/train"} < stages.keys(), name
+    for name in ("parts.cameras.json", "edits/stop.json"):
+        stages = finished.read(f"results/0001/street/{name}")["provenance"]["stages"]
+        assert {"extract", "actors", "lidar_depth", "street/train"} < stages.keys(), name
 
 
 def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
@@ -107,11 +163,14 @@ def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
         names = {Path(name).name for name in report.namelist()}
         page = report.read("report/report.html").decode()
     pictures = {"ghost_panel.png", "removal.png", "original.mp4", "lateral_2m.mp4", "metrics.json", "gap_report.csv"}
-    assert pictures < names
+    assert pictures | {"parts.mp4", "stop.mp4", "stop.png", "gone.mp4", "gone.png"} < names
     assert "Scene 0001" in page and "Across scenes" in page and "the moving vehicle that fills most pixels" in page
+    assert "what moves, before plain grey" in page and "the frame in which both differ most" in page
 
 
-FILMS_AND_LOOKS = {"film": 4, "ghost_panel": 2, "remove_actor": 2}
+OF_ACTORS = {"film_parts": 1, "edit": 2}
+"""What a method with actors has and others have not."""
+FILMS_AND_LOOKS = {"film": 4, "ghost_panel": 2, "remove_actor": 2, **OF_ACTORS}
 EXPORTS = {"export": 2, "export_usd": 2, "export_viewer": 2}
 TRAINING_AND_AFTER = {
     "train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1, **FILMS_AND_LOOKS, **EXPORTS
@@ -120,7 +179,11 @@ ONE_TRAINING_AND_AFTER = {
     "train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1, "film": 2, "ghost_panel": 1, "remove_actor": 1,
     "export": 1, "export_usd": 1, "export_viewer": 1,
 }  # fmt: skip
-EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_AND_AFTER}
+STREETS_TRAINING_AND_AFTER = ONE_TRAINING_AND_AFTER | OF_ACTORS
+TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
+EVERYTHING = {
+    "extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -128,14 +191,17 @@ EVERYTHING = {"extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 
     [
         ({}, {}),
         ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
-        ({"methods": {"plain": {"overrides": {"sky": "mask", "train": {"strategy": "default"}}}}},
-         ONE_TRAINING_AND_AFTER),
+        ({"methods": {"vanilla": {"overrides": {"sky": "mask"}}}}, ONE_TRAINING_AND_AFTER),
+        ({"actors": {"humans": True}}, {"actors": 1, **STREETS_TRAINING_AND_AFTER}),
+        ({"train": {"actors": {"fourier": 3}}}, STREETS_TRAINING_AND_AFTER),
         ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
-         {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
-        ({"holdout": {"last_block": 3}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
+         {"masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
+        ({"holdout": {"last_block": 3}},
+         {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
         ({"extract": {"on_missing": "warn"}}, EVERYTHING),
-        ({"render": {"fps": 5}}, {"film": 4}),
+        ({"render": {"fps": 5}}, {"film": 4, **OF_ACTORS}),
+        ({"render": {"edited_frames": True}}, {"edit": 2}),
         ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2}),
         ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2}),
         ({"export": {"viewer_gaussians": 100}}, {"export_viewer": 2}),
@@ -149,6 +215,59 @@ def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, set
     for key, value in setting.items():
         changed[key] = {**changed[key], **value} if isinstance(changed.get(key), dict) else value
     assert WorkflowWithConfig(finished, changed).planned() == expected
+
+
+def test_what_concerns_actors_reruns_nothing_of_a_method_without_them(finished):
+    changed = {**finished.config, "actors": {"humans": True}}
+    changed["train"] = {**changed["train"], "actors": {"fourier": 3}}
+    looks = ("original.mp4", "removal.png", "splat.ply")
+    targets = [f"results/0001/vanilla/{name}" for name in ("train.json", "eval.json", *looks)]
+    assert WorkflowWithConfig(finished, changed).planned(*targets) == {}
+
+
+LEFT_GONE = "results/0001/street/edits/gone.mp4"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected", "of_gone"),
+    [
+        ("at: 2}", "at: 2.5}", {"edit": 1}, {}),
+        ("remove: {track: 0001 instance 0}", "reverse: {track: 0001 instance 0}", {"edit": 1}, {"edit": 1}),
+        ("  stop:", "  also_gone:\n    - remove: {track: 0001 instance 0}\n  stop:", {"edit": 1}, {}),
+        ("  gone:\n    - remove: {track: 0001 instance 0}\n", "", {}, None),
+        (EDITS, EDITS, {}, {}),
+        (EDITS, """# written otherwise
+edits: {stop: [{shift: {lateral: 1, "track": "0001 instance 0", yaw: 0.0, start: null}},
+               {stop: {duration: 2, at: 2.0, track: 0001 instance 0}}],
+        gone: [{remove: {track: '0001 instance 0'}}]}
+""", {}, {}),
+    ],
+    ids=["a step", "another kind of step", "one more edit", "one edit less", "touched", "written otherwise"],
+)  # fmt: skip
+def test_a_changed_step_reruns_its_edit_and_no_other(finished, old, new, expected, of_gone):
+    path = finished.folder / "edits.yaml"
+    assert old in EDITS
+    path.unlink()
+    path.write_text(EDITS.replace(old, new))
+    try:
+        assert finished.planned() == expected
+        if of_gone is not None:
+            assert finished.planned(LEFT_GONE) == of_gone
+    finally:
+        path.write_text(EDITS)
+
+
+def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
+    path = finished.folder / "edits.yaml"
+    path.write_text(EDITS + "  typo:\n    - remove: {track: abcd}\n")
+    try:
+        done = finished.run("results/0001/street/edits/typo.mp4")
+    finally:
+        path.write_text(EDITS)
+    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
+    (line,) = {line for line in done.stdout.splitlines() if line.startswith("drivesplat: ")}
+    assert all(word in line for word in ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", CAR)), line
+    assert not list((finished.folder / "results/0001/street/edits").glob("*typo*"))
 
 
 def test_order_comments_and_written_out_defaults_rerun_nothing(finished):
@@ -189,7 +308,9 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
         ("drivesplat/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING | {"extract": 0}),
         ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
-        ("drivesplat/video.py", "bicubic", "bilinear", {"film": 4}),
+        ("drivesplat/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
+        ("drivesplat/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
+        ("drivesplat/editing/veering.py", "STANDS, DRIVES = 1.0", "STANDS, DRIVES = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report.py", "SCHEMA = 1", "SCHEMA = 2", {"gap_report": 1}),
     ],

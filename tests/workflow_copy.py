@@ -45,7 +45,8 @@ class WorkflowCopy:
 
     @classmethod
     def make(cls, folder: Path, world: World | None = None, **config: Any) -> "WorkflowCopy":
-        """Copies the workflow and writes a tiny world beside it; `config` is laid over the tests' settings."""
+        """Copies the workflow and writes a tiny world beside it; `config` is laid over the tests' settings. The methods
+        that it names are all there are."""
         folder.mkdir(parents=True, exist_ok=True)
         for part in PARTS:
             source = REPOSITORY / part
@@ -53,6 +54,8 @@ class WorkflowCopy:
             shutil.copytree(source, folder / part, ignore=ignore) if source.is_dir() else shutil.copy2(
                 source, folder / part
             )
+        if "methods" in config:
+            _drop(folder / "config.yaml", "methods")  # what is laid over that file can only add to them
         world = world or World()
         write_world(folder / "data", world)
         base = {
@@ -97,3 +100,10 @@ class WorkflowCopy:
 
     def read(self, path: str) -> Any:
         return json.loads((self.folder / path).read_text())
+
+
+def _drop(config: Path, key: str) -> None:
+    """Takes a key out of a YAML file."""
+    content = yaml.safe_load(config.read_text())
+    del content[key]
+    config.write_text(yaml.safe_dump(content, sort_keys=False))

@@ -15,7 +15,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.settings.edit import Edit, Step
 
 RESERVED = ("ego",)
-"""Names that nothing else may have: it is the camera's car."""
+"""Names that no duplicate may have: it is the camera's car."""
 
 
 def read_edits(path: str | Path) -> dict[str, Edit]:
@@ -64,7 +64,9 @@ def _step(step: Any, where: str) -> Step:
     except ValidationError as error:
         raise ConfigError(f"{where}: " + "; ".join(_sentence(item, kind) for item in error.errors())) from None
     if checked.duplicate is not None:
-        _name(checked.duplicate.name, f"{where}: 'as'")
+        name = _name(checked.duplicate.name, f"{where}: 'as'")
+        if name in RESERVED:
+            raise ConfigError(f"{where}: 'as' {name!r} is a name kept for the camera's car; choose another")
     return checked
 
 
@@ -73,8 +75,6 @@ def _name(name: Any, what: str) -> str:
         raise ConfigError(f"{what} {name!r} is not text: put the name in quotes")
     if not re.fullmatch(NAME, name):
         raise ConfigError(f"{what} {name!r} cannot name a file: use letters, digits, '_', '-' and '.'")
-    if name in RESERVED:
-        raise ConfigError(f"{what} {name!r} is a name kept for the camera's car; choose another")
     return name
 
 

@@ -1,22 +1,20 @@
 """The stage `edit`: a drive that was never driven, as a film with the recorded one beside it, and as labels."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from drivesplat.editing.cast import Actor, Role, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
-from drivesplat.errors import ConfigError
+from drivesplat.errors import ConfigError, ResultError
 from drivesplat.film import Shot, film_frame, write_film
 from drivesplat.images import write_png
-from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Appearance
-from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.splat_model import SplatModel, View
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob, TrajectorySettings
@@ -39,25 +37,29 @@ class EditFiles:
 def render_edit(
     scene: Scene, checkpoint: dict[str, Any], job: EditJob, device_settings: DeviceSettings, files: EditFiles
 ) -> dict[str, Any]:
-    """Writes the film and the still, both with the recorded drive on the left and the edited one on the right; returns
-    the content of the edit's JSON, provenance aside: the cameras of the edited drive, and its tracks.
+    """Writes the film and the still, both with the recorded drive on the left and the edited one on the right, and the
+    frames of the edited one, if wanted; returns the content of the edit's JSON, provenance aside: the cameras of the
+    edited drive, at the size of the frames, and where everything is in it.
 
     `checkpoint` is the content of checkpoint.pt. Raises ConfigError where the edit does not fit the scene or the model
     has no actors; DatasetError, DeviceError and ResultError as films do.
     """
     model, device = open_model(checkpoint, device_settings)
-    actors = actors_of(model, scene)
-    roles = edited_cast(actors, job.edit, f"scene {scene.name}, edit {files.film.stem!r}")
+    where = f"scene {scene.name}, edit {files.film.stem!r}"
+    actors = actors_of(model, scene, where)
+    roles = edited_cast(actors, job.edit, where)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit)
     recorded = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
-    seconds = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])
-    stage, still = Stage(model, appearances(roles, seconds), seconds), Still()
-    shots = Shot(scene, recorded, job, job.tile(2)), Shot(scene, path, job, job.tile(2))
+    left, right = (Shot(scene, cameras, job, job.tile(2)) for cameras in (recorded, path))
     large = Shot(scene, path, job, (job.width, job.height))
-    write_film(files.film, _pairs(stage, shots, still, device), shots[1], len(model), columns=2)
-    write_png(files.still, np.hstack(still.pair))
+    seconds = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])
+    present, still = appearances(roles, seconds), Still()
+    before = (film_frame(model, view) for view in left.views(device))
+    after = staged_frames(model, right.views(device), present)
+    write_film(files.film, still.side_by_side(before, after), right, model, columns=2)
+    write_png(files.still, still.picture)
     remove_frames(files.frames)
-    images = write_frames(files.frames, stage, large, device) if job.frames else []
+    images = write_frames(files.frames, staged_frames(model, large.views(device), present)) if job.frames else []
     return {
         **large.record(),
         "edit": job.edit.model_dump(mode="json"),
@@ -67,17 +69,24 @@ def render_edit(
     }
 
 
-def actors_of(model: SplatModel, scene: Scene) -> list[Actor]:
+def actors_of(model: SplatModel, scene: Scene, where: str) -> list[Actor]:
     """Who can be edited: the objects that the model knows, as it has come to know their motion.
 
-    Raises ConfigError where it knows none.
+    `where` begins messages. Raises ConfigError where it knows none, ResultError where the scene lacks one.
     """
-    moving = {name: piece.motion for name, piece in model.pieces(0.0).items() if piece.motion is not None}
-    known = ((scene.track(name), motion) for name, motion in moving.items())
-    actors = [Actor(track.id, track.category, track.size, motion) for track, motion in known if track is not None]
+    actors = []
+    for name, piece in model.pieces(0.0).items():
+        track = scene.track(name)
+        if piece.motion is None:
+            continue
+        if track is None:
+            raise ResultError(
+                f"{where}: scene.json has no track {name}, which checkpoint.pt knows; delete it and rerun"
+            )
+        actors.append(Actor(track.id, track.category, track.size, piece.motion))
     if not actors:
         raise ConfigError(
-            f"scene {scene.name}: nothing can be edited, since this method's model knows no actors; "
+            f"{where}: nothing can be edited, since this method's model knows no actors; "
             "train one with the part 'actors' (the method 'street'), on a scene in which something moves"
         )
     return actors
@@ -94,49 +103,38 @@ def appearances(roles: Sequence[Role], seconds: np.ndarray) -> list[list[Appeara
     return entries
 
 
-@dataclass(frozen=True)
-class Stage:
-    """A model with what appears in each frame, at `seconds` (n,)."""
-
-    model: SplatModel
-    appearances: Sequence[Sequence[Appearance]]
-    seconds: np.ndarray
-
-    @torch.no_grad()
-    def gaussians(self, number: int) -> Gaussians:
-        """What is there in a frame, in world coordinates."""
-        return self.model.staged_at(float(self.seconds[number]), self.appearances[number])
+def staged_frames(
+    model: SplatModel, views: Iterable[View], present: Iterable[Sequence[Appearance]]
+) -> Iterator[np.ndarray]:
+    """What each view shows of a model with those of its objects alone that appear then: (h, w, 3) uint8 each."""
+    for view, shown in zip(views, present, strict=True):
+        yield film_frame(model, view, model.staged_at(view.time, shown))
 
 
-@dataclass
 class Still:
-    """Of the pairs of recorded and edited picture that it has seen the one that differs most, and its number."""
+    """Of the pairs of a recorded and an edited frame that went by the one whose frames differ most: its `number`,
+    counted from 0, and `picture`, both side by side."""
 
-    number: int = 0
-    pair: tuple[np.ndarray, ...] = ()
-    _difference: float = -1.0
+    number: int
+    picture: np.ndarray
 
-    def look(self, number: int, pair: tuple[np.ndarray, ...]) -> None:
-        left, right = (picture.astype(np.int16) for picture in pair)
-        difference = float(np.abs(left - right).mean())
-        if difference > self._difference:
-            self.number, self.pair, self._difference = number, pair, difference
-
-
-def _pairs(stage: Stage, shots: Sequence[Shot], still: Still, device: torch.device) -> Iterator[np.ndarray]:
-    """The recorded and the edited drive side by side, frame by frame."""
-    for number, (recorded, edited) in enumerate(zip(*(shot.views(device) for shot in shots), strict=True)):
-        pair = film_frame(stage.model, recorded), film_frame(stage.model, edited, stage.gaussians(number))
-        still.look(number, pair)
-        yield np.hstack(pair)
+    def side_by_side(self, recorded: Iterable[np.ndarray], edited: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+        """The pairs, each as one picture."""
+        most = -1.0
+        for number, pair in enumerate(zip(recorded, edited, strict=True)):
+            picture, difference = np.hstack(pair), float(np.abs(np.subtract(*pair, dtype=np.int16)).mean())
+            if difference > most:
+                most, self.number, self.picture = difference, number, picture
+            yield picture
 
 
-def write_frames(folder: Path, stage: Stage, shot: Shot, device: torch.device) -> list[str]:
-    """Writes every frame of the edited drive as PNG into `folder`; returns their paths from the folder above it."""
+def write_frames(folder: Path, frames: Iterable[np.ndarray]) -> list[str]:
+    """Writes frames (h, w, 3) uint8 as PNGs into `folder`; returns their paths from the folder above it."""
     folder.mkdir(exist_ok=True)
-    names = [f"{folder.name}/{number:06d}.png" for number in range(len(stage.seconds))]
-    for number, view in enumerate(shot.views(device)):
-        write_png(folder.parent / names[number], film_frame(stage.model, view, stage.gaussians(number)))
+    names = []
+    for number, frame in enumerate(frames):
+        names.append(f"{folder.name}/{number:06d}.png")
+        write_png(folder.parent / names[-1], frame)
     return names
 
 

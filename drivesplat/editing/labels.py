@@ -8,7 +8,7 @@ import numpy as np
 from drivesplat.editing.cast import Role
 from drivesplat.motion import Motion
 from drivesplat.regions import is_dynamic
-from drivesplat.scene import Scene
+from drivesplat.scene import Scene, Track
 
 
 def track_labels(scene: Scene, roles: Sequence[Role], actors: set[str], seconds: np.ndarray) -> list[dict[str, Any]]:
@@ -16,38 +16,27 @@ def track_labels(scene: Scene, roles: Sequence[Role], actors: set[str], seconds:
     still in the model, or of its ghosts, and stays as it was recorded. `actors`: the ids of all that can be edited,
     removed ones included; `seconds` (n,) one a frame.
 
-    `object_to_world` (n times 4, 4) is at the box's centre, None in frames in which the object is absent.
+    `size` is length, width, height in metres, `scale` included; `object_to_world` (n times 4, 4) is at the box's
+    centre, None in frames in which the object is absent.
     """
-    played = [
-        {
-            "id": role.id,
-            "source": role.source,
-            "category": role.category,
-            "size": role.size.tolist(),
-            "scale": role.scale,
-            "edited": role.edited,
-            "editable": True,
-            "object_to_world": _frames(role, seconds),
-        }
-        for role in roles
-    ]
-    recorded = [
-        {
-            "id": track.id,
-            "source": track.id,
-            "category": track.category,
-            "size": track.size.tolist(),
-            "scale": 1.0,
-            "edited": False,
-            "editable": False,
-            "object_to_world": _frames(Motion.of_track(scene, track), seconds),
-        }
-        for track in scene.tracks
-        if is_dynamic(track.category) and track.id not in actors
-    ]
-    return played + recorded
+    others = (track for track in scene.tracks if is_dynamic(track.category) and track.id not in actors)
+    return [*(_played(role, seconds) for role in roles), *(_recorded(scene, track, seconds) for track in others)]
 
 
-def _frames(moving: Role | Motion, seconds: np.ndarray) -> list[list[list[float]] | None]:
-    there, poses = moving.present(seconds), moving.poses(seconds)
+def _played(role: Role, seconds: np.ndarray) -> dict[str, Any]:
+    known = {"source": role.source, "scale": role.scale, "edited": role.edited, "editable": True}
+    return {**_annotation(role), **known, "object_to_world": _frames(role, seconds)}
+
+
+def _recorded(scene: Scene, track: Track, seconds: np.ndarray) -> dict[str, Any]:
+    known = {"source": track.id, "scale": 1.0, "edited": False, "editable": False}
+    return {**_annotation(track), **known, "object_to_world": _frames(Motion.of_track(scene, track), seconds)}
+
+
+def _annotation(it: Role | Track) -> dict[str, Any]:
+    return {"id": it.id, "category": it.category, "size": it.size.tolist()}
+
+
+def _frames(it: Role | Motion, seconds: np.ndarray) -> list[list[list[float]] | None]:
+    there, poses = it.present(seconds), it.poses(seconds)
     return [pose.tolist() if now else None for now, pose in zip(there, poses, strict=True)]

@@ -92,10 +92,11 @@ class Actors(Part):
         colors: Sequence[np.ndarray],
         settings: ActorSettings,
         gaussians: GaussianSettings,
+        classes: int = 0,
     ) -> "Actors":
         """Started from every track's points (p, 3) in its object's frame and their colours (p, 3) in [0, 1]."""
         own = gaussians.model_copy(update={"sh_degree": settings.sh_degree})
-        sets = [started_at(p, c, own) for p, c in zip(points, colors, strict=True)]
+        sets = [started_at(p, c, own, classes) for p, c in zip(points, colors, strict=True)]
         params = {key: torch.cat([s[key] for s in sets]) for key in sets[0]}
         for key in ("sh0", "shN"):
             constant = params[key][:, None]

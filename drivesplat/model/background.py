@@ -25,10 +25,10 @@ class Background(Part):
 
     @classmethod
     def from_points(
-        cls, positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings, extent: float
+        cls, positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings, extent: float, classes: int = 0
     ) -> "Background":
         """Started from seed points: `positions` (n, 3) metres and `colors` (n, 3) in [0, 1]."""
-        return cls(started_at(positions, colors, settings), settings, extent)
+        return cls(started_at(positions, colors, settings, classes), settings, extent)
 
     def at(self, time: float) -> Gaussians:
         p = self.params

@@ -20,11 +20,12 @@ from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 @dataclass(frozen=True)
 class Beginnings:
     """What a model starts from: the scene's parser record, the records of its `actors` (empty where none are wanted),
-    and the mean colour (3,) in [0, 1] of its sky."""
+    the mean colour (3,) in [0, 1] of its sky, and how many classes are told apart (0: none)."""
 
     parser: dict[str, Any]
     actors: list[dict[str, Any]]
     sky_color: np.ndarray
+    classes: int = 0
 
 
 def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
@@ -70,7 +71,7 @@ def _background(beginnings: Beginnings, settings: TrainSettings) -> Part:
     parser = beginnings.parser
     kept = _some(len(parser["points"]), settings.cap_max)
     positions, colors = parser["points"][kept], parser["points_rgb"][kept] / 255.0
-    return Background.from_points(positions, colors, settings.gaussians, parser["scene_scale"])
+    return Background.from_points(positions, colors, settings.gaussians, parser["scene_scale"], beginnings.classes)
 
 
 def _background_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
@@ -88,7 +89,9 @@ def _actors(beginnings: Beginnings, settings: TrainSettings) -> Part | None:
         [actor[key][chosen] for actor, chosen in zip(actors, kept, strict=True)] for key in ("points", "points_rgb")
     )
     capped = settings.actors.model_copy(update={"cap_max": min(settings.actors.cap_max, sum(limits))})
-    return Actors.from_points(tracks, points, [c / 255.0 for c in colors], capped, settings.gaussians)
+    return Actors.from_points(
+        tracks, points, [c / 255.0 for c in colors], capped, settings.gaussians, beginnings.classes
+    )
 
 
 def actor_cap(actor: dict[str, Any], settings: TrainSettings) -> int:

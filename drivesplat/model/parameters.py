@@ -1,7 +1,7 @@
 """The parameters of Gaussians, under the names and in the units that gsplat's strategies densify.
 
 `means` (n, 3) metres, `scales` (n, 3) log metres, `quats` (n, 4) w, x, y, z, `opacities` (n,) logits, `sh0` and `shN`
-spherical harmonics of degree 0 and of the degrees above.
+spherical harmonics of degree 0 and of the degrees above; with maps of classes also `classes` (n, c) logits.
 """
 
 import math
@@ -17,9 +17,11 @@ SH_C0 = 0.28209479177387814
 """The constant of the spherical harmonic of degree 0."""
 
 
-def started_at(positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings) -> dict[str, Tensor]:
-    """Parameters of Gaussians that begin at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1]: `sh0` (n, 1, 3),
-    `shN` (n, k - 1, 3)."""
+def started_at(
+    positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings, classes: int = 0
+) -> dict[str, Tensor]:
+    """Parameters of Gaussians that begin at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1], each as likely of
+    any of so many `classes`: `sh0` (n, 1, 3), `shN` (n, k - 1, 3)."""
     neighbours = min(4, len(positions))
     distances = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0].reshape(len(positions), -1)[:, 1:]
     spacing = np.sqrt(np.mean(distances**2, axis=1)) if neighbours > 1 else np.ones(len(positions))
@@ -32,6 +34,7 @@ def started_at(positions: np.ndarray, colors: np.ndarray, settings: GaussianSett
         "opacities": torch.full((count,), math.log(settings.init_opacity / (1.0 - settings.init_opacity))),
         "sh0": ((torch.from_numpy(np.asarray(colors)).float() - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3),
+        **({"classes": torch.zeros(count, classes)} if classes else {}),
     }
 
 
@@ -48,4 +51,5 @@ def optimised(params: dict[str, Tensor]) -> nn.ParameterDict:
 def learning_rates(settings: GaussianSettings, extent: float) -> dict[str, float]:
     """The initial rate of each parameter of Gaussians that spread over `extent` metres."""
     rates = {"means": settings.lr_means * extent, "scales": settings.lr_scales, "quats": settings.lr_quats}
-    return {**rates, "opacities": settings.lr_opacities, "sh0": settings.lr_sh0, "shN": settings.lr_shN}
+    rates |= {"opacities": settings.lr_opacities, "sh0": settings.lr_sh0, "shN": settings.lr_shN}
+    return {**rates, "classes": settings.lr_classes}

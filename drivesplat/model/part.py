@@ -116,11 +116,6 @@ class Sky(nn.Module, ABC):
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """RGB in [0, 1] seen along unit world directions."""
 
-    def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
-        """As `at`, with these of its objects and no others: an object that does not appear is absent, a second
-        appearance of one follows in rows of its own."""
-        return self.at(time)
-
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:
         """The learning rate of every entry of `params`."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Appearance, Part, Piece, Sky
-from drivesplat.rasterize import rasterize
+from drivesplat.rasterize import Rendering, rasterize
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,17 @@ class SplatModel(nn.Module):
         if not moving:
             return None
         alone = concatenate(moving)
-        rendering = rasterize(
-            alone.means, alone.quats, alone.scales, alone.opacities, torch.ones_like(alone.means),
+        return self._composited(alone, torch.ones_like(alone.means), view).alpha[0, ..., 0]
+
+    def class_logits(self, picture: Picture, view: View) -> Float[Tensor, "h w c"] | None:
+        """The logits of classes in a picture of this model; None for a model that tells no classes apart."""
+        if not all("classes" in part.params for part in self.parts):
+            return None
+        logits = torch.cat([part.params["classes"] for part in self.parts])
+        return self._composited(picture.gaussians, logits, view).image[0]
+
+    def _composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
+        return rasterize(
+            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, values,
             view.viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
         )  # fmt: skip
-        return rendering.alpha[0, ..., 0]

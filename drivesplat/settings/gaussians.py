@@ -25,5 +25,7 @@ class GaussianSettings(Settings):
     """Learning rate of opacity logits."""
     lr_sh0: float = Field(2.5e-3, gt=0)
     """Learning rate of the colours' constant term."""
+    lr_classes: float = Field(1e-2, gt=0)
+    """Learning rate of the logits of classes, where maps of classes are given."""
     lr_shN: float = Field(1.25e-4, gt=0)
     """Learning rate of the colours' view-dependent terms."""

@@ -12,6 +12,9 @@ class MaskSettings(Settings):
     annotated boxes."""
     sky_folder: str | None = None
     """Your own sky masks (255 = sky), named {camera}/{image name}.png. null = a heuristic."""
+    semantic_folder: str | None = None
+    """Your own maps of classes (0, 1, 2, ...; 255 = unlabelled), named {camera}/{image name}.png: what
+    train.semantic_weight holds trainings to. null = there are none."""
     own_car_polygons: dict[str, tuple[tuple[float, float], ...]] = Field(default_factory=dict)
     """Per camera the outline of the own car's body, as x, y in fractions of the image's width and height: left out of
     every region."""

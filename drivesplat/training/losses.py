@@ -2,9 +2,10 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from drivesplat.masks import UNLABELLED
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.views import LidarDepth, TrainingView
@@ -36,6 +37,9 @@ def loss_terms(
         terms["sky_bce"] = settings.sky_bce_weight * sky_cross_entropy(picture.alpha, view.sky)
     if view.lidar is not None and picture.depth is not None:
         terms["depth"] = settings.depth_weight * depth_loss(picture.depth, view.lidar)
+    logits = model.class_logits(picture, view.view) if view.classes is not None else None
+    if logits is not None:
+        terms["semantic"] = settings.semantic_weight * class_cross_entropy(logits, view.classes)
     return {**terms, **_moving_terms(picture, view, model, settings)}
 
 
@@ -55,6 +59,14 @@ def _moving_terms(
 def sky_cross_entropy(alpha: Float[Tensor, "h w"], sky: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
     """Mean binary cross entropy between alpha and the absence of sky."""
     return F.binary_cross_entropy(alpha.clamp(1e-4, 1.0 - 1e-4), 1.0 - sky.float())
+
+
+def class_cross_entropy(logits: Float[Tensor, "h w c"], classes: UInt8[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean over the labelled pixels of -log of the softmax of the class that is there (Street Gaussians, section 3.3);
+    0 where no pixel is labelled."""
+    flat = classes.reshape(-1).long()
+    total = F.cross_entropy(logits.reshape(len(flat), -1), flat, ignore_index=UNLABELLED, reduction="sum")
+    return total / (flat != UNLABELLED).sum().clamp(min=1)
 
 
 def depth_loss(depth: Float[Tensor, "h w"], lidar: LidarDepth) -> Float[Tensor, ""]:

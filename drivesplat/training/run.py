@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from drivesplat.device import choose_device, telling_out_of_memory
-from drivesplat.masks import read_labels, read_masks_record, read_sky_mask
+from drivesplat.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size, read_parser
@@ -29,12 +29,13 @@ from drivesplat.training.views import Guides, TrainingView, load_views
 @dataclass(frozen=True)
 class TrainingInputs:
     """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
-    has no use for them), and the folder of masks."""
+    has no use for them), the folder of masks, and how many `classes` the user's maps there tell apart (0: none)."""
 
     parser: dict[str, Any]
     masks: Path
     actors: list[dict[str, Any]]
     lidar_depth: list[dict[str, np.ndarray]]
+    classes: int = 0
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
@@ -43,7 +44,12 @@ class TrainingInputs:
             sky={i: self._sky(i) for i in images} if job.sky != "none" or job.train.sky_bce_weight else {},
             moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
+            classes={i: read_classes(self.masks, *self._image(i)) for i in images} if self.told_apart(job) else {},
         )
+
+    def told_apart(self, job: TrainJob) -> int:
+        """How many classes the Gaussians of `job` tell apart."""
+        return self.classes if job.train.semantic_weight else 0
 
     def _sky(self, index: int) -> np.ndarray:
         return read_sky_mask(self.masks, *self._image(index))
@@ -64,15 +70,17 @@ def read_inputs(
     """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl and lidar_depth.pkl,
     with the provenances of these files."""
     folder = Path(masks).parent
-    packed, moving = read_parser(parser), [read_actors(path) for path in actors]
+    packed, made = read_parser(parser), read_masks_record(folder)
+    moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
     inputs = TrainingInputs(
         packed,
         folder,
         [actor for record in moving for actor in record["actors"]],
         [image for record in depths for image in record["images"]],
+        made["semantic_classes"],
     )
-    records = [packed, read_masks_record(folder), *moving, *depths]
+    records = [packed, made, *moving, *depths]
     return inputs, [record["provenance"] for record in records]
 
 
@@ -103,7 +111,7 @@ def run_training(
         with telling_out_of_memory(lambda: 0):
             views = load_views(inputs.parser, inputs.guides(job), device)
         settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
-        beginnings = Beginnings(inputs.parser, inputs.actors, mean_sky_color(views))
+        beginnings = Beginnings(inputs.parser, inputs.actors, mean_sky_color(views), inputs.told_apart(job))
         model = build_model(beginnings, job.parts, job.sky, settings)
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])

@@ -1,7 +1,7 @@
 """The training images on the device, as bytes, with their cameras."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,14 @@ class LidarDepth:
 @dataclass(frozen=True)
 class TrainingView:
     """A camera and what it recorded; `sky` and `moving` are True where the sky is and where something moves, None where
-    that is unknown or not wanted; so is `lidar`."""
+    that is unknown or not wanted; so are `lidar` and the `classes` of its pixels (UNLABELLED: none)."""
 
     view: View
     pixels: UInt8[Tensor, "h w 3"]
     sky: Bool[Tensor, "h w"] | None = None
     moving: Bool[Tensor, "h w"] | None = None
     lidar: LidarDepth | None = None
+    classes: UInt8[Tensor, "h w"] | None = None
 
     def target(self) -> Float[Tensor, "h w 3"]:
         """The recorded colours in [0, 1]."""
@@ -54,11 +55,13 @@ def view_of(parser: dict[str, Any], index: int, device: torch.device) -> View:
 @dataclass(frozen=True)
 class Guides:
     """What is known of training images beside their pixels, by their number: masks (h, w) bool of the `sky` and of what
-    is `moving`, and the records of `lidar` (rows, columns, depth); an empty mapping where a guide is not wanted."""
+    is `moving`, `classes` (h, w) uint8, and the records of `lidar` (rows, columns, depth); an empty mapping where a
+    guide is not wanted."""
 
     sky: Mapping[int, np.ndarray]
     moving: Mapping[int, np.ndarray]
     lidar: Mapping[int, dict[str, np.ndarray]]
+    classes: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> list[TrainingView]:
@@ -67,12 +70,12 @@ def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> 
     for index in map(int, parser["splits"]["train"]):
         size = image_size(parser, index)
         pixels = torch.from_numpy(read_image(parser["image_paths"][index], size).copy()).to(device)
-        sky, moving = (
-            torch.from_numpy(masks[index]).to(device) if index in masks else None
-            for masks in (guides.sky, guides.moving)
+        sky, moving, classes = (
+            torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
+            for masks in (guides.sky, guides.moving, guides.classes)
         )
         lidar = _lidar_depth(guides.lidar[index], size[0], device) if index in guides.lidar else None
-        views.append(TrainingView(view_of(parser, index, device), pixels, sky, moving, lidar))
+        views.append(TrainingView(view_of(parser, index, device), pixels, sky, moving, lidar, classes))
     return views
 
 

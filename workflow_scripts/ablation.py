@@ -1,0 +1,16 @@
+"""The eval.json of a method, whole and without each thing, into ablation.json, ablation.csv and a table."""
+
+from pathlib import Path
+
+from drivesplat.ablation import ablation, markdown, write_csv
+from drivesplat.job import job
+from drivesplat.settings.ablation import AblationJob
+from drivesplat.storage import read_json, write_json
+
+with job(snakemake) as current:
+    evals = {Path(path).parent.name: read_json(path, rule="evaluate") for path in current.input.evals}
+    provenance = current.provenance(*(record["provenance"] for record in evals.values()))
+    compared = ablation(evals, current.settings(AblationJob))
+    write_csv(current.output.table, compared)
+    write_json(current.output.record, {**compared, "provenance": provenance})
+    print(markdown(compared), flush=True)
