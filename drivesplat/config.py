@@ -130,8 +130,9 @@ def _default_methods() -> dict[str, MethodSettings]:
 class Config(Settings):
     datasets: dict[str, DatasetSettings] = Field(default_factory=_default_datasets, min_length=1)
     """Recorded drives, each under a name of your choice."""
-    methods: dict[str, MethodSettings] = Field(default_factory=_default_methods, min_length=1)
-    """Methods to train and compare, each under a name of your choice; a result folder each."""
+    methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
+    """Methods to train and compare, each under a name of your choice; a result folder each. null = no such method: a
+    file laid over this one drops `street` by {street: null}."""
     ablation: AblationSettings = AblationSettings()
     """What each thing in a method is worth; trained for `snakemake results/{scene}/ablation.csv` alone."""
     cameras: tuple[str, ...] = Field(("CAM_FRONT",), min_length=1)
@@ -162,6 +163,14 @@ class Config(Settings):
     """Seeds every random choice."""
     results_dir: str = Field("results", min_length=1)
     """The folder of all output; keep experiments apart by giving each its own."""
+
+    @field_validator("methods")
+    @classmethod
+    def _none_is_no_method(cls, value: dict[str, MethodSettings | None]) -> dict[str, MethodSettings | None]:
+        wanted = {name: method for name, method in value.items() if method is not None}
+        if not wanted:
+            raise ValueError("no method is left; keep one")
+        return wanted
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> "Config":

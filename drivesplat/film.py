@@ -15,7 +15,7 @@ import torch
 from tqdm import tqdm
 
 from drivesplat.device import telling_out_of_memory
-from drivesplat.errors import ConfigError, ResultError
+from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel, View
 from drivesplat.scene import Scene
@@ -93,17 +93,11 @@ def render_parts(
     scene: Scene, checkpoint: dict[str, Any], job: FilmFormat, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
     """Writes the MP4 `path` of three pictures side by side along the recorded path: everything, what stands still, and
-    what moves before plain grey. Returns the record of its cameras, as `render_film` does; its size is one picture's.
-
-    Raises ConfigError where the model has no parts that move; else as `render_film`.
+    what moves before plain grey, which is all there is to see where nothing does. Returns the record of its cameras, as
+    `render_film` does; its size is one picture's. Raises what `render_film` raises.
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
     model, device = open_model(checkpoint, device_settings)
-    if not model.moving().any():
-        raise ConfigError(
-            f"scene {scene.name}: nothing in this method's model moves that could be shown apart; "
-            "its films show all of it"
-        )
     taken = write_film(path, (_apart(model, view) for view in shot.views(device)), shot, model, columns=3)
     return {**shot.record(), "shows": ["all", "still", "moving"], **taken}
 

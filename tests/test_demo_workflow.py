@@ -11,13 +11,14 @@ pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("demo_workflow")]
 
 TARGET = "results/demo/metrics.json"
 AFTER_THE_WORLD = {
-    "extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "train": 1, "evaluate": 1, "scene_metrics": 1
+    "extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "actors": 1, "lidar_depth": 1, "train": 2, "evaluate": 2,
+    "scene_metrics": 1,
 }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> WorkflowCopy:
-    """The workflow run to the end for a small world, beside a recorded drive; the device is left to it."""
+    """The workflow run to the end for a small world, beside a recorded drive; methods and device are left to it."""
     demo = {
         "dataroot": "resources/demo",
         "scenes": ["demo"],
@@ -41,8 +42,10 @@ def test_metrics_come_from_nothing_on_the_cpu(finished):
     assert (metrics["scene"], metrics["dataset"]) == ("demo", "demo")
     assert (metrics["protocol"]["width"], metrics["protocol"]["height"]) == (128, 72)
     assert metrics["protocol"]["held_out_frames"] == {"interpolation": [2], "extrapolation": [5]}
-    assert metrics["methods"]["vanilla"]["interpolation"]["all"]["psnr"] > 8.0
-    assert finished.read("results/demo/vanilla/train.json")["device"].startswith("cpu")
+    assert metrics["methods"].keys() == {"vanilla", "street"}
+    for method, result in metrics["methods"].items():
+        assert result["interpolation"]["all"]["psnr"] > 8.0
+        assert finished.read(f"results/demo/{method}/train.json")["device"].startswith("cpu")
 
 
 def test_what_only_a_synthetic_world_knows_is_measured_too(finished):
@@ -73,7 +76,7 @@ def test_a_second_call_plans_nothing(finished):
     ("changes", "expected"),
     [
         ({"world": {"random_seed": 5}}, {"demo_world_demo": 1, **AFTER_THE_WORLD}),
-        ({"overrides": {"train": {"iterations": 31}}}, {"train": 1, "evaluate": 1, "scene_metrics": 1}),
+        ({"overrides": {"train": {"iterations": 31}}}, {"train": 2, "evaluate": 2, "scene_metrics": 1}),
         ({"device": {"kind": "cpu"}, "batch": True}, {}),
     ],
 )

@@ -237,6 +237,9 @@ def test_a_faster_camera_shortens_both_halves(scene, model, tmp_path):
     np.testing.assert_allclose(ways[0] - ways[0][0], 4.0 * 1.5 * 0.25 * np.arange(13), atol=1e-3)
     np.testing.assert_allclose(ways[1] - ways[1][0], 4.0 * 0.5 * 0.25 * np.arange(19), atol=1e-3)
     np.testing.assert_array_equal(made.halves[0], slow.halves[0][:13])
+    frames = make(scene, model, tmp_path, {"ego": {"speed": 1.5}}, width=16, height=8, frames=True).pictures()
+    np.testing.assert_array_equal(made.halves[1], frames)
+    assert (frames[-1] != made.halves[0][-1]).mean() > 0.5
 
 
 def test_at_60_frames_a_second_there_are_twice_as_many_and_actors_move_between(scene, model):

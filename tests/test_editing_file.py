@@ -109,7 +109,6 @@ def test_a_missing_file_is_said_to_be_missing(tmp_path):
         ("edits: {a b: []}", "edits.yaml: edit 'a b' cannot name a file: use letters, digits, '_', '-' and '.'"),
         ("edits: {../a: []}", "edits.yaml: edit '../a' cannot name a file: use letters, digits, '_', '-' and '.'"),
         ("edits: {0103: []}", "edits.yaml: edit 67 is not text: put the name in quotes"),
-        ("edits: {ego: []}", "edits.yaml: edit 'ego' is a name kept for the camera's car; choose another"),
         ("edits: {a: []}", "edits.yaml: edit 'a' is []; it is a list of steps, at least one: - remove: {track: 6e5c}"),
         ("edits: {a: {remove: {track: x}}}", "edits.yaml: edit 'a' is {'remove': {'track': 'x'}}; it is a"),
     ],

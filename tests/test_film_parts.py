@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hand_made_street import Reels, a_format, checkpoint_of, street_actors, street_model, street_scene, views_of
 
-from drivesplat.errors import ConfigError
 from drivesplat.film import BACKDROP, film_frame, render_film, render_parts
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene import Scene
@@ -81,11 +80,13 @@ def test_a_film_of_parts_has_a_frame_for_each_camera(scene, tmp_path):
     assert json.loads(json.dumps(record)) == record
 
 
-def test_a_model_of_what_stands_still_is_refused_before_anything_is_written(scene, tmp_path):
+def test_where_nothing_moves_the_third_picture_is_plain_grey(scene, tmp_path, reels):
     still = street_model(street_model().parts[0])
-    with pytest.raises(ConfigError, match="scene 0001: nothing in this method's model moves"):
-        parts_film(scene, tmp_path, checkpoint_of(still))
-    assert not list(tmp_path.iterdir())
+    record = parts_film(scene, tmp_path, checkpoint_of(still))
+    for frame in reels["parts"]:
+        everything, standing, moving = np.split(frame, 3, axis=1)
+        assert (everything == standing).all() and (moving == round(255 * BACKDROP)).all()
+    assert record["frames"] == len(reels["parts"])
 
 
 def test_frames_are_rendered_as_the_encoder_takes_them(scene, tmp_path, monkeypatch):

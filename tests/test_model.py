@@ -252,10 +252,10 @@ def a_track(name: str = "it", start: float = 0.0) -> ActorTrack:
     return track_of(motion_through(times, [[0.5 * i, -0.2, 3.0 + i] for i in range(4)], 0.4 * times), name)
 
 
-def street(*, still: int = 12) -> SplatModel:
+def street(antialiased: bool = False) -> SplatModel:
     """Background, two actors, more background; of which the second actor comes at 1 second."""
-    first, second = (Background.from_points(*seed_points(n), GaussianSettings(), 1.0) for n in (still, 5))
-    return SplatModel([first, actors_of(a_track(), a_track("later", 1.0), count=4), second], None)
+    first, second = (Background.from_points(*seed_points(n), GaussianSettings(), 1.0) for n in (12, 5))
+    return SplatModel([first, actors_of(a_track(), a_track("later", 1.0), count=4), second], None, antialiased)
 
 
 def test_rows_say_which_gaussians_are_each_parts():
@@ -268,12 +268,14 @@ def test_rows_say_which_gaussians_are_each_parts():
     assert model.of_track("later").tolist() == [False] * 16 + [True] * 4 + [False] * 5
 
 
-def test_what_moves_is_as_opaque_by_itself_as_it_is_rendered_alone():
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_what_moves_is_as_opaque_by_itself_as_it_is_rendered_alone(antialiased):
     """Whatever stands before or behind it in the picture."""
-    model = street()
+    model = street(antialiased)
+    model.parts[1].params["scales"].data -= 2.0  # small enough for antialiasing to matter
     picture = model.render(a_view())
     found = model.objects_alpha(picture, a_view())
-    alone = SplatModel([model.parts[1]], None).render(a_view()).alpha
+    alone = SplatModel([model.parts[1]], None, antialiased).render(a_view()).alpha
     torch.testing.assert_close(found, alone)
     assert float(found.detach().max()) > 0.05 and float((picture.alpha - found).detach().abs().max()) > 0.1
 

@@ -173,8 +173,8 @@ def test_of_a_car_that_goes_straight_it_says_what_the_measuring_protocol_says(ti
 
 
 def test_on_a_bend_it_is_near_the_boxes_and_nearer_to_the_truth(tiny_scene):
-    """A straight line between key frames leaves an arc by up to (speed x interval)² / 8 radius. The spline may leave
-    the line by little more than that; the arc it may leave by half of it near the ends and by next to nothing within."""
+    """A straight line between key frames leaves an arc by up to (speed x interval)² / 8 radius. The spline may
+    leave the line by little more than that; the arc it may leave by half of it near the ends and hardly within."""
     radius, rate = 12.0, 0.6
     sagitta = (radius * rate * 0.5) ** 2 / (8 * radius)
 

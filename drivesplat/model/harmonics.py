@@ -17,11 +17,11 @@ def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) 
     """The maps of k `coefficients` under `rotations` (object to world): sh_world = map @ sh_object.
 
     Exact for every degree, from as many directions as determine it: with Y(d) the basis along directions d (rows),
-    Y(d) sh_world = Y(R^T d) sh_object for all d.
+    Y(d) sh_world = Y(R^T d) sh_object for all d. Between degrees it is exactly 0: Adam makes whole steps of rounding.
     """
-    directions, inverse = _directions(coefficients, rotations.dtype, rotations.device)
+    directions, inverse, same_degree = _directions(coefficients, rotations.dtype, rotations.device)
     turned = directions @ rotations  # rows are R^T d
-    return inverse @ _eval_sh_bases_fast(coefficients, turned)
+    return inverse @ _eval_sh_bases_fast(coefficients, turned) * same_degree
 
 
 def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
@@ -32,8 +32,9 @@ def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -
 
 
 @cache
-def _directions(coefficients: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Directions (m, 3) spread over the sphere (a Fibonacci lattice), and the pseudo-inverse (k, m) of their basis."""
+def _directions(coefficients: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Directions (m, 3) spread over the sphere (a Fibonacci lattice), the pseudo-inverse (k, m) of their basis, and
+    which coefficients (k, k) are of one degree."""
     count = 4 * coefficients
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1.0 - 2.0 * index / count
@@ -41,4 +42,6 @@ def _directions(coefficients: int, dtype: torch.dtype, device: torch.device) -> 
     ring = torch.sqrt(1.0 - z**2)
     directions = torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=-1)
     inverse = torch.linalg.pinv(_eval_sh_bases_fast(coefficients, directions))
-    return directions.to(device, dtype), inverse.to(device, dtype)
+    degrees = torch.arange(coefficients).sqrt().long()
+    same_degree = degrees[:, None] == degrees
+    return directions.to(device, dtype), inverse.to(device, dtype), same_degree.to(device, dtype)

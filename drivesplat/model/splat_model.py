@@ -114,7 +114,7 @@ class SplatModel(nn.Module):
         rendering = rasterize(
             shown.means, shown.quats, shown.scales, shown.opacities, shown.sh,
             view.viewmat[None], view.K[None], view.width, view.height,
-            sh_degree=shown.sh_degree if sh_degree is None else sh_degree,
+            sh_degree=shown.sh_degree if sh_degree is None else min(sh_degree, shown.sh_degree),
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
         )  # fmt: skip
         splats, alpha = rendering.image[0], rendering.alpha[0]

@@ -41,8 +41,8 @@ class Densifier:
         Draws from torch's global generator, as gsplat does.
         """
         params = self._part.params
-        if len(self._part) == 0:
-            return
+        if len(self._part) == 0 or (self.due(step) and not self.any_alive()):
+            return  # nothing is left to grow from; the model's other parts may go on
         if self._by_gradient:
             info = _own(info, rows)
         extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}

@@ -100,7 +100,7 @@ class Trainer:
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        return min(self.step // every, self.settings.gaussians.sh_degree)
+        return self.step // every
 
     def _gradient_norms(self) -> dict[str, torch.Tensor]:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
