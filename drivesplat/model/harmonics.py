@@ -8,7 +8,6 @@ colours that evaluation along directions in the object's frame gives.
 from functools import cache
 
 import torch
-from gsplat.cuda._torch_impl import _eval_sh_bases_fast
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,7 +20,7 @@ def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) 
     """
     directions, inverse, same_degree = _directions(coefficients, rotations.dtype, rotations.device)
     turned = directions @ rotations  # rows are R^T d
-    return inverse @ _eval_sh_bases_fast(coefficients, turned) * same_degree
+    return inverse @ _basis(coefficients, turned) * same_degree
 
 
 def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
@@ -29,6 +28,13 @@ def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -
     if sh.shape[1] == 1:
         return sh
     return rotation_of_harmonics(object_to_world[None].to(sh), sh.shape[1])[0] @ sh
+
+
+def _basis(coefficients: int, directions: Float[Tensor, "m 3"]) -> Float[Tensor, "m k"]:
+    """The first k functions along unit directions, in the order and with the signs of 3D Gaussian Splatting."""
+    from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # the stages say in a sentence where gsplat is missing
+
+    return _eval_sh_bases_fast(coefficients, directions)
 
 
 @cache
@@ -41,7 +47,7 @@ def _directions(coefficients: int, dtype: torch.dtype, device: torch.device) -> 
     angle = index * (torch.pi * (3.0 - 5.0**0.5))
     ring = torch.sqrt(1.0 - z**2)
     directions = torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=-1)
-    inverse = torch.linalg.pinv(_eval_sh_bases_fast(coefficients, directions))
+    inverse = torch.linalg.pinv(_basis(coefficients, directions))
     degrees = torch.arange(coefficients).sqrt().long()
     same_degree = degrees[:, None] == degrees
     return directions.to(device, dtype), inverse.to(device, dtype), same_degree.to(device, dtype)
