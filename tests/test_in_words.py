@@ -67,11 +67,12 @@ def test_what_there_is_to_look_at_is_named_last_by_method(tmp_path):
         for file in files:
             (tmp_path / name / file).touch()
     (tmp_path / "plain" / "original.mp4").mkdir()
+    (tmp_path / "plain" / "edits").mkdir()
     metrics = {"methods": {name: method() for name in ("vanilla", "plain", "bare", "absent")}}
     lines = in_words(metrics, tmp_path / "metrics.json")
     assert lines[-2:] == [
         f"To look at, in {tmp_path}/vanilla: original.mp4, removal.png, viewer.html",
-        f"To look at, in {tmp_path}/plain: ghost_panel.png",
+        f"To look at, in {tmp_path}/plain: ghost_panel.png, edits/",
     ]
     assert sum("To look at" in line for line in lines) == 2
 

@@ -7,7 +7,7 @@ from typing import Any
 from drivesplat.errors import DriveSplatError
 from drivesplat.storage import read_json
 
-LOOKS = ("original.mp4", "lateral_2m.mp4", "ghost_panel.png", "removal.png", "viewer.html")
+LOOKS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
 BETWEEN = {"interpolation": "between training frames", "extrapolation": "beyond the last training frame"}
 
 
@@ -35,6 +35,7 @@ def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
     lines.append(f"All figures: {path}; training curves and pictures: tensorboard --logdir {folder}")
     for name in metrics["methods"]:
         there = [look for look in LOOKS if (folder / name / look).is_file()]
+        there += ["edits/"] if (folder / name / "edits").is_dir() else []
         if there:
             lines.append(f"To look at, in {folder / name}: {', '.join(there)}")
     return lines
