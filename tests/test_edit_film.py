@@ -26,7 +26,7 @@ from PIL import Image
 
 from drivesplat.editing.cast import edited_cast
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import EditFiles, actors_of, appearances, render_edit
+from drivesplat.editing.film import EditFiles, Still, actors_of, appearances, crashes, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.film import film_frame, render_film
 from drivesplat.model.part import Appearance
@@ -36,6 +36,7 @@ from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import EditJob, FilmJob, TrajectorySettings
+from drivesplat.trajectory import CameraPath
 from drivesplat.video import read_footage
 
 CPU = DeviceSettings(kind="cpu")
@@ -329,3 +330,42 @@ def test_actors_that_the_scene_does_not_hold_are_refused(scene, model, tmp_path)
     other = replace(scene, tracks=tuple(track for track in scene.tracks if track.id != TURNING))
     message = refusal(other, model, tmp_path, {"remove": {"track": AHEAD}}, kind=ResultError)
     assert TURNING in message and "checkpoint.pt" in message
+
+
+def test_a_still_is_not_taken_from_inside_a_vehicle_unless_there_is_no_other():
+    recorded = [np.zeros((2, 2, 3), np.uint8)] * 3
+    edited = [np.full((2, 2, 3), value, np.uint8) for value in (10, 200, 90)]
+    for spoilt, number in (([False, True, False], 2), ([True, True, True], 1)):
+        still = Still(np.array(spoilt))
+        assert len(list(still.side_by_side(recorded, edited))) == 3
+        assert still.number == number
+
+
+@dataclass(frozen=True)
+class Parked:
+    """A role that stands across the world's axes at x = 10, 4 m long and 2 m wide, from second 1 on."""
+
+    size = np.array([4.0, 2.0, 1.5])
+
+    def present(self, at):
+        return at >= 1.0
+
+    def poses(self, at):
+        turned = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+        return np.tile(turned, (len(at), 1, 1))
+
+
+def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
+    places = [
+        (10.0, 0.0, 0.0),
+        (10.0, 0.0, 0.0),
+        (10.0, 2.4, 0.0),
+        (10.0, 2.6, 0.0),
+        (11.4, 0.0, 0.0),
+        (11.6, 0.0, 0.0),
+    ]
+    cameras = np.tile(np.eye(4), (6, 1, 1))
+    cameras[:, :3, 3] = places
+    seconds = np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
+    found = crashes([Parked()], CameraPath(np.arange(6), cameras), seconds)
+    assert found.tolist() == [False, True, True, False, True, False]

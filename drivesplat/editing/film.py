@@ -1,5 +1,6 @@
 """The stage `edit`: a drive that was never driven, as a film with the recorded one beside it, and as labels."""
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +16,17 @@ from drivesplat.film import Shot, film_frame, write_film
 from drivesplat.images import write_png
 from drivesplat.model.part import Appearance
 from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.rigid import inverse
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob, TrajectorySettings
 from drivesplat.training.run import open_model
-from drivesplat.trajectory import film_path
+from drivesplat.trajectory import CameraPath, film_path
+
+log = logging.getLogger(__name__)
+
+NEAR = 0.5
+"""Metres from a box within which a camera sees little but what is in it."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,11 @@ def render_edit(
     left, right = (Shot(scene, cameras, job, job.tile(2)) for cameras in (recorded, path))
     large = Shot(scene, path, job, (job.width, job.height))
     seconds = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])
-    present, still = appearances(roles, seconds), Still()
+    crashed = crashes(roles, path, seconds)
+    if crashed.any():
+        first, last = seconds[crashed][[0, -1]]
+        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
+    present, still = appearances(roles, seconds), Still(crashed)
     before = (film_frame(model, view) for view in left.views(device))
     after = staged_frames(model, right.views(device), present)
     write_film(files.film, still.side_by_side(before, after), right, model, columns=2)
@@ -103,6 +114,17 @@ def appearances(roles: Sequence[Role], seconds: np.ndarray) -> list[list[Appeara
     return entries
 
 
+def crashes(roles: Sequence[Role], path: CameraPath, seconds: np.ndarray) -> np.ndarray:
+    """In which frames (n,) bool the camera is in the box of an object, or nearer to it than NEAR: its picture is then
+    of that object's inside."""
+    inside = np.zeros(len(seconds), dtype=bool)
+    for role in roles:
+        to_object = inverse(role.poses(seconds))
+        camera = (to_object[:, :3, :3] @ path.camera_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
+        inside |= role.present(seconds) & (np.abs(camera) < role.size / 2 + NEAR).all(axis=1)
+    return inside
+
+
 def staged_frames(
     model: SplatModel, views: Iterable[View], present: Iterable[Sequence[Appearance]]
 ) -> Iterator[np.ndarray]:
@@ -112,19 +134,23 @@ def staged_frames(
 
 
 class Still:
-    """Of the pairs of a recorded and an edited frame that went by the one whose frames differ most: its `number`,
-    counted from 0, and `picture`, both side by side."""
+    """Of the pairs of a recorded and an edited frame that went by the one whose frames differ most, `spoilt` (n,) bool
+    ones only where there is no other: its `number`, counted from 0, and `picture`, both side by side."""
 
     number: int
     picture: np.ndarray
 
+    def __init__(self, spoilt: np.ndarray):
+        self._spoilt = spoilt
+
     def side_by_side(self, recorded: Iterable[np.ndarray], edited: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         """The pairs, each as one picture."""
-        most = -1.0
+        most = (False, -1.0)
         for number, pair in enumerate(zip(recorded, edited, strict=True)):
             picture, difference = np.hstack(pair), float(np.abs(np.subtract(*pair, dtype=np.int16)).mean())
-            if difference > most:
-                most, self.number, self.picture = difference, number, picture
+            worth = (not self._spoilt[number], difference)
+            if worth > most:
+                most, self.number, self.picture = worth, number, picture
             yield picture
 
 

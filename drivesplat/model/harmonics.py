@@ -30,7 +30,7 @@ def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -
     return rotation_of_harmonics(object_to_world[None].to(sh), sh.shape[1])[0] @ sh
 
 
-def _basis(coefficients: int, directions: Float[Tensor, "m 3"]) -> Float[Tensor, "m k"]:
+def _basis(coefficients: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
     """The first k functions along unit directions, in the order and with the signs of 3D Gaussian Splatting."""
     from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # the stages say in a sentence where gsplat is missing
 
