@@ -24,13 +24,14 @@ from hand_made_street import (
 from hand_made_traffic import placed
 from PIL import Image
 
-from drivesplat.editing.cast import edited_cast
+from drivesplat.editing.cast import Actor, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, actors_of, appearances, crashes, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.film import film_frame, render_film
 from drivesplat.model.part import Appearance
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.motion import Motion
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
@@ -341,21 +342,8 @@ def test_a_still_is_not_taken_from_inside_a_vehicle_unless_there_is_no_other():
         assert still.number == number
 
 
-@dataclass(frozen=True)
-class Parked:
-    """A role that stands across the world's axes at x = 10, 4 m long and 2 m wide, from second 1 on."""
-
-    size = np.array([4.0, 2.0, 1.5])
-
-    def present(self, at):
-        return at >= 1.0
-
-    def poses(self, at):
-        turned = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-        return np.tile(turned, (len(at), 1, 1))
-
-
 def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
+    """A car 4 m long and 2 m wide stands across the world's axes at x = 10, from second 1 on."""
     places = [
         (10.0, 0.0, 0.0),
         (10.0, 0.0, 0.0),
@@ -367,5 +355,8 @@ def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
     cameras = np.tile(np.eye(4), (6, 1, 1))
     cameras[:, :3, 3] = places
     seconds = np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
-    found = crashes([Parked()], CameraPath(np.arange(6), cameras), seconds)
+    across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
+    car = Actor("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
+    found = crashes(edited_cast([car], Edit(steps=()), ""), CameraPath(np.arange(6), cameras), seconds)
     assert found.tolist() == [False, True, True, False, True, False]
