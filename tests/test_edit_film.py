@@ -342,6 +342,10 @@ def test_a_still_is_not_taken_from_inside_a_vehicle_unless_there_is_no_other():
         assert still.number == number
 
 
+BESIDE = Edit.model_validate({"steps": [{"ego": {"lateral": 1.0}}]})
+"""Of the camera alone."""
+
+
 def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
     """A car 4 m long and 2 m wide stands across the world's axes at x = 10, from second 1 on."""
     places = [
@@ -358,5 +362,5 @@ def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
     across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
     car = Actor("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
-    found = crashes(edited_cast([car], Edit(steps=()), ""), CameraPath(np.arange(6), cameras), seconds)
+    found = crashes(edited_cast([car], BESIDE, ""), CameraPath(np.arange(6), cameras), seconds)
     assert found.tolist() == [False, True, True, False, True, False]
