@@ -51,7 +51,7 @@ class FloaterSettings(Settings):
 
 class TrainSettings(Settings):
     iterations: int = Field(15_000, ge=1, le=1_000_000)
-    """Optimisation steps, one image each. On held-out frames of scene 0061 twice as many gain nothing."""
+    """Optimisation steps, one image each. Vanilla measures the same from 7,000 to 30,000 on scene 0061, held out."""
     strategy: Literal["mcmc", "default"] = "mcmc"
     """Densification: 'mcmc', or 'default' by gradient, which fills the air before the few cameras of a driving log."""
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
