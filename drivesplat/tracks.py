@@ -1,5 +1,6 @@
 """Where an annotated object is at a time between its annotations."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,8 @@ MOVING_VEHICLE = 1.0
 """Horizontal speed in m/s above which a vehicle counts as moving."""
 MOVING_HUMAN = 0.3
 """Horizontal speed in m/s above which a person counts as moving."""
+SHORT = 8
+"""At least so many characters of an id are shown to people."""
 
 
 @dataclass(frozen=True)
@@ -103,3 +106,11 @@ def runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
     """First and last position of every run of consecutive key frames."""
     breaks = np.flatnonzero(np.diff(sample_indices) != 1).tolist()
     return list(zip([0, *(i + 1 for i in breaks)], [*breaks, len(sample_indices) - 1], strict=True))
+
+
+def beginnings(ids: Sequence[str]) -> dict[str, str]:
+    """For each id its beginning: SHORT characters, or as many more as tell all of them apart."""
+    longest = max(map(len, ids), default=0)
+    told_apart = (n for n in range(SHORT, longest) if len({name[:n] for name in ids}) == len(ids))
+    length = next(told_apart, longest)
+    return {name: name[:length] for name in ids}

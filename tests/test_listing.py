@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 
 from drivesplat.actors.listing import (
     MOST_PICTURES,
-    SHORT,
-    beginnings,
     draw_tracks,
     fewest_that_show_all,
     sightings_of,
@@ -21,6 +19,7 @@ from drivesplat.actors.listing import (
 from drivesplat.errors import ResultError
 from drivesplat.recording import Recording
 from drivesplat.scene import Scene
+from drivesplat.tracks import SHORT, beginnings
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from drivesplat.recording import Recording
 from drivesplat.regions import LEAST_PIXELS, is_dynamic
 from drivesplat.scene import Track
 from drivesplat.storage import atomic_write
-from drivesplat.tracks import box_at, moves_at_all
+from drivesplat.tracks import beginnings, box_at, moves_at_all
 
 MOST_PICTURES = 6
 TITLE = "what moves, by the beginning of its id (tracks.csv)"
@@ -24,8 +24,6 @@ WELL_SEEN = 0.5
 """A mover is well seen where it fills at least this share of the pixels that it fills where it fills most."""
 NARROW = 0.06
 """The labels of boxes narrower than this share of the image stand aslant."""
-SHORT = 8
-"""At least so many characters of an id stand in the pictures."""
 
 
 @dataclass(frozen=True)
@@ -131,14 +129,6 @@ def fewest_that_show_all(pixels: Mapping[int, Mapping[str, int]]) -> list[int]:
         chosen.append(best)
         missing -= pixels[best].keys()
     return sorted(chosen)
-
-
-def beginnings(ids: Sequence[str]) -> dict[str, str]:
-    """For each id its beginning: SHORT characters, or as many more as tell all of them apart."""
-    longest = max(map(len, ids), default=0)
-    told_apart = (n for n in range(SHORT, longest) if len({name[:n] for name in ids}) == len(ids))
-    length = next(told_apart, longest)
-    return {name: name[:length] for name in ids}
 
 
 def _label(axis: Axes, subject: Subject, name: str, shape: tuple[int, ...]) -> None:

@@ -10,9 +10,7 @@ from drivesplat.editing.way import Way, recorded_way
 from drivesplat.errors import ConfigError
 from drivesplat.motion import Motion
 from drivesplat.settings.edit import Duplicate, Edit, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
-
-SHORT = 8
-"""So many characters of an id stand in messages, or as many more as tell all of them apart."""
+from drivesplat.tracks import beginnings
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ class _Cast:
         """The role of that id, or the only one whose id begins so."""
         known = [*self.roles, *self.removed]
         found = [name] if name in known else [other for other in known if other.startswith(name)]
-        short = _shortened(known)
+        short = beginnings(known)
         if not found:
             there = ", ".join(short[other] for other in self.roles)
             raise _ContradictionError(
@@ -169,14 +167,6 @@ def _swapped(cast: _Cast, role: Role, swap: Swap) -> _Cast:
 def _duplicated(cast: _Cast, role: Role, duplicate: Duplicate) -> _Cast:
     taken = [*cast.roles, *cast.removed]
     if duplicate.name in taken:
-        there = ", ".join(_shortened(taken).values())
+        there = ", ".join(beginnings(taken).values())
         raise _ContradictionError(f"'as' is {duplicate.name!r}, which is taken; choose another name than {there}")
     return cast.having(replace(role, id=duplicate.name, way=copied(role.way, duplicate), edited=True))
-
-
-def _shortened(ids: Sequence[str]) -> dict[str, str]:
-    """For each id its beginning, long enough to tell all of them apart."""
-    longest = max(map(len, ids), default=0)
-    told_apart = (n for n in range(SHORT, longest) if len({name[:n] for name in ids}) == len(ids))
-    length = next(told_apart, longest)
-    return {name: name[:length] for name in ids}
