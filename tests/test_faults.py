@@ -251,7 +251,7 @@ def test_an_ffmpeg_that_is_absent_or_dies_is_named_and_leaves_no_half_film(train
     [
         ("film", "vanilla/original.mp4"),
         ("film_parts", "street/parts.mp4"),
-        ("edit", "street/edits/stop.mp4"),
+        ("edit", "street/edits/gone.mp4"),
         ("ghost_panel", "vanilla/ghost_panel.png"),
         ("remove_actor", "vanilla/with_car.png"),
         ("export", "vanilla/splat.ply"),
