@@ -15,11 +15,12 @@ from typing import Any
 
 import numba
 
+from drivesplat.errors import ResultError
 from drivesplat.rerun import code_digest
-from drivesplat.storage import sha256_text
+from drivesplat.storage import atomic_write
 
 KEPT_S = 14 * 24 * 3600
-"""How long (seconds) what earlier code compiled is kept: another run may still be at it."""
+"""How long (seconds) what is compiled is kept unused: another run may still be at it."""
 
 
 OPTIONS = {"nogil": True, "error_model": "numpy"}
@@ -37,27 +38,40 @@ def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False
         return lambda f: kernel(f, fastmath=fastmath)
     options = {**OPTIONS, "fastmath": fastmath}
     given = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_cache_folder(Path(function.__code__.co_filename), given))
     try:
+        source = _kept_source(Path(function.__code__.co_filename), given)
+        function.__code__ = function.__code__.replace(co_filename=str(source))
+        numba.config.CACHE_DIR = str(source.parent)
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:
+    except (OSError, RuntimeError, ResultError):  # from here, and from numba
         return numba.njit(**options)(function)
     finally:
         numba.config.CACHE_DIR = given
 
 
 @cache
+def _kept_source(file: Path, given: str) -> Path:
+    """A copy of `file` in the folder for what is compiled from it. numba files what it compiles under the path of the
+    source: under this one, every checkout with the same code finds it. Raises ResultError where it cannot be written.
+    """
+    kept = _cache_folder(file, given) / file.name
+    if not kept.exists():
+        with atomic_write(kept) as copy:
+            copy.write(file.read_bytes())
+    os.utime(kept.parent)
+    return kept
+
+
 def _cache_folder(file: Path, given: str) -> Path:
     """The folder for what is compiled from `file` and the code it imports, below the first that can be written of
-    `given`, __pycache__ beside the file, and the user's cache. What earlier code left there weeks ago is removed."""
+    `given`, __pycache__ beside the file, and the user's cache. What went unused there for weeks is removed."""
     beside, users = file.parent / "__pycache__", Path.home() / ".cache" / "drivesplat"
     parent = Path(given) if given else next((folder for folder in (beside, users) if _writable(folder)), beside)
-    name = f"kernels-{file.stem}-{sha256_text(str(file))[:8]}"
-    folder = parent / f"{name}-{code_digest(file)[:16]}"
-    for earlier in parent.glob(f"{name}-*"):
+    folder = parent / f"kernels-{file.stem}-{code_digest(file)[:16]}"
+    for other in parent.glob(f"kernels-{file.stem}-*"):
         with suppress(OSError):
-            if earlier != folder and time.time() - earlier.stat().st_mtime > KEPT_S:
-                shutil.rmtree(earlier)
+            if other != folder and time.time() - other.stat().st_mtime > KEPT_S:
+                shutil.rmtree(other)
     return folder
 
 

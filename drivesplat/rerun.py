@@ -3,11 +3,13 @@
 Snakemake compares a rule's `params`; this digest and the stage's canonical settings are two of them (rules/common.smk).
 """
 
-import ast
 import hashlib
+from collections.abc import Iterator
 from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
+
+from drivesplat.meaning import Meaning, meanings
 
 PACKAGE = "drivesplat"
 PACKAGE_FOLDER = Path(__file__).parent
@@ -27,62 +29,38 @@ def code_digest(script: str | Path) -> str:
         name = waiting.pop()
         if name not in modules:
             file = _file_of(name)
-            modules[name] = _meaning(file)
+            modules[name] = _content(file)
             waiting |= _imports(file, package=name if file.name == "__init__.py" else name.rpartition(".")[0])
-    content = [_meaning(path), *(f"{name}\n{modules[name]}" for name in sorted(modules))]
+    content = [_content(path), *(f"{name}\n{modules[name]}" for name in sorted(modules))]
+    meanings(PACKAGE_FOLDER / "__pycache__").remember()
     return hashlib.sha256("\n\n".join(content).encode()).hexdigest()
 
 
 @cache
-def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+def _meaning(path: Path) -> Meaning:
+    return meanings(PACKAGE_FOLDER / "__pycache__").of(path)
 
 
 @cache
-def _meaning(path: Path) -> str:
-    code = ast.unparse(_WithoutBareStrings().visit(ast.parse(path.read_text(encoding="utf-8"))))
+def _content(path: Path) -> str:
+    """Digests of all that decides a result in a file, and in what lies beside it where it opens a package."""
+    digest = _meaning(path).digest
     if path.name != "__init__.py":
-        return code
+        return digest
     others = sorted(file for kind in PAGE_FILES for file in path.parent.glob(f"[!.]*{kind}"))
-    return "\n".join([code, *(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in others)])
-
-
-class _WithoutBareStrings(ast.NodeTransformer):
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        super().generic_visit(node)
-        if isinstance(getattr(node, "body", None), list):
-            node.body = [s for s in node.body if not _is_bare_string(s)] or [ast.Pass()]
-        return node
-
-
-def _is_bare_string(statement: ast.AST) -> bool:
-    return (
-        isinstance(statement, ast.Expr)
-        and isinstance(statement.value, ast.Constant)
-        and isinstance(statement.value.value, str)
-    )
+    return "\n".join([digest, *(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in others)])
 
 
 @cache
 def _imports(path: Path, package: str) -> frozenset[str]:
-    """The modules of this package that a file imports, packages on the way to them included."""
-    names: set[str] = set()
-    for node in ast.walk(_tree(path)):
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module
-            names.update([base, *(f"{base}.{alias.name}" for alias in node.names)])
-        elif isinstance(node, ast.Constant) and _names_a_module(node.value):
-            names.add(node.value)
-    parts = (name.split(".") for name in names if name.split(".")[0] == PACKAGE)
-    candidates = {".".join(p[: i + 1]) for p in parts for i in range(len(p))}
+    """The modules of this package that a file names, packages on the way to them included."""
+    parts = [name.split(".") for name in _absolute(_meaning(path).names, package)]
+    candidates = {".".join(p[: i + 1]) for p in parts if p[0] == PACKAGE for i in range(len(p))}
     return frozenset(name for name in candidates if _file_of(name) is not None)
 
 
-def _names_a_module(value: object) -> bool:
-    """Whether a string constant spells a module of this package: modules imported by name."""
-    return isinstance(value, str) and value.startswith(f"{PACKAGE}.") and _file_of(value) is not None
+def _absolute(names: tuple[str, ...], package: str) -> Iterator[str]:
+    return (resolve_name(name, package) if name.startswith(".") else name for name in names)
 
 
 @cache

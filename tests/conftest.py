@@ -4,6 +4,8 @@ import os
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch comes: its threads times pytest's workers is slow
+# Copies of the workflow run the same kernels as the tests themselves: they are compiled once.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drivesplat/rasterize/cpu/__pycache__"))
 
 import pytest
 from jaxtyping import install_import_hook

@@ -18,7 +18,7 @@ def small_package(root: Path) -> Path:
     package = root / "drivesplat"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    for name in ("kernels", "rerun", "storage", "errors"):
+    for name in ("kernels", "rerun", "meaning", "storage", "errors"):
         (package / f"{name}.py").write_text((Path(__file__).parents[1] / "drivesplat" / f"{name}.py").read_text())
     (package / "caller.py").write_text(CALLER)
     return package
@@ -39,6 +39,20 @@ def test_what_was_compiled_is_kept_until_an_imported_constant_changes(tmp_path):
     assert show(tmp_path) == (22.0, 1)
     (package / "callee.py").write_text(CALLEE.format(scale=3.0))
     assert show(tmp_path) == (33.0, 0), "numba alone would have kept 22"
+
+
+def test_checkouts_of_the_same_code_share_what_they_compile(tmp_path):
+    """And a comment, or the time of a file, makes no other code."""
+    caches, roots = str(tmp_path / "cache"), [tmp_path / name for name in ("one", "another")]
+    for root in roots:
+        root.mkdir()
+        (small_package(root) / "callee.py").write_text(CALLEE.format(scale=2.0))
+    assert show(roots[0], NUMBA_CACHE_DIR=caches) == (22.0, 0)
+    (roots[1] / "drivesplat/caller.py").write_text(CALLER + "# the same code\n")
+    assert show(roots[1], NUMBA_CACHE_DIR=caches) == (22.0, 1)
+    (roots[1] / "drivesplat/callee.py").write_text(CALLEE.format(scale=3.0))
+    assert show(roots[1], NUMBA_CACHE_DIR=caches) == (33.0, 0)
+    assert show(roots[0], NUMBA_CACHE_DIR=caches) == (22.0, 1)
 
 
 def test_what_earlier_code_left_goes_after_two_weeks_and_not_before(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivesplat import rerun
+from drivesplat.meaning import meanings
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -97,7 +98,7 @@ def toy(tmp_path, monkeypatch) -> Path:
 
 def forget() -> None:
     """As a new process would: it reads every file anew."""
-    for remembered in (rerun._meaning, rerun._imports, rerun._tree, rerun._file_of):
+    for remembered in (meanings, rerun._meaning, rerun._content, rerun._imports, rerun._file_of):
         remembered.cache_clear()
 
 

@@ -4,7 +4,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import lpips
 import numpy as np
 import torch
 
@@ -31,6 +30,8 @@ def lpips_map(backbone: Path, device: torch.device) -> LpipsMap:
     Raises ResultError where the backbone's file is missing or no AlexNet; it is read as tensors, nothing in it is
     executed.
     """
+    import lpips  # with torchvision: seconds, for who measures it
+
     with warnings.catch_warnings():  # lpips calls torchvision and torch.load in ways they have deprecated
         warnings.simplefilter("ignore")
         network = lpips.LPIPS(net="alex", spatial=True, pnet_rand=True, verbose=False)
