@@ -1,14 +1,119 @@
-"""How many GPUs there are, without importing torch."""
+"""How many GPUs there are, and which job has which: one job a card, whoever starts them. Without importing torch."""
 
+import fcntl
+import logging
 import os
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
+
+from drivesplat.errors import DeviceError
+
+log = logging.getLogger(__name__)
+
+VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
+"""What a user or a scheduler says with which cards are to be used; the first that is set counts."""
+PATIENCE_S = 1.0
+"""Seconds between two looks for a free card."""
 
 
 def visible_cards() -> int:
     """How many GPUs this process may use, of any maker; never under 1, so that GPU rules can be scheduled on a CPU."""
-    for variable in ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES"):
+    return max(1, len(_visible()[1]))
+
+
+def hold_card(jobs_per_card: int) -> BinaryIO | None:
+    """Takes a card that fewer than `jobs_per_card` jobs of this user hold on this machine, and hides all others from
+    this process; to be called before anything looks for a GPU.
+
+    Returns the file whose kernel lock says so: the card is held until it is closed, at the latest until the process
+    ends, however it ends. None where there is nothing to hold: no card, or a single one, given by a scheduler, of which
+    nobody knows which it is. Waits, and says so, while all are taken. Raises DeviceError where no lock can be made.
+    """
+    variable, names = _visible()
+    cards = dict(zip(names, _identities(names), strict=True))
+    if not cards or (len(cards) == 1 and variable in os.environ and next(iter(cards.values())).isdigit()):
+        return None
+    told = False
+    while True:
+        card, lock, holders = _free_card(cards, jobs_per_card)
+        if lock is not None:
+            os.environ[variable] = card
+            log.info("runs on the GPU %s (%s)", card, cards[card])
+            return lock
+        if not told:
+            log.warning(
+                "waits for a GPU: jobs hold all there are (%d; processes %s); device.jobs_per_card lets more share one",
+                *(len(cards), ", ".join(holders)),
+            )
+            told = True
+        time.sleep(PATIENCE_S)
+
+
+def _free_card(cards: dict[str, str], jobs_per_card: int) -> tuple[str, BinaryIO | None, list[str]]:
+    """A card of the fewest jobs, and the lock on a place on it; or no lock, and the processes that hold all places.
+    `cards` are their identities by name."""
+    holders = []
+    for place in range(jobs_per_card):
+        for card, identity in cards.items():
+            lock, holder = _lock(_lock_folder() / f"{identity}.{place}")
+            if lock is not None:
+                return card, lock, []
+            holders.append(holder)
+    return "", None, holders
+
+
+def _visible() -> tuple[str, list[str]]:
+    """The variable that says which cards are to be used, and their names in it."""
+    for variable in VARIABLES:
         if variable in os.environ:
-            return max(1, len([card for card in os.environ[variable].split(",") if card.strip() not in ("", "-1")]))
+            names = (name.strip() for name in os.environ[variable].split(","))
+            return variable, [name for name in names if name not in ("", "-1")]
     nvidia = [p for p in Path("/dev").glob("nvidia[0-9]*") if p.name[6:].isdigit()]
     amd = [p for p in Path("/sys/class/kfd/kfd/topology/nodes").glob("*/gpu_id") if p.read_text().strip() != "0"]
-    return max(1, len(nvidia) or len(amd))
+    variable = "HIP_VISIBLE_DEVICES" if amd and not nvidia else "CUDA_VISIBLE_DEVICES"
+    return variable, [str(number) for number in range(len(nvidia) or len(amd))]
+
+
+def _identities(cards: Sequence[str]) -> list[str]:
+    """What each card is called whichever others can be seen: numbers count those that can, and a scheduler may show
+    every job its card as number 0. The number, where nvidia-smi cannot tell."""
+    if all(not card.isdigit() for card in cards):
+        return list(cards)
+    command = ("nvidia-smi", "--query-gpu=index,uuid", "--format=csv,noheader")
+    known: dict[str, str] = {}
+    with suppress(OSError, subprocess.SubprocessError):
+        lines = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.splitlines()
+        known = dict(line.replace(" ", "").split(",", 1) for line in lines if "," in line)
+    return [known.get(card, card) for card in cards]
+
+
+def _lock_folder() -> Path:
+    """This user's locks on this machine, whose cards they are."""
+    return Path(tempfile.gettempdir()) / f"drivesplat-cards-{os.getuid()}"
+
+
+def _lock(path: Path) -> tuple[BinaryIO | None, str]:
+    """The open, locked file, or None, and the process that holds it."""
+    try:
+        path.parent.mkdir(mode=0o700, exist_ok=True)
+        file = open(path, "a+b")  # noqa: SIM115
+    except OSError as error:
+        raise DeviceError(
+            f"{path}: cannot be written ({error.strerror or error}), and says which job has which GPU; "
+            "fix its permissions, or set TMPDIR to a folder of this machine"
+        ) from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        with file:
+            file.seek(0)
+            return None, file.read().decode(errors="replace").strip() or "unknown"
+    file.truncate(0)
+    file.write(str(os.getpid()).encode())
+    file.flush()
+    return file, str(os.getpid())

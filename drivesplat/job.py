@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from drivesplat.cards import hold_card
 from drivesplat.errors import DriveSplatError
 from drivesplat.provenance import provenance
 from drivesplat.settings import Settings
@@ -45,8 +46,12 @@ class Job:
         return model.model_validate_json(self._params.settings)
 
     def device(self) -> DeviceSettings:
-        """Where to run; not one of the settings, since it decides no result."""
-        return DeviceSettings.model_validate_json(self._resources.device)
+        """Where to run; not one of the settings, since it decides no result. From now on until it ends, the job has a
+        GPU, where there is one to have, and sees no other."""
+        settings = DeviceSettings.model_validate_json(self._resources.device)
+        if settings.kind != "cpu":
+            self._card = hold_card(settings.jobs_per_card)
+        return settings
 
     def param(self, name: str) -> Any:
         """A further parameter of the rule, given as JSON."""

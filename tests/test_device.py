@@ -12,7 +12,6 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import torch
 
-from drivesplat.cards import visible_cards
 from drivesplat.device import choose_device, device_name, telling_out_of_memory
 from drivesplat.errors import DeviceError
 from drivesplat.gsplat_build.installed import RECORD, versions
@@ -251,71 +250,3 @@ def test_out_of_memory_is_told_with_what_lowers_the_need():
 def test_other_errors_are_not_taken_for_out_of_memory():
     with pytest.raises(ZeroDivisionError), telling_out_of_memory(lambda: 1):
         raise ZeroDivisionError
-
-
-CARD_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
-
-
-@pytest.fixture
-def four_cards(monkeypatch):
-    """A machine with four NVIDIA cards, nothing hidden."""
-    for variable in CARD_VARIABLES:
-        monkeypatch.delenv(variable, raising=False)
-    devices = [Path(f"/dev/nvidia{i}") for i in range(4)] + [Path("/dev/nvidiactl"), Path("/dev/nvidia-uvm")]
-    with_cards = {Path("/dev"): devices, Path("/sys/class/kfd/kfd/topology/nodes"): []}
-    real = Path.glob
-    monkeypatch.setattr(
-        Path, "glob", lambda self, *a, **k: iter(with_cards[self]) if self in with_cards else real(self, *a, **k)
-    )
-
-
-def test_all_cards_count_where_none_is_hidden(four_cards):
-    assert visible_cards() == 4
-
-
-@pytest.mark.parametrize("variable", CARD_VARIABLES)
-@pytest.mark.parametrize(
-    ("value", "cards"),
-    [
-        ("0", 1),
-        ("2,3", 2),
-        ("0,1,2", 3),
-        ("GPU-5a3c,GPU-77de", 2),
-        ("MIG-1f0e", 1),
-        ("-1", 1),
-        (" 0 , 1 ", 2),
-    ],
-)
-def test_hidden_cards_do_not_count_and_there_is_always_one(four_cards, monkeypatch, variable, value, cards):
-    monkeypatch.setenv(variable, value)
-    assert visible_cards() == cards
-
-
-def test_an_empty_list_hides_all_nvidia_cards(four_cards, monkeypatch):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert visible_cards() == 1
-
-
-def test_a_machine_without_cards_schedules_one_gpu_job_at_a_time(four_cards, monkeypatch):
-    monkeypatch.setattr(Path, "glob", lambda *_: iter(()))
-    assert visible_cards() == 1
-
-
-def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path):
-    for node, gpu_id in enumerate(("0", "0", "51234", "8121")):
-        (tmp_path / str(node)).mkdir()
-        (tmp_path / str(node) / "gpu_id").write_text(f"{gpu_id}\n")
-    found = {
-        Path("/dev"): [],
-        Path("/sys/class/kfd/kfd/topology/nodes"): [tmp_path / str(node) / "gpu_id" for node in range(4)],
-    }
-    monkeypatch.setattr(Path, "glob", lambda self, *_: iter(found[self]))
-    assert visible_cards() == 2
-
-
-def test_counting_cards_does_not_import_torch():
-    """Planning takes about a second; torch takes longer."""
-    script = (
-        "import sys; from drivesplat.cards import visible_cards; visible_cards(); assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, check=True)

@@ -10,6 +10,9 @@ from drivesplat.motion import Motion
 from drivesplat.regions import is_dynamic
 from drivesplat.scene import Scene, Track
 
+DECIMALS = 6
+"""Of a pose: micrometres, and ten thousandths of a degree. More would double the file."""
+
 
 def track_labels(scene: Scene, roles: Sequence[Role], actors: set[str], seconds: np.ndarray) -> list[dict[str, Any]]:
     """A record for every role, and for everything else that is annotated and can move: that is part of what stands
@@ -17,7 +20,7 @@ def track_labels(scene: Scene, roles: Sequence[Role], actors: set[str], seconds:
     removed ones included; `seconds` (n,) one a frame.
 
     `size` is length, width, height in metres, `scale` included; `object_to_world` (n times 4, 4) is at the box's
-    centre, None in frames in which the object is absent.
+    centre, to a millionth, None in frames in which the object is absent.
     """
     others = (track for track in scene.tracks if is_dynamic(track.category) and track.id not in actors)
     return [*(_played(role, seconds) for role in roles), *(_recorded(scene, track, seconds) for track in others)]
@@ -38,5 +41,5 @@ def _annotation(it: Role | Track) -> dict[str, Any]:
 
 
 def _frames(it: Role | Motion, seconds: np.ndarray) -> list[list[list[float]] | None]:
-    there, poses = it.present(seconds), it.poses(seconds)
+    there, poses = it.present(seconds), it.poses(seconds).round(DECIMALS)
     return [pose.tolist() if now else None for now, pose in zip(there, poses, strict=True)]

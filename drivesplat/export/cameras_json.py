@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.export.placement import placement
 from drivesplat.parser import image_size
 from drivesplat.scene import Frame, Scene
 
 SCHEMA = 1
 CONVENTIONS = {
     "world": "Metres, z up, the axes of the dataset's global frame; splat.ply is in these coordinates.",
-    "global": "A position in the dataset's global frame is its world position plus origin.",
     "camera": "OpenCV: x right, y down, z forward, metres; pinhole without distortion.",
     "ego": "The recording vehicle: x forward, y left, z up, on the ground under the rear axle.",
     "K": "Continuous pixels of an image of width x height: the image's corner is (0, 0), "
@@ -30,13 +30,7 @@ def cameras_record(scene: Scene, parser: dict[str, Any]) -> dict[str, Any]:
     """
     split_of = {int(i): split for split, images in parser["splits"].items() for i in images}
     return {
-        "schema": SCHEMA,
-        "scene": scene.name,
-        "dataset": scene.dataset,
-        "version": scene.version,
-        "poses": scene.poses,
-        "conventions": CONVENTIONS,
-        "origin": scene.origin.tolist(),
+        **placement(scene, SCHEMA, CONVENTIONS),
         "key_frame_timestamps": scene.key_frame_timestamps.tolist(),
         "images": [
             _image(frame, parser["image_names"][i], image_size(parser, i), parser["Ks"][i], split_of[i])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.export.cameras_json import CONVENTIONS as CAMERA_CONVENTIONS
+from drivesplat.export.placement import placement
 from drivesplat.export.sampled_motion import SampledMotion
 from drivesplat.export.spelling import distinct
 from drivesplat.export.splat_ply import note_of, write_splat_ply
@@ -21,7 +21,6 @@ from drivesplat.storage import write_json
 SCHEMA = 1
 CONVENTIONS = {
     "world": "Metres, z up, the axes of the dataset's global frame; files of frame 'world' are in these coordinates.",
-    "global": CAMERA_CONVENTIONS["global"],
     "object": "Metres, x forward, y left, z up, the origin in the middle of the object's box; files of frame 'object' "
     "are in these coordinates, and their spherical harmonics want directions in them.",
     "transforms": "Matrices 4x4, row by row, applied to column vectors: world = object_to_world object.",
@@ -53,13 +52,7 @@ def write_parts(path: str | Path, pieces: Mapping[str, SampledPiece], scene: Sce
 def _record(pieces: Mapping[str, SampledPiece], files: Mapping[str, str], scene: Scene) -> dict[str, Any]:
     first_image = min(frame.timestamp for frame in scene.frames)
     return {
-        "schema": SCHEMA,
-        "scene": scene.name,
-        "dataset": scene.dataset,
-        "version": scene.version,
-        "poses": scene.poses,
-        "conventions": CONVENTIONS,
-        "origin": scene.origin.tolist(),
+        **placement(scene, SCHEMA, CONVENTIONS),
         "first_image": first_image,
         "colors_timestamp": middle_timestamp(scene),
         "parts": [

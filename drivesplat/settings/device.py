@@ -18,6 +18,10 @@ class DeviceSettings(Settings):
     max_gb: float | None = Field(None, gt=0, le=1000)
     """A job takes no more GPU memory than this (GB), where others share the card. null = all there is."""
 
+    jobs_per_card: int = Field(1, ge=1, le=64)
+    """How many jobs may share a GPU; further ones wait. Where it is more than 1, let Snakemake start as many, too:
+    `--resources gpu=<cards times this>`."""
+
     @model_validator(mode="before")
     @classmethod
     def _short_form(cls, value: Any) -> Any:
