@@ -232,7 +232,7 @@ def test_a_faster_camera_shortens_both_halves(scene, model, tmp_path):
     """The recorded drive goes on beside it at its own speed until the edited film ends."""
     small = {"width": 32, "height": 18}
     made, slow = (make(scene, model, tmp_path, {"ego": {"speed": speed}}, **small) for speed in (1.5, 0.5))
-    path = edited_camera_path(scene, "CAM_FRONT", 4, edit_of({"ego": {"speed": 1.5}}))
+    path = edited_camera_path(scene, "CAM_FRONT", 4, edit_of({"ego": {"speed": 1.5}}), "")
     assert len(made.reels["it"]) == made.record["frames"] == len(path) == 13 and slow.record["frames"] == 19
     np.testing.assert_allclose(made.record["camera_to_world"], path.camera_to_world)
     ways = [np.array(record["camera_to_world"])[:, 0, 3] for record in (made.record, slow.record)]
@@ -246,7 +246,7 @@ def test_a_faster_camera_shortens_both_halves(scene, model, tmp_path):
 
 def test_at_60_frames_a_second_there_are_twice_as_many_and_actors_move_between(scene, model):
     step = {"shift": {"track": AHEAD, "lateral": 2.0}}
-    slow, fast = (edited_camera_path(scene, "CAM_FRONT", fps, edit_of(step)) for fps in (30, 60))
+    slow, fast = (edited_camera_path(scene, "CAM_FRONT", fps, edit_of(step), "") for fps in (30, 60))
     assert (len(slow), len(fast)) == (136, 271)
     assert np.abs(fast.timestamps[::2] - slow.timestamps).max() <= 1
     seconds = np.array([scene.seconds(timestamp) for timestamp in fast.timestamps])

@@ -77,17 +77,24 @@ def test_the_cameras_car_is_no_actor():
          f"step 2 (duplicate): 'as' is '{IDS[0]}', which is taken; "
          "choose another name than 6e7d0000, 91ab0000, 6e5c0000"),
         ([{"stop": {"track": "91", "at": 1.5}}],
-         "step 1 (stop): the track begins after 'at' (1.5 s): it is there from 1.75 to 6.25 s"),
+         "step 1 (stop): the track begins after 'at' (1.5 s): it was recorded from 1.75 to 6.25 s"),
         ([{"stop": {"track": "91", "at": 7.0}}],
-         "step 1 (stop): the track ends before 'at' (7 s): it is there from 1.75 to 6.25 s"),
+         "step 1 (stop): the track ends before 'at' (7 s): it was recorded from 1.75 to 6.25 s"),
         ([{"speed": {"track": "91", "factor": 2.0, "start": 7.0}}],
-         "step 1 (speed): the track ends before 'start' (7 s): it is there from 1.75 to 6.25 s"),
+         "step 1 (speed): the track ends before 'start' (7 s): it was recorded from 1.75 to 6.25 s"),
         ([{"shift": {"track": "91", "yaw": 2.0, "start": 7.0}}],
-         "step 1 (shift): the track ends before 'start' (7 s): it is there from 1.75 to 6.25 s"),
+         "step 1 (shift): the track ends before 'start' (7 s): it was recorded from 1.75 to 6.25 s"),
     ],
 )  # fmt: skip
 def test_contradictions_are_refused_by_the_number_of_the_step(steps, said):
     assert refusal(*steps) == said
+
+
+def test_a_duplicate_is_not_called_like_a_track_that_is_no_actor():
+    """Labels hold that one, too."""
+    edit = Edit.model_validate({"steps": [{"duplicate": {"track": "91", "as": "parked"}}]})
+    with pytest.raises(ConfigError, match="'as' is 'parked', which is the id of another track; choose another name"):
+        edited_cast([actor(name) for name in IDS], edit, "here", {"parked", "walker"})
 
 
 def test_whom_no_actor_can_be_named_after_everything_is_removed():

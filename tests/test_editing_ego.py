@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.errors import DatasetError
+from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.rigid import inverse, rigid
 from drivesplat.scene import Frame, Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import TrajectorySettings
-from drivesplat.trajectory import CameraPath, film_path
+from drivesplat.trajectory import CameraPath, film_path, recorded_frames
 
 START = 1_532_402_927_612_460
 SPEED, RADIUS, FPS = 8.0, 20.0, 10
@@ -48,7 +48,7 @@ def scene_of(motion) -> Scene:
 
 def edited(motion, *ego: dict) -> CameraPath:
     edit = Edit.model_validate({"steps": [{"ego": step} for step in ego]})
-    return edited_camera_path(scene_of(motion), "CAM_FRONT", FPS, edit)
+    return edited_camera_path(scene_of(motion), "CAM_FRONT", FPS, edit, "")
 
 
 def cars(path: CameraPath) -> np.ndarray:
@@ -64,7 +64,7 @@ def seconds(path: CameraPath) -> np.ndarray:
 def test_without_steps_of_its_own_the_camera_takes_the_recorded_path(motion):
     scene = scene_of(motion)
     path = edited_camera_path(
-        scene, "CAM_FRONT", FPS, Edit.model_validate({"steps": [{"stop": {"track": "x", "at": 1}}]})
+        scene, "CAM_FRONT", FPS, Edit.model_validate({"steps": [{"stop": {"track": "x", "at": 1}}]}), ""
     )
     recorded = film_path(scene, "CAM_FRONT", FPS, TrajectorySettings())
     np.testing.assert_array_equal(path.timestamps, recorded.timestamps)
@@ -132,4 +132,13 @@ def test_changing_lanes_the_car_points_where_it_drives(motion):
 
 def test_a_camera_that_the_scene_does_not_hold_is_refused():
     with pytest.raises(DatasetError, match="no image of camera CAM_LEFT"):
-        edited_camera_path(scene_of(straight), "CAM_LEFT", FPS, Edit.model_validate({"steps": [{"ego": {"speed": 2}}]}))
+        edit = Edit.model_validate({"steps": [{"ego": {"speed": 2}}]})
+        edited_camera_path(scene_of(straight), "CAM_LEFT", FPS, edit, "")
+
+
+def test_a_step_that_begins_after_the_drive_is_refused():
+    scene = scene_of(straight)
+    end = scene.seconds(recorded_frames(scene, "CAM_FRONT")[-1].timestamp)
+    edit = Edit.model_validate({"steps": [{"ego": {"lateral": 1}}, {"ego": {"speed": 0.5, "start": 100.0}}]})
+    with pytest.raises(ConfigError, match=rf"^here, step 2 \(ego\): the drive ends before 'start': at {end:.2f} s$"):
+        edited_camera_path(scene, "CAM_FRONT", FPS, edit, "here")

@@ -178,6 +178,11 @@ def test_a_step_with_other_fields_is_refused_by_its_number_and_kind(tmp_path, ki
     assert refused_step(f"{kind}: {{{fields}}}", tmp_path) == f" ({kind}): {said}"
 
 
+def test_a_decimal_comma_is_told_apart_from_a_point(tmp_path):
+    said = refused_step("shift: {track: x, lateral: 3,5}", tmp_path)
+    assert said == " (shift): 5 stands where a key should; a decimal has a point: 3.5, not 3,5"
+
+
 def test_yaml_merges_stay_possible(tmp_path):
     text = "edits:\n  a:\n  - stop: &s {track: x, at: 1}\n  - stop: {<<: *s, at: 2}\n"
     assert [step.change.at for step in read(text, tmp_path)["a"].steps] == [1.0, 2.0]

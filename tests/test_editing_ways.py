@@ -1,10 +1,13 @@
 """How actors move in an edited drive, against closed forms on straight and circular ways."""
 
+import time
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from drivesplat.editing.cast import Actor, Role, edited_cast
+from drivesplat.errors import ConfigError
 from drivesplat.motion import Motion
 from drivesplat.rigid import rigid
 from drivesplat.settings.edit import Edit
@@ -99,8 +102,10 @@ LATER = [
 ]
 
 
-@pytest.mark.parametrize("pose_at", [straight, circle, waiting, parked])
-@pytest.mark.parametrize("step", LATER)
+@pytest.mark.parametrize(
+    ("pose_at", "step"),
+    [(way, step) for way in (straight, circle, waiting, parked) for step in LATER[way is parked :]],
+)
 def test_until_an_edit_begins_an_actor_is_where_it_was_recorded(pose_at, step):
     role, at = edited(pose_at, step), np.arange(0.0, 4.0, 0.01)
     recorded = driver(pose_at).motion.poses(at)
@@ -123,15 +128,63 @@ def test_a_factor_from_the_beginning_multiplies_the_way_driven():
 
 def test_past_the_end_of_its_track_an_actor_drives_straight_on_as_long_as_it_was_recorded():
     role = edited(circle, {"speed": {"factor": 1.5}})
-    at = np.array([8.0, 9.0, 10.0])
-    end = driver(circle).motion.poses(np.array([9.999, 10.0]))
-    velocity = (end[1] - end[0])[:3, 3] / 0.001
-    expected = end[1, :3, 3] + (1.5 * at - 10.0)[:, None] * velocity
-    np.testing.assert_allclose(role.poses(at)[:, :3, 3], expected, atol=1e-4)
+    at, tangent = np.array([8.0, 9.0, 10.0]), np.array([np.cos(5.0), np.sin(5.0), 0.0])
+    places = role.poses(at)[:, :3, 3]
+    np.testing.assert_allclose(np.diff(places, axis=0), 1.5 * SPEED * tangent[None].repeat(2, axis=0), atol=0.05)
+    np.testing.assert_allclose(places, circle(END)[:3, 3] + (1.5 * at - END)[:, None] * SPEED * tangent, atol=0.4)
     assert role.present(np.array([0.0, 10.2])).all() and not role.present(np.array([10.3])).any()
-    heading = np.arctan2(velocity[1], velocity[0])
     assert np.ptp(yaws(role.poses(at))) < 1e-9, "it no longer turns"
-    np.testing.assert_allclose(yaws(role.poses(at)), heading, atol=np.radians(5))
+    np.testing.assert_allclose(yaws(role.poses(at)), 5.0 - 2 * np.pi, atol=np.radians(2))
+
+
+def trembling(pose_at, seed):
+    """Annotated 3 cm off, and 1 cm in height."""
+    noise = np.random.default_rng(seed)
+
+    def annotated(seconds: float) -> np.ndarray:
+        pose = pose_at(seconds)
+        return facing(yaws(pose[None])[0], pose[:3, 3] + noise.normal(size=3) * [0.03, 0.03, 0.01])
+
+    return annotated
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("step", [{"speed": {"factor": 2.0}}, {"shift": {"yaw": 1.0}}, {"stop": {"at": 9.0}}])
+def test_who_stands_at_the_end_of_its_track_stays_where_it_stands(step, seed):
+    """It drives 50 m, and waits from second 6 on."""
+    role = edited(trembling(lambda seconds: straight(min(seconds, 6.0)), seed), step, key_frames=range(25))
+    rest = role.poses(np.array([13.0, 20.0, 60.0]))[:, :3, 3]
+    np.testing.assert_allclose(rest, straight(6.0)[None, :3, 3].repeat(3, axis=0), atol=0.25)
+    np.testing.assert_allclose(rest[1:], rest[:1].repeat(2, axis=0), atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_who_stands_at_the_beginning_of_its_track_stood_there_before(seed):
+    """It waits until second 5; a copy does everything 8 s later."""
+    car = driver(trembling(lambda seconds: straight(max(seconds - 5.0, 0.0)), seed))
+    twin = roles([car], {"duplicate": {"track": "car", "as": "twin", "delay": 8.0}})["twin"]
+    before = twin.poses(np.array([0.0, 7.0]))[:, :3, 3]
+    np.testing.assert_allclose(before, straight(0.0)[None, :3, 3].repeat(2, axis=0), atol=0.25)
+    np.testing.assert_allclose(before[0], before[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("step", "speed"), [({"factor": 1.5}, 1.5 * SPEED), ({"to": 15.0}, 15.0)])
+def test_far_past_the_end_of_its_track_an_actor_is_on_its_way_however_its_annotations_tremble(step, speed, seed):
+    """200 m further on: annotations tell its speed to 1 %, its direction to half a degree."""
+    at = np.array([20.0])
+    place = edited(trembling(straight, seed), {"speed": step}).poses(at)[0, :3, 3] - straight(0.0)[:3, 3]
+    assert place @ DIRECTION == pytest.approx(20.0 * speed, abs=3.0)
+    assert abs(place @ LEFT) < 2.0 and abs(place[2]) < 0.25
+
+
+def test_on_a_slope_it_goes_on_climbing_as_it_did():
+    def uphill(seconds: float) -> np.ndarray:
+        return facing(0.6, SPEED * seconds * DIRECTION + [0, 0, 0.05 * SPEED * seconds])
+
+    for step in ({"factor": 2.0}, {"to": 20.0}):
+        place = edited(uphill, {"speed": step}).poses(np.array([10.0]))[0, :3, 3]
+        np.testing.assert_allclose(place, uphill(20.0)[:3, 3], atol=0.2)
 
 
 def test_a_factor_comes_in_over_its_duration():
@@ -404,6 +457,54 @@ def test_who_is_faster_is_there_while_it_was_and_where_it_was():
     role = edited(straight, {"speed": {"factor": 2.0}}, key_frames=[i for i in range(21) if not 8 < i < 12])
     at = np.array([1.0, 2.5, 3.5, 4.5, 5.5, 7.0, 10.3])
     np.testing.assert_array_equal(role.present(at), [True, True, True, True, False, True, False])
+
+
+@pytest.mark.parametrize(
+    ("steps", "there", "gone"),
+    [
+        ([{"speed": {"factor": 0.5}}], [0.0, 15.0, 20.4], [20.6, 60.0]),
+        ([{"speed": {"factor": 0.5}}, {"speed": {"factor": 4.0}}], [0.0, 4.0, 10.2], [10.3, 20.0]),
+        ([{"speed": {"factor": 0.5}}, {"reverse": {}}], [0.0, 9.9, 10.2], [11.0, 20.0]),
+        ([{"stop": {"at": 2.0}}, {"speed": {"to": 20.0, "start": 4.0}}], [0.0, 3.0, 8.0, 10.2], [10.3, 60.0]),
+        ([{"stop": {"at": 2.0}}, {"reverse": {}}], [0.0, 5.0, 10.2], [10.6, 60.0]),
+        ([{"stop": {"at": 2.0}}, {"speed": {"to": 2.0, "start": 4.0}}], [0.0, 12.0, 30.0], [60.0]),
+        ([{"shift": {"longitudinal": 60.0}}, {"stop": {"at": 8.0}}], [0.0, 9.0, 60.0], []),
+    ],
+)
+def test_it_is_there_when_it_was_recorded_and_where_it_was_recorded(steps, there, gone):
+    """Recorded from 0 to 100 m, and from 0 to 10 s."""
+    role = edited(straight, *steps)
+    np.testing.assert_array_equal(role.present(np.array(there)), True)
+    np.testing.assert_array_equal(role.present(np.array(gone)), False)
+
+
+@pytest.mark.parametrize("at", [2.5, 5.0])
+def test_who_stops_in_a_gap_of_its_track_stays_in_sight(at):
+    """Not annotated from 4 to 6 s: the first stops before the gap and comes to rest in it."""
+    role = edited(straight, {"stop": {"at": at, "duration": 4.0}}, key_frames=[i for i in range(21) if not 8 < i < 12])
+    assert role.present(np.arange(at, 60.0, 0.1)).all()
+    assert role.present(np.array([4.5])).all() == (at < 4.0), "until it brakes it is as recorded"
+
+
+def test_many_steps_of_one_track_take_no_longer_than_they_are_many():
+    """Each asks the one before it once: twice would be a million times."""
+    steps = [{"speed": {"to": 5.0 + i % 3, "start": 0.4 * i, "duration": 0.4}} for i in range(20)]
+    began = time.process_time()
+    role = edited(straight, *steps)
+    role.present(FILM), role.poses(FILM)
+    assert time.process_time() - began < 5.0
+
+
+@pytest.mark.parametrize(
+    ("steps", "second"),
+    [
+        ([{"stop": {"at": 2.0}}, {"speed": {"factor": 2.0, "start": 6.0}}], "6.00"),
+        ([{"stop": {"at": 0.0, "duration": 0.0}}, {"speed": {"factor": 2.0}}], "0.00"),
+    ],
+)
+def test_a_factor_of_what_stands_is_refused(steps, second):
+    with pytest.raises(ConfigError, match=f"step 2 .speed.: the track stands from {second} s on, and a factor"):
+        edited(straight, *steps)
 
 
 @pytest.mark.parametrize("pose_at", [straight, circle])

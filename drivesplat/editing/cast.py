@@ -1,6 +1,6 @@
 """Who is seen in an edited drive: the recorded actors after every step of an edit."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,6 +11,11 @@ from drivesplat.errors import ConfigError
 from drivesplat.motion import Motion
 from drivesplat.settings.edit import Duplicate, Edit, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 from drivesplat.tracks import beginnings
+
+STANDS = 0.5
+"""Metres: what comes less far stands; its annotations tremble."""
+LOOKS_AHEAD = 60.0
+"""Seconds past the end of a track in which it may come on."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +48,17 @@ class Role:
     def poses(self, at: np.ndarray) -> np.ndarray:
         """Object to world (n, 4, 4) at the seconds `at` (n,), at the centre of the enlarged box."""
         at = np.asarray(at, dtype=np.float64)
-        return self.way.poses(at, float(self.size[2])) if self.edited else self.way.path.motion.poses(at)
+        return self.way.poses(at, float(self.size[2])) if self.edited else self.way.course.motion.poses(at)
 
 
-def edited_cast(actors: Sequence[Actor], edit: Edit, where: str) -> list[Role]:
+def edited_cast(actors: Sequence[Actor], edit: Edit, where: str, others: Collection[str] = ()) -> list[Role]:
     """The roles after all steps of an edit: actors in their order without the removed ones, then duplicates.
 
-    Raises ConfigError, one line that begins with `where` (the file and the edit) and says what there is, where a step
-    names what is not there or contradicts one before it.
+    `others` are the ids of tracks that no step can name, and no duplicate may have. Raises ConfigError, one line that
+    begins with `where` (the scene and the edit) and says what there is, where a step names what is not there, changes
+    nothing or contradicts one before it.
     """
-    cast = _Cast({actor.id: _as_recorded(actor) for actor in actors}, {})
+    cast = _Cast({actor.id: _as_recorded(actor) for actor in actors}, {}, frozenset(others))
     for number, step in enumerate(edit.steps, start=1):
         try:
             cast = _after(cast, step, number)
@@ -72,10 +78,11 @@ class _ContradictionError(Exception):
 
 @dataclass(frozen=True)
 class _Cast:
-    """The roles so far by their ids; per id that was removed, the number of the step that did."""
+    """The roles so far by their ids; per id that was removed, the number of the step that did; ids of other tracks."""
 
     roles: dict[str, Role]
     removed: dict[str, int]
+    others: frozenset[str]
 
     def find(self, name: str) -> Role:
         """The role of that id, or the only one whose id begins so."""
@@ -106,7 +113,7 @@ class _Cast:
     def without(self, role: Role, number: int) -> "_Cast":
         """The cast after step `number` has removed a role."""
         remaining = {name: other for name, other in self.roles.items() if name != role.id}
-        return _Cast(remaining, self.removed | {role.id: number})
+        return replace(self, roles=remaining, removed=self.removed | {role.id: number})
 
 
 def _after(cast: _Cast, step: Step, number: int) -> _Cast:
@@ -133,6 +140,8 @@ def _driven(role: Role, change: Speed | Stop | Reverse | Shift) -> Way:
     match change:
         case Speed():
             _require_there(role, change.start, "start", before=True)
+            if change.factor is not None:
+                _require_pace(role, change.start)
             return sped(role.way, change)
         case Stop():
             _require_there(role, change.at, "at", before=False)
@@ -153,8 +162,18 @@ def _require_there(role: Role, second: float | None, key: str, before: bool) -> 
         return
     problem = "ends before" if second > way.end else "begins after"
     raise _ContradictionError(
-        f"the track {problem} {key!r} ({second:g} s): it is there from {way.begin:.2f} to {way.end:.2f} s"
+        f"the track {problem} {key!r} ({second:g} s): it was recorded from {way.begin:.2f} to {way.end:.2f} s"
     )
+
+
+def _require_pace(role: Role, start: float | None) -> None:
+    """A factor of what stands changes nothing."""
+    begin = max(role.way.begin, start or 0.0)
+    first, last = role.way.metres(np.array([begin, max(begin, role.way.end) + LOOKS_AHEAD]))
+    if abs(last - first) < STANDS:
+        raise _ContradictionError(
+            f"the track stands from {begin:.2f} s on, and a factor of no speed is none; 'to' lets it drive"
+        )
 
 
 def _swapped(cast: _Cast, role: Role, swap: Swap) -> _Cast:
@@ -169,4 +188,6 @@ def _duplicated(cast: _Cast, role: Role, duplicate: Duplicate) -> _Cast:
     if duplicate.name in taken:
         there = ", ".join(beginnings(taken).values())
         raise _ContradictionError(f"'as' is {duplicate.name!r}, which is taken; choose another name than {there}")
+    if duplicate.name in cast.others:
+        raise _ContradictionError(f"'as' is {duplicate.name!r}, which is the id of another track; choose another name")
     return cast.having(replace(role, id=duplicate.name, way=copied(role.way, duplicate), edited=True))

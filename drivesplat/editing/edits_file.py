@@ -59,6 +59,9 @@ def _step(step: Any, where: str) -> Step:
     where = f"{where} ({kind})"
     if not isinstance(fields, dict):
         raise ConfigError(f"{where} is {_shown(fields)}; it is a mapping: {kind}: {{{_example(kind)}}}")
+    for key in fields:
+        if not isinstance(key, str):
+            raise ConfigError(f"{where}: {key!r} stands where a key should; a decimal has a point: 3.5, not 3,5")
     try:
         checked = Step.model_validate({kind: fields})
     except ValidationError as error:

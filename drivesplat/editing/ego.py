@@ -6,6 +6,7 @@ import numpy as np
 
 from drivesplat.editing.easing import Onset
 from drivesplat.editing.veering import beside_the_way
+from drivesplat.errors import ConfigError
 from drivesplat.rigid import inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.settings.edit import Edit, Ego
@@ -15,23 +16,27 @@ from drivesplat.trajectory import CameraPath, film_path, recorded_frames, smooth
 Seconds = Callable[[np.ndarray], np.ndarray]
 
 
-def edited_camera_path(scene: Scene, camera: str, fps: int, edit: Edit) -> CameraPath:
+def edited_camera_path(scene: Scene, camera: str, fps: int, edit: Edit, where: str) -> CameraPath:
     """Where an edited film is looked at from, `fps` frames a second.
 
     The world runs at its own time, which `timestamps` are of. A car that is faster comes to the end of its recorded way
-    earlier: there the film ends. Without `ego` steps it is the recorded path. Raises DatasetError where the scene does
-    not hold that camera.
+    earlier: there the film ends. Without `ego` steps it is the recorded path. Raises ConfigError, beginning with
+    `where` (the scene and the edit), for a step that begins after the film, DatasetError where the scene does not hold
+    that camera.
     """
     path = film_path(scene, camera, fps, TrajectorySettings())
     steps = [step.ego for step in edit.steps if step.ego is not None]
     if not steps:
         return path
     frames = recorded_frames(scene, camera)
-    first = frames[0].timestamp
+    first, last = frames[0].timestamp, scene.seconds(frames[-1].timestamp)
+    for number, step in enumerate(edit.steps, start=1):
+        if step.ego is not None and (step.ego.start or 0.0) >= last:
+            raise ConfigError(f"{where}, step {number} (ego): the drive ends before 'start': at {last:.2f} s")
     begin = scene.seconds(first)
     at = begin + (path.timestamps - first) * 1e-6
     clock = _clock(steps, begin)
-    there = clock(at) <= scene.seconds(frames[-1].timestamp) + 1e-9
+    there = clock(at) <= last + 1e-9
     return CameraPath(path.timestamps[there], _cameras(frames, begin, clock, steps, at[there]))
 
 

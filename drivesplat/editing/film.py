@@ -54,8 +54,9 @@ def render_edit(
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {scene.name}, edit {files.film.stem!r}"
     actors = actors_of(model, scene, where)
-    roles = edited_cast(actors, job.edit, where)
-    path = edited_camera_path(scene, job.camera, job.fps, job.edit)
+    others = {track.id for track in scene.tracks} - {actor.id for actor in actors}
+    roles = edited_cast(actors, job.edit, where, others)
+    path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     recorded = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     left, right = (Shot(scene, cameras, job, job.tile(2)) for cameras in (recorded, path))
     large = Shot(scene, path, job, (job.width, job.height))

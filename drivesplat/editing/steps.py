@@ -24,12 +24,14 @@ Clock = Callable[[np.ndarray], np.ndarray]
 def sped(way: Way, speed: Speed) -> Way:
     """Faster or slower: by a factor it lives through its way at another pace; at a speed of its own it leaves the
     recorded pace behind."""
+    if speed.factor == 1.0:
+        return way
     beginning = max(way.begin, 0.0)
     onset = Onset.of(speed, beginning)
     onset = Onset(max(onset.start, beginning), onset.duration)
     if speed.factor is None:
         return _at_own_speed(way, onset, way.direction * speed.to)
-    return _paced(way, lambda at: onset.paced(at, speed.factor))
+    return _paced(way, lambda at: onset.paced(at, speed.factor), onset.start)
 
 
 def stopped(way: Way, stop: Stop) -> Way:
@@ -40,12 +42,12 @@ def stopped(way: Way, stop: Stop) -> Way:
         then = way.offsets(onset.paced(at, 0.0))
         return replace(then, drift=then.drift * (1.0 - onset.share(at)))
 
-    return replace(_paced(way, lambda at: onset.paced(at, 0.0)), offsets=offsets)
+    return replace(_paced(way, lambda at: onset.paced(at, 0.0), stop.at), offsets=offsets)
 
 
 def reversed_way(way: Way, reverse: Reverse) -> Way:
     """Time runs backwards between its first and its last second."""
-    back = _paced(way, lambda at: way.begin + way.end - at)
+    back = _paced(way, lambda at: way.begin + way.end - at, -np.inf)
     back = replace(back, direction=-way.direction)
     if not reverse.turn:
         return back
@@ -77,10 +79,13 @@ def copied(way: Way, duplicate: Duplicate) -> Way:
         return at - delay
 
     later = replace(
-        _paced(way, clock),
+        way,
+        progress=lambda at: way.progress(clock(at)),
         offsets=lambda at: way.offsets(clock(at)),
+        recorded=lambda at: way.recorded(at) | way.recorded(clock(at)),
         begin=min(way.begin, way.begin + delay),
         end=max(way.end, way.end + delay),
+        since=way.since + delay,
     )
     if not (duplicate.longitudinal or duplicate.lateral):
         return later
@@ -88,33 +93,22 @@ def copied(way: Way, duplicate: Duplicate) -> Way:
     return shifted(later, Shift(track=duplicate.name, **offset))
 
 
-def _paced(way: Way, clock: Clock) -> Way:
-    """A way whose progress at a second is that of `way` when `clock` says. It is there whenever it was, and while it is
-    where it was there."""
-    return replace(
-        way,
-        progress=lambda at: way.progress(clock(at)),
-        present=lambda at: way.present(at) | way.present(clock(at)),
-    )
+def _paced(way: Way, clock: Clock, since: float) -> Way:
+    """A way whose progress at a second is that of `way` when `clock` says, from second `since` on another."""
+    return replace(way, progress=lambda at: way.progress(clock(at)), since=min(way.since, since))
 
 
 def _at_own_speed(way: Way, onset: Onset, velocity: float) -> Way:
-    """Along the path at `velocity` (m/s, negative: backwards), to which the speed changes from what it would be. It is
-    there whenever it was, and from the change on while it is on the stretch that was recorded."""
+    """Along its course at `velocity` (m/s, negative: backwards), to which the speed changes from what it would be."""
     left_behind = _integral(way, onset)
 
-    def metres(at: np.ndarray) -> np.ndarray:
-        return (1.0 - onset.share(at)) * way.metres(at) + left_behind(at) + velocity * onset.elapsed(at)
-
     def progress(at: np.ndarray) -> Progress:
-        old = way.progress(at)
-        return Progress(old.clock, metres(at) - way.path.metres(old.clock), old.faithful * (1.0 - onset.share(at)))
+        old, remaining = way.progress(at), 1.0 - onset.share(at)
+        there = way.course.metres(old.clock)
+        metres = remaining * (there + old.along) + left_behind(at) + velocity * onset.elapsed(at)
+        return Progress(old.clock, metres - there, old.faithful * remaining)
 
-    def present(at: np.ndarray) -> np.ndarray:
-        place = metres(at) + way.offsets(at).ahead
-        return way.present(at) | ((at > onset.start) & (place >= 0.0) & (place <= way.path.length))
-
-    return replace(way, progress=progress, present=present)
+    return replace(way, progress=progress, since=min(way.since, onset.start))
 
 
 def _integral(way: Way, onset: Onset) -> Callable[[np.ndarray], np.ndarray]:

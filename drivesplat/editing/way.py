@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.editing.path import Path
+from drivesplat.editing.course import Course
 from drivesplat.editing.veering import beside_the_way, turned
 from drivesplat.motion import Motion
 
@@ -47,20 +47,31 @@ class Way:
     round.
     """
 
-    path: Path
+    course: Course
     height: float
     progress: Callable[[np.ndarray], Progress]
     offsets: Callable[[np.ndarray], Offsets]
-    present: Callable[[np.ndarray], np.ndarray]
+    recorded: Callable[[np.ndarray], np.ndarray]
     begin: float
     end: float
+    since: float = np.inf
     direction: int = 1
     faces: int = 1
 
     def metres(self, at: np.ndarray) -> np.ndarray:
         """How far along its path (n,) its progress is."""
         progress = self.progress(at)
-        return self.path.metres(progress.clock) + progress.along
+        return self.course.metres(progress.clock) + progress.along
+
+    def present(self, at: np.ndarray) -> np.ndarray:
+        """Whether it is there (n,): whenever it was recorded, and at a pace of its own besides while it has come to the
+        stretch that was recorded, and not past it; how far it is shifted along its way counts for nothing."""
+        there, own = self.recorded(at), at >= self.since
+        if own.any():
+            low, high = self.course.stretch
+            metres = self.metres(at[own])
+            there[own] |= (low <= metres) & (metres <= high)
+        return there
 
     def poses(self, at: np.ndarray, height: float) -> np.ndarray:
         """The poses (n, 4, 4) of the centre of a box `height` metres high that stands on the ground of this way."""
@@ -72,14 +83,14 @@ class Way:
     def _on_the_path(self, at: np.ndarray) -> np.ndarray:
         """The poses (n, 4, 4) that lie beside none."""
         progress, ahead = self.progress(at), self.offsets(at).ahead
-        metres = self.path.metres(progress.clock) + progress.along + ahead
-        return self.path.places(metres) @ _partly(self.path.deviation(progress.clock), progress.faithful)
+        metres = self.course.metres(progress.clock) + progress.along + ahead
+        return self.course.places(metres) @ _partly(self.course.deviation(progress.clock), progress.faithful)
 
 
 def recorded_way(motion: Motion, height: float) -> Way:
     """The way as it was driven, by an object `height` metres high."""
     begin, end = motion.span
-    return Way(Path(motion), height, _as_recorded, _none, motion.present, begin, end)
+    return Way(Course(motion), height, _as_recorded, _none, motion.present, begin, end)
 
 
 def _as_recorded(at: np.ndarray) -> Progress:

@@ -1,4 +1,4 @@
-"""The path of a recorded object: by the clock, as it was driven, and by the metre, however fast it is driven.
+"""The course of a recorded object: by the clock, as it was driven, and by the metre, however fast it is driven.
 
 Frames as in `drivesplat.scene`: object x forward, y left, z up, at the box centre; world metres.
 """
@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from drivesplat.editing.onward import End, end_of, onward
 from drivesplat.motion import Motion
 from drivesplat.rigid import inverse
 
@@ -21,15 +22,18 @@ next. The path between them bends as it was driven: by 0.02 mm off in a turn of 
 LEAST_WAY = 3.0
 """A path shorter than this (metres) is that of something that stands: it leads straight on where that points."""
 SETTLES = 0.5
-"""Seconds in which a bend that goes on past the end of a track straightens."""
+"""Seconds in which what it does at the end of a track becomes steady: a bend straightens, speed no longer changes."""
+SETTLES_OVER = 5.0
+"""Metres over which the path by the metre does."""
 
 
 @dataclass(frozen=True)
-class Path:
+class Course:
     """The path that a motion leads along.
 
     Metres count horizontally along the path from the first annotation; they never decrease, and do not grow while the
-    object stands. Past its ends the path leads straight on, and over a gap of the track smoothly.
+    object stands. Past its ends the path leads straight on, as `drivesplat.editing.onward` says, and over a gap of the
+    track smoothly.
     """
 
     motion: Motion
@@ -43,6 +47,7 @@ class Path:
         if straight.any():
             bent = clock[straight] - past[straight] + self._bends_on(past[straight])
             poses[straight, :3, :3] = self.motion.poses(bent)[:, :3, :3]
+            poses[straight, :3, 3] = self._goes_on(past[straight])
         for (low, high), (positions, rotations) in self._bridges.items():
             within = (clock > low) & (clock < high)
             poses[within, :3, 3] = positions(clock[within])
@@ -53,32 +58,58 @@ class Path:
         """How far along the path (n,) it was at the recorded seconds `clock` (n,)."""
         spline = self._metres
         within = clock.clip(spline.x[0], spline.x[-1])
-        return spline(within) + (clock - within) * spline(within, 1)
+        metres, past = spline(within), clock - within
+        for end, chosen in self._beyond(past):
+            slope = spline(within[chosen][:1], 1)
+            steady, over = np.array([end.speed]), self.motion.reach + SETTLES
+            metres[chosen] += onward(past[chosen], slope, steady, over)[:, 0]
+        return metres
 
-    @property
-    def length(self) -> float:
-        """How far along the path the last annotation is."""
-        return float(self._metres(self._metres.x[-1]))
+    @cached_property
+    def stretch(self) -> tuple[float, float]:
+        """From where to where (metres) it was recorded."""
+        low, high = self.metres(np.array(self.motion.span))
+        return float(low), float(high)
 
     def places(self, metres: np.ndarray) -> np.ndarray:
         """The poses (n, 4, 4) that lie `metres` (n,) along the path, without what happened while the object stood."""
         known, poses = self._places
         within = metres.clip(known[0], known[-1])
-        result = np.tile(poses[0], (len(metres), 1, 1))
-        if len(known) == 1:
-            direction = poses[0, :3, 0]
-        else:
+        past, result = metres - within, np.tile(poses[0], (len(metres), 1, 1))
+        if len(known) > 1:
             positions, rotations = self._through
             result[:, :3, 3], result[:, :3, :3] = positions(within), rotations(within).as_matrix()
-            direction = positions(within, 1)
-        length = np.linalg.norm(direction[..., :2], axis=-1, keepdims=True)
-        result[:, :3, 3] += (metres - within)[:, None] * direction / length
+        for end, chosen in self._beyond(past):
+            momentary = positions(within[chosen][0], 1) if len(known) > 1 else end.direction
+            momentary = momentary / np.linalg.norm(momentary[:2])
+            result[chosen, :3, 3] += onward(past[chosen], momentary, end.after(momentary), SETTLES_OVER)
         return result
 
     def deviation(self, clock: np.ndarray) -> np.ndarray:
         """The transforms (n, 4, 4) that take `places(metres(clock))` to `recorded(clock)`, in the frames of the former:
         centimetres, most of them while it stands."""
         return inverse(self.places(self.metres(clock))) @ self.recorded(clock)
+
+    def _beyond(self, past: np.ndarray) -> list[tuple[End, np.ndarray]]:
+        """How it goes on before its beginning and past its end, and which (n,) of `past` (n,) are there."""
+        sides = ((self._ends[0], past < 0.0), (self._ends[1], past > 0.0))
+        return [(end, chosen) for end, chosen in sides if chosen.any()]
+
+    def _goes_on(self, past: np.ndarray) -> np.ndarray:
+        """Positions (n, 3) at seconds `past` (n,) an end, beyond the reach of the motion there."""
+        motion, positions = self.motion, np.empty((len(past), 3))
+        for end, chosen in self._beyond(past):
+            side = float(np.sign(past[chosen][0]))
+            reached = side * motion.reach
+            at = motion.times[-1 if side > 0 else 0] + np.array([0.0, reached])
+            known = motion.poses(at)[:, :3, 3]
+            momentary = (known[1] - known[0]) / reached
+            positions[chosen] = known[1] + onward(past[chosen] - reached, momentary, end.velocity, SETTLES)
+        return positions
+
+    @cached_property
+    def _ends(self) -> tuple[End, End]:
+        return end_of(self.motion, last=False), end_of(self.motion, last=True)
 
     def _bends_on(self, past: np.ndarray) -> np.ndarray:
         """For seconds (n,) past an end, up to which of them a bend goes on: within reach as the motion has it, then
