@@ -23,6 +23,7 @@ from drivesplat.stages import (
     METHOD_STAGES,
     SCENE_STAGES,
     TRAINING_INPUTS,
+    idle_variants,
     no_such_edit,
     no_such_film,
     scene_edits,
@@ -189,13 +190,16 @@ class Plan:
         }
 
     def refuse_unknown(self, targets: list[str]) -> None:
-        """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know."""
+        """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know, or
+        an ablation that would train one thing twice."""
         for target in targets:
             scene, *rest = self._inside_results(target)
             if not rest:
                 continue
             self.config.dataset_of(scene)
             self._refuse_unknown_method(rest)
+            if rest[0] in ABLATION_FILES:
+                self._refuse_idle_variants(scene)
             if len(rest) > 1:
                 self._refuse_unknown_film(scene, rest[0], rest[1:])
 
@@ -209,6 +213,16 @@ class Plan:
         if len(path) > 1 and path[0] not in (*self.config.all_methods, "masks"):
             more = f"; for the ablation: {ablation.job.spelled}" if self.config.ablated else ""
             raise ConfigError(f"method {path[0]!r} is not in the config; there are: {known}{more}")
+
+    def _refuse_idle_variants(self, scene: str) -> None:
+        """Raises ConfigError where a variant of the ablation would be the whole method, trained again."""
+        idle = idle_variants(self.config, scene)
+        if idle:
+            drop = ", ".join(f"{name}: null" for name in idle)
+            raise ConfigError(
+                f"on scene {scene} these variants take nothing out of {self.config.ablation.of!r} and would train it "
+                f"again as it is: {', '.join(idle)}; drop them with ablation: {{without: {{{drop}}}}}"
+            )
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError where `path` below a method's folder is a film or an edit that there is none of."""

@@ -72,6 +72,15 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
 
+def idle_variants(config: Config, scene: str) -> list[str]:
+    """The variants of the ablation that are trained on a scene just as the whole method is."""
+    job = config.ablation.job
+    whole, *others = (
+        stage_settings(config, "train", scene, job.method(without, job.seeds[0])) for without in (None, *job.without)
+    )
+    return [without for without, settings in zip(job.without, others, strict=True) if settings == whole]
+
+
 def _extract(place: Place) -> SceneSource:
     config, dataset = place.config, place.dataset
     return SceneSource(

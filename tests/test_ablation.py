@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import subprocess
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -156,7 +157,9 @@ def test_a_method_called_like_a_variant_is_refused(name):
         ({"without": {"x": {"overrides": {"train": {"iteration": 3}}}}}, ["ablation.without.x", "train.iteration"]),
         ({"without": {"x": {"overrides": {"holdout": {"offset": 1}}}}}, ["ablation.without.x.overrides.holdout"]),
         ({"without": {"x": {"overrides": {"random_seed": 3}}}}, ["ablation.without.x.overrides.random_seed", "train"]),
-        ({"without": {"x": {"parts": []}}}, ["ablation.without.x.parts"]),
+        ({"without": {"x": {"parts": []}}}, ["ablation.without.x.parts", "lacks 'background'"]),
+        ({"without": {"x": {"parts": ["actors"]}}}, ["ablation.without.x.parts", "lacks 'background'"]),
+        ({"without": {"x": {"parts": ["background"] * 2}}}, ["ablation.without.x.parts", "twice"]),
         ({"without": {"x": {"parts": ["wheels"]}}}, ["ablation.without.x.parts", "wheels"]),
         ({"without": {"a/b": {"parts": ["background"]}}}, ["variant", "a/b", "letters"]),
         ({"seeds": []}, ["ablation.seeds", "at least 1"]),
@@ -183,6 +186,59 @@ def test_a_config_without_the_method_is_valid_until_its_ablation_is_asked_for(ta
     with pytest.raises(ConfigError, match=r"ablation\.of.*'street'.*vanilla, mine"):
         made.refuse_unknown([target])
     plan().refuse_unknown([target])
+
+
+def told_to_drop(made: Plan, target: str) -> dict[str, Any]:
+    """What a refusal of an ablation says to add to the config."""
+    with pytest.raises(ConfigError) as failure:
+        made.refuse_unknown([target])
+    message, advice = str(failure.value).split("drop them with ")
+    assert "\n" not in message and "vanilla" in message and "a1" in message and "nothing" in message
+    return yaml.safe_load(advice)
+
+
+@pytest.mark.parametrize("target", ["results/a1/ablation.csv", "results/a1/ablation.json"])
+def test_variants_that_take_nothing_out_are_refused_with_what_drops_them(target):
+    """Vanilla has no actors, and is held neither to LiDAR's depth nor to masks of the sky: there is its sky alone."""
+    of_vanilla = {"ablation": {"of": "vanilla"}}
+    idle = [name for name in VARIANTS if name != "sky"]
+    assert told_to_drop(plan(**of_vanilla), target) == {"ablation": {"without": dict.fromkeys(idle)}}
+    defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
+    values = merged(merged(defaults, of_vanilla), {"ablation": {"without": dict.fromkeys(idle)}})
+    made = plan(**{**values, "datasets": {"a": {"scenes": ["a1"]}}})
+    made.refuse_unknown([target])
+    assert list(made.config.ablated) == names(of="vanilla", without=["sky"])
+
+
+def test_variants_that_take_nothing_out_hinder_nothing_but_the_ablation():
+    files = ("metrics.json", "street/eval.json", "vanilla-without-sky-seed0/eval.json")
+    plan(ablation={"of": "vanilla"}).refuse_unknown(["all", *(f"results/a1/{file}" for file in files)])
+
+
+def test_what_a_variant_takes_out_is_judged_by_what_holds_on_the_scene():
+    """Where the drive's settings have no loss of entropy the method is without it anyway."""
+    free = {"scenes": ["a1"], "overrides": {"train": {"entropy_weight": 0.0}}}
+    made = Plan({"datasets": {"a": free, "b": {"scenes": ["b1"]}}}, str(REPOSITORY))
+    made.refuse_unknown(["results/b1/ablation.csv"])
+    with pytest.raises(ConfigError, match=r"a1.*'street'.*: entropy; drop them.*\{entropy: null\}"):
+        made.refuse_unknown(["results/a1/ablation.csv"])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "without", "expected"),
+    [
+        ((0, 1), ("sky", "depth"), "it-seed{0,1}, it-without-{sky,depth}-seed{0,1}"),
+        ((2,), ("sky", "depth"), "it-seed2, it-without-{sky,depth}-seed2"),
+        ((2, 3), ("sky",), "it-seed{2,3}, it-without-sky-seed{2,3}"),
+        ((2,), (), "it-seed2"),
+    ],
+)
+def test_names_of_methods_are_spelled_as_a_shell_expands_them(seeds, without, expected):
+    job = AblationJob(of="it", seeds=seeds, without=without)
+    assert job.spelled == expected
+    command = ["bash", "-c", f"echo {expected.replace(', ', ' ')}"]
+    expanded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert sorted(expanded) == sorted(job.method(name, seed) for name in (None, *without) for seed in seeds)
 
 
 def test_a_variant_that_there_is_none_of_is_refused_with_those_there_are():

@@ -443,6 +443,6 @@ def test_in_its_pieces_an_actor_is_where_it_is_in_the_model(time, corrected, tol
         torch.testing.assert_close(piece.gaussians.sh, own.sh.detach())
 
 
-def test_more_points_than_the_cap_are_kept():
-    assert actors_of(van(), count=30, settings=ActorSettings(cap_max=10)).cap_max == 30
-    assert actors_of(van(), count=30, settings=ActorSettings(cap_max=100)).cap_max == 100
+@pytest.mark.parametrize("cap_max", [10, 100])
+def test_densification_is_held_to_the_cap_however_many_there_are(cap_max):
+    assert actors_of(van(), count=30, settings=ActorSettings(cap_max=cap_max)).cap_max == cap_max

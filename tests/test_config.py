@@ -124,6 +124,9 @@ def refusal(values: dict[str, Any]) -> str:
         ("cameras", [], ["cameras", "at least 1"]),
         ("images.width", 8, ["images.width", "8", "greater than or equal to 16"]),
         ("methods.vanilla.parts", ["backgruond"], ["methods.vanilla.parts", "backgruond", "background"]),
+        ("methods.vanilla.parts", ["actors"], ["methods.vanilla.parts", "lacks 'background'", "add it"]),
+        ("methods.vanilla.parts", [], ["methods.vanilla.parts", "lacks 'background'"]),
+        ("methods.vanilla.parts", ["background", "actors", "background"], ["methods.vanilla.parts", "twice"]),
         ("datasets.nuscenes.reader", "kitti", ["datasets.nuscenes.reader", "kitti", "nuscenes"]),
         ("datasets.nuscenes.frames", {"0061": [5, 2]}, ["frames", "0061", "first < last"]),
         ("datasets.nuscenes.frames", {"0061": [-1, 2]}, ["frames", "0061", "0 <= first"]),
@@ -187,6 +190,8 @@ def test_device_has_a_short_form(kind):
         {"datasets": {"nuscenes": {"frames": {"0061": [0, 9]}, "overrides": {"sky": "none"}}}},
         {"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 0.9], [1, 0.9], [1, 1]]}}},
         {"methods": {"other": {"overrides": {"train": {"iterations": 9}}}}},
+        {"methods": {"other": {"parts": ["actors", "background"]}}},
+        {"ablation": {"without": {"x": {"parts": ["background"]}}}},
     ],
     ids=str,
 )
@@ -211,7 +216,17 @@ def test_text_for_a_number_is_taken_or_refused_by_config_and_schema_alike(defaul
 
 
 @pytest.mark.parametrize(
-    "values", [{"trian": {}}, {"train": {"iterations": 0}}, {"device": "gpu"}, {"sky": "blue"}], ids=str
+    "values",
+    [
+        {"trian": {}},
+        {"train": {"iterations": 0}},
+        {"device": "gpu"},
+        {"sky": "blue"},
+        {"methods": {"other": {"parts": ["actors"]}}},
+        {"methods": {"other": {"parts": ["background", "background"]}}},
+        {"ablation": {"without": {"x": {"parts": ["actors"]}}}},
+    ],
+    ids=str,
 )
 def test_editors_see_by_the_schema_what_is_wrong(defaults, values):
     with pytest.raises(jsonschema.ValidationError):

@@ -219,12 +219,6 @@ def test_a_name_made_distinct_does_not_take_anothers():
     assert distinct(["camera", "b"], str, taken=["Camera"]) == {"camera": "camera_2", "b": "b"}
 
 
-def test_two_pieces_of_one_name_are_refused(tiny_scene):
-    twice = SplatModel([round_gaussians(STREET), round_gaussians(STREET)], None)
-    with pytest.raises(ValueError, match="'background'"):
-        trained_pieces(twice, tiny_scene, np.array([], dtype=np.int64))
-
-
 def test_what_is_not_finite_stays_behind_in_every_export(tiny_scene, monkeypatch, caplog):
     def broken(track_id: str, time: float) -> Gaussians:
         own = own_gaussians(track_id, time)

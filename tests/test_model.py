@@ -10,7 +10,9 @@ from hand_made import actor_record, actors_of, looking_at, motion_through, round
 from scipy.spatial.transform import Rotation
 from torch import nn
 
+from drivesplat.errors import ResultError
 from drivesplat.images import pixel_rays
+from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.build import Beginnings, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.gaussians import Gaussians, concatenate
@@ -268,6 +270,15 @@ def test_rows_say_which_gaussians_are_each_parts():
     assert model.of_track("later").tolist() == [False] * 16 + [True] * 4 + [False] * 5
 
 
+def test_two_pieces_of_one_name_are_refused():
+    """Two parts of one name, and a track that is called like a part."""
+    still = Background.from_points(*seed_points(3), GaussianSettings(), 1.0)
+    for other in (still, actors_of(a_track("it"), a_track("background"))):
+        with pytest.raises(ResultError, match=r"'background'.*train it again"):
+            SplatModel([still, other], None).pieces(0.0)
+    assert list(SplatModel([still, actors_of(a_track("it"))], None).pieces(0.0)) == ["background", "it"]
+
+
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_what_moves_is_as_opaque_by_itself_as_it_is_rendered_alone(antialiased):
     """Whatever stands before or behind it in the picture."""
@@ -350,6 +361,43 @@ def test_each_actor_starts_with_no_more_points_than_its_cap():
     np.testing.assert_allclose(
         own, [colors[tuple(row)] for row in actors.params["means"].detach()[:20].numpy()], atol=0.01
     )
+
+
+def with_cap(cap_max: int, counts: list[int]) -> Actors:
+    """The actors of a model whose seeds have so many points each."""
+    records = [actor_record(a_track(str(i)), count, seed=i, pixels=100_000) for i, count in enumerate(counts)]
+    settings = TrainSettings(actors=ActorSettings(cap_max=cap_max))
+    return build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", settings).parts[1]
+
+
+@pytest.mark.parametrize(
+    ("cap_max", "counts", "expected"),
+    [
+        pytest.param(400, [100] * 4, [100] * 4, id="no more than the cap: all"),
+        pytest.param(40, [100] * 4, [10] * 4, id="equals share alike"),
+        pytest.param(68, [104, 204, 404], [4 + 8, 4 + 16, 4 + 32], id="four each, and 56 of 700 beyond them"),
+        pytest.param(20, [2, 3, 100], [2, 3, 15], id="who has fewer than four keeps them"),
+        pytest.param(1, [100, 3, 100], [4, 3, 4], id="four each where the cap has no room for them"),
+    ],
+)
+def test_actors_share_a_cap_in_proportion_to_their_seeds(cap_max, counts, expected):
+    actors = with_cap(cap_max, counts)
+    assert torch.bincount(actors.params["owner"], minlength=len(counts)).tolist() == expected
+    assert actors.cap_max == cap_max
+
+
+def test_a_cap_that_divides_unevenly_is_used_up_fairly():
+    counts = torch.bincount(with_cap(50, [100] * 4).params["owner"])
+    assert counts.sum() == 50 and set(counts.tolist()) == {12, 13}
+
+
+def test_seeds_are_thinned_to_points_of_their_own_the_same_every_time():
+    actors, again = (with_cap(60, [100, 200]) for _ in range(2))
+    assert torch.equal(actors.params["means"], again.params["means"])
+    for i, count in enumerate((100, 200)):
+        own = actors.params["means"].detach()[actors.params["owner"] == i].numpy()
+        points = {tuple(row) for row in actor_record(a_track(), count, seed=i)["points"]}
+        assert len({tuple(row) for row in own} & points) == len(own) > 20
 
 
 @pytest.mark.parametrize("records", [[], [actor_record(track_of(motion_through([0.0], [[0.0, 0.0, 0.0]])), 0)]])

@@ -52,9 +52,14 @@ def test_those_present_are_where_their_motions_say(time):
 def test_every_actors_weights_stand_with_its_own_annotations(time):
     moment = timeline().at(time, CPU)
     assert timeline().owned == [slice(0, 5), slice(5, 12)]
-    np.testing.assert_allclose(moment.weights[0, :5], a_van().motion.weights(np.array([time]))[0], atol=1e-6)
-    np.testing.assert_allclose(moment.weights[1, 5:], a_car().motion.weights(np.array([time]))[0], atol=1e-6)
-    assert not moment.weights[0, 5:].any() and not moment.weights[1, :5].any()
+    assert timeline().of_actors.tolist() == [[True] * 5 + [False] * 7, [False] * 5 + [True] * 7]
+    np.testing.assert_allclose(moment.weights[:5], a_van().motion.weights(np.array([time]))[0], atol=1e-6)
+    np.testing.assert_allclose(moment.weights[5:], a_car().motion.weights(np.array([time]))[0], atol=1e-6)
+
+
+def test_annotations_of_an_absent_actor_weigh_nothing():
+    weights = timeline().at(2.0, CPU).weights
+    assert weights[:5].any() and not weights[5:].any()
 
 
 @pytest.mark.parametrize(
@@ -96,3 +101,17 @@ def test_a_track_survives_a_checkpoint(tmp_path):
 def test_a_moment_is_computed_once():
     times = timeline()
     assert times.at(1.5, CPU) is times.at(1.5, CPU) and times.at(1.5, CPU) is not times.at(1.6, CPU)
+
+
+def test_the_moments_of_all_images_of_six_cameras_are_kept():
+    """At 12 Hz for 20 s, each camera at times of its own, once more through all of them."""
+    times, seconds = timeline(), np.arange(6 * 12 * 20) / 72.0
+    first = [times.at(time, CPU) for time in seconds]
+    assert all(times.at(time, CPU) is moment for time, moment in zip(seconds, first, strict=True))
+
+
+def test_a_moment_of_30_actors_takes_a_few_kilobytes():
+    """Each with 40 annotations, all the key frames of a drive: so many times are kept that it matters."""
+    annotated = motion_through(0.5 * np.arange(40), np.zeros((40, 3)))
+    moment = Timeline([track_of(annotated, str(i)) for i in range(30)], 5).at(1.7, CPU)
+    assert sum(value.untyped_storage().nbytes() for value in vars(moment).values()) < 10_000

@@ -14,7 +14,6 @@ import torch
 
 from drivesplat.export.sampled_motion import SampledMotion, sampled
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.part import Piece
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene import Scene, Track
 
@@ -54,9 +53,7 @@ def trained_pieces(model: SplatModel, scene: Scene, timestamps: np.ndarray) -> d
     middle = scene.seconds(middle_timestamp(scene))
     recorded = (timestamps - min(frame.timestamp for frame in scene.frames)) * 1e-6
     found: dict[str, SampledPiece] = {}
-    for name, piece in _pieces(model, middle):
-        if name in found:
-            raise ValueError(f"two pieces of the model are called {name!r}")
+    for name, piece in model.pieces(middle).items():
         motion = None if piece.motion is None else sampled(piece.motion, recorded, middle)
         track = None if piece.motion is None else scene.track(name)
         found[name] = SampledPiece(_finite(piece.gaussians, name), motion, track)
@@ -66,10 +63,6 @@ def trained_pieces(model: SplatModel, scene: Scene, timestamps: np.ndarray) -> d
 def digests(provenance: dict[str, Any]) -> dict[str, str]:
     """Of a provenance what fits where there is little room."""
     return {name: provenance[name] for name in ("settings_sha256", "code_sha256", "inputs_sha256")}
-
-
-def _pieces(model: SplatModel, time: float) -> list[tuple[str, Piece]]:
-    return [named for part in model.parts for named in part.pieces(time).items()]
 
 
 def _finite(gaussians: Gaussians, name: str) -> Gaussians:

@@ -77,11 +77,12 @@ class Actors(Part):
         corrections = {"translation": torch.zeros(annotations, 3), "yaw": torch.zeros(annotations)}
         self.shared = optimised(corrections).requires_grad_(settings.tracks.corrected)
         self.extent = float(np.median([np.linalg.norm(track.size) for track in tracks]))
-        self.cap_max = max(settings.cap_max, len(self))
+        self.cap_max = settings.cap_max
         self._settings = settings
         self._gaussians = gaussians
         sizes = torch.from_numpy(np.stack([track.size for track in tracks])).float()
         self.register_buffer("_reach", 0.5 * sizes + settings.box_margin, persistent=False)
+        self.register_buffer("_annotated", self.timeline.of_actors, persistent=False)
         self.register_buffer("_neighbours", self.timeline.neighbours, persistent=False)
 
     @classmethod
@@ -111,10 +112,11 @@ class Actors(Part):
     def placements(self, time: float) -> Placements:
         """Where the actors are at a time, by their annotations and the learned corrections."""
         moment = self.timeline.at(time, self.params["means"].device)
-        turns = about_vertical(moment.weights @ self.shared["yaw"])
+        weights = moment.weights * self._annotated
+        turns = about_vertical(weights @ self.shared["yaw"])
         return Placements(
             (left_factor(moment.quats) @ turns[..., None])[..., 0],
-            moment.translations + moment.weights @ self.shared["translation"],
+            moment.translations + weights @ self.shared["translation"],
             moment.present,
             torch.ones_like(moment.translations[:, 0]),
         )

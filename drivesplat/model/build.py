@@ -1,6 +1,6 @@
 """A method's settings into a model: the only place that knows parts and skies by name."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,9 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.seeding.actors import motion_of
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
+
+FEW = 4
+"""An actor keeps so many points of its seed whatever the cap: a Gaussian's first size is by its three neighbours."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,9 @@ def _actors(beginnings: Beginnings, settings: TrainSettings) -> Part | None:
         return None
     tracks = [ActorTrack(actor["id"], actor["size"], motion_of(actor)) for actor in actors]
     limits = [actor_cap(actor, settings) for actor in actors]
-    kept = [_some(len(actor["points"]), limit) for actor, limit in zip(actors, limits, strict=True)]
+    counts = [len(actor["points"]) for actor in actors]
+    shares = shared_out(list(map(min, counts, limits)), settings.actors.cap_max)
+    kept = [_some(count, share) for count, share in zip(counts, shares, strict=True)]
     points, colors = (
         [actor[key][chosen] for actor, chosen in zip(actors, kept, strict=True)] for key in ("points", "points_rgb")
     )
@@ -99,6 +104,18 @@ def actor_cap(actor: dict[str, Any], settings: TrainSettings) -> int:
     if not settings.pixels_per_gaussian:
         return settings.actors.cap_max
     return max(settings.actors.least, int(actor["pixels"] / settings.pixels_per_gaussian))
+
+
+def shared_out(wanted: Sequence[int], cap: int) -> list[int]:
+    """How many of the Gaussians that each wants it may have, `cap` in all: FEW, or all if it wants fewer, and of those
+    beyond the same fraction as the others. Where the cap has no room for FEW each, they have them nonetheless."""
+    if sum(wanted) <= cap:
+        return list(wanted)
+    least = np.minimum(wanted, FEW)
+    more = wanted - least
+    room = max(0, cap - int(least.sum()))
+    ends = np.cumsum([0, *more]) * room // max(1, int(more.sum()))
+    return (least + np.diff(ends)).tolist()
 
 
 def _some(count: int, limit: int) -> np.ndarray:

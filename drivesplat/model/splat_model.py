@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Appearance, Part, Piece, Sky
 from drivesplat.rasterize import Rendering, rasterize
@@ -74,8 +75,18 @@ class SplatModel(nn.Module):
         return concatenate([part.staged(time, appearances) for part in self.parts])
 
     def pieces(self, time: float) -> dict[str, Piece]:
-        """What all parts consist of: see `Part.pieces`."""
-        return {name: piece for part in self.parts for name, piece in part.pieces(time).items()}
+        """What all parts consist of: see `Part.pieces`. Raises ResultError where two pieces have one name."""
+        found: dict[str, Piece] = {}
+        for part in self.parts:
+            pieces = part.pieces(time)
+            twice = found.keys() & pieces.keys()
+            if twice:
+                raise ResultError(
+                    f"two pieces of the model are called {min(twice)!r}; train it again with every part and track "
+                    "under a name of its own"
+                )
+            found |= pieces
+        return found
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         """Which of `gaussians_at`'s rows are a track's own; None where no part knows the track as an object."""

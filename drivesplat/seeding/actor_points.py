@@ -47,7 +47,7 @@ def actors_record(scene: Scene, job: ActorSeedJob) -> dict[str, Any]:
     actors = [seed.record() for seed in seeds if seed.seen]
     for actor in actors:
         log.info("%s: %d points, %d of them LiDAR's", actor["id"], len(actor["points"]), actor["lidar_points"])
-    return {"actors": actors, "first_timestamp": int(min(frame.timestamp for frame in scene.frames))}
+    return {"actors": actors}
 
 
 def may_be_actor(track: Track, settings: ActorSeedSettings) -> bool:

@@ -10,7 +10,6 @@
         points_rgb       (p, 3) uint8
         lidar_points     how many of the points are LiDAR's: the first so many
         pixels           how many pixels of training images, at the size of training, are its own
-    first_timestamp  microseconds: of the scene's first image
     provenance
 
 The stage `actors` makes it (`drivesplat.seeding.actor_points`).
@@ -32,7 +31,7 @@ def read_actors(path: str | Path) -> dict[str, Any]:
     """Reads actors.pkl. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
     content = read_plain_pickle(path, rule="actors")
     try:
-        if not content.keys() >= {"actors", "first_timestamp", "provenance"}:
+        if not content.keys() >= {"actors", "provenance"}:
             raise ValueError("it lacks the keys of one")
         if any(not actor.keys() >= _KEYS for actor in content["actors"]):
             raise ValueError("an actor in it lacks keys")

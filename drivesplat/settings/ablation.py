@@ -1,5 +1,6 @@
 """The ablation of a method: what it is without each of the things that make it up, trained with several seeds."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
@@ -7,13 +8,13 @@ from pydantic import Field, field_validator, model_validator
 from drivesplat.settings import Settings
 from drivesplat.settings.method import MethodSettings
 from drivesplat.settings.overrides import merged
-from drivesplat.settings.train import PartName
+from drivesplat.settings.train import Parts
 
 
 class VariantSettings(Settings):
     """A method with something taken out of it."""
 
-    parts: Annotated[tuple[PartName, ...], Field(min_length=1)] | None = None
+    parts: Parts | None = None
     """What the variant's model is made of. null = what the method's is."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings laid over the method's own overrides, as a tree; `sky` and `train` may."""
@@ -99,5 +100,11 @@ class AblationJob(Settings):
     @property
     def spelled(self) -> str:
         """The names of all methods, as a shell would expand them."""
-        seeds, without = (f"{{{','.join(map(str, names))}}}" for names in (self.seeds, self.without))
-        return ", ".join(f"{self.variant(name)}-seed{seeds}" for name in (None, *([without] if self.without else [])))
+        stems = [self.of, *([self.variant(_either(self.without))] if self.without else [])]
+        return ", ".join(f"{stem}-seed{_either(self.seeds)}" for stem in stems)
+
+
+def _either(names: Sequence[Any]) -> str:
+    """Names as a shell would expand them: it leaves braces around a single one."""
+    spelled = ",".join(map(str, names))
+    return f"{{{spelled}}}" if len(names) > 1 else spelled

@@ -29,7 +29,7 @@ class ActorSettings(Settings):
     """The part `actors`: the vehicles that move, each a set of Gaussians in its own box's frame."""
 
     cap_max: int = Field(200_000, ge=1, le=20_000_000)
-    """Most Gaussians of all actors together."""
+    """Most Gaussians of all actors together; each keeps four, however low this is."""
     least: int = Field(500, ge=1)
     """An actor may have so many Gaussians, however few pixels show it. Otherwise train.pixels_per_gaussian limits it by
     the training pixels in its box: on scene 0061 twenty times as many Gaussians cost 1 dB on what moves, held out."""

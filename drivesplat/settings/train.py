@@ -1,8 +1,8 @@
 """The settings of a training."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.actors import ActorSettings
@@ -12,6 +12,23 @@ PartName = Literal["background", "actors"]
 MOVING_PARTS = frozenset({"actors"})
 """Those whose Gaussians are objects that move."""
 SkyKind = Literal["none", "mask", "cubemap"]
+
+
+def _complete(parts: tuple[PartName, ...]) -> tuple[PartName, ...]:
+    """Refuses parts of which a scene where nothing moves would have none, and a part that would be trained twice."""
+    if "background" not in parts:
+        raise ValueError("it lacks 'background', the only part that every scene has: add it")
+    if len(set(parts)) != len(parts):
+        raise ValueError("it names a part twice")
+    return parts
+
+
+Parts = Annotated[
+    tuple[PartName, ...],
+    AfterValidator(_complete),
+    Field(json_schema_extra={"contains": {"const": "background"}, "uniqueItems": True}),
+]
+"""What a model may be made of."""
 
 
 class McmcSettings(Settings):
