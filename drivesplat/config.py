@@ -14,7 +14,6 @@ from pydantic import Field, field_validator, model_validator
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
 from drivesplat.settings.ablation import AblationSettings
-from drivesplat.settings.actor import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.actor_seed import ActorSeedSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import LpipsSettings
@@ -23,6 +22,7 @@ from drivesplat.settings.extract import ExtractSettings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
+from drivesplat.settings.looks import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import MethodSettings
 from drivesplat.settings.overrides import merged

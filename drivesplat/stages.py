@@ -12,7 +12,6 @@ from drivesplat.config import Config, DatasetSettings, for_scene
 from drivesplat.editing.edits_file import read_edits
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings
-from drivesplat.settings.actor import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob
@@ -20,6 +19,7 @@ from drivesplat.settings.export import UsdJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
+from drivesplat.settings.looks import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob

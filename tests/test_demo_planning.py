@@ -42,8 +42,10 @@ def test_without_a_word_about_the_device_the_demo_makes_do_with_the_cpu():
 
 
 def test_the_demo_asks_for_little_gpu_memory_and_keeps_the_rest_of_the_device():
-    told = json.loads(plan(device={"kind": "cuda", "min_free_gb": 6, "max_gb": 10}).device(scene("demo")))
-    assert told == {"kind": "cuda", "min_free_gb": 1.0, "max_gb": 10.0}
+    told = json.loads(
+        plan(device={"kind": "cuda", "min_free_gb": 6, "max_gb": 10, "jobs_per_card": 2}).device(scene("demo"))
+    )
+    assert told == {"kind": "cuda", "min_free_gb": 1.0, "max_gb": 10.0, "jobs_per_card": 2}
 
 
 def test_any_device_without_a_gpu_is_the_cpu(monkeypatch):

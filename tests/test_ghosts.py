@@ -14,7 +14,7 @@ from drivesplat.actors.sight import Drive, Sight
 from drivesplat.model.part import Part
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene import Scene, Track
-from drivesplat.settings.actor import GhostSettings
+from drivesplat.settings.looks import GhostSettings
 from drivesplat.tracks import box_at
 
 START = 1_532_402_927_647_951

@@ -25,7 +25,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.regions import LABELS
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene, Track
-from drivesplat.settings.actor import GhostSettings, PanelJob, RemovalJob, RemovalSettings, SubjectSettings
+from drivesplat.settings.looks import GhostSettings, PanelJob, RemovalJob, RemovalSettings, SubjectSettings
 from drivesplat.training.views import view_of
 
 SIZE = np.array([4.0, 2.0, 1.6])

@@ -19,7 +19,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.regions import LABELS, fill
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene, Track
-from drivesplat.settings.actor import GhostSettings, RemovalJob, RemovalSettings, SubjectSettings
+from drivesplat.settings.looks import GhostSettings, RemovalJob, RemovalSettings, SubjectSettings
 from drivesplat.tracks import Box
 
 SIZE = np.array([4.0, 2.0, 1.6])

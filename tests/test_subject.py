@@ -14,7 +14,7 @@ from drivesplat.recording import Recording
 from drivesplat.regions import LABELS
 from drivesplat.rigid import rigid
 from drivesplat.scene import Frame, Scene, Track
-from drivesplat.settings.actor import SubjectSettings
+from drivesplat.settings.looks import SubjectSettings
 
 WIDTH = 192
 """Twice as wide as the tiny drive's images."""

@@ -26,10 +26,10 @@ from drivesplat.model.splat_model import Picture, SplatModel, View
 from drivesplat.regions import LABELS, is_dynamic
 from drivesplat.rigid import rigid
 from drivesplat.scene import Frame
-from drivesplat.settings.actor import RemovalSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.looks import RemovalSettings
 from drivesplat.tracks import Box, box_at, boxes_at
 from drivesplat.training.views import view_of
 from drivesplat.truth import Truth, TruthFrame, read_truth, truth_image

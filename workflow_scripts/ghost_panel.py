@@ -6,7 +6,7 @@ from drivesplat.actors.sheet import save_figure
 from drivesplat.actors.sight import open_drive
 from drivesplat.job import job
 from drivesplat.recording import read_recording
-from drivesplat.settings.actor import PanelJob
+from drivesplat.settings.looks import PanelJob
 from drivesplat.storage import write_json
 from drivesplat.training.run import read_checkpoint
 

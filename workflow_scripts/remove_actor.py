@@ -7,7 +7,7 @@ from drivesplat.actors.sight import open_drive
 from drivesplat.images import write_image
 from drivesplat.job import job
 from drivesplat.recording import read_recording
-from drivesplat.settings.actor import RemovalJob
+from drivesplat.settings.looks import RemovalJob
 from drivesplat.storage import write_json
 from drivesplat.training.run import read_checkpoint
 

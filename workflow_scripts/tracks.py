@@ -4,7 +4,7 @@ from drivesplat.actors.listing import draw_tracks, sightings_of, track_rows, wri
 from drivesplat.actors.sheet import save_figure
 from drivesplat.job import job
 from drivesplat.recording import read_recording
-from drivesplat.settings.actor import TracksJob
+from drivesplat.settings.looks import TracksJob
 
 with job(snakemake) as current:
     files, camera = current.input, current.settings(TracksJob).eval_camera

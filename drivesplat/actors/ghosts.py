@@ -12,7 +12,7 @@ from torch import Tensor
 from drivesplat.actors.sight import Sight
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.scene import Track
-from drivesplat.settings.actor import GhostSettings
+from drivesplat.settings.looks import GhostSettings
 from drivesplat.tracks import Box, box_at
 
 STEP = 0.25

@@ -12,7 +12,7 @@ from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.images import continuous_intrinsics, project
 from drivesplat.regions import region_mask
 from drivesplat.rigid import inverse
-from drivesplat.settings.actor import GhostSettings, PanelJob
+from drivesplat.settings.looks import GhostSettings, PanelJob
 
 SCHEMA = 1
 DIMMED = 0.3

@@ -15,7 +15,7 @@ from drivesplat.actors.subject import Subject, choose_subject, described
 from drivesplat.evaluation.metrics import psnr_record
 from drivesplat.model.removal import Removal, removal_of
 from drivesplat.regions import fill
-from drivesplat.settings.actor import RemovalJob
+from drivesplat.settings.looks import RemovalJob
 
 log = logging.getLogger(__name__)
 

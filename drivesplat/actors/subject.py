@@ -10,7 +10,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.recording import Recording
 from drivesplat.regions import LABELS, REGIONS, Hull, hulls_in, label_of, owner_image
 from drivesplat.scene import Frame
-from drivesplat.settings.actor import SubjectSettings
+from drivesplat.settings.looks import SubjectSettings
 from drivesplat.tracks import Box
 
 MOVERS = REGIONS["moving_vehicle"]
