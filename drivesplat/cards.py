@@ -48,7 +48,8 @@ def hold_card(jobs_per_card: int) -> BinaryIO | None:
         if not told:
             log.warning(
                 "waits for a GPU: jobs hold all there are (%d; processes %s); device.jobs_per_card lets more share one",
-                *(len(cards), ", ".join(holders)),
+                len(cards),
+                ", ".join(holders),
             )
             told = True
         time.sleep(PATIENCE_S)

@@ -7,7 +7,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from drivesplat.cards import hold_card
 from drivesplat.errors import DriveSplatError
@@ -29,6 +29,7 @@ class Job:
         self._rule: str = snakemake.rule
         self._params = snakemake.params
         self._resources = snakemake.resources
+        self._card: BinaryIO | None = None
 
     @property
     def stage(self) -> str:
@@ -49,7 +50,7 @@ class Job:
         """Where to run; not one of the settings, since it decides no result. From now on until it ends, the job has a
         GPU, where there is one to have, and sees no other."""
         settings = DeviceSettings.model_validate_json(self._resources.device)
-        if settings.kind != "cpu":
+        if settings.kind != "cpu" and self._card is None:  # a second lock would wait for the first
             self._card = hold_card(settings.jobs_per_card)
         return settings
 

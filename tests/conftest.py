@@ -15,6 +15,17 @@ install_import_hook("drivesplat", "beartype.beartype")
 REPOSITORY = Path(__file__).parent.parent
 
 
+@pytest.fixture(scope="module")
+def one_thread():
+    """Tests run side by side: with a thread per core each, they would mostly wait for each other."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory) -> Path:
     """A tiny drive in nuScenes format: scene 0001, read only."""

@@ -21,21 +21,14 @@ from drivesplat.settings.train import TrainSettings
 from drivesplat.training.train import Trainer
 from drivesplat.training.views import TrainingView
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 COUNT, SIZE = 14, np.array([2.0, 1.2, 1.0])
 SPREAD, OPACITY = 0.12, 0.9
 """Standard deviation (metres) and opacity of every Gaussian."""
 C0, C1 = 0.28209479, 0.48860251
 """Of the spherical harmonics of degrees 0 and 1."""
 KEY_FRAMES = np.linspace(0.0, 4.0, 9)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Two processes on two cores, each with two threads, would mostly wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @dataclasses.dataclass(frozen=True)

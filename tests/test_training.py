@@ -56,6 +56,8 @@ from drivesplat.training.run import (
 from drivesplat.training.train import Trainer, TrainingSummary, Workspace, train
 from drivesplat.training.views import Guides, LidarDepth, TrainingView, load_views, order, view_of
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 REPOSITORY = Path(__file__).parent.parent
 CPU = torch.device("cpu")
 NO_GUIDES = Guides(sky={}, moving={}, lidar={})
@@ -201,15 +203,6 @@ def in_subprocess(function: Callable[..., None], *arguments: str) -> subprocess.
         f"import sys; sys.path[:0] = {paths}; import {function.__module__} as m; m.{function.__name__}(*{arguments})"
     )
     return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Tests run side by side: with a thread per core each, they would mostly wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

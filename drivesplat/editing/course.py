@@ -20,7 +20,7 @@ SPACING = 1.0
 """Metres between the places that it leads through: annotations tremble, and who stands shall not get from one to the
 next. The path between them bends as it was driven: by 0.02 mm off in a turn of 5 m radius."""
 LEAST_WAY = 3.0
-"""A path shorter than this (metres) is that of something that stands: it leads straight on where that points."""
+"""A path shorter than this (metres) is that of something that stands: it leads straight on from one place."""
 SETTLES = 0.5
 """Seconds in which what it does at the end of a track becomes steady: a bend straightens, speed no longer changes."""
 SETTLES_OVER = 5.0
