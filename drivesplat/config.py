@@ -26,6 +26,7 @@ from drivesplat.settings.looks import GhostSettings, RemovalSettings, SubjectSet
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import MethodSettings
 from drivesplat.settings.overrides import merged
+from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.world import WorldSettings
@@ -33,8 +34,8 @@ from drivesplat.settings.world import WorldSettings
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 DATASET_OVERRIDES = (
-    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "actors", "masks", "sky", "train",
-    "render", "ghosts", "removal", "export", "device",
+    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors", "masks",
+    "sky", "train", "render", "ghosts", "removal", "export", "device",
 )  # fmt: skip
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
@@ -144,6 +145,7 @@ class Config(Settings):
     images: ImageSettings = ImageSettings()
     holdout: HoldoutSettings = HoldoutSettings()
     extract: ExtractSettings = ExtractSettings()
+    refine_poses: RefinePosesSettings = RefinePosesSettings()
     lidar_seed: LidarSeedSettings = LidarSeedSettings()
     actors: ActorSeedSettings = ActorSeedSettings()
     masks: MaskSettings = MaskSettings()

@@ -20,13 +20,15 @@ from drivesplat.rerun import code_digest
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.stages import (
+    ALL_SCENE_STAGES,
     METHOD_STAGES,
-    SCENE_STAGES,
     TRAINING_INPUTS,
     idle_variants,
     no_such_edit,
     no_such_film,
+    refines_poses,
     scene_edits,
+    scene_stages,
     stage_settings,
     training_inputs,
 )
@@ -97,6 +99,17 @@ class Plan:
         """The truth of a scene: recorded drives have none."""
         name = self.config.dataset_of(wildcards.scene)
         return [self.truth_file(name)] if name in self.worlds else []
+
+    def scene(self, wildcards: Any) -> str:
+        """The record of a scene that all stages take: with refined poses, where they are wanted."""
+        name = "scene_refined.json" if refines_poses(self.config, wildcards.scene) else "scene.json"
+        return f"{self.config.results_dir}/{wildcards.scene}/{name}"
+
+    def triangulated(self, wildcards: Any) -> list[str]:
+        """The points that the refinement of poses triangulated, where they are to be seeds."""
+        config = for_scene(self.config, wildcards.scene)
+        wanted = config.refine_poses.enabled and config.lidar_seed.triangulated
+        return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.pkl"] if wanted else []
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, where given."""
@@ -177,12 +190,12 @@ class Plan:
     def expected_stages(self) -> str:
         """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what
         else is stale."""
-        codes = {stage: self.code(stage) for stage in (*SCENE_STAGES, *TRAINING_INPUTS, *METHOD_STAGES)}
+        codes = {stage: self.code(stage) for stage in (*ALL_SCENE_STAGES, *TRAINING_INPUTS, *METHOD_STAGES)}
         return canonical_json({scene: self._stages(scene, codes) for scene in self.config.batch_scenes})
 
     def _stages(self, scene: str, codes: Mapping[str, str]) -> dict[str, Any]:
         taken = {stage for method in self.config.methods for stage in training_inputs(self.config, scene, method)}
-        stages = {stage: (stage, None) for stage in (*SCENE_STAGES, *taken)}
+        stages = {stage: (stage, None) for stage in (*scene_stages(self.config, scene), *taken)}
         stages |= {f"{method}/{stage}": (stage, method) for method in self.config.methods for stage in METHOD_STAGES}
         return {
             name: {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": codes[stage]}

@@ -22,6 +22,7 @@ from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.looks import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.refine_poses import RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import MOVING_PARTS, TrainJob
 from drivesplat.settings.world import WorldJob
@@ -30,6 +31,8 @@ from drivesplat.storage import canonical_json
 SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
+ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
+"""And that behind those of scenes whose poses are refined."""
 TRAINING_INPUTS = ("actors", "lidar_depth")
 """Stages of a scene that only some methods train on."""
 
@@ -65,6 +68,16 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
     return canonical_json(_RECORDS[stage](place).model_dump(mode="json"))
 
 
+def refines_poses(config: Config, scene: str) -> bool:
+    """Whether a scene's poses are refined before anything else is made of it."""
+    return for_scene(config, scene).refine_poses.enabled
+
+
+def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
+    """The stages of a scene behind its metrics.json."""
+    return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES
+
+
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     """Which of TRAINING_INPUTS a method's training on a scene takes."""
     train = for_scene(config, scene, method).train
@@ -92,6 +105,15 @@ def _extract(place: Place) -> SceneSource:
         cameras=config.cameras,
         sweeps=config.sweeps,
         on_missing=config.extract.on_missing,
+    )
+
+
+def _refine_poses(place: Place) -> RefinePosesJob:
+    config = place.config
+    return RefinePosesJob(
+        refine_poses=config.refine_poses,
+        own_car_polygons=config.masks.own_car_polygons,
+        random_seed=config.random_seed,
     )
 
 
@@ -197,6 +219,7 @@ def _remove_actor(place: Place) -> RemovalJob:
 _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "demo_world": lambda at: WorldJob(scene=at.scene, version=at.dataset.version, world=at.dataset.world),
     "extract": _extract,
+    "refine_poses": _refine_poses,
     "lidar_seed": _lidar_seed,
     "parser": lambda at: ParserJob(holdout=at.config.holdout, images=at.config.images),
     "masks": lambda at: MaskJob(masks=at.config.masks, images=at.config.images),

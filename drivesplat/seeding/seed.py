@@ -1,13 +1,14 @@
 """The stage `lidar_seed`: where the Gaussians start.
 
 LiDAR of the training key frames in world coordinates, without the own car and without what moves, thinned, coloured
-from training images; then points of a file, if given; then far points along pixels that none of these cover. Held-out
-images and sweeps contribute nothing, neither position (of LiDAR) nor colour, and a point that no training image sees is
-left out.
+from training images; points that the refinement of poses triangulated, if two training images see them; points of a
+file, if given; then far points along pixels that none of these cover. Held-out images and sweeps contribute nothing,
+neither position (of LiDAR) nor colour, and a point that no training image sees is left out.
 """
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from plyfile import PlyParseError
@@ -16,6 +17,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.holdout import frame_groups, sweep_groups
 from drivesplat.images import continuous_intrinsics, read_image, target_size
 from drivesplat.point_cloud import PointCloud, read_positions
+from drivesplat.poses.triangulated import mean_over_views, seen_in
 from drivesplat.regions import fill, hulls_in
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene
@@ -28,8 +30,9 @@ from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 log = logging.getLogger(__name__)
 
 
-def seed_points(scene: Scene, job: SeedJob) -> PointCloud:
-    """The seed of a scene. Its note counts points by source, missing sweeps, and names the points file.
+def seed_points(scene: Scene, job: SeedJob, triangulated: dict[str, Any] | None = None) -> PointCloud:
+    """The seed of a scene, `triangulated` being the content of its triangulated.pkl. Its note counts points by source,
+    missing sweeps, and names the points file.
 
     Raises DatasetError where a LiDAR file is missing (unless told to go on) or nothing is left to start from.
     """
@@ -41,19 +44,23 @@ def seed_points(scene: Scene, job: SeedJob) -> PointCloud:
             "train on; lower holdout.last_block, or set holdout.every_nth: 0"
         )
     lidar, times, missing = lidar_points(scene, job)
+    middle = float(np.median(scene.key_frame_timestamps))
     extra = extra_points(scene, job.lidar_seed.points_file)
-    positions = np.concatenate([lidar, extra])
-    times = np.concatenate([times, np.full(len(extra), np.median(scene.key_frame_timestamps))])
-    from_file = np.arange(len(positions)) >= len(lidar)
+    sources = {
+        "lidar": (lidar, times),
+        "triangulated": triangulated_points(scene, job, triangulated) if triangulated else (np.empty((0, 3)), []),
+        "points_file": (extra, np.full(len(extra), middle)),
+    }
+    positions, times = (np.concatenate(columns) for columns in zip(*sources.values(), strict=True))
+    source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
     colors, seen = color_by_visibility(positions, times, [view for _, view in views])
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
-    positions, colors, from_file = positions[kept], colors[kept], from_file[kept]
+    positions, colors, source = positions[kept], colors[kept], source[kept]
     far, far_colors = _far_points(views, positions, job.lidar_seed, random)
     note = {
-        "lidar": int((~from_file).sum()),
-        "points_file": int(from_file.sum()),
+        **{name: int((source == i).sum()) for i, name in enumerate(sources)},
         "far": len(far),
         "lidar_missing": missing,
         "extra_points": Path(job.lidar_seed.points_file).name if job.lidar_seed.points_file else None,
@@ -112,6 +119,16 @@ def extra_points(scene: Scene, path: str | None) -> np.ndarray:
         return read_positions(Path(path).expanduser()) - scene.origin
     except (OSError, PlyParseError, KeyError, ValueError) as error:
         raise DatasetError(f"lidar_seed.points_file {path} is no readable PLY of points ({error})") from error
+
+
+def triangulated_points(scene: Scene, job: SeedJob, record: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The triangulated points (n, 3) that enough training images see, in world coordinates, and the times (n,) at which
+    they do, on average."""
+    groups = frame_groups(scene, job.holdout)
+    training = np.array([i for i, group in enumerate(groups) if group == "train"])
+    times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
+    chosen = seen_in(record, training)
+    return record["points"][chosen], mean_over_views(record, training, times)[chosen]
 
 
 def training_views(scene: Scene, job: SeedJob) -> list[tuple[Frame, ColorView]]:
