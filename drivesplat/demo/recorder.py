@@ -133,9 +133,11 @@ class Recorder:
         return result
 
     def box_to_global(self, thing: Thing, seconds: float) -> np.ndarray:
-        """The pose (4, 4) of the centre of a thing's box."""
+        """The pose (4, 4) of the centre of a thing's box that the tables state: boxes are annotated as seen from the
+        own car, and are as far off as its pose."""
         center = rigid(np.eye(3), np.array([0.0, 0.0, thing.body.size[2] / 2]))
-        return STREET_TO_GLOBAL @ thing.motion.pose_at(seconds) @ center
+        box_to_ego = inverse(self.ego_to_street(seconds)) @ thing.motion.pose_at(seconds) @ center
+        return self.ego_to_global(seconds) @ box_to_ego
 
     def _random(self, *name: str | int) -> np.random.Generator:
         words = [n if isinstance(n, int) else sum(ord(c) * 31**i for i, c in enumerate(n)) for n in name]

@@ -18,7 +18,7 @@ from pycolmap import cost_functions
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.rig import RigImages, to_pycolmap
 from drivesplat.rigid import inverse
-from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob
+from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob, RefinePosesSettings
 
 WORST_PIXELS = 8.0
 """Reprojection errors up to this make a point while poses are still off."""
@@ -28,11 +28,13 @@ LEAST_SECONDS = 1e-3
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of the poses beforehand: `given` ego_to_world (n, 4, 4) at `seconds` (n,), increasing."""
+    """What is known of the poses beforehand: `given` ego_to_world (n, 4, 4) at `seconds` (n,), increasing. Residuals of
+    images are in pixels, so those of poses are in units of `feature_noise` pixels."""
 
     given: np.ndarray
     seconds: np.ndarray
     settings: PriorSettings
+    feature_noise: float
 
     def attach(self, problem: pyceres.Problem, poses: list[np.ndarray]) -> None:
         """Adds its residuals on `poses`, the parameters of world to ego in the order of the given ones."""
@@ -49,13 +51,15 @@ class Priors:
             problem.add_residual_block(cost, pyceres.TrivialLoss(), [poses[i], poses[j]])
 
     def _deviations(self) -> np.ndarray:
-        """Standard deviations (6,) of rotation and translation about and along the car's axes."""
+        """Standard deviations (6,) of rotation and translation about and along the car's axes, as the solver takes
+        them."""
         s = self.settings
-        return np.array([s.tilt, s.tilt, s.heading, s.position, s.position, s.height])
+        return np.array([s.tilt, s.tilt, s.heading, s.position, s.position, s.height]) / self.feature_noise
 
 
-def priors_of(images: RigImages, settings: PriorSettings) -> Priors:
-    return Priors(np.stack([frame.ego_to_world for frame in images.frames]), images.seconds, settings)
+def priors_of(images: RigImages, settings: RefinePosesSettings) -> Priors:
+    given = np.stack([frame.ego_to_world for frame in images.frames])
+    return Priors(given, images.seconds, settings.priors, settings.feature_noise)
 
 
 def triangulated(

@@ -8,13 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+from numpy.linalg import inv
 
-from drivesplat.images import read_image
+from drivesplat.images import continuous_intrinsics, read_image
 from drivesplat.poses.rig import RigImages
-from drivesplat.regions import Outline, fill, hulls_in, own_car_pixels
+from drivesplat.regions import own_car_pixels
 from drivesplat.rigid import inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.settings.refine_poses import FeatureSettings, RefinePosesJob
+from drivesplat.tracks import boxes_at
 
 
 def find_features(images: RigImages, job: RefinePosesJob, database: Path, threads: int) -> pycolmap.Reconstruction:
@@ -33,8 +35,7 @@ def find_features(images: RigImages, job: RefinePosesJob, database: Path, thread
     reconstruction.add_rig(rig)
 
     def features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        usable = usable_pixels(images.scene, frame, job)
-        return _features(frame, usable, job.refine_poses.features)
+        return _features(images.scene, frame, job)
 
     with ThreadPoolExecutor(threads) as pool:
         found = pool.map(features, images.frames)
@@ -108,22 +109,34 @@ def views_overlap(a: Frame, b: Frame) -> bool:
     return bool(abs(turn) < half_fields)
 
 
-def usable_pixels(scene: Scene, frame: Frame, job: RefinePosesJob) -> np.ndarray:
-    """The pixels (h, w) bool of a recorded image that show what stands still, and not the own car."""
+def shows_what_stands(scene: Scene, frame: Frame, pixels: np.ndarray, job: RefinePosesJob) -> np.ndarray:
+    """Which pixels (n, 2), continuous, of a recorded image show neither a box that moves nor the own car: (n,) bool."""
     size = (frame.width, frame.height)
-    outline: Outline | None = job.own_car_polygons.get(frame.camera)
-    usable = ~own_car_pixels(outline, size)
-    for hull in hulls_in(scene, frame, size):
-        if hull.box.moves:
-            center = hull.polygon.mean(axis=0)
-            grown = center + (1.0 + job.refine_poses.features.box_margin) * (hull.polygon - center)
-            usable &= ~fill(grown, size)
-    return usable
+    own_car = own_car_pixels(job.own_car_polygons.get(frame.camera), size)
+    columns, rows = (pixels[:, i].astype(int).clip(0, size[i] - 1) for i in (0, 1))
+    stands = ~own_car[rows, columns]
+    in_camera = np.column_stack([pixels, np.ones(len(pixels))]) @ inv(continuous_intrinsics(frame, size)).T
+    for box in boxes_at(scene, frame.timestamp):
+        if box.moves:
+            camera_to_object = inverse(box.object_to_world) @ frame.camera_to_world
+            reach = box.size / 2 + job.refine_poses.features.box_margin
+            stands &= ~meets_box(camera_to_object[:3, 3], in_camera @ camera_to_object[:3, :3].T, reach)
+    return stands
 
 
-def _features(frame: Frame, usable: np.ndarray, settings: FeatureSettings) -> tuple[np.ndarray, np.ndarray]:
+def meets_box(origin: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Which rays (n,) bool from `origin` (3,) along `directions` (n, 3) meet the box from -`reach` to `reach` (3,), by
+    the slab method."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sides = np.stack([(-reach - origin) / directions, (reach - origin) / directions])
+    enters, leaves = np.nanmin(sides, axis=0).max(axis=1), np.nanmax(sides, axis=0).min(axis=1)
+    return (enters <= leaves) & (leaves > 0)
+
+
+def _features(scene: Scene, frame: Frame, job: RefinePosesJob) -> tuple[np.ndarray, np.ndarray]:
     """Keypoints (n, 4) or (n, 6) float32, x and y first, in continuous pixels of the recorded image, and descriptors
     (n, 128) uint8; those of the largest scale where there are too many."""
+    settings = job.refine_poses.features
     reduction = min(1.0, settings.max_image_size / max(frame.width, frame.height))
     size = (round(frame.width * reduction), round(frame.height * reduction))
     grey = cv2.cvtColor(read_image(frame.image_path, size), cv2.COLOR_RGB2GRAY)
@@ -133,6 +146,5 @@ def _features(frame: Frame, usable: np.ndarray, settings: FeatureSettings) -> tu
     found, described = extractor.extract(pycolmap.Bitmap.from_array(grey))
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)
     keypoints[:, :2] *= np.array([frame.width, frame.height], dtype=np.float32) / size
-    columns, rows = (keypoints[:, i].astype(int).clip(0, usable.shape[1 - i] - 1) for i in (0, 1))
-    kept = usable[rows, columns]
+    kept = shows_what_stands(scene, frame, keypoints[:, :2], job)
     return keypoints[kept], np.ascontiguousarray(np.asarray(described.data)[kept])

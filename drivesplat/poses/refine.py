@@ -68,7 +68,7 @@ def refine_poses(scene: Scene, job: RefinePosesJob, threads: int = 1) -> Refinem
         database = Path(folder) / "features.db"
         reconstruction = find_features(images, job, database, threads)
         match_features(images, job, database, threads)
-        priors = priors_of(images, job.refine_poses.priors)
+        priors = priors_of(images, job.refine_poses)
         for _ in range(job.refine_poses.rounds):
             reconstruction = triangulated(reconstruction, database, job)
             untouched = pycolmap.Reconstruction(reconstruction)

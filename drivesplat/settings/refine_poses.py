@@ -16,8 +16,8 @@ class FeatureSettings(Settings):
     """Features are matched with those of so many key frames that follow, seen by the same camera."""
     across: int = Field(2, ge=0, le=100)
     """Of cameras whose views overlap, key frames up to so far apart are matched as well."""
-    box_margin: float = Field(0.1, ge=0, le=1)
-    """Boxes of what moves are grown by this fraction of their outline before the features in them are left out."""
+    box_margin: float = Field(0.3, ge=0, le=5)
+    """Boxes of what moves are grown by this (metres) before the features in them are left out."""
 
 
 class PriorSettings(Settings):
@@ -59,6 +59,8 @@ class RefinePosesSettings(Settings):
     limits: LimitSettings = LimitSettings()
     min_angle: float = Field(1.0, gt=0, le=90)
     """Rays that meet under a smaller angle than this (degrees) make no point."""
+    feature_noise: float = Field(0.3, gt=0)
+    """How far off (pixels of the recorded image) features are found: what images are trusted by against the priors."""
     robust_pixels: float = Field(1.0, gt=0)
     """Reprojection errors well beyond this (pixels) hardly count (Cauchy's loss)."""
     rounds: int = Field(3, ge=1, le=20)
