@@ -1,8 +1,8 @@
 # From a dataset's tables to what a training needs.
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
-# OUTPUTS: <results>/{scene}/scene.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it); where a method
-# asks for them, actors.pkl and lidar_depth.pkl.
+# OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
+# where a method asks for them, actors.pkl and lidar_depth.pkl.
 
 
 rule extract:
@@ -30,6 +30,31 @@ rule extract:
         "../workflow_scripts/extract.py"
 
 
+rule own_car:
+    """
+    Says where each camera sees the recording car's own body: by the outlines that the user gave, or where images stay
+    as they are while the car drives.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+    output:
+        own_car="<results>/{scene}/own_car.json",
+    log:
+        "<logs>/{scene}/own_car.log",
+    benchmark:
+        "<benchmarks>/{scene}/own_car.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("own_car"),
+        code=plan.code("own_car"),
+    script:
+        "../workflow_scripts/own_car.py"
+
+
 rule lidar_seed:
     """
     Starts the Gaussians where LiDAR of the training key frames found something that stands still, coloured from
@@ -37,6 +62,7 @@ rule lidar_seed:
     """
     input:
         scene="<results>/{scene}/scene.json",
+        own_car="<results>/{scene}/own_car.json",
         points_file=plan.points_file,
     output:
         seed="<results>/{scene}/seed.ply",
@@ -87,6 +113,7 @@ rule masks:
     """
     input:
         scene="<results>/{scene}/scene.json",
+        own_car="<results>/{scene}/own_car.json",
     output:
         masks="<results>/{scene}/masks/masks.json",
     log:
@@ -112,6 +139,7 @@ rule actors:
     """
     input:
         scene="<results>/{scene}/scene.json",
+        own_car="<results>/{scene}/own_car.json",
     output:
         actors="<results>/{scene}/actors.pkl",
     log:
@@ -136,6 +164,7 @@ rule lidar_depth:
     """
     input:
         scene="<results>/{scene}/scene.json",
+        own_car="<results>/{scene}/own_car.json",
     output:
         depth="<results>/{scene}/lidar_depth.pkl",
     log:
