@@ -21,6 +21,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.looks import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.masks import MaskJob
+from drivesplat.settings.own_car import OwnCarJob, OwnCarSearch
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.refine_poses import RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
@@ -28,7 +29,7 @@ from drivesplat.settings.train import MOVING_PARTS, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.storage import canonical_json
 
-SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
+SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
 ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
@@ -109,12 +110,16 @@ def _extract(place: Place) -> SceneSource:
 
 
 def _refine_poses(place: Place) -> RefinePosesJob:
-    config = place.config
-    return RefinePosesJob(
-        refine_poses=config.refine_poses,
-        own_car_polygons=config.masks.own_car_polygons,
-        random_seed=config.random_seed,
-    )
+    return RefinePosesJob(refine_poses=place.config.refine_poses, random_seed=place.config.random_seed)
+
+
+def _own_car(place: Place) -> OwnCarJob:
+    config, kind = place.config, place.config.masks.own_car
+    polygons = config.masks.own_car_polygons if kind != "none" else {}
+    spared = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
+    cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *spared})
+    search = OwnCarSearch(cameras=cameras, holdout=config.holdout, own_car_radius=config.lidar_seed.own_car_radius)
+    return OwnCarJob(polygons=polygons, search=search if cameras else None)
 
 
 def _lidar_seed(place: Place) -> SeedJob:
@@ -131,7 +136,6 @@ def _actors(place: Place) -> ActorSeedJob:
         holdout=config.holdout,
         images=config.images,
         own_car_radius=config.lidar_seed.own_car_radius,
-        own_car_polygons=config.masks.own_car_polygons,
         random_seed=config.random_seed,
     )
 
@@ -142,7 +146,6 @@ def _lidar_depth(place: Place) -> LidarDepthJob:
         holdout=config.holdout,
         images=config.images,
         own_car_radius=config.lidar_seed.own_car_radius,
-        own_car_polygons=config.masks.own_car_polygons,
         box_margin=config.lidar_seed.box_margin,
     )
 
@@ -150,7 +153,10 @@ def _lidar_depth(place: Place) -> LidarDepthJob:
 def _train(place: Place) -> TrainJob:
     config, parts = place.config, place.config.all_methods[place.method].parts
     train = config.train if set(parts) & MOVING_PARTS else config.train.of_what_stands_still()
-    return TrainJob(parts=parts, sky=config.sky, train=train, random_seed=config.random_seed)
+    reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
+    return TrainJob(
+        parts=parts, sky=config.sky, train=train, random_seed=config.random_seed, reference_camera=reference
+    )
 
 
 def _evaluate(place: Place) -> EvaluateJob:
@@ -219,6 +225,7 @@ def _remove_actor(place: Place) -> RemovalJob:
 _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "demo_world": lambda at: WorldJob(scene=at.scene, version=at.dataset.version, world=at.dataset.world),
     "extract": _extract,
+    "own_car": _own_car,
     "refine_poses": _refine_poses,
     "lidar_seed": _lidar_seed,
     "parser": lambda at: ParserJob(holdout=at.config.holdout, images=at.config.images),

@@ -1,9 +1,9 @@
 # From a dataset's tables to what a training needs.
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
-# OUTPUTS: <results>/{scene}/scene.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it); where poses are
-# refined, scene_refined.json, poses.json and triangulated.pkl; where a method asks for them, actors.pkl and
-# lidar_depth.pkl. The scene of all later rules (plan.scene) is the refined one where there is one.
+# OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
+# where poses are refined, scene_refined.json, poses.json and triangulated.pkl; where a method asks for them, actors.pkl
+# and lidar_depth.pkl. The scene of all rules after these (plan.scene) is the refined one where there is one.
 
 
 rule extract:
@@ -31,6 +31,31 @@ rule extract:
         "../workflow_scripts/extract.py"
 
 
+rule own_car:
+    """
+    Says where each camera sees the recording car's own body: by the outlines that the user gave, or where images stay
+    as they are while the car drives.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+    output:
+        own_car="<results>/{scene}/own_car.json",
+    log:
+        "<logs>/{scene}/own_car.log",
+    benchmark:
+        "<benchmarks>/{scene}/own_car.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("own_car"),
+        code=plan.code("own_car"),
+    script:
+        "../workflow_scripts/own_car.py"
+
+
 rule refine_poses:
     """
     Corrects the poses by what the images show: features triangulated between key frames, bundle adjustment with the
@@ -38,6 +63,7 @@ rule refine_poses:
     """
     input:
         scene="<results>/{scene}/scene.json",
+        own_car="<results>/{scene}/own_car.json",
     output:
         scene="<results>/{scene}/scene_refined.json",
         poses="<results>/{scene}/poses.json",
@@ -66,6 +92,7 @@ rule lidar_seed:
     """
     input:
         scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
         points_file=plan.points_file,
         triangulated=plan.triangulated,
     output:
@@ -117,6 +144,7 @@ rule masks:
     """
     input:
         scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
     output:
         masks="<results>/{scene}/masks/masks.json",
     log:
@@ -142,6 +170,7 @@ rule actors:
     """
     input:
         scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
     output:
         actors="<results>/{scene}/actors.pkl",
     log:
@@ -166,6 +195,7 @@ rule lidar_depth:
     """
     input:
         scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
     output:
         depth="<results>/{scene}/lidar_depth.pkl",
     log:

@@ -331,10 +331,10 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
 @pytest.mark.parametrize(
     ("change", "readers"),
     [
-        (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract evaluate"),
+        (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car evaluate"),
         (
             {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
-            "extract evaluate tracks film ghost_panel remove_actor export_usd export_viewer",
+            "extract own_car evaluate tracks film ghost_panel remove_actor export_usd export_viewer",
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks actors lidar_depth"),
@@ -350,11 +350,13 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
         (at("actors.humans", True), "actors"),
         (at("datasets.nuscenes.overrides", {"actors": {"max_points": 9}}), "actors"),
         (at("masks.sky_folder", "sky"), "masks"),
-        (at("masks.own_car_polygons", {"CAM_FRONT": [[0, 0], [1, 1], [0, 1]]}), "masks actors lidar_depth"),
+        (at("masks.own_car_polygons", {"CAM_FRONT": [[0, 0], [1, 1], [0, 1]]}), "own_car masks"),
+        (at("masks.own_car", "auto_measured"), "own_car masks"),
         (at("sky", "none"), "train"),
         (at("train.iterations", 9), "train"),
         (at("train.mcmc.noise_lr", 9), "train"),
         (at("train.gaussians.sh_degree", 1), "train"),
+        (at("train.exposure.kind", "affine"), "train"),
         (at("methods.vanilla.overrides", {"train": {"iterations": 9}}), "train"),
         (at("methods.another.overrides", {"train": {"iterations": 9}}), ""),
         (at("random_seed", 1), "lidar_seed actors train"),

@@ -14,6 +14,7 @@ from tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from drivesplat.errors import ResultError
 from drivesplat.extract import extract_scene
 from drivesplat.holdout import frame_groups, sweep_groups
+from drivesplat.own_car import OwnCar
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene
 from drivesplat.seeding.depth_points import Depths, lidar_depths, taken_apart
@@ -32,13 +33,12 @@ CROSSING = Thing("vehicle.truck", (4.0, 2.0, 2.6), (24.0, -9.0, 1.3), (0.0, 4.0)
 """It crosses the road before the own car, from the right to the left."""
 
 
-def job(holdout=HELD_OUT, width=None, radius=2.5, outline=None, margin=0.1) -> LidarDepthJob:
+def job(holdout=HELD_OUT, width=None, radius=2.5, margin=0.1) -> LidarDepthJob:
     return LidarDepthJob.model_validate(
         {
             "holdout": holdout,
             "images": {"width": width},
             "own_car_radius": radius,
-            "own_car_polygons": {"CAM_FRONT": outline} if outline else {},
             "box_margin": margin,
         }
     )
@@ -224,7 +224,7 @@ def test_returns_of_the_own_car_are_left_out(tiny_scene):
 
 def test_pixels_of_the_own_cars_body_have_no_depth(tiny_scene):
     outline = ((0.0, 0.5), (0.5, 0.5), (0.5, 1.0), (0.0, 1.0))
-    whole, cut = (lidar_depths(tiny_scene, job(outline=o))[0] for o in (None, outline))
+    whole, cut = (lidar_depths(tiny_scene, job(), OwnCar(seen))[0] for seen in ({}, {"CAM_FRONT": (outline,)}))
     body = [(image["rows"] >= 27) & (image["columns"] <= 48) for image in (whole, cut)]
     assert body[0].sum() > 50 and body[1].sum() == 0
     for key in whole:

@@ -77,15 +77,13 @@ def told(stage: str, **values: Any) -> dict[str, Any]:
 
 
 def test_each_is_told_what_decides_it():
-    outline = {"CAM_FRONT": [[0, 0.9], [1, 0.9], [1, 1]]}
     values = {
         "actors": {"humans": True}, "holdout": {"last_block": 2}, "images": {"width": 320}, "random_seed": 7,
-        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3}, "masks": {"own_car_polygons": outline},
+        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3},
     }  # fmt: skip
     actors, depth = told("actors", **values), told("lidar_depth", **values)
     for record in (actors, depth):
         assert (record["holdout"]["last_block"], record["images"]["width"], record["own_car_radius"]) == (2, 320, 3.0)
-        assert record["own_car_polygons"] == outline
     assert (actors["actors"]["humans"], actors["random_seed"]) == (True, 7)
     assert depth["box_margin"] == 0.3 and "actors" not in depth and "random_seed" not in depth
 

@@ -32,7 +32,7 @@ def labels() -> np.ndarray:
 @pytest.fixture(scope="module")
 def masks(labels, tiny_scene, tmp_path_factory):
     folder = write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
-    write_json(folder / "masks.json", {"regions": "boxes", "provenance": {"made": "masks"}})
+    write_json(folder / "masks.json", {"regions": "boxes", "own_car": {}, "provenance": {"made": "masks"}})
     return folder
 
 

@@ -15,6 +15,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.extract import extract_scene
 from drivesplat.holdout import frame_groups, sweep_groups
 from drivesplat.images import project
+from drivesplat.own_car import OwnCar
 from drivesplat.point_cloud import PointCloud
 from drivesplat.regions import fill, hull_of
 from drivesplat.rigid import inverse, rigid
@@ -516,3 +517,19 @@ def test_the_real_scene_is_seeded_from_the_one_sweep_there_is_and_from_points_of
     assert (seed.note["lidar_missing"], seed.note["extra_points"]) == (38, "sfm_points_global.ply")
     assert 1_000 < seed.note["points_file"] <= 2_403
     assert seed.note["lidar"] > 1_000
+
+
+def test_the_own_cars_body_lends_no_colour(root):
+    """The left half of every image is the own car's body, and red: no seed point is, near or far, nor lies there."""
+    scene = scene_at(root)
+    for frame in scene.frames:
+        pixels = np.full((54, 96, 3), (0, 0, 255), dtype=np.uint8)
+        pixels[:, :49] = (255, 0, 0)
+        Image.fromarray(pixels).save(frame.image_path, quality=100, subsampling=0)
+    half = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
+    red = {}
+    for name, seen in (("whole", {}), ("half", {"CAM_FRONT": (half,)})):
+        cloud = seed_points(scene, job(), OwnCar(seen))
+        red[name] = int((cloud.colors[:, 0] > 150).sum())
+        assert len(cloud.positions) > 200 and cloud.note["far"] > 100
+    assert red["whole"] > 100 and red["half"] == 0

@@ -28,8 +28,8 @@ def test_both_stages_leave_records_that_know_where_they_come_from(trained):
     actors, depth = read_actors(folder / "actors.pkl"), read_lidar_depth(folder / "lidar_depth.pkl")
     assert [actor["category"] for actor in actors["actors"]] == ["vehicle.car"]
     assert sum(len(image["depth"]) > 0 for image in depth["images"]) == 5
-    assert actors["provenance"]["stages"].keys() == {"extract", "actors"}
-    assert depth["provenance"]["stages"].keys() == {"extract", "lidar_depth"}
+    assert actors["provenance"]["stages"].keys() == {"extract", "own_car", "actors"}
+    assert depth["provenance"]["stages"].keys() == {"extract", "own_car", "lidar_depth"}
     made_from = [trained.read(training)["provenance"]["stages"].keys() for training in TRAININGS]
     assert made_from[1] - made_from[0] == {"actors", "lidar_depth", "mine/train"}
 

@@ -96,6 +96,7 @@ def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: Evaluate
         "train_images": len(parser["splits"]["train"]),
         "poses": parser["scene"]["poses"],
         "regions": masks_record["regions"],
+        "own_car": masks_record["own_car"].get(job.eval_camera),
         "extra_points": parser["seed"]["extra_points"],
         "lidar_missing": parser["seed"]["lidar_missing"],
         "images_missing": parser["scene"]["missing_images"],

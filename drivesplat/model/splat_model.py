@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.errors import ResultError
+from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Appearance, Part, Piece, Sky
 from drivesplat.rasterize import Rendering, rasterize
@@ -18,13 +19,15 @@ from drivesplat.rasterize import Rendering, rasterize
 
 @dataclass(frozen=True)
 class View:
-    """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image."""
+    """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image. `camera` names the one of
+    the rig whose colours it shows; None: the reference's, which are the model's own."""
 
     K: Float[Tensor, "3 3"]
     camera_to_world: Float[Tensor, "4 4"]
     width: int
     height: int
     time: float
+    camera: str | None = None
 
     @cached_property
     def viewmat(self) -> Float[Tensor, "4 4"]:
@@ -42,8 +45,8 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view shows of `gaussians`: `image` with the sky behind, `splats` without it (premultiplied by their
-    `alpha`), `depth` in metres or None."""
+    """What a view shows of `gaussians`: `image` with the sky behind, as the view's camera exposes it; `splats` without
+    sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or None."""
 
     gaussians: Gaussians
 
@@ -55,16 +58,25 @@ class Picture:
 
 
 class SplatModel(nn.Module):
-    """Parts and a sky (None: black)."""
+    """Parts, a sky (None: black), and how cameras expose (None: all alike)."""
 
-    def __init__(self, parts: Sequence[Part], sky: Sky | None, antialiased: bool = False):
+    def __init__(
+        self, parts: Sequence[Part], sky: Sky | None, antialiased: bool = False, exposure: Exposures | None = None
+    ):
         super().__init__()
         self.parts = nn.ModuleList(parts)
         self.sky = sky
+        self.exposure = exposure
         self.antialiased = antialiased
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
+
+    @property
+    def beside_parts(self) -> dict[str, Sky | Exposures]:
+        """What else is learned, by name: modules with `params` and their `learning_rates()`."""
+        named = {"sky": self.sky, "exposure": self.exposure}
+        return {name: module for name, module in named.items() if module is not None}
 
     def gaussians_at(self, time: float) -> Gaussians:
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
@@ -132,6 +144,8 @@ class SplatModel(nn.Module):
         image = splats
         if self.sky is not None:
             image = splats + (1.0 - alpha) * self.sky.colors(view.rays() if rays is None else rays)
+        if self.exposure is not None:
+            image = self.exposure.shown(image, view.camera)
         depth = rendering.depth[0, ..., 0] if rendering.depth is not None else None
         return Picture(shown, image, splats, alpha[..., 0], depth, rendering.info)
 

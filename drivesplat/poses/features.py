@@ -11,8 +11,8 @@ import pycolmap
 from numpy.linalg import inv
 
 from drivesplat.images import continuous_intrinsics, read_image
+from drivesplat.own_car import OwnCar
 from drivesplat.poses.rig import RigImages
-from drivesplat.regions import own_car_pixels
 from drivesplat.rigid import inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.settings.refine_poses import FeatureSettings, RefinePosesJob
@@ -35,7 +35,7 @@ def find_features(images: RigImages, job: RefinePosesJob, database: Path, thread
     reconstruction.add_rig(rig)
 
     def features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        return _features(images.scene, frame, job)
+        return _features(images, frame, job)
 
     with ThreadPoolExecutor(threads) as pool:
         found = pool.map(features, images.frames)
@@ -109,17 +109,17 @@ def views_overlap(a: Frame, b: Frame) -> bool:
     return bool(abs(turn) < half_fields)
 
 
-def shows_what_stands(scene: Scene, frame: Frame, pixels: np.ndarray, job: RefinePosesJob) -> np.ndarray:
-    """Which pixels (n, 2), continuous, of a recorded image show neither a box that moves nor the own car: (n,) bool."""
+def shows_what_stands(scene: Scene, frame: Frame, pixels: np.ndarray, own_car: OwnCar, box_margin: float) -> np.ndarray:
+    """Which pixels (n, 2), continuous, of a recorded image show neither a box that moves, grown by `box_margin` metres,
+    nor the own car: (n,) bool."""
     size = (frame.width, frame.height)
-    own_car = own_car_pixels(job.own_car_polygons.get(frame.camera), size)
     columns, rows = (pixels[:, i].astype(int).clip(0, size[i] - 1) for i in (0, 1))
-    stands = ~own_car[rows, columns]
+    stands = ~own_car.pixels(frame.camera, size)[rows, columns]
     in_camera = np.column_stack([pixels, np.ones(len(pixels))]) @ inv(continuous_intrinsics(frame, size)).T
     for box in boxes_at(scene, frame.timestamp):
         if box.moves:
             camera_to_object = inverse(box.object_to_world) @ frame.camera_to_world
-            reach = box.size / 2 + job.refine_poses.features.box_margin
+            reach = box.size / 2 + box_margin
             stands &= ~meets_box(camera_to_object[:3, 3], in_camera @ camera_to_object[:3, :3].T, reach)
     return stands
 
@@ -133,7 +133,7 @@ def meets_box(origin: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> 
     return (enters <= leaves) & (leaves > 0)
 
 
-def _features(scene: Scene, frame: Frame, job: RefinePosesJob) -> tuple[np.ndarray, np.ndarray]:
+def _features(images: RigImages, frame: Frame, job: RefinePosesJob) -> tuple[np.ndarray, np.ndarray]:
     """Keypoints (n, 4) or (n, 6) float32, x and y first, in continuous pixels of the recorded image, and descriptors
     (n, 128) uint8; those of the largest scale where there are too many."""
     settings = job.refine_poses.features
@@ -146,5 +146,7 @@ def _features(scene: Scene, frame: Frame, job: RefinePosesJob) -> tuple[np.ndarr
     found, described = extractor.extract(pycolmap.Bitmap.from_array(grey))
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)
     keypoints[:, :2] *= np.array([frame.width, frame.height], dtype=np.float32) / size
-    kept = shows_what_stands(scene, frame, keypoints[:, :2], job)
+    kept = shows_what_stands(
+        images.scene, frame, keypoints[:, :2], images.own_car, job.refine_poses.features.box_margin
+    )
     return keypoints[kept], np.ascontiguousarray(np.asarray(described.data)[kept])

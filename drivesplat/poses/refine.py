@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.poses.adjustment import (
     Priors,
     adjust,
@@ -57,13 +58,14 @@ class Trial:
     after: float
 
 
-def refine_poses(scene: Scene, job: RefinePosesJob, threads: int = 1) -> Refinement:
-    """The refinement of a scene. Logs a warning, and keeps the given poses, where images cannot improve them.
+def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, threads: int = 1) -> Refinement:
+    """The refinement of a scene, to which the own car's body contributes nothing. Logs a warning, and keeps the given poses, where images cannot improve them.
 
     Raises DatasetError where an image cannot be read, or a camera is not fixed to the car.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR
-    images = RigImages.of(scene, [i for i, frame in enumerate(scene.frames) if frame.is_key_frame])
+    key_frames = [i for i, frame in enumerate(scene.frames) if frame.is_key_frame]
+    images = RigImages.of(scene, key_frames, own_car)
     with tempfile.TemporaryDirectory(prefix="drivesplat-poses-") as folder:
         database = Path(folder) / "features.db"
         reconstruction = find_features(images, job, database, threads)

@@ -12,6 +12,7 @@ import pycolmap
 
 from drivesplat.errors import DatasetError
 from drivesplat.images import continuous_intrinsics
+from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.rigid import inverse
 from drivesplat.scene import Frame, Scene
 
@@ -25,16 +26,17 @@ _SAME_MOUNT = 1e-3
 @dataclass(frozen=True)
 class RigImages:
     """Images `indices` (of `scene.frames`) in the order of their times; image i is i + 1 to pycolmap. `cameras` are
-    their cameras' names, camera c is c + 1 there."""
+    their cameras' names, camera c is c + 1 there. `own_car` says where they see its body."""
 
     scene: Scene
     indices: tuple[int, ...]
     cameras: tuple[str, ...]
+    own_car: OwnCar = NOWHERE
 
     @classmethod
-    def of(cls, scene: Scene, indices: Sequence[int]) -> "RigImages":
+    def of(cls, scene: Scene, indices: Sequence[int], own_car: OwnCar = NOWHERE) -> "RigImages":
         ordered = tuple(sorted(indices, key=lambda i: (scene.frames[i].timestamp, scene.frames[i].camera)))
-        return cls(scene, ordered, tuple(dict.fromkeys(scene.frames[i].camera for i in ordered)))
+        return cls(scene, ordered, tuple(dict.fromkeys(scene.frames[i].camera for i in ordered)), own_car)
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -11,7 +11,8 @@ import numpy as np
 
 from drivesplat.holdout import frame_groups
 from drivesplat.images import continuous_intrinsics, target_size
-from drivesplat.regions import fill, hulls_in, own_car_pixels
+from drivesplat.own_car import NOWHERE, OwnCar
+from drivesplat.regions import fill, hulls_in
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.seeding.coloring import visible
@@ -35,8 +36,9 @@ class Cloud:
     moving: list[tuple[Mover, np.ndarray]]
 
 
-def lidar_depths(scene: Scene, job: LidarDepthJob) -> list[Depths]:
-    """What LiDAR says of each of the scene's frames; nothing of those that no training sees."""
+def lidar_depths(scene: Scene, job: LidarDepthJob, own_car: OwnCar = NOWHERE) -> list[Depths]:
+    """What LiDAR says of each of the scene's frames, the own car's body left out; nothing of those that no training
+    sees."""
     moving = movers(scene)
     clouds = [
         taken_apart(points, sweep.timestamp, scene.seconds(sweep.timestamp), moving, job.box_margin)
@@ -45,7 +47,7 @@ def lidar_depths(scene: Scene, job: LidarDepthJob) -> list[Depths]:
     images = []
     for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
         cloud = nearest_cloud(clouds, frame.timestamp, scene.key_frame_interval) if group == "train" else None
-        images.append(depths_in(scene, frame, cloud, job) if cloud else _depths(np.empty((0, 3))))
+        images.append(depths_in(scene, frame, cloud, job, own_car) if cloud else _depths(np.empty((0, 3))))
     known = [len(image["depth"]) for image in images if len(image["depth"])]
     log.info("%d depths in %d of %d images", sum(known), len(known), len(images))
     return images
@@ -66,7 +68,7 @@ def nearest_cloud(clouds: list[Cloud], timestamp: int, interval: float) -> Cloud
     return nearest if nearest and abs(nearest.timestamp - timestamp) < interval else None
 
 
-def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob) -> Depths:
+def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, own_car: OwnCar) -> Depths:
     """The returns of a cloud that a frame sees, the nearest of a pixel. What is absent by then is left out."""
     size, seconds = target_size(frame, job.images), scene.seconds(frame.timestamp)
     posed = [(mover.pose(seconds), own) for mover, own in cloud.moving]
@@ -76,7 +78,7 @@ def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob) -> D
     index, rows, columns, depth = visible(points, *camera, (size[1], size[0]))
     boxes = box_depths(scene, frame, size, {mover.track.id for mover, _ in cloud.moving})
     kept = (index >= len(cloud.still)) | (depth < boxes[rows, columns])
-    kept &= ~own_car_pixels(job.own_car_polygons.get(frame.camera), size)[rows, columns]
+    kept &= ~own_car.pixels(frame.camera, size)[rows, columns]
     return _depths(np.column_stack([rows, columns, depth])[kept])
 
 

@@ -16,6 +16,7 @@ from plyfile import PlyParseError
 from drivesplat.errors import DatasetError
 from drivesplat.holdout import frame_groups, sweep_groups
 from drivesplat.images import continuous_intrinsics, read_image, target_size
+from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.point_cloud import PointCloud, read_positions
 from drivesplat.poses.triangulated import mean_over_views, seen_in
 from drivesplat.regions import fill, hulls_in
@@ -30,14 +31,16 @@ from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 log = logging.getLogger(__name__)
 
 
-def seed_points(scene: Scene, job: SeedJob, triangulated: dict[str, Any] | None = None) -> PointCloud:
-    """The seed of a scene, `triangulated` being the content of its triangulated.pkl. Its note counts points by source,
-    missing sweeps, and names the points file.
+def seed_points(
+    scene: Scene, job: SeedJob, own_car: OwnCar = NOWHERE, triangulated: dict[str, Any] | None = None
+) -> PointCloud:
+    """The seed of a scene, to which the own car's body lends nothing; `triangulated` is the content of its
+    triangulated.pkl. Its note counts points by source, missing sweeps, and names the points file.
 
     Raises DatasetError where a LiDAR file is missing (unless told to go on) or nothing is left to start from.
     """
     random = np.random.default_rng(job.random_seed)
-    views = training_views(scene, job)
+    views = training_views(scene, job, own_car)
     if not views:
         raise DatasetError(
             f"scene {scene.name}: the hold-out leaves none of its {len(scene.key_frame_timestamps)} key frames to "
@@ -131,19 +134,19 @@ def triangulated_points(scene: Scene, job: SeedJob, record: dict[str, Any]) -> t
     return record["points"][chosen], mean_over_views(record, training, times)[chosen]
 
 
-def training_views(scene: Scene, job: SeedJob) -> list[tuple[Frame, ColorView]]:
-    """The training images as sources of colour; pixels of moving boxes are not usable."""
+def training_views(scene: Scene, job: SeedJob, own_car: OwnCar) -> list[tuple[Frame, ColorView]]:
+    """The training images as sources of colour; pixels of moving boxes and of the own car are not usable."""
     groups = frame_groups(scene, job.holdout)
     return [
-        (frame, color_view(scene, frame, job.images))
+        (frame, color_view(scene, frame, job.images, own_car))
         for frame, group in zip(scene.frames, groups, strict=True)
         if group == "train"
     ]
 
 
-def color_view(scene: Scene, frame: Frame, images: ImageSettings) -> ColorView:
+def color_view(scene: Scene, frame: Frame, images: ImageSettings, own_car: OwnCar = NOWHERE) -> ColorView:
     size = target_size(frame, images)
-    usable = np.ones((size[1], size[0]), dtype=bool)
+    usable = ~own_car.pixels(frame.camera, size)
     for hull in hulls_in(scene, frame, size):
         if hull.box.moves:
             usable[fill(hull.polygon, size)] = False

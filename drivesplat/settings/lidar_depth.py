@@ -11,6 +11,5 @@ class LidarDepthJob(Settings):
     holdout: HoldoutSettings
     images: ImageSettings
     own_car_radius: float
-    own_car_polygons: dict[str, tuple[tuple[float, float], ...]]
     box_margin: float
     """Returns nearer than this (metres) to the box of something that moves do not stand still."""

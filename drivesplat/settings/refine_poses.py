@@ -74,5 +74,4 @@ class RefinePosesJob(Settings):
     """Everything that decides the content of one scene_refined.json, the scene aside."""
 
     refine_poses: RefinePosesSettings
-    own_car_polygons: dict[str, tuple[tuple[float, float], ...]]
     random_seed: int

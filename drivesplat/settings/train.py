@@ -66,6 +66,19 @@ class FloaterSettings(Settings):
     """Iterations between prunings."""
 
 
+class ExposureSettings(Settings):
+    """Cameras of one rig expose and white-balance by themselves, which shows as seams where their images meet."""
+
+    kind: Literal["none", "affine"] = "none"
+    """'affine': for every camera but eval_camera, which is the reference, a gain and an offset of each colour channel
+    are learned and applied to what it shows. With one camera there is nothing to learn."""
+    learning_rate: float = Field(2e-3, gt=0)
+    """Learning rate of log gains and offsets; decays exponentially to a hundredth."""
+    weight: float = Field(0.1, ge=0)
+    """Weight of the mean square of a camera's log gains and offsets (1 = full scale) in the loss: what exposure need
+    not explain it does not."""
+
+
 class TrainSettings(Settings):
     iterations: int = Field(15_000, ge=1, le=1_000_000)
     """Optimisation steps, one image each. Vanilla measures the same from 7,000 to 30,000 on scene 0061, held out."""
@@ -81,6 +94,7 @@ class TrainSettings(Settings):
     mcmc: McmcSettings = McmcSettings()
     default: DefaultSettings = DefaultSettings()
     floaters: FloaterSettings = FloaterSettings()
+    exposure: ExposureSettings = ExposureSettings()
     refine_start: float = Field(0.0167, ge=0, le=1)
     """Densification starts after this fraction of the iterations."""
     refine_stop: float = Field(0.833, ge=0, le=1)
@@ -134,3 +148,5 @@ class TrainJob(Settings):
     sky: SkyKind
     train: TrainSettings
     random_seed: int
+    reference_camera: str | None = None
+    """The camera whose exposure is that of the model, where exposures are learned; None where they are not."""

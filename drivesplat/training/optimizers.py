@@ -9,23 +9,24 @@ from drivesplat.model.splat_model import SplatModel
 
 Optimizers = dict[str, torch.optim.Optimizer]
 
-MEANS_DECAY = 0.01
-"""Positions learn at the end at this fraction of their initial rate."""
+DECAY = 0.01
+"""Positions and exposures learn at the end at this fraction of their initial rate."""
 
 
 @dataclass
 class ModelOptimizers:
-    """`parts[i]` belongs to the Gaussians of part i of the model, `shared[i]` to what they share, `sky` to its sky."""
+    """`parts[i]` belongs to the Gaussians of part i of the model, `shared[i]` to what they share, `beside_parts`, by
+    name, to what the model learns beside them: its sky, its cameras' exposure."""
 
     parts: list[Optimizers]
     shared: list[Optimizers]
-    sky: Optimizers
+    beside_parts: dict[str, Optimizers]
 
     def all(self) -> list[tuple[str, torch.optim.Optimizer]]:
         return [
             *((f"{i}.{k}", o) for i, group in enumerate(self.parts) for k, o in group.items()),
             *((f"{i}.shared.{k}", o) for i, group in enumerate(self.shared) for k, o in group.items()),
-            *((f"sky.{k}", o) for k, o in self.sky.items()),
+            *((f"{name}.{k}", o) for name, group in self.beside_parts.items() for k, o in group.items()),
         ]
 
     def step(self) -> None:
@@ -38,7 +39,7 @@ def make_optimizers(model: SplatModel) -> ModelOptimizers:
     return ModelOptimizers(
         parts=[_adams(part.params, part.learning_rates()) for part in model.parts],
         shared=[_adams(part.shared, part.learning_rates()) for part in model.parts],
-        sky=_adams(model.sky.params, model.sky.learning_rates()) if model.sky is not None else {},
+        beside_parts={name: _adams(it.params, it.learning_rates()) for name, it in model.beside_parts.items()},
     )
 
 
@@ -51,7 +52,10 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
 
 
 def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, iterations: int) -> None:
-    """Sets the learning rates of `step`: positions decay exponentially, the rest stay."""
+    """Sets the learning rates of `step`: those of positions and exposures decay exponentially, the rest stay."""
+    left = DECAY ** (step / iterations)
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         if "means" in group:
-            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * MEANS_DECAY ** (step / iterations)
+            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * left
+    for camera, optimizer in optimizers.beside_parts.get("exposure", {}).items():
+        optimizer.param_groups[0]["lr"] = model.exposure.learning_rates()[camera] * left

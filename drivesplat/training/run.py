@@ -15,7 +15,7 @@ from drivesplat.masks import read_classes, read_labels, read_masks_record, read_
 from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size, read_parser
-from drivesplat.regions import region_mask
+from drivesplat.regions import LABELS, region_mask
 from drivesplat.seeding.actors import read_actors
 from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
@@ -23,19 +23,21 @@ from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
 from drivesplat.training.train import Workspace, train
-from drivesplat.training.views import Guides, TrainingView, load_views
+from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
 
 
 @dataclass(frozen=True)
 class TrainingInputs:
     """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
-    has no use for them), the folder of masks, and how many `classes` the user's maps there tell apart (0: none)."""
+    has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), and the
+    cameras that see the own car."""
 
     parser: dict[str, Any]
     masks: Path
     actors: list[dict[str, Any]]
     lidar_depth: list[dict[str, np.ndarray]]
     classes: int = 0
+    seeing_own_car: frozenset[str] = frozenset()
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
@@ -45,6 +47,7 @@ class TrainingInputs:
             moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
             classes={i: read_classes(self.masks, *self._image(i)) for i in images} if self.told_apart(job) else {},
+            own_car={i: self._own_car(i) for i in images if camera_of(self.parser, i) in self.seeing_own_car},
         )
 
     def told_apart(self, job: TrainJob) -> int:
@@ -54,14 +57,23 @@ class TrainingInputs:
     def _sky(self, index: int) -> np.ndarray:
         return read_sky_mask(self.masks, *self._image(index))
 
+    def exposed(self, job: TrainJob) -> tuple[str, ...]:
+        """The cameras with training images whose exposure `job` learns: all but the reference."""
+        if job.reference_camera is None:
+            return ()
+        seen = {camera_of(self.parser, int(i)) for i in self.parser["splits"]["train"]}
+        return tuple(sorted(seen - {job.reference_camera}))
+
+    def _own_car(self, index: int) -> np.ndarray:
+        return read_labels(self.masks, *self._image(index)) == LABELS["own_car"]
+
     def _moving(self, index: int) -> np.ndarray:
         labels = read_labels(self.masks, *self._image(index))
         return region_mask(labels, "moving_vehicle") | region_mask(labels, "moving_human")
 
     def _image(self, index: int) -> tuple[str, int, tuple[int, int]]:
         """Camera, timestamp and size of an image."""
-        camera = self.parser["camera_names"][self.parser["camera_indices"][index]]
-        return camera, int(self.parser["timestamps"][index]), image_size(self.parser, index)
+        return camera_of(self.parser, index), int(self.parser["timestamps"][index]), image_size(self.parser, index)
 
 
 def read_inputs(
@@ -79,6 +91,7 @@ def read_inputs(
         [actor for record in moving for actor in record["actors"]],
         [image for record in depths for image in record["images"]],
         made["semantic_classes"],
+        frozenset(made["own_car"]),
     )
     records = [packed, made, *moving, *depths]
     return inputs, [record["provenance"] for record in records]
@@ -111,7 +124,11 @@ def run_training(
         with telling_out_of_memory(lambda: 0):
             views = load_views(inputs.parser, inputs.guides(job), device)
         settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
-        beginnings = Beginnings(inputs.parser, inputs.actors, mean_sky_color(views), inputs.told_apart(job))
+        beginnings = Beginnings(
+            inputs.parser, inputs.actors, mean_sky_color(views), inputs.told_apart(job), inputs.exposed(job)
+        )
+        if not learns_from_sky_masks(job):
+            views = [dataclasses.replace(view, sky=None) for view in views]
         model = build_model(beginnings, job.parts, job.sky, settings)
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
@@ -152,6 +169,12 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
     model, _ = trained_model(checkpoint)
     with telling_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device
+
+
+def learns_from_sky_masks(job: TrainJob) -> bool:
+    """Whether a term of the loss looks at sky masks; otherwise only the sky's first colour does, and the device need
+    not hold them, a byte a pixel, while it trains."""
+    return job.sky == "mask" or job.train.sky_bce_weight > 0
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:

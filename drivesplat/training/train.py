@@ -117,7 +117,8 @@ class Trainer:
 class TrainingSummary:
     """What `train.json` says of a finished training.
 
-    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too.
+    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too; `exposure` has the gains and offsets
+    that were learned for cameras, by name.
     """
 
     iterations: int
@@ -127,6 +128,7 @@ class TrainingSummary:
     device: str
     random_seed: int
     resumed_at: list[int]
+    exposure: dict[str, float]
 
 
 def train(
@@ -209,7 +211,16 @@ class Run:
         if on_gpu:
             torch.cuda.synchronize(t.device)
         peak = torch.cuda.max_memory_allocated(t.device) / 1e9 if on_gpu else None
-        return TrainingSummary(t.step, self.seconds, len(t.model), peak, device_name(t.device), t.seed, self.resumed_at)
+        return TrainingSummary(
+            iterations=t.step,
+            seconds=self.seconds,
+            gaussians=len(t.model),
+            peak_gpu_memory_gb=peak,
+            device=device_name(t.device),
+            random_seed=t.seed,
+            resumed_at=self.resumed_at,
+            exposure=exposures_of(t.model),
+        )
 
 
 def _iterate(run: Run, monitor: Monitor) -> None:
@@ -239,4 +250,10 @@ def _iterate(run: Run, monitor: Monitor) -> None:
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
     losses = {f"loss/{name}": float(value.detach()) for name, value in terms.items()}
-    return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model))}
+    exposures = {f"exposure/{name}": value for name, value in exposures_of(trainer.model).items()}
+    return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model)), **exposures}
+
+
+def exposures_of(model: SplatModel) -> dict[str, float]:
+    """The gains and offsets that a model has learned for cameras, by name; none where it learns none."""
+    return model.exposure.figures() if model.exposure is not None else {}
