@@ -109,8 +109,8 @@ def distances(actors: Actors, thing: Thing, pose: np.ndarray, time: float) -> np
 
 
 def test_an_object_is_found_in_its_own_frame_from_images_of_it_passing_by():
-    """Places from 0.08 m off to within half a centimetre of each other and colours from grey to within 1 % on the whole,
-    none of them far off. The object as a whole and its track, which is right, may lean against each other by a
+    """Places from 0.08 m off to within half a centimetre of each other and colours from grey to within 1 % on the
+    whole, none of them far off. The object as a whole and its track, which is right, may lean against each other by a
     centimetre or two: images cannot tell, and the track's penalty draws them back slowly. In the world it is there."""
     thing, motion = a_thing(), passing_by()
     actors = guessed(thing, motion, ActorSettings(sh_degree=0, fourier=1))
@@ -142,7 +142,7 @@ def turned(pose: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("mistake", [pytest.param(shifted, id="0.3 m off"), pytest.param(turned, id="0.25 rad off")])
 def test_a_wrong_annotation_among_right_ones_is_corrected(mistake: Callable[[np.ndarray], np.ndarray]):
     """Less than a third of the error at its key frame is left, and nine tenths of it without corrections. Elsewhere the
-    object stays where it is. Annotations are trusted little here, since so few iterations hardly move them otherwise."""
+    object stays where it is. Annotations are trusted little here: so few iterations hardly move them otherwise."""
     thing, motion = a_thing(), passing_by()
     poses, wrong = motion.object_to_world, motion.object_to_world.copy()
     wrong[4] = mistake(poses[4])

@@ -59,7 +59,8 @@ class Trial:
 
 
 def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, threads: int = 1) -> Refinement:
-    """The refinement of a scene, to which the own car's body contributes nothing. Logs a warning, and keeps the given poses, where images cannot improve them.
+    """The refinement of a scene; features on the own car's body are left out. Logs a warning, and keeps the given poses,
+    where images cannot improve them.
 
     Raises DatasetError where an image cannot be read, or a camera is not fixed to the car.
     """
