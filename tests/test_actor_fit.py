@@ -12,7 +12,8 @@ import torch
 from hand_made import about_z, looking_at, motion_through, track_of
 
 from drivesplat.model.actors import Actors
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.motion import Motion
 from drivesplat.rasterize import rasterize
 from drivesplat.settings.actors import ActorSettings, TrackSettings

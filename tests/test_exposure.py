@@ -165,11 +165,13 @@ def test_a_resumed_training_of_exposures_is_the_same_training(tmp_path):
     resumed, again = trained(tmp_path / "it", settings, rig_views(), model=exposed(settings))
     assert again.resumed_at == [CHECKPOINT_AT] and again.iterations == ITERATIONS
     assert same_parameters(resumed, whole)
-    assert summary.exposure == again.exposure and summary.exposure["BACK/gain_red"] != 1.0
+    assert summary.of_cameras == again.of_cameras and summary.of_cameras["exposure/BACK/gain_red"] != 1.0
     board = EventAccumulator(str(tmp_path / "whole/tensorboard"))
     board.Reload()
-    assert {f"exposure/{name}" for name in summary.exposure} < set(board.Tags()["scalars"])
-    assert board.Scalars("exposure/BACK/gain_red")[-1].value == pytest.approx(summary.exposure["BACK/gain_red"])
+    assert set(summary.of_cameras) < set(board.Tags()["scalars"])
+    assert board.Scalars("exposure/BACK/gain_red")[-1].value == pytest.approx(
+        summary.of_cameras["exposure/BACK/gain_red"]
+    )
 
 
 def test_exposures_learn_ever_more_slowly():

@@ -11,7 +11,8 @@ from skimage.metrics import structural_similarity
 
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky, CubemapSky
-from drivesplat.model.splat_model import Picture, SplatModel, View
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.losses import (

@@ -22,7 +22,8 @@ from drivesplat.extract import extract_scene
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import Picture, SplatModel, View
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
 from drivesplat.regions import LABELS, is_dynamic
 from drivesplat.rigid import rigid
 from drivesplat.scene import Frame

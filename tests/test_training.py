@@ -26,8 +26,9 @@ from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.masks import mask_name
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import View
 from drivesplat.rasterize import rasterize
 from drivesplat.regions import LABELS
 from drivesplat.settings.actors import ActorSettings

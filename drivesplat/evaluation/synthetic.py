@@ -14,7 +14,8 @@ from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics
 from drivesplat.images import continuous_intrinsics, read_image
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.recording import Recording
 from drivesplat.regions import fill, hull_of, label_image, region_masks
 from drivesplat.rigid import inverse

@@ -59,7 +59,7 @@ class Trial:
 
 
 def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, threads: int = 1) -> Refinement:
-    """The refinement of a scene; features on the own car's body are left out. Logs a warning, and keeps the given poses,
+    """The refinement of a scene; features on the own car do not count. Logs a warning, and keeps the given poses,
     where images cannot improve them.
 
     Raises DatasetError where an image cannot be read, or a camera is not fixed to the car.

@@ -6,6 +6,7 @@ from pydantic import AfterValidator, Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.actors import ActorSettings
+from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.gaussians import GaussianSettings
 
 PartName = Literal["background", "actors"]
@@ -95,6 +96,7 @@ class TrainSettings(Settings):
     default: DefaultSettings = DefaultSettings()
     floaters: FloaterSettings = FloaterSettings()
     exposure: ExposureSettings = ExposureSettings()
+    camera_poses: CameraPoseSettings = CameraPoseSettings()
     refine_start: float = Field(0.0167, ge=0, le=1)
     """Densification starts after this fraction of the iterations."""
     refine_stop: float = Field(0.833, ge=0, le=1)

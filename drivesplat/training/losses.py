@@ -44,9 +44,10 @@ def loss_terms(
     logits = model.class_logits(picture, view.view) if view.classes is not None else None
     if logits is not None:
         terms["semantic"] = settings.semantic_weight * class_cross_entropy(logits, view.classes)
-    paid = model.exposure.penalty(view.view.camera) if model.exposure is not None else None
-    if paid is not None:
-        terms["exposure"] = paid
+    for name, learned in (("exposure", model.exposure), ("camera_poses", model.camera_poses)):
+        paid = learned.penalty(view.view.camera) if learned is not None else None
+        if paid is not None:
+            terms[name] = paid
     return {**terms, **_moving_terms(picture, target, view, model, settings)}
 
 

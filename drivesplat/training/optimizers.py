@@ -10,13 +10,14 @@ from drivesplat.model.splat_model import SplatModel
 Optimizers = dict[str, torch.optim.Optimizer]
 
 DECAY = 0.01
-"""Positions and exposures learn at the end at this fraction of their initial rate."""
+"""Positions, and what is learned of cameras, learn at the end at this fraction of their initial rate."""
+OF_CAMERAS = ("exposure", "camera_poses")
 
 
 @dataclass
 class ModelOptimizers:
     """`parts[i]` belongs to the Gaussians of part i of the model, `shared[i]` to what they share, `beside_parts`, by
-    name, to what the model learns beside them: its sky, its cameras' exposure."""
+    name, to what the model learns beside them: its sky, its cameras' exposure and poses."""
 
     parts: list[Optimizers]
     shared: list[Optimizers]
@@ -52,10 +53,11 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
 
 
 def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, iterations: int) -> None:
-    """Sets the learning rates of `step`: those of positions and exposures decay exponentially, the rest stay."""
+    """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, the rest stay."""
     left = DECAY ** (step / iterations)
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         if "means" in group:
             group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * left
-    for camera, optimizer in optimizers.beside_parts.get("exposure", {}).items():
-        optimizer.param_groups[0]["lr"] = model.exposure.learning_rates()[camera] * left
+    for name in OF_CAMERAS:
+        for camera, optimizer in optimizers.beside_parts.get(name, {}).items():
+            optimizer.param_groups[0]["lr"] = model.beside_parts[name].learning_rates()[camera] * left

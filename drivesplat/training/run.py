@@ -125,7 +125,12 @@ def run_training(
             views = load_views(inputs.parser, inputs.guides(job), device)
         settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
         beginnings = Beginnings(
-            inputs.parser, inputs.actors, mean_sky_color(views), inputs.told_apart(job), inputs.exposed(job)
+            inputs.parser,
+            inputs.actors,
+            mean_sky_color(views),
+            inputs.told_apart(job),
+            inputs.exposed(job),
+            _times_by_camera(views) if job.train.camera_poses.corrected else {},
         )
         if not learns_from_sky_masks(job):
             views = [dataclasses.replace(view, sky=None) for view in views]
@@ -169,6 +174,14 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
     model, _ = trained_model(checkpoint)
     with telling_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device
+
+
+def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
+    """By camera the seconds of its training images, increasing."""
+    times: dict[str, set[float]] = {}
+    for view in views:
+        times.setdefault(view.view.camera, set()).add(view.view.time)
+    return {camera: sorted(at) for camera, at in sorted(times.items())}
 
 
 def learns_from_sky_masks(job: TrainJob) -> bool:

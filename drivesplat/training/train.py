@@ -117,8 +117,8 @@ class Trainer:
 class TrainingSummary:
     """What `train.json` says of a finished training.
 
-    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too; `exposure` has the gains and offsets
-    that were learned for cameras, by name.
+    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too; `of_cameras` has what was learned of
+    each camera, by name: gains and offsets, how far poses were corrected.
     """
 
     iterations: int
@@ -128,7 +128,7 @@ class TrainingSummary:
     device: str
     random_seed: int
     resumed_at: list[int]
-    exposure: dict[str, float]
+    of_cameras: dict[str, float]
 
 
 def train(
@@ -219,7 +219,7 @@ class Run:
             device=device_name(t.device),
             random_seed=t.seed,
             resumed_at=self.resumed_at,
-            exposure=exposures_of(t.model),
+            of_cameras=learned_of_cameras(t.model),
         )
 
 
@@ -250,10 +250,16 @@ def _iterate(run: Run, monitor: Monitor) -> None:
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
     losses = {f"loss/{name}": float(value.detach()) for name, value in terms.items()}
-    exposures = {f"exposure/{name}": value for name, value in exposures_of(trainer.model).items()}
-    return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model)), **exposures}
+    of_cameras = learned_of_cameras(trainer.model)
+    return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model)), **of_cameras}
 
 
-def exposures_of(model: SplatModel) -> dict[str, float]:
-    """The gains and offsets that a model has learned for cameras, by name; none where it learns none."""
-    return model.exposure.figures() if model.exposure is not None else {}
+def learned_of_cameras(model: SplatModel) -> dict[str, float]:
+    """What a model has learned of cameras, by name: 'exposure/CAM_BACK/gain_red', 'camera_poses/CAM_FRONT/shift_m'."""
+    learned = {"exposure": model.exposure, "camera_poses": model.camera_poses}
+    return {
+        f"{kind}/{name}": value
+        for kind, module in learned.items()
+        if module is not None
+        for name, value in module.figures().items()
+    }

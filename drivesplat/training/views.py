@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from drivesplat.images import read_image
-from drivesplat.model.splat_model import View
+from drivesplat.model.view import View
 from drivesplat.parser import image_size
 
 
