@@ -7,7 +7,7 @@ import fcntl
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +22,7 @@ from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.stages import (
     METHOD_STAGES,
     SCENE_STAGES,
-    TRAINING_INPUTS,
+    SIDE_BY_SIDE,
     idle_variants,
     no_such_edit,
     no_such_film,
@@ -177,17 +177,21 @@ class Plan:
     def expected_stages(self) -> str:
         """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what
         else is stale."""
-        codes = {stage: self.code(stage) for stage in (*SCENE_STAGES, *TRAINING_INPUTS, *METHOD_STAGES)}
-        return canonical_json({scene: self._stages(scene, codes) for scene in self.config.batch_scenes})
+        return canonical_json({scene: self._metrics_stages(scene) for scene in self.config.batch_scenes})
 
-    def _stages(self, scene: str, codes: Mapping[str, str]) -> dict[str, Any]:
-        taken = {stage for method in self.config.methods for stage in training_inputs(self.config, scene, method)}
-        stages = {stage: (stage, None) for stage in (*SCENE_STAGES, *taken)}
-        stages |= {f"{method}/{stage}": (stage, method) for method in self.config.methods for stage in METHOD_STAGES}
-        return {
-            name: {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": codes[stage]}
-            for name, (stage, method) in stages.items()
-        }
+    def _metrics_stages(self, scene: str) -> dict[str, Any]:
+        methods = self.evaluation_stages(scene, self.config.methods)
+        return {**methods, SIDE_BY_SIDE: self._stage(SIDE_BY_SIDE, scene)}
+
+    def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
+        """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
+        taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
+        stages = {(stage, None): stage for stage in (*SCENE_STAGES, *sorted(taken)) if stage != SIDE_BY_SIDE}
+        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in METHOD_STAGES}
+        return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
+
+    def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:
+        return {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": self.code(stage)}
 
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know, or

@@ -30,6 +30,8 @@ from drivesplat.storage import canonical_json
 SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
+SIDE_BY_SIDE = "scene_metrics"
+"""The one of them that no eval.json comes from."""
 TRAINING_INPUTS = ("actors", "lidar_depth")
 """Stages of a scene that only some methods train on."""
 
