@@ -1,11 +1,10 @@
 """The stage `ablation`: what each thing in a method is worth, from trainings of the method without it."""
 
-import csv
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from drivesplat import storage
 from drivesplat.comparison import (
     PSNRS,
     WHERE,
@@ -21,7 +20,6 @@ from drivesplat.comparison import (
 from drivesplat.evaluation.scene_metrics import side_by_side
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.settings.ablation import AblationJob
-from drivesplat.storage import atomic_write
 
 COSTS = ("gaussians", "train_seconds")
 
@@ -51,12 +49,7 @@ def _row(runs: list[dict[str, Any]], whole: list[dict[str, Any]] | None) -> dict
 def write_csv(path: str | Path, record: dict[str, Any]) -> None:
     """The rows of an ablation as a table; empty cells where a figure is null."""
     lines = [dict(_cells(row, record)) for row in record["rows"]]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(lines[0]))
-    writer.writeheader()
-    writer.writerows(lines)
-    with atomic_write(path) as file:
-        file.write(text.getvalue().encode())
+    storage.write_csv(path, list(lines[0]), lines)
 
 
 def _cells(row: dict[str, Any], record: dict[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -153,26 +153,27 @@ class Plan:
 
     def films(self, scenes: list[str]) -> list[str]:
         """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
+        return self._films(scenes, self._films_of)
+
+    def edits(self, scenes: list[str]) -> list[str]:
+        """The films of every edit of `scenes`, by every method that can be edited."""
+        return self._films(scenes, self._edits_of)
+
+    def _films(self, scenes: list[str], names_of: Callable[[str, str], list[str]]) -> list[str]:
         return [
-            f"{self.config.results_dir}/{scene}/{method}/{film}.mp4"
+            f"{self.config.results_dir}/{scene}/{method}/{name}.mp4"
             for scene in scenes
             for method in self.config.methods
-            for film in self._films_of(scene, method)
+            for name in names_of(scene, method)
         ]
 
     def _films_of(self, scene: str, method: str) -> list[str]:
         parts = [PARTS_FILM] if method in self.methods_with_actors else []
         return [*for_scene(self.config, scene).render.trajectories, *parts]
 
-    def edits(self, scenes: list[str]) -> list[str]:
-        """The films of every edit of `scenes`, by every method that can be edited."""
-        return [
-            f"{self.config.results_dir}/{scene}/{method}/edits/{edit}.mp4"
-            for scene in scenes
-            for method in self.config.methods
-            if method in self.methods_with_actors
-            for edit in scene_edits(self.config, scene)
-        ]
+    def _edits_of(self, scene: str, method: str) -> list[str]:
+        edits = scene_edits(self.config, scene) if method in self.methods_with_actors else {}
+        return [f"edits/{edit}" for edit in edits]
 
     def expected_stages(self) -> str:
         """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what

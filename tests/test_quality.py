@@ -14,7 +14,7 @@ import yaml
 from hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_evaluation
 from workflow_copy import TINY_TRAINING, WorkflowCopy
 
-from benchmarks.quality import measure
+from benchmarks.quality import main, measure
 from drivesplat.errors import ConfigError
 from drivesplat.quality.compare import quality
 from drivesplat.quality.results import results_of
@@ -208,6 +208,53 @@ def test_the_record_holds_every_seeds_figures_and_where_they_came_from(compared)
         [0, 1],
         {"sky": "none"},
     )
+
+
+@pytest.fixture
+def called(tmp_path, monkeypatch):
+    """Calls the command with these words for Snakemake, whose run leaves the results of these recipes; returns the exit
+    status, and what Snakemake was told."""
+
+    def call(words: list[str], done: tuple[str, ...] = ("plain", "street"), status: int = 0) -> tuple[int, list[str]]:
+        recipe_file(tmp_path, recipes=TWO)
+        told: list[str] = []
+
+        def run(group, arguments, workflow) -> Outcome:
+            told.extend(arguments)
+            for recipe in done:
+                for seed, content in enumerate(EVALS[recipe]):
+                    write_evaluation(group, recipe, seed, content)
+            return Outcome(status, None, {})
+
+        monkeypatch.setattr("benchmarks.quality.run", run)
+        monkeypatch.chdir(REPOSITORY)
+        return main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), *words]), told
+
+    return call
+
+
+def test_the_command_hands_on_what_is_snakemakes_and_writes_page_and_record(called, tmp_path, capsys):
+    assert called(["--", "--cores", "4", "--resources", "gpu=2"]) == (0, ["--cores", "4", "--resources", "gpu=2"])
+    page = (tmp_path / "out/quality.md").read_text(encoding="utf-8")
+    record = json.loads((tmp_path / "out/quality.json").read_text())
+    assert page == markdown(record) and page in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("done", "status", "expected"), [(("plain",), 0, 1), (("plain", "street"), 7, 7)])
+def test_the_exit_status_says_whether_all_is_there(called, done, status, expected):
+    assert called(["--", "--cores", "4"], done, status)[0] == expected
+
+
+def test_a_dry_run_writes_nothing(called, tmp_path):
+    assert called(["--", "-n"], done=())[0] == 0
+    assert not list((tmp_path / "out").glob("quality.*"))
+
+
+def test_results_lie_by_the_files_name_unless_told_otherwise(monkeypatch, capsys):
+    places = []
+    monkeypatch.setattr("benchmarks.quality.measure", lambda file, out, words, workflow: places.append(out) or 0)
+    assert main(["a/mine.yaml"]) == main(["a/mine.yaml", "--out", "there", "--", "-n"]) == 0
+    assert places == [Path("results/quality/mine"), Path("there")]
 
 
 def test_it_is_called_where_snakemake_is(tmp_path):
