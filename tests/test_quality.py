@@ -17,7 +17,7 @@ from workflow_copy import TINY_TRAINING, WorkflowCopy
 from benchmarks.quality import main, measure
 from drivesplat.errors import ConfigError
 from drivesplat.quality.compare import quality
-from drivesplat.quality.results import results_of
+from drivesplat.quality.results import Result, results_of
 from drivesplat.quality.runs import Outcome
 from drivesplat.quality.table import markdown
 
@@ -159,6 +159,18 @@ def test_what_recipes_are_trained_on_belongs_to_their_rows(compared, change, cel
     text = markdown(record)
     assert rows(text)[-1][3][2:5] == cells and rows(text)[-1][2][2:5] == ["31", "no", "nuscenes"]
     assert ("poses: nuscenes, refined" in text) == ("poses" in change)
+
+
+def test_seconds_of_trainings_that_shared_a_card_say_so(tmp_path):
+    file, _ = recipe_file(tmp_path, recipes=TWO)
+    results = [
+        Result(recipe, seed, tmp_path, {**content, "provenance": {}}, shared=(recipe, seed) == ("street", 1))
+        for recipe in TWO
+        for seed, content in enumerate(EVALS[recipe])
+    ]
+    text = markdown(quality(file, results))
+    assert [line[7] for line in rows(text)[2][2:]] == ["60 s", "110 s, shared"]
+    assert "\n\nShared: while it was trained another job ran on the same card" in text
 
 
 def test_a_recipe_that_failed_is_named_with_its_reason_and_the_others_stand(compared):

@@ -37,6 +37,7 @@ def test_a_failed_job_is_told_of_the_method_it_belongs_to():
     ended = outcome(1, FAILED)
     assert ended.why("b-seed1") == "train: out of GPU memory with 9,000 Gaussians: lower it"
     assert ended.why("b-seed0") is ended.why("a-b-seed1") is None
+    assert outcome(1, FAILED.replace("b-seed1/", "a-b-seed1/")).why("b-seed1") is None
     assert outcome(1, FAILED.replace("ERROR drivesplat.job", "INFO drivesplat.job")).why("b-seed1") is None
 
 
@@ -132,12 +133,14 @@ def test_a_file_that_is_no_evaluation_is_named(groups, content):
 
 
 def write_log(group, recipe: str, seed: int, began: str, finished: str, card: str | None, stage: str = "train") -> Path:
+    """What a job logs that had its card from `began` on; for a card it has waited since nine."""
     path = group.log(recipe, seed, stage)
     path.parent.mkdir(parents=True, exist_ok=True)
-    took = f"2026-11-21 {began},500 INFO drivesplat.cards: runs on the GPU 0 ({card})\n" if card else ""
+    took = f"2026-11-21 {began},000 INFO drivesplat.cards: runs on the GPU 0 ({card})\n" if card else ""
     name = f"{recipe}-seed{seed}/{stage} 0061"
+    started = "09:00:00" if card else began
     path.write_text(
-        f"2026-11-21 {began},000 INFO drivesplat.job: {name} begins\n{took}a line of a traceback\n"
+        f"2026-11-21 {started},000 INFO drivesplat.job: {name} begins\n{took}a line of a traceback\n"
         f"2026-11-21 {finished},000 INFO drivesplat.job: {name} ends\n"
     )
     return path
