@@ -4,8 +4,9 @@
 # make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
 # make test-gpu   what needs a GPU: the rasterizers agree, trainings resume
 # make bench      what the benchmarks/ measure, against their bounds (two idle cores)
+# make quality    RECIPES=file: recipes trained with several seeds on one scene, and their table (docs/quality.md)
 # make config     config.yaml and config.schema.json from the settings' definitions
-.PHONY: demo setup doctor test lint test-gpu bench config
+.PHONY: demo setup doctor test lint test-gpu bench quality config
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -36,6 +37,11 @@ test-gpu:
 
 bench: setup
 	$(BIN)/python -m pytest benchmarks -q
+
+# SNAKEMAKE="--resources gpu=8 --scheduler greedy": further arguments of Snakemake
+quality: setup
+	@test -n "$(RECIPES)" || { echo "make quality RECIPES=benchmarks/recipes/demo.yaml" >&2; exit 2; }
+	$(BIN)/python -m benchmarks.quality $(RECIPES) -- --cores $(CORES) $(SNAKEMAKE)
 
 config: setup
 	$(BIN)/python -m drivesplat.config_document

@@ -5,7 +5,7 @@ from them (`python -m drivesplat.config_document`). Importing this module is che
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,10 +24,11 @@ from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.looks import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.masks import MaskSettings
-from drivesplat.settings.method import MethodSettings
+from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings
 from drivesplat.settings.overrides import merged
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
+from drivesplat.settings.scene_name import require_text
 from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.world import WorldSettings
 
@@ -45,7 +46,6 @@ DEMO_OVERRIDES = {
 }
 """What makes the demo world train, and its films render, in minutes on a CPU."""
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
-VARIANT_OVERRIDES = ("sky", "train")
 
 
 class DatasetSettings(Settings):
@@ -80,12 +80,7 @@ class DatasetSettings(Settings):
     @classmethod
     def _scenes_are_quoted(cls, value: Any) -> Any:
         for scene in value if isinstance(value, (list, tuple)) else ():
-            if not isinstance(scene, str):
-                octal = f'"{scene:04o}" or ' if isinstance(scene, int) else ""
-                raise ValueError(
-                    f'scene numbers are strings: put {octal}"{scene:0>4}" in quotes, '
-                    "since bare YAML reads 0061 as octal 49"
-                )
+            require_text(scene)
         return value
 
     @model_validator(mode="after")
@@ -179,7 +174,7 @@ class Config(Settings):
         owners: dict[str, str] = {}
         for name, dataset in self.datasets.items():
             for scene in dataset.scenes:
-                _require_name(scene, "scene")
+                require_name(scene, "scene")
                 if owners.setdefault(scene, name) != name:
                     raise ValueError(
                         f"scene {scene!r} is in two datasets, {owners[scene]} and {name}; rename or drop one"
@@ -191,7 +186,7 @@ class Config(Settings):
             raise ValueError("two datasets make their world in the same dataroot; give each its own")
         for kind, names in (("method", self.methods), ("trajectory", self.render.trajectories)):
             for name in names:
-                _require_name(name, kind)
+                require_name(name, kind)
         if "parts" in self.render.trajectories:
             raise ValueError("a trajectory cannot be called 'parts': the name is kept for the film of a method's parts")
         for scene in self.subjects:
@@ -204,7 +199,7 @@ class Config(Settings):
     @model_validator(mode="after")
     def _variants_have_names_of_their_own(self) -> "Config":
         for name in self.ablation.without:
-            _require_name(name, "variant")
+            require_name(name, "variant")
         for name in self.ablated:
             if name in self.methods:
                 raise ValueError(f"method {name!r} is called like a variant of the ablation; rename it")
@@ -242,7 +237,8 @@ class Config(Settings):
         )
 
 
-def _require_name(name: str, kind: str) -> None:
+def require_name(name: str, kind: str) -> None:
+    """Raises ValueError where `name`, of some `kind` of thing, cannot name a folder."""
     if not re.match(NAME, name) or name in ("logs", "benchmarks"):
         raise ValueError(f"{kind} {name!r} cannot name a folder: use letters, digits, '_', '-' and '.'")
 
@@ -254,10 +250,10 @@ def load(values: Mapping[str, Any]) -> Config:
     for kind, named, allowed in (
         ("datasets", config.datasets, DATASET_OVERRIDES),
         ("methods", config.methods, METHOD_OVERRIDES),
-        ("ablation.without", variants, VARIANT_OVERRIDES),
+        ("ablation.without", variants, VARIATION_OVERRIDES),
     ):
         for name, item in named.items():
-            _require_known(item.overrides, allowed, f"{kind}.{name}.overrides")
+            require_known(item.overrides, allowed, f"{kind}.{name}.overrides")
             _overridden(config, item.overrides, f"{kind}.{name}.overrides")
     return config
 
@@ -275,7 +271,8 @@ def _overridden(config: Config, overrides: Mapping[str, Any], where: str) -> Con
     return validated(Config, merged(config.model_dump(), overrides), f"(with {where}) ")
 
 
-def _require_known(overrides: Mapping[str, Any], allowed: tuple[str, ...], where: str) -> None:
+def require_known(overrides: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
+    """Raises ConfigError where the tree of overrides at `where` sets what it may not."""
     for key in overrides:
         if key not in allowed:
             raise ConfigError(f"'{where}.{key}' cannot be set there; what can: {', '.join(allowed)}")

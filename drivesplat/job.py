@@ -79,15 +79,18 @@ def job(snakemake: Any) -> Iterator[Job]:
     logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
     logging.captureWarnings(True)
     current = Job(snakemake)
+    log = logging.getLogger(__name__)
+    log.info("%s begins", current.name)
     try:
         yield current
+        log.info("%s ends", current.name)
     except DriveSplatError as error:
-        logging.getLogger(__name__).error("%s: %s", current.name, error)
+        log.error("%s: %s", current.name, error)
         sys.exit(1)
     except Exception as error:
         handler.stream.write(traceback.format_exc())
         message = "%s: %s: %s (a bug; the traceback is in %s)"
-        logging.getLogger(__name__).error(message, current.name, type(error).__name__, error, log_path)
+        log.error(message, current.name, type(error).__name__, error, log_path)
         sys.exit(1)
     finally:
         logging.shutdown()

@@ -7,7 +7,7 @@ import fcntl
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,9 +20,8 @@ from drivesplat.rerun import code_digest
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.stages import (
-    ALL_SCENE_STAGES,
     METHOD_STAGES,
-    TRAINING_INPUTS,
+    SIDE_BY_SIDE,
     idle_variants,
     no_such_edit,
     no_such_film,
@@ -166,41 +165,46 @@ class Plan:
 
     def films(self, scenes: list[str]) -> list[str]:
         """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
+        return self._films(scenes, self._films_of)
+
+    def edits(self, scenes: list[str]) -> list[str]:
+        """The films of every edit of `scenes`, by every method that can be edited."""
+        return self._films(scenes, self._edits_of)
+
+    def _films(self, scenes: list[str], names_of: Callable[[str, str], list[str]]) -> list[str]:
         return [
-            f"{self.config.results_dir}/{scene}/{method}/{film}.mp4"
+            f"{self.config.results_dir}/{scene}/{method}/{name}.mp4"
             for scene in scenes
             for method in self.config.methods
-            for film in self._films_of(scene, method)
+            for name in names_of(scene, method)
         ]
 
     def _films_of(self, scene: str, method: str) -> list[str]:
         parts = [PARTS_FILM] if method in self.methods_with_actors else []
         return [*for_scene(self.config, scene).render.trajectories, *parts]
 
-    def edits(self, scenes: list[str]) -> list[str]:
-        """The films of every edit of `scenes`, by every method that can be edited."""
-        return [
-            f"{self.config.results_dir}/{scene}/{method}/edits/{edit}.mp4"
-            for scene in scenes
-            for method in self.config.methods
-            if method in self.methods_with_actors
-            for edit in scene_edits(self.config, scene)
-        ]
+    def _edits_of(self, scene: str, method: str) -> list[str]:
+        edits = scene_edits(self.config, scene) if method in self.methods_with_actors else {}
+        return [f"edits/{edit}" for edit in edits]
 
     def expected_stages(self) -> str:
         """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what
         else is stale."""
-        codes = {stage: self.code(stage) for stage in (*ALL_SCENE_STAGES, *TRAINING_INPUTS, *METHOD_STAGES)}
-        return canonical_json({scene: self._stages(scene, codes) for scene in self.config.batch_scenes})
+        return canonical_json({scene: self._metrics_stages(scene) for scene in self.config.batch_scenes})
 
-    def _stages(self, scene: str, codes: Mapping[str, str]) -> dict[str, Any]:
-        taken = {stage for method in self.config.methods for stage in training_inputs(self.config, scene, method)}
-        stages = {stage: (stage, None) for stage in (*scene_stages(self.config, scene), *taken)}
-        stages |= {f"{method}/{stage}": (stage, method) for method in self.config.methods for stage in METHOD_STAGES}
-        return {
-            name: {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": codes[stage]}
-            for name, (stage, method) in stages.items()
-        }
+    def _metrics_stages(self, scene: str) -> dict[str, Any]:
+        methods = self.evaluation_stages(scene, self.config.methods)
+        return {**methods, SIDE_BY_SIDE: self._stage(SIDE_BY_SIDE, scene)}
+
+    def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
+        """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
+        taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
+        stages = {(stage, None): stage for stage in (*scene_stages(self.config, scene), *sorted(taken)) if stage != SIDE_BY_SIDE}
+        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in METHOD_STAGES}
+        return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
+
+    def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:
+        return {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": self.code(stage)}
 
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know, or

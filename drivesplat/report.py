@@ -1,14 +1,13 @@
 """The report across scenes: the gap between static and moving pixels, a row per scene and method."""
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
+from drivesplat import storage
 from drivesplat.errors import ResultError
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.provenance import differences
-from drivesplat.storage import atomic_write, read_json, unreadable
+from drivesplat.storage import read_json, unreadable
 
 SCHEMA = 1
 REGIONS = ("static", "vehicle", "moving_vehicle")
@@ -49,12 +48,7 @@ def gap_report(paths: list[str], expected: dict[str, dict[str, Any]]) -> dict[st
 
 def write_csv(path: str | Path, report: dict[str, Any]) -> None:
     """The rows of a report as a table; empty cells where a figure is null."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=COLUMNS)
-    writer.writeheader()
-    writer.writerows(report["rows"])
-    with atomic_write(path) as file:
-        file.write(text.getvalue().encode())
+    storage.write_csv(path, COLUMNS, report["rows"])
 
 
 def console_table(report: dict[str, Any]) -> str:

@@ -34,6 +34,8 @@ METHOD_STAGES = ("train", "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
 ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """And that behind those of scenes whose poses are refined."""
+SIDE_BY_SIDE = "scene_metrics"
+"""The one of them that no eval.json comes from."""
 TRAINING_INPUTS = ("actors", "lidar_depth")
 """Stages of a scene that only some methods train on."""
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from workflow_copy import TINY_TRAINING, WorkflowCopy
 
-from drivesplat.ablation import ablation, difference, figure, markdown, write_csv
+from drivesplat.ablation import ablation, markdown, write_csv
 from drivesplat.config import Config, for_scene, load, merged
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.planning import Plan
@@ -340,29 +340,6 @@ def test_a_row_holds_means_spreads_and_differences_paired_by_seed():
     assert depth["interpolation"]["difference"]["static"]["mean"] == 0.0
     assert whole["interpolation"]["difference"] == {"static": None, "moving_vehicle": None, "gap_db": None}
     assert (sky["gaussians"]["mean"], sky["gaussians"]["max"], sky["train_seconds"]["mean"]) == (1100.0, 1400, 55.0)
-
-
-def test_differences_are_of_trainings_with_one_seed():
-    """What all trainings of a seed have in common cancels: the spread of the figures is not that of the difference."""
-    assert difference([10.0, 20.0, 30.0], [11.0, 21.0, 31.0]) == {
-        "mean": -1.0, "standard_error": 0.0, "by_seed": [-1.0] * 3
-    }  # fmt: skip
-    shuffled = difference([10.0, 20.0, 30.0], [31.0, 11.0, 21.0])
-    assert shuffled["mean"] == -1.0 and shuffled["standard_error"] > 5.0
-
-
-def test_a_single_seed_has_no_standard_error():
-    assert difference([1.0], [3.0]) == {"mean": -2.0, "standard_error": None, "by_seed": [-2.0]}
-    assert figure([1.0]) == {"mean": 1.0, "min": 1.0, "max": 1.0, "by_seed": [1.0]}
-
-
-def test_null_figures_count_in_no_mean_and_no_difference():
-    assert figure([None, None]) is None and difference([None, 1.0], [1.0, None]) is None
-    assert figure([0.0, 2.0])["mean"] == 1.0 and difference([1.0, 4.0], [1.0, 2.0])["mean"] == 1.0, "0 is not null"
-    assert figure([2.0, None, 4.0]) == {"mean": 3.0, "min": 2.0, "max": 4.0, "by_seed": [2.0, None, 4.0]}
-    assert difference([2.0, None, 4.0], [1.0, 1.0, None]) == {
-        "mean": 1.0, "standard_error": None, "by_seed": [1.0, None, None]
-    }  # fmt: skip
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from tiny_world import World, write_world
 REPOSITORY = Path(__file__).parent.parent
 PARTS = (
     "Snakefile",
+    "benchmarks",
     "config.yaml",
     "config.schema.json",
     "drivesplat",

@@ -1,7 +1,5 @@
 """The stage `tracks`: what moves in a drive and can be named, as a table and as pictures with labels."""
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,7 +13,7 @@ from drivesplat.actors.subject import Subject, seen_in
 from drivesplat.recording import Recording
 from drivesplat.regions import LEAST_PIXELS, is_dynamic
 from drivesplat.scene import Track
-from drivesplat.storage import atomic_write
+from drivesplat.storage import write_csv
 from drivesplat.tracks import beginnings, box_at, moves_at_all
 
 MOST_PICTURES = 6
@@ -86,12 +84,7 @@ def _row(track: Track, seen: list[Subject], interval: float) -> TrackRow:
 
 def write_tracks(path: str | Path, rows: Sequence[TrackRow]) -> None:
     """Writes tracks.csv; an empty cell where there is no value."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=[field.name for field in fields(TrackRow)])
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    with atomic_write(path) as file:
-        file.write(text.getvalue().encode())
+    write_csv(path, [field.name for field in fields(TrackRow)], map(asdict, rows))
 
 
 def draw_tracks(recording: Recording, sightings: Sightings, rows: Sequence[TrackRow], camera: str) -> Figure:

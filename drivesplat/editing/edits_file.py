@@ -7,12 +7,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from drivesplat.config import NAME
 from drivesplat.errors import ConfigError
 from drivesplat.settings.edit import Edit, Step
+from drivesplat.yaml_file import read_yaml
 
 RESERVED = ("ego",)
 """Names that no duplicate may have: it is the camera's car."""
@@ -23,24 +23,13 @@ def read_edits(path: str | Path) -> dict[str, Edit]:
 
     Raises ConfigError, one line with the file, the edit and the step, where it is missing or not what it should be.
     """
-    content = _content(path)
+    content = read_yaml(path, "edits file")
     if not isinstance(content, dict) or set(content) != {"edits"}:
         raise ConfigError(f"{path}: an edits file holds the one key 'edits', under it a list of steps per name")
     edits = {} if content["edits"] is None else content["edits"]
     if not isinstance(edits, dict):
         raise ConfigError(f"{path}: 'edits' is {_shown(edits)}; it holds a list of steps per name")
     return {_name(name, f"{path}: edit"): _edit(steps, f"{path}: edit {name!r}") for name, steps in edits.items()}
-
-
-def _content(path: str | Path) -> Any:
-    try:
-        return yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_EveryKeyOnce)  # a SafeLoader
-    except OSError as error:
-        raise ConfigError(f"{path}: the edits file cannot be read ({error.strerror or error})") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: the edits file is not UTF-8 text ({error.reason})") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not YAML: {error}") from None
 
 
 def _edit(steps: Any, where: str) -> Edit:
@@ -108,20 +97,3 @@ def _shown(value: Any) -> str:
     """A value of the file, not too long for a line."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-class _EveryKeyOnce(yaml.SafeLoader):
-    """A safe loader that refuses a key which stands twice in a mapping: plain YAML drops the first in silence."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        known: list[Any] = []
-        for key_node, _ in node.value:
-            if key_node.tag == "tag:yaml.org,2002:merge":
-                continue
-            key = self.construct_object(key_node, deep=True)
-            if key in known:
-                raise yaml.constructor.ConstructorError(
-                    problem=f"the key {key!r} stands twice", problem_mark=key_node.start_mark
-                )
-            known.append(key)
-        return super().construct_mapping(node, deep)

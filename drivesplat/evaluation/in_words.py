@@ -4,18 +4,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from drivesplat.comparison import WHERE
 from drivesplat.errors import DriveSplatError
 from drivesplat.storage import read_json
 
 LOOKS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
-BETWEEN = {"interpolation": "between training frames", "extrapolation": "beyond the last training frame"}
 
 
 def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
     """A sentence per method and group of held-out frames, more where there is truth, and where to look."""
     lines = []
     for name, method in metrics["methods"].items():
-        for group, where in BETWEEN.items():
+        for group, where in WHERE.items():
             gap = method[group].get("gap_db")
             if (static := _psnr(method[group], "static")) is not None:
                 lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_movers(method[group], gap)}")

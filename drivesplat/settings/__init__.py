@@ -32,22 +32,24 @@ class Settings(BaseModel):
         return value
 
 
-def validated(model: type[S], values: dict[str, Any], where: str) -> S:
-    """`model` made from `values`.
+def validated(model: type[S], values: dict[str, Any], where: str, document: str = "config.yaml") -> S:
+    """`model` made from `values`, which `document` describes.
 
     Raises ConfigError: one line that names each offending key, with `where` before it, its value and what is allowed.
     """
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise ConfigError("; ".join(_sentence(item, where) for item in error.errors())) from None
+        raise ConfigError("; ".join(_sentence(item, where, document) for item in error.errors())) from None
 
 
-def _sentence(item: dict[str, Any], where: str) -> str:
+def _sentence(item: dict[str, Any], where: str, document: str) -> str:
     if not item["loc"]:
         return where + item["msg"].removeprefix("Value error, ")
     key = where + ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
-        return f"unknown key '{key}' (value {item['input']!r}): check its spelling against config.yaml"
+        return f"unknown key '{key}' (value {item['input']!r}): check its spelling against {document}"
+    if item["type"] == "missing":
+        return f"'{key}' is missing: {document} says what it is"
     message = item["msg"].removeprefix("Value error, ")
     return f"'{key}' is {item['input']!r}: {message[:1].lower()}{message[1:]}"

@@ -1,13 +1,12 @@
 """The ablation of a method: what it is without each of the things that make it up, trained with several seeds."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from drivesplat.settings import Settings
-from drivesplat.settings.method import MethodSettings
-from drivesplat.settings.overrides import merged
+from drivesplat.settings.method import MethodSettings, Seeds, with_seed, with_seeds
 from drivesplat.settings.train import Parts
 
 
@@ -45,18 +44,11 @@ def _default_variants() -> dict[str, VariantSettings | None]:
 class AblationSettings(Settings):
     of: str = "street"
     """The method that is taken apart."""
-    seeds: tuple[Annotated[int, Field(ge=0, lt=2**31)], ...] = Field((0, 1, 2), min_length=1)
+    seeds: Seeds = (0, 1, 2)
     """Random seeds of the trainings: the method and every variant of it are trained with each."""
     without: dict[str, VariantSettings | None] = Field(default_factory=_default_variants)
     """The variants, under names of your choice, by what each is without; null = no such variant. They are methods,
     called {of}-without-{name}-seed{n}; the whole is {of}-seed{n}."""
-
-    @field_validator("seeds")
-    @classmethod
-    def _no_seed_twice(cls, value: tuple[int, ...]) -> tuple[int, ...]:
-        if len(set(value)) != len(value):
-            raise ValueError("it names a seed twice")
-        return value
 
     @property
     def job(self) -> "AblationJob":
@@ -66,20 +58,12 @@ class AblationSettings(Settings):
 
     def methods(self, whole: MethodSettings) -> dict[str, MethodSettings]:
         """The methods to train, by name: `whole` and every variant of it, each with every seed."""
-        variants = {None: whole} | {
-            name: MethodSettings(
-                parts=variant.parts or whole.parts, overrides=merged(whole.overrides, variant.overrides)
-            )
+        variants = {
+            self.job.variant(name): whole.varied(variant.parts, variant.overrides)
             for name, variant in self.without.items()
             if variant is not None
         }
-        return {
-            self.job.method(name, seed): variant.model_copy(
-                update={"overrides": {**variant.overrides, "random_seed": seed}}
-            )
-            for name, variant in variants.items()
-            for seed in self.seeds
-        }
+        return with_seeds({self.of: whole, **variants}, self.seeds)
 
 
 class AblationJob(Settings):
@@ -95,7 +79,7 @@ class AblationJob(Settings):
 
     def method(self, without: str | None, seed: int) -> str:
         """The name of a variant trained with a seed."""
-        return f"{self.variant(without)}-seed{seed}"
+        return with_seed(self.variant(without), seed)
 
     @property
     def spelled(self) -> str:
