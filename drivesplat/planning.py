@@ -199,7 +199,8 @@ class Plan:
     def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
         """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
         taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
-        stages = {(stage, None): stage for stage in (*scene_stages(self.config, scene), *sorted(taken)) if stage != SIDE_BY_SIDE}
+        made = (*scene_stages(self.config, scene), *sorted(taken))
+        stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
         stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in METHOD_STAGES}
         return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
 
