@@ -7,6 +7,7 @@
 """
 
 import logging
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -15,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import DatasetError
+from drivesplat.holdout import Group, frame_groups
 from drivesplat.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
 from drivesplat.regions import LABELS, label_image, own_car_pixels
 from drivesplat.rigid import apply
-from drivesplat.scene import Frame, Scene
-from drivesplat.seeding.sweeps import read_sweep
+from drivesplat.scene import Frame, Scene, Sweep
+from drivesplat.seeding.sweeps import read_sweep, training_sweeps
 from drivesplat.settings.masks import MaskJob
 from drivesplat.sky_mask import sky_mask
 from drivesplat.storage import read_json, unreadable
@@ -31,20 +33,24 @@ UNLABELLED = 255
 
 
 def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
-    """Writes the masks of every image below `folder`; returns the record for masks.json.
+    """Writes the masks of every image below `folder`; returns the record for masks.json. The sky of a training image is
+    told by sweeps that a training may see alone.
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
 
-    def one(frame: Frame) -> tuple[float, int]:
+    groups, training = frame_groups(scene, job.holdout), training_sweeps(scene, job.holdout)
+
+    def one(frame: Frame, group: Group) -> tuple[float, int]:
         size = target_size(frame, job.images)
-        sky = _sky(frame, job, size, _nearest_returns(scene, frame))
+        sweeps = training if group == "train" else scene.sweeps
+        sky = _sky(frame, job, size, _nearest_returns(sweeps, frame, scene.key_frame_interval))
         write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
         write_png(folder / mask_name("regions", frame.camera, frame.timestamp), _regions(scene, frame, job, size))
         return float(sky.mean()), _semantic(frame, job, size, folder)
 
     with ThreadPoolExecutor() as pool:
-        sky_shares, classes = zip(*pool.map(one, scene.frames), strict=True)
+        sky_shares, classes = zip(*pool.map(one, scene.frames, groups), strict=True)
     return {
         "labels": LABELS,
         "images": len(scene.frames),
@@ -55,10 +61,11 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
     }
 
 
-def _nearest_returns(scene: Scene, frame: Frame) -> np.ndarray | None:
-    """World points (n, 3) of the readable sweep nearest to a frame; None where none is within a key-frame interval."""
-    for sweep in sorted(scene.sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp)):
-        if abs(sweep.timestamp - frame.timestamp) >= scene.key_frame_interval:
+def _nearest_returns(sweeps: Sequence[Sweep], frame: Frame, interval: float) -> np.ndarray | None:
+    """World points (n, 3) of the readable one of some sweeps that is nearest to a frame; None where none is within a
+    key-frame `interval` (microseconds)."""
+    for sweep in sorted(sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp)):
+        if abs(sweep.timestamp - frame.timestamp) >= interval:
             break
         with suppress(DatasetError):  # the stage lidar_seed is the one that complains
             return apply(sweep.sensor_to_world, read_sweep(sweep))

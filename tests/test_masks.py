@@ -26,7 +26,7 @@ SIZE = (96, 54)
 
 
 def job(width=None, **masks) -> MaskJob:
-    return MaskJob.model_validate({"masks": masks, "images": {"width": width}})
+    return MaskJob.model_validate({"masks": masks, "holdout": {}, "images": {"width": width}})
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +156,25 @@ def test_masks_are_made_though_a_lidar_file_is_bad(tiny_root, tmp_path, damage):
     path = Path(scene.sweeps[0].path)
     path.unlink() if damage == "missing" else path.write_bytes(path.read_bytes()[:-7])
     assert make_masks(scene, job(), tmp_path / "masks")["images"] == len(scene.frames)
+
+
+def test_the_sky_of_a_training_image_is_told_by_no_held_out_sweep(tiny_scene, tmp_path):
+    """There is one sweep, that of key frame 2, with a return in the middle of every image's sky. It is 465 ms from the
+    image of key frame 3, and 285 from the one before its own."""
+    frames = [tiny_scene.frames[i] for i in (3, 4, 6)]
+    at = np.concatenate([[f.camera_to_world @ [0.0, -8.0, 30.0, 1.0]] for f in frames])
+    sweep = tiny_scene.sweeps[2]
+    returns = np.zeros((len(frames), 5), dtype=np.float32)
+    returns[:, :3] = (at @ inverse(sweep.sensor_to_world).T)[:, :3]
+    returns.tofile(tmp_path / "one.pcd.bin")
+    only = dataclasses.replace(sweep, path=str(tmp_path / "one.pcd.bin"))
+    scene = dataclasses.replace(tiny_scene, frames=tuple(frames), sweeps=(only,))
+    row, column = int(27.0 - 0.62 * 96 * 8.0 / 30.0), 48
+    for every_nth, open_sky in ((0, [False, False, False]), (8, [True, False, True])):
+        holdout = {"every_nth": every_nth, "offset": 2, "last_block": 0}
+        make_masks(scene, MaskJob.model_validate({"masks": {}, "holdout": holdout, "images": {}}), tmp_path)
+        skies = [read_sky_mask(tmp_path, f.camera, f.timestamp, SIZE) for f in frames]
+        assert [sky[row, column] for sky in skies] == open_sky
 
 
 def extracted(root: Path) -> Scene:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from drivesplat.ahead import ahead
 from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
@@ -41,15 +42,18 @@ class TrainingInputs:
         """What `job` wants to know of the training images."""
         images = [int(i) for i in self.parser["splits"]["train"]]
         return Guides(
-            sky={i: self._sky(i) for i in images} if job.sky != "none" or job.train.sky_bce_weight else {},
-            moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
+            sky=_each(self._sky, images) if job.sky != "none" or job.train.sky_bce_weight else {},
+            moving=_each(self._moving, images) if self.actors and job.train.dynamic_weight else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
-            classes={i: read_classes(self.masks, *self._image(i)) for i in images} if self.told_apart(job) else {},
+            classes=_each(self._classes, images) if self.told_apart(job) else {},
         )
 
     def told_apart(self, job: TrainJob) -> int:
         """How many classes the Gaussians of `job` tell apart."""
         return self.classes if job.train.semantic_weight else 0
+
+    def _classes(self, index: int) -> np.ndarray:
+        return read_classes(self.masks, *self._image(index))
 
     def _sky(self, index: int) -> np.ndarray:
         return read_sky_mask(self.masks, *self._image(index))
@@ -62,6 +66,10 @@ class TrainingInputs:
         """Camera, timestamp and size of an image."""
         camera = self.parser["camera_names"][self.parser["camera_indices"][index]]
         return camera, int(self.parser["timestamps"][index]), image_size(self.parser, index)
+
+
+def _each(mask: Callable[[int], np.ndarray], images: list[int]) -> dict[int, np.ndarray]:
+    return dict(zip(images, ahead(mask, images), strict=True))
 
 
 def read_inputs(

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from drivesplat.ahead import ahead
 from drivesplat.images import read_image
 from drivesplat.model.splat_model import View
 from drivesplat.parser import image_size
@@ -67,9 +68,11 @@ class Guides:
 def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> list[TrainingView]:
     """The training images of a parser record, with all masks at training resolution."""
     views = []
-    for index in map(int, parser["splits"]["train"]):
+    images = [int(i) for i in parser["splits"]["train"]]
+    recorded = ahead(lambda i: read_image(parser["image_paths"][i], image_size(parser, i)), images)
+    for index, image in zip(images, recorded, strict=True):
         size = image_size(parser, index)
-        pixels = torch.from_numpy(read_image(parser["image_paths"][index], size).copy()).to(device)
+        pixels = torch.from_numpy(image.copy()).to(device)
         sky, moving, classes = (
             torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
             for masks in (guides.sky, guides.moving, guides.classes)
