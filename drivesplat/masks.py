@@ -30,6 +30,12 @@ log = logging.getLogger(__name__)
 
 UNLABELLED = 255
 """The value of pixels that a user's map of classes says nothing of."""
+LEAST_SKY = 0.005
+"""Where the heuristic finds less sky than this share of all pixels, it has found none: it looks for what is bright."""
+NO_SKY = (
+    "scene %s: no sky was found, as by night or in a tunnel: losses about the sky are left out; "
+    "masks.sky_folder takes masks of your own"
+)
 
 
 def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
@@ -38,7 +44,6 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
-
     groups, training = frame_groups(scene, job.holdout), training_sweeps(scene, job.holdout)
 
     def one(frame: Frame, group: Group) -> tuple[float, int]:
@@ -51,12 +56,16 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
 
     with ThreadPoolExecutor() as pool:
         sky_shares, classes = zip(*pool.map(one, scene.frames, groups), strict=True)
+    sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= LEAST_SKY
+    if not sky_known:
+        log.warning(NO_SKY, scene.name)
     return {
         "labels": LABELS,
         "images": len(scene.frames),
         "regions": "masks" if job.masks.regions_folder else "boxes",
         "sky": "masks" if job.masks.sky_folder else "heuristic",
         "sky_share": float(np.mean(sky_shares)),
+        "sky_known": sky_known,
         "semantic_classes": max(classes),
     }
 

@@ -13,7 +13,7 @@ from tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.extract import extract_scene
 from drivesplat.images import project, read_image
-from drivesplat.masks import make_masks, mask_name, read_labels, read_masks_record, read_sky_mask
+from drivesplat.masks import NO_SKY, make_masks, mask_name, read_labels, read_masks_record, read_sky_mask
 from drivesplat.regions import LABELS, label_image, region_mask
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene
@@ -212,6 +212,25 @@ def test_the_users_own_masks_are_used(two_images, tmp_path):
     for frame in two_images.frames:
         np.testing.assert_array_equal(read_labels(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), labels)
         np.testing.assert_array_equal(read_sky_mask(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), sky > 0)
+
+
+@pytest.mark.parametrize(
+    ("light", "sky", "known"),
+    [(1.0, None, True), (0.2, None, False), (1.0, 0, True)],
+    ids=["day", "night", "the user's, without sky"],
+)
+def test_where_no_sky_is_found_none_is_known_unless_the_user_says_so(two_images, tmp_path, caplog, light, sky, known):
+    dimmed = []
+    for frame in two_images.frames:
+        path = tmp_path / "images" / Path(frame.image_path).name
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray((light * read_image(frame.image_path)).astype(np.uint8)).save(path, quality=95)
+        dimmed.append(dataclasses.replace(frame, image_path=str(path)))
+    scene = dataclasses.replace(two_images, frames=tuple(dimmed))
+    mine = None if sky is None else str(users_masks(scene, tmp_path / "mine", np.full((54, 96), sky, np.uint8)))
+    record = make_masks(scene, job(sky_folder=mine), tmp_path / "masks")
+    assert record["sky_known"] is known
+    assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
 
 
 def test_the_users_masks_at_another_size_are_brought_to_that_of_the_images(two_images, tmp_path):

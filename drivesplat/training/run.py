@@ -2,7 +2,7 @@
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.ahead import ahead
 from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
@@ -30,30 +29,30 @@ from drivesplat.training.views import Guides, TrainingView, load_views
 @dataclass(frozen=True)
 class TrainingInputs:
     """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
-    has no use for them), the folder of masks, and how many `classes` the user's maps there tell apart (0: none)."""
+    has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), and
+    `sky_known`: where no sky was found, it is not known of any pixel that it is none."""
 
     parser: dict[str, Any]
     masks: Path
     actors: list[dict[str, Any]]
     lidar_depth: list[dict[str, np.ndarray]]
     classes: int = 0
+    sky_known: bool = True
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
         images = [int(i) for i in self.parser["splits"]["train"]]
+        sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         return Guides(
-            sky=_each(self._sky, images) if job.sky != "none" or job.train.sky_bce_weight else {},
-            moving=_each(self._moving, images) if self.actors and job.train.dynamic_weight else {},
+            sky={i: self._sky(i) for i in images} if sky_wanted else {},
+            moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
-            classes=_each(self._classes, images) if self.told_apart(job) else {},
+            classes={i: read_classes(self.masks, *self._image(i)) for i in images} if self.told_apart(job) else {},
         )
 
     def told_apart(self, job: TrainJob) -> int:
         """How many classes the Gaussians of `job` tell apart."""
         return self.classes if job.train.semantic_weight else 0
-
-    def _classes(self, index: int) -> np.ndarray:
-        return read_classes(self.masks, *self._image(index))
 
     def _sky(self, index: int) -> np.ndarray:
         return read_sky_mask(self.masks, *self._image(index))
@@ -66,10 +65,6 @@ class TrainingInputs:
         """Camera, timestamp and size of an image."""
         camera = self.parser["camera_names"][self.parser["camera_indices"][index]]
         return camera, int(self.parser["timestamps"][index]), image_size(self.parser, index)
-
-
-def _each(mask: Callable[[int], np.ndarray], images: list[int]) -> dict[int, np.ndarray]:
-    return dict(zip(images, ahead(mask, images), strict=True))
 
 
 def read_inputs(
@@ -87,6 +82,7 @@ def read_inputs(
         [actor for record in moving for actor in record["actors"]],
         [image for record in depths for image in record["images"]],
         made["semantic_classes"],
+        made["sky_known"],
     )
     records = [packed, made, *moving, *depths]
     return inputs, [record["provenance"] for record in records]
@@ -163,10 +159,12 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:
-    """The mean colour (3,) in [0, 1] of the sky pixels of the training images; light grey where there are none."""
+    """The mean colour (3,) in [0, 1] of the sky pixels of the training images, of all pixels where there are none."""
     sums, count = np.zeros(3), 0
     for view in views:
         if view.sky is not None:
             sums += (view.target() * view.sky[..., None]).sum(dim=(0, 1)).cpu().numpy()
             count += int(view.sky.sum())
-    return sums / count if count else np.full(3, 0.75)
+    if count:
+        return sums / count
+    return np.mean([view.target().mean(dim=(0, 1)).double().cpu().numpy() for view in views], axis=0)
