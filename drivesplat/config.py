@@ -136,7 +136,8 @@ class Config(Settings):
     eval_camera: str = "CAM_FRONT"
     """The camera whose held-out images are measured; one of cameras."""
     sweeps: bool = False
-    """Train on the 12 Hz images between key frames, too."""
+    """Train on the 12 Hz images between key frames, too, but for those nearer than half a key-frame interval to a
+    held-out one. LiDAR between key frames: lidar_seed.sweeps. docs/real_logs.md"""
     images: ImageSettings = ImageSettings()
     holdout: HoldoutSettings = HoldoutSettings()
     extract: ExtractSettings = ExtractSettings()

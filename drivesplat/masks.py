@@ -7,6 +7,7 @@
 """
 
 import logging
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import DatasetError
+from drivesplat.holdout import Group, frame_groups
 from drivesplat.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
 from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.regions import LABELS, label_image
-from drivesplat.scene import Frame, Scene
+from drivesplat.scene import Frame, Scene, Sweep
 from drivesplat.seeding.nearest_sweep import nearest_returns
+from drivesplat.seeding.sweeps import training_sweeps
 from drivesplat.settings.masks import MaskJob
 from drivesplat.sky_mask import sky_mask
 from drivesplat.storage import read_json, unreadable
@@ -27,34 +30,46 @@ log = logging.getLogger(__name__)
 
 UNLABELLED = 255
 """The value of pixels that a user's map of classes says nothing of."""
+LEAST_SKY = 0.005
+"""Where the heuristic finds less sky than this share of all pixels, it has found none: it looks for what is bright."""
+NO_SKY = (
+    "scene %s: no sky was found, as by night or in a tunnel: losses about the sky are left out; "
+    "masks.sky_folder takes masks of your own"
+)
 
 
 def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
     """Writes the masks of every image below `folder`; returns the record for masks.json. The own car's body is a region
-    of its own, no sky, and of no class.
+    of its own, no sky, and of no class. The sky of a training image is told by sweeps that a training may see alone.
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
+    groups, training = frame_groups(scene, job.holdout), training_sweeps(scene, job.holdout)
 
-    def one(frame: Frame) -> tuple[float, int, bool]:
+    def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
         size = target_size(frame, job.images)
         labels = _regions(scene, frame, job, size)
         labels[own_car.pixels(frame.camera, size)] = LABELS["own_car"]
         body = labels == LABELS["own_car"]
-        sky = _sky(scene, frame, job, size) & ~body
+        sweeps = training if group == "train" else scene.sweeps
+        sky = _sky(sweeps, frame, job, size, scene.key_frame_interval) & ~body
         write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
         write_png(folder / mask_name("regions", frame.camera, frame.timestamp), labels)
         return float(sky.mean()), _semantic(frame, job, body, folder), bool(body.any())
 
     with ThreadPoolExecutor() as pool:
-        sky_shares, classes, bodies = zip(*pool.map(one, scene.frames), strict=True)
+        sky_shares, classes, bodies = zip(*pool.map(one, scene.frames, groups), strict=True)
     seeing = {frame.camera for frame, body in zip(scene.frames, bodies, strict=True) if body}
+    sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= LEAST_SKY
+    if not sky_known:
+        log.warning(NO_SKY, scene.name)
     return {
         "labels": LABELS,
         "images": len(scene.frames),
         "regions": "masks" if job.masks.regions_folder else "boxes",
         "sky": "masks" if job.masks.sky_folder else "heuristic",
         "sky_share": float(np.mean(sky_shares)),
+        "sky_known": sky_known,
         "semantic_classes": max(classes),
         "own_car": {camera: own_car.source.get(camera, "masks") for camera in sorted(seeing)},
     }
@@ -116,10 +131,11 @@ def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple
         raise unreadable(path, "masks", str(error)) from error
 
 
-def _sky(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) -> np.ndarray:
+def _sky(sweeps: Sequence[Sweep], frame: Frame, job: MaskJob, size: tuple[int, int], interval: float) -> np.ndarray:
+    """The sky (h, w) bool of a frame; the one of `sweeps` that is nearest, within `interval` microseconds, helps."""
     if job.masks.sky_folder:
         return _users_mask(job.masks.sky_folder, frame, size) > 127
-    lidar = nearest_returns(scene.sweeps, frame.timestamp, scene.key_frame_interval)
+    lidar = nearest_returns(sweeps, frame.timestamp, interval)
     return sky_mask(
         read_image(frame.image_path, size), continuous_intrinsics(frame, size), frame.camera_to_world, lidar
     )

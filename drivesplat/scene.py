@@ -125,6 +125,12 @@ class Scene:
         return int(np.argmin(np.abs(self.key_frame_timestamps - timestamp)))
 
 
+def place_of(recording: Frame | Sweep) -> str:
+    """Which recording it is, for messages: its key frame, or the nearest one, and its token."""
+    where = "" if recording.is_key_frame else "between key frames, nearest "
+    return f"{where}key frame {recording.sample_index}, sample_data {recording.token}"
+
+
 _ARRAYS = {
     "intrinsics": np.float64,
     "camera_to_world": np.float64,

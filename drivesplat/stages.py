@@ -107,6 +107,7 @@ def _extract(place: Place) -> SceneSource:
         frames=dataset.frames.get(place.scene),
         cameras=config.cameras,
         sweeps=config.sweeps,
+        lidar_sweeps=config.lidar_seed.sweeps,
         on_missing=config.extract.on_missing,
     )
 
@@ -231,7 +232,7 @@ _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "refine_poses": _refine_poses,
     "lidar_seed": _lidar_seed,
     "parser": lambda at: ParserJob(holdout=at.config.holdout, images=at.config.images),
-    "masks": lambda at: MaskJob(masks=at.config.masks, images=at.config.images),
+    "masks": lambda at: MaskJob(masks=at.config.masks, holdout=at.config.holdout, images=at.config.images),
     "actors": _actors,
     "lidar_depth": _lidar_depth,
     "train": _train,

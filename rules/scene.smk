@@ -87,7 +87,7 @@ rule refine_poses:
 
 rule lidar_seed:
     """
-    Starts the Gaussians where LiDAR of the training key frames found something that stands still, coloured from
+    Starts the Gaussians where LiDAR of the training sweeps found something that stands still, coloured from
     training images, with random far points along pixels that LiDAR does not reach.
     """
     input:

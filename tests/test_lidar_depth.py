@@ -170,12 +170,6 @@ def test_an_image_gets_the_training_sweep_nearest_in_time_within_a_key_frames_in
     assert kinds.count(True) >= 6 and kinds.count(False) == 1, "at 1.715 s the next sweep stands in for the last"
 
 
-def test_sweeps_between_key_frames_are_not_read(tiny_scene):
-    between = dataclasses.replace(tiny_scene.sweeps[7], timestamp=tiny_scene.frames[1].timestamp, is_key_frame=False)
-    with_it = dataclasses.replace(tiny_scene, sweeps=(*tiny_scene.sweeps, between))
-    assert pickle.dumps(lidar_depths(with_it, job())) == pickle.dumps(lidar_depths(tiny_scene, job()))
-
-
 def test_held_out_sweeps_and_images_contribute_nothing(root):
     scene = lost(root, 1, 7)
     before = lidar_depths(scene, job())

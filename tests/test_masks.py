@@ -14,6 +14,7 @@ from drivesplat.errors import DatasetError, ResultError
 from drivesplat.extract import extract_scene
 from drivesplat.images import project, read_image
 from drivesplat.masks import (
+    NO_SKY,
     UNLABELLED,
     make_masks,
     mask_name,
@@ -43,7 +44,7 @@ def seen_in_front(outline: tuple) -> OwnCar:
 
 
 def job(width=None, **masks) -> MaskJob:
-    return MaskJob.model_validate({"masks": masks, "images": {"width": width}})
+    return MaskJob.model_validate({"masks": masks, "holdout": {}, "images": {"width": width}})
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +176,25 @@ def test_masks_are_made_though_a_lidar_file_is_bad(tiny_root, tmp_path, damage):
     assert make_masks(scene, job(), tmp_path / "masks")["images"] == len(scene.frames)
 
 
+def test_the_sky_of_a_training_image_is_told_by_no_held_out_sweep(tiny_scene, tmp_path):
+    """There is one sweep, that of key frame 2, with a return in the middle of every image's sky. It is 465 ms from the
+    image of key frame 3, and 285 from the one before its own."""
+    frames = [tiny_scene.frames[i] for i in (3, 4, 6)]
+    at = np.concatenate([[f.camera_to_world @ [0.0, -8.0, 30.0, 1.0]] for f in frames])
+    sweep = tiny_scene.sweeps[2]
+    returns = np.zeros((len(frames), 5), dtype=np.float32)
+    returns[:, :3] = (at @ inverse(sweep.sensor_to_world).T)[:, :3]
+    returns.tofile(tmp_path / "one.pcd.bin")
+    only = dataclasses.replace(sweep, path=str(tmp_path / "one.pcd.bin"))
+    scene = dataclasses.replace(tiny_scene, frames=tuple(frames), sweeps=(only,))
+    row, column = int(27.0 - 0.62 * 96 * 8.0 / 30.0), 48
+    for every_nth, open_sky in ((0, [False, False, False]), (8, [True, False, True])):
+        holdout = {"every_nth": every_nth, "offset": 2, "last_block": 0}
+        make_masks(scene, MaskJob.model_validate({"masks": {}, "holdout": holdout, "images": {}}), tmp_path)
+        skies = [read_sky_mask(tmp_path, f.camera, f.timestamp, SIZE) for f in frames]
+        assert [sky[row, column] for sky in skies] == open_sky
+
+
 def extracted(root: Path) -> Scene:
     source = SceneSource(
         dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=(0, 2), cameras=("CAM_FRONT",),
@@ -212,6 +232,25 @@ def test_the_users_own_masks_are_used(two_images, tmp_path):
     for frame in two_images.frames:
         np.testing.assert_array_equal(read_labels(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), labels)
         np.testing.assert_array_equal(read_sky_mask(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), sky > 0)
+
+
+@pytest.mark.parametrize(
+    ("light", "sky", "known"),
+    [(1.0, None, True), (0.2, None, False), (1.0, 0, True)],
+    ids=["day", "night", "the user's, without sky"],
+)
+def test_where_no_sky_is_found_none_is_known_unless_the_user_says_so(two_images, tmp_path, caplog, light, sky, known):
+    dimmed = []
+    for frame in two_images.frames:
+        path = tmp_path / "images" / Path(frame.image_path).name
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray((light * read_image(frame.image_path)).astype(np.uint8)).save(path, quality=95)
+        dimmed.append(dataclasses.replace(frame, image_path=str(path)))
+    scene = dataclasses.replace(two_images, frames=tuple(dimmed))
+    mine = None if sky is None else str(users_masks(scene, tmp_path / "mine", np.full((54, 96), sky, np.uint8)))
+    record = make_masks(scene, job(sky_folder=mine), tmp_path / "masks")
+    assert record["sky_known"] is known
+    assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
 
 
 def test_the_users_masks_at_another_size_are_brought_to_that_of_the_images(two_images, tmp_path):

@@ -8,6 +8,7 @@ import torch
 
 from drivesplat.device import telling_out_of_memory
 from drivesplat.errors import DatasetError
+from drivesplat.evaluation.drive import drive_record
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
@@ -53,6 +54,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
         "scene": parser["scene"]["name"],
         "dataset": parser["scene"]["dataset"],
         "protocol": protocol(parser, inputs.masks_record, job),
+        "drive": drive_record(inputs.recording, job.eval_camera, measured_images(parser, job.eval_camera)),
         "result": {
             **groups,
             **against,
@@ -82,7 +84,7 @@ def against_truth(
 
 def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
     """What every figure must be read with."""
-    measured = [i for group in HELD_OUT_GROUPS for i in held_out_images(parser, group, job.eval_camera)]
+    measured = [i for images in measured_images(parser, job.eval_camera).values() for i in images]
     width, height = image_size(parser, measured[0] if measured else 0)
     return {
         "version": parser["scene"]["version"],
@@ -132,14 +134,19 @@ def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int
     ]
 
 
+def measured_images(parser: dict[str, Any], camera: str) -> dict[str, list[int]]:
+    """The images that are measured, by held-out group. Raises what `held_out_images` raises."""
+    return {group: held_out_images(parser, group, camera) for group in HELD_OUT_GROUPS}
+
+
 def evaluate_groups(
     model: SplatModel, recording: Recording, camera: str, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, dict[str, Any]]:
     """The metrics of every held-out group, by region."""
     groups = {}
-    for group in HELD_OUT_GROUPS:
+    for group, images in measured_images(recording.parser, camera).items():
         metrics = RegionMetrics(lpips_map)
-        for index in held_out_images(recording.parser, group, camera):
+        for index in images:
             image = rendered(model, view_of(recording.parser, index, device))
             metrics.add(image, recording.image(index), region_masks(recording.labels(index)))
         groups[group] = with_gap(metrics.summary())

@@ -1,6 +1,6 @@
 """The stage `actors`: which vehicles become actors, and where their Gaussians start.
 
-LiDAR of the training key frames that lies in an actor's box, gathered over the drive in the actor's own frame; random
+LiDAR of the training sweeps that lies in an actor's box, gathered over the drive in the actor's own frame; random
 points in the box where that is little (Street Gaussians, Yan et al. 2024, arXiv 2401.01339). Colours are those of
 training images in whose pixels the actor is seen. Held-out images and sweeps contribute nothing.
 """
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.ahead import ahead
 from drivesplat.holdout import frame_groups
 from drivesplat.images import continuous_intrinsics, read_image, target_size
 from drivesplat.own_car import NOWHERE, OwnCar
@@ -94,9 +95,9 @@ class Sight:
 
 def training_sights(scene: Scene, job: ActorSeedJob, own_car: OwnCar) -> Iterator[Sight]:
     """The training images, one by one."""
-    for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
-        if group == "train":
-            yield sight_of(scene, frame, job, own_car)
+    groups = frame_groups(scene, job.holdout)
+    frames = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
+    return ahead(lambda frame: sight_of(scene, frame, job, own_car), frames)
 
 
 def sight_of(scene: Scene, frame: Frame, job: ActorSeedJob, own_car: OwnCar) -> Sight:

@@ -13,6 +13,10 @@ from drivesplat.settings.images import ImageSettings
 class LidarSeedSettings(Settings):
     on_missing: OnMissing = "stop"
     """A missing or corrupt LiDAR file: 'stop' names it and fails; 'warn' goes on without it and counts it."""
+    sweeps: bool = False
+    """Use the LiDAR sweeps between key frames, too (nuScenes: at 20 Hz, ten times the returns): for this seed, for what
+    actors start from, and for LiDAR's depth in training images, which then see the sweep of their own moment. Those
+    nearer than half a key-frame interval to a held-out key frame contribute nothing. docs/real_logs.md"""
     points_file: str | None = None
     """A PLY of extra points in the dataset's global frame (metres), recoloured from training images. null = none."""
     triangulated: bool = True

@@ -3,6 +3,7 @@
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.own_car import OwnCarKind
 
@@ -28,4 +29,5 @@ class MaskJob(Settings):
     """Everything that decides the content of one masks folder, the scene aside."""
 
     masks: MaskSettings
+    holdout: HoldoutSettings
     images: ImageSettings

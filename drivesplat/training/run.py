@@ -29,8 +29,9 @@ from drivesplat.training.views import Guides, TrainingView, camera_of, load_view
 @dataclass(frozen=True)
 class TrainingInputs:
     """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
-    has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), and the
-    cameras that see the own car."""
+    has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), the
+    cameras that see the own car, and `sky_known`: where no sky was found, it is not known of any pixel that it is none.
+    """
 
     parser: dict[str, Any]
     masks: Path
@@ -38,12 +39,14 @@ class TrainingInputs:
     lidar_depth: list[dict[str, np.ndarray]]
     classes: int = 0
     seeing_own_car: frozenset[str] = frozenset()
+    sky_known: bool = True
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
         images = [int(i) for i in self.parser["splits"]["train"]]
+        sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         return Guides(
-            sky={i: self._sky(i) for i in images} if job.sky != "none" or job.train.sky_bce_weight else {},
+            sky={i: self._sky(i) for i in images} if sky_wanted else {},
             moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
             classes={i: read_classes(self.masks, *self._image(i)) for i in images} if self.told_apart(job) else {},
@@ -92,6 +95,7 @@ def read_inputs(
         [image for record in depths for image in record["images"]],
         made["semantic_classes"],
         frozenset(made["own_car"]),
+        made["sky_known"],
     )
     records = [packed, made, *moving, *depths]
     return inputs, [record["provenance"] for record in records]
@@ -191,10 +195,12 @@ def learns_from_sky_masks(job: TrainJob) -> bool:
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:
-    """The mean colour (3,) in [0, 1] of the sky pixels of the training images; light grey where there are none."""
+    """The mean colour (3,) in [0, 1] of the sky pixels of the training images, of all pixels where there are none."""
     sums, count = np.zeros(3), 0
     for view in views:
         if view.sky is not None:
             sums += (view.target() * view.sky[..., None]).sum(dim=(0, 1)).cpu().numpy()
             count += int(view.sky.sum())
-    return sums / count if count else np.full(3, 0.75)
+    if count:
+        return sums / count
+    return np.mean([view.target().mean(dim=(0, 1)).double().cpu().numpy() for view in views], axis=0)

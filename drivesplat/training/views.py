@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from drivesplat.ahead import ahead
 from drivesplat.images import read_image
 from drivesplat.model.view import View
 from drivesplat.parser import image_size
@@ -78,9 +79,11 @@ def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> 
     of the own car."""
     views: list[TrainingView] = []
     bodies: dict[bytes, Tensor] = {}
-    for index in map(int, parser["splits"]["train"]):
+    images = [int(i) for i in parser["splits"]["train"]]
+    recorded = ahead(lambda i: read_image(parser["image_paths"][i], image_size(parser, i)), images)
+    for index, image in zip(images, recorded, strict=True):
         size = image_size(parser, index)
-        pixels = torch.from_numpy(read_image(parser["image_paths"][index], size).copy()).to(device)
+        pixels = torch.from_numpy(image.copy()).to(device)
         sky, moving, classes = (
             torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
             for masks in (guides.sky, guides.moving, guides.classes)
