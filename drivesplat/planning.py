@@ -111,6 +111,10 @@ class Plan:
         """LiDAR's depth in the training images, where a training is held to it."""
         return self._training_input("lidar_depth", wildcards)
 
+    def free_space(self, wildcards: Any) -> list[str]:
+        """The space that LiDAR's rays prove empty, where a training keeps Gaussians out of it."""
+        return self._training_input("free_space", wildcards)
+
     def _training_input(self, stage: str, wildcards: Any) -> list[str]:
         taken = training_inputs(self.config, wildcards.scene, wildcards.method)
         return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.pkl"] if stage in taken else []

@@ -17,6 +17,7 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.looks import PanelJob, RemovalJob, SubjectSettings, TracksJob
@@ -30,7 +31,7 @@ from drivesplat.storage import canonical_json
 SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
-TRAINING_INPUTS = ("actors", "lidar_depth")
+TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
 
 
@@ -68,7 +69,11 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     """Which of TRAINING_INPUTS a method's training on a scene takes."""
     train = for_scene(config, scene, method).train
-    taken = {"actors": "actors" in config.all_methods[method].parts, "lidar_depth": train.depth_weight > 0}
+    taken = {
+        "actors": "actors" in config.all_methods[method].parts,
+        "lidar_depth": train.depth_weight > 0,
+        "free_space": train.floaters.free_space,
+    }
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
 
@@ -117,10 +122,21 @@ def _actors(place: Place) -> ActorSeedJob:
 def _lidar_depth(place: Place) -> LidarDepthJob:
     config = place.config
     return LidarDepthJob(
+        ray_spacing=config.lidar_depth.ray_spacing,
         holdout=config.holdout,
         images=config.images,
         own_car_radius=config.lidar_seed.own_car_radius,
         own_car_polygons=config.masks.own_car_polygons,
+        box_margin=config.lidar_seed.box_margin,
+    )
+
+
+def _free_space(place: Place) -> FreeSpaceJob:
+    config = place.config
+    return FreeSpaceJob(
+        free_space=config.free_space,
+        holdout=config.holdout,
+        own_car_radius=config.lidar_seed.own_car_radius,
         box_margin=config.lidar_seed.box_margin,
     )
 
@@ -138,6 +154,7 @@ def _evaluate(place: Place) -> EvaluateJob:
         cameras=config.cameras,
         sweeps=config.sweeps,
         holdout=config.holdout,
+        lidar=_lidar_depth(place),
         lpips=config.lpips.enabled,
         removal=config.removal if place.dataset.world else None,
     )
@@ -202,6 +219,7 @@ _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "masks": lambda at: MaskJob(masks=at.config.masks, images=at.config.images),
     "actors": _actors,
     "lidar_depth": _lidar_depth,
+    "free_space": _free_space,
     "train": _train,
     "evaluate": _evaluate,
     "scene_metrics": lambda _: Settings(),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.holdout import sweep_groups
+from drivesplat.holdout import Group, sweep_groups
 from drivesplat.rigid import apply
 from drivesplat.scene import Scene, Sweep
 from drivesplat.settings.holdout import HoldoutSettings
@@ -39,11 +39,18 @@ def read_sweep(sweep: Sweep) -> np.ndarray:
 
 
 def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
-    """The key-frame sweeps that a training may see, each with its returns (n, 3) in world coordinates, the own car's
-    left out. A sweep whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
+    """The key-frame sweeps that a training may see, as `returns_of` gives them."""
+    return returns_of(scene, holdout, own_car_radius, ("train",))
+
+
+def returns_of(
+    scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...]
+) -> list[tuple[Sweep, np.ndarray]]:
+    """The key-frame sweeps of some groups, each with its returns (n, 3) in world coordinates, the own car's left out. A
+    sweep whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
     found = []
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, holdout), strict=True):
-        if sweep.is_key_frame and group == "train":
+        if sweep.is_key_frame and group in groups:
             with suppress(DatasetError):
                 points = without_own_car(read_sweep(sweep), own_car_radius)
                 found.append((sweep, apply(sweep.sensor_to_world, points)))

@@ -17,11 +17,13 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size, read_parser
 from drivesplat.regions import region_mask
 from drivesplat.seeding.actors import read_actors
+from drivesplat.seeding.free_space import read_free_space
 from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
+from drivesplat.training.surfaces import surroundings_of
 from drivesplat.training.train import Workspace, train
 from drivesplat.training.views import Guides, TrainingView, load_views
 
@@ -29,13 +31,15 @@ from drivesplat.training.views import Guides, TrainingView, load_views
 @dataclass(frozen=True)
 class TrainingInputs:
     """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
-    has no use for them), the folder of masks, and how many `classes` the user's maps there tell apart (0: none)."""
+    has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), and the
+    record of free_space.pkl (None where the method has no use for it)."""
 
     parser: dict[str, Any]
     masks: Path
     actors: list[dict[str, Any]]
     lidar_depth: list[dict[str, np.ndarray]]
     classes: int = 0
+    free_space: dict[str, Any] | None = None
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
@@ -65,22 +69,24 @@ class TrainingInputs:
 
 
 def read_inputs(
-    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str]
+    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str], free_space: Sequence[str]
 ) -> tuple[TrainingInputs, list[dict[str, Any]]]:
-    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl and lidar_depth.pkl,
-    with the provenances of these files."""
+    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl, lidar_depth.pkl and
+    free_space.pkl, with the provenances of these files."""
     folder = Path(masks).parent
     packed, made = read_parser(parser), read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
+    spaces = [read_free_space(path) for path in free_space]
     inputs = TrainingInputs(
         packed,
         folder,
         [actor for record in moving for actor in record["actors"]],
         [image for record in depths for image in record["images"]],
         made["semantic_classes"],
+        next(iter(spaces), None),
     )
-    records = [packed, made, *moving, *depths]
+    records = [packed, made, *moving, *depths, *spaces]
     return inputs, [record["provenance"] for record in records]
 
 
@@ -117,7 +123,8 @@ def run_training(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
         workspace = Workspace(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
-        summary = train(model, views, settings, job.random_seed, device, workspace)
+        surroundings = surroundings_of(inputs.parser, inputs.free_space, settings)
+        summary = train(model, views, settings, job.random_seed, device, workspace, surroundings)
         content = {
             "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
             "job": job.model_dump_json(),
