@@ -52,7 +52,9 @@ def test_the_stages_leave_records_that_know_where_they_come_from(trained):
 )  # fmt: skip
 def test_a_changed_setting_reruns_its_stage_and_the_trainings_that_take_it(trained, setting, expected):
     before = trained.config
-    changed = {key: {**before.get(key, {}), **value} if isinstance(value, dict) else value for key, value in setting.items()}
+    changed = {
+        key: {**before.get(key, {}), **value} if isinstance(value, dict) else value for key, value in setting.items()
+    }
     trained.config = {**before, **changed}
     trained.write_config()
     try:
