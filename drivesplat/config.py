@@ -19,8 +19,10 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
 from drivesplat.settings.extract import ExtractSettings
+from drivesplat.settings.free_space import FreeSpaceSettings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.looks import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.masks import MaskSettings
@@ -35,8 +37,8 @@ from drivesplat.settings.world import WorldSettings
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 DATASET_OVERRIDES = (
-    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors", "masks",
-    "sky", "train", "render", "ghosts", "removal", "export", "device",
+    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
+    "lidar_depth", "free_space", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
 )  # fmt: skip
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
@@ -144,6 +146,8 @@ class Config(Settings):
     refine_poses: RefinePosesSettings = RefinePosesSettings()
     lidar_seed: LidarSeedSettings = LidarSeedSettings()
     actors: ActorSeedSettings = ActorSeedSettings()
+    lidar_depth: LidarDepthSettings = LidarDepthSettings()
+    free_space: FreeSpaceSettings = FreeSpaceSettings()
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
     """Behind the Gaussians: 'cubemap' (learned, by direction), 'mask' (one learned colour, Gaussians kept out of sky

@@ -17,6 +17,7 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.looks import PanelJob, RemovalJob, SubjectSettings, TracksJob
@@ -36,7 +37,7 @@ ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """And that behind those of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The one of them that no eval.json comes from."""
-TRAINING_INPUTS = ("actors", "lidar_depth")
+TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
 
 
@@ -84,7 +85,11 @@ def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     """Which of TRAINING_INPUTS a method's training on a scene takes."""
     train = for_scene(config, scene, method).train
-    taken = {"actors": "actors" in config.all_methods[method].parts, "lidar_depth": train.depth_weight > 0}
+    taken = {
+        "actors": "actors" in config.all_methods[method].parts,
+        "lidar_depth": train.depth_weight > 0,
+        "free_space": train.floaters.free_space,
+    }
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
 
@@ -146,8 +151,19 @@ def _actors(place: Place) -> ActorSeedJob:
 def _lidar_depth(place: Place) -> LidarDepthJob:
     config = place.config
     return LidarDepthJob(
+        ray_spacing=config.lidar_depth.ray_spacing,
         holdout=config.holdout,
         images=config.images,
+        own_car_radius=config.lidar_seed.own_car_radius,
+        box_margin=config.lidar_seed.box_margin,
+    )
+
+
+def _free_space(place: Place) -> FreeSpaceJob:
+    config = place.config
+    return FreeSpaceJob(
+        free_space=config.free_space,
+        holdout=config.holdout,
         own_car_radius=config.lidar_seed.own_car_radius,
         box_margin=config.lidar_seed.box_margin,
     )
@@ -169,6 +185,7 @@ def _evaluate(place: Place) -> EvaluateJob:
         cameras=config.cameras,
         sweeps=config.sweeps,
         holdout=config.holdout,
+        lidar=_lidar_depth(place),
         lpips=config.lpips.enabled,
         removal=config.removal if place.dataset.world else None,
     )
@@ -235,6 +252,7 @@ _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "masks": lambda at: MaskJob(masks=at.config.masks, holdout=at.config.holdout, images=at.config.images),
     "actors": _actors,
     "lidar_depth": _lidar_depth,
+    "free_space": _free_space,
     "train": _train,
     "evaluate": _evaluate,
     "scene_metrics": lambda _: Settings(),

@@ -2,8 +2,8 @@
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
-# where poses are refined, scene_refined.json, poses.json and triangulated.pkl; where a method asks for them, actors.pkl
-# and lidar_depth.pkl. The scene of all rules after these (plan.scene) is the refined one where there is one.
+# where poses are refined, scene_refined.json, poses.json and triangulated.pkl; where a method asks for them, actors.pkl,
+# lidar_depth.pkl and free_space.pkl. The scene of all rules after these (plan.scene) is the refined one where there is one.
 
 
 rule extract:
@@ -212,3 +212,28 @@ rule lidar_depth:
         code=plan.code("lidar_depth"),
     script:
         "../workflow_scripts/lidar_depth.py"
+
+
+rule free_space:
+    """
+    Follows every LiDAR ray of the training key frames from sensor to return: the voxels that rays passed, and near
+    which none ended, are empty.
+    """
+    input:
+        scene=plan.scene,
+    output:
+        free_space="<results>/{scene}/free_space.pkl",
+    log:
+        "<logs>/{scene}/free_space.log",
+    benchmark:
+        "<benchmarks>/{scene}/free_space.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("free_space"),
+        code=plan.code("free_space"),
+    script:
+        "../workflow_scripts/free_space.py"

@@ -128,6 +128,7 @@ def test_only_what_has_actors_takes_actors_and_only_what_is_held_to_depth_takes_
     taken = {name: training_inputs(load({}), "0061", name) for name in names(seeds=[1])}
     for name, inputs in taken.items():
         expected = {"actors": "without-actors" not in name, "lidar_depth": "without-depth" not in name}
+        expected["free_space"] = False  # asked for by no default
         assert {stage: stage in inputs for stage in TRAINING_INPUTS} == expected, name
 
 

@@ -45,6 +45,8 @@ def test_metrics_come_from_nothing_on_the_cpu(finished):
     assert metrics["methods"].keys() == {"vanilla", "street"}
     for method, result in metrics["methods"].items():
         assert result["interpolation"]["all"]["psnr"] > 8.0
+        depth = result["interpolation"]["depth"]
+        assert 0.0 < depth["median_relative_error"] < 0.5 and depth["pixels"] > 1000
         assert finished.read(f"results/demo/{method}/train.json")["device"].startswith("cpu")
 
 

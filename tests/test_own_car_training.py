@@ -144,7 +144,7 @@ def prepared(tmp_path_factory) -> Path:
     record = own_car_record(scene, OwnCarJob(polygons={}, search=search))
     write_json(folder / "own_car.json", {**record, "provenance": {"made": "own_car"}})
     own_car, _ = read_own_car(folder / "own_car.json")
-    made = make_masks(scene, MaskJob(masks=MaskSettings(), images=images), folder / "masks", own_car)
+    made = make_masks(scene, MaskJob(masks=MaskSettings(), holdout=holdout, images=images), folder / "masks", own_car)
     write_json(folder / "masks/masks.json", {**made, "provenance": {}})
     settings = LidarSeedSettings(max_points=2000, far_points=500)
     seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0), own_car)

@@ -65,6 +65,13 @@ def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) 
     return model.render(view, gaussians=gaussians).image.float().cpu().numpy()
 
 
+@torch.no_grad()
+def rendered_with_depth(model: SplatModel, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """What the model shows, as `rendered`, and how far away it is (h, w), metres along the camera's axis."""
+    picture = model.render(view, with_depth=True)
+    return picture.image.float().cpu().numpy(), picture.depth.float().cpu().numpy()
+
+
 def lateral_metrics(
     model: SplatModel, known: KnownTruth, camera: str, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any] | None:

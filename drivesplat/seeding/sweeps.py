@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.holdout import sweep_groups
+from drivesplat.holdout import Group, sweep_groups
 from drivesplat.rigid import apply
 from drivesplat.scene import Scene, Sweep, place_of
 from drivesplat.settings.holdout import HoldoutSettings
@@ -44,13 +44,22 @@ def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:
 
 
 def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
-    """The sweeps that a training may see, each with its returns (n, 3) in world coordinates, the own car's left out. A
-    sweep whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
+    """The sweeps that a training may see, as `returns_of` gives them."""
+    return returns_of(scene, holdout, own_car_radius, ("train",))
+
+
+def returns_of(
+    scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...]
+) -> list[tuple[Sweep, np.ndarray]]:
+    """The sweeps of some groups, of key frames and, where the scene holds any, between them, each with its returns (n,
+    3) in world coordinates, the own car's left out. A sweep whose file is missing or corrupt is left out: the stage
+    lidar_seed is the one that complains."""
     found = []
-    for sweep in training_sweeps(scene, holdout):
-        with suppress(DatasetError):
-            points = without_own_car(read_sweep(sweep), own_car_radius)
-            found.append((sweep, apply(sweep.sensor_to_world, points)))
+    for sweep, group in zip(scene.sweeps, sweep_groups(scene, holdout), strict=True):
+        if group in groups:
+            with suppress(DatasetError):
+                points = without_own_car(read_sweep(sweep), own_car_radius)
+                found.append((sweep, apply(sweep.sensor_to_world, points)))
     return found
 
 

@@ -8,6 +8,7 @@ from drivesplat.settings import Settings
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.road import RoadSettings
 
 PartName = Literal["background", "actors"]
 MOVING_PARTS = frozenset({"actors"})
@@ -63,6 +64,8 @@ class FloaterSettings(Settings):
     radius: float = Field(1.0, ge=0, le=10)
     """Gaussians whose centre is nearer than this (metres) to the path of a training camera are faded out: the
     recording car drove there, so it is empty. Worth 1.5 dB of static PSNR on scene 0061. 0 = off."""
+    free_space: bool = False
+    """Whether those are faded out, too, whose centre lies where LiDAR's rays prove space empty (`free_space`)."""
     every: int = Field(100, ge=1)
     """Iterations between prunings."""
 
@@ -109,6 +112,13 @@ class TrainSettings(Settings):
     """Weight of the mean opacity in the loss: what is not needed fades."""
     scale_reg: float = Field(0.01, ge=0)
     """Weight of the mean scale (metres) in the loss: what is large must earn it."""
+    flatness_weight: float = Field(0.0, ge=0)
+    """Weight of the background Gaussians' mean thickness (metres, their smallest scale) in the loss: surfaces are
+    flat."""
+    road_weight: float = Field(0.0, ge=0)
+    """Weight of how far (metres) the mass of Gaussians under the car's path lies from the road there, whose height and
+    slope the car's poses tell."""
+    road: RoadSettings = RoadSettings()
     sky_alpha_weight: float = Field(0.05, ge=0)
     """Weight of -log(1 - alpha) on sky pixels with `sky: mask`: no Gaussian in the sky. A cube map does without:
     it cost 0.5 dB of static PSNR on scene 0061, where masks and tree tops disagree."""

@@ -17,11 +17,13 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size, read_parser
 from drivesplat.regions import LABELS, region_mask
 from drivesplat.seeding.actors import read_actors
+from drivesplat.seeding.free_space import read_free_space
 from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
+from drivesplat.training.surfaces import surroundings_of
 from drivesplat.training.train import Workspace, train
 from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
 
@@ -30,8 +32,8 @@ from drivesplat.training.views import Guides, TrainingView, camera_of, load_view
 class TrainingInputs:
     """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
     has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), the
-    cameras that see the own car, and `sky_known`: where no sky was found, it is not known of any pixel that it is none.
-    """
+    cameras that see the own car, `sky_known` (where no sky was found, it is not known of any pixel that it is none),
+    and the record of free_space.pkl (None where the method has no use for it)."""
 
     parser: dict[str, Any]
     masks: Path
@@ -40,6 +42,7 @@ class TrainingInputs:
     classes: int = 0
     seeing_own_car: frozenset[str] = frozenset()
     sky_known: bool = True
+    free_space: dict[str, Any] | None = None
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
@@ -80,14 +83,15 @@ class TrainingInputs:
 
 
 def read_inputs(
-    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str]
+    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str], free_space: Sequence[str]
 ) -> tuple[TrainingInputs, list[dict[str, Any]]]:
-    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl and lidar_depth.pkl,
-    with the provenances of these files."""
+    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl, lidar_depth.pkl and
+    free_space.pkl, with the provenances of these files."""
     folder = Path(masks).parent
     packed, made = read_parser(parser), read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
+    spaces = [read_free_space(path) for path in free_space]
     inputs = TrainingInputs(
         packed,
         folder,
@@ -96,8 +100,9 @@ def read_inputs(
         made["semantic_classes"],
         frozenset(made["own_car"]),
         made["sky_known"],
+        next(iter(spaces), None),
     )
-    records = [packed, made, *moving, *depths]
+    records = [packed, made, *moving, *depths, *spaces]
     return inputs, [record["provenance"] for record in records]
 
 
@@ -143,7 +148,8 @@ def run_training(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
         workspace = Workspace(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
-        summary = train(model, views, settings, job.random_seed, device, workspace)
+        surroundings = surroundings_of(inputs.parser, inputs.free_space, settings)
+        summary = train(model, views, settings, job.random_seed, device, workspace, surroundings)
         content = {
             "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
             "job": job.model_dump_json(),
