@@ -98,17 +98,22 @@ def _result(group: Group, recipe: str, seed: int, outcome: Outcome, expected: di
     return Result(recipe, seed, path, evaluation)
 
 
+def occupation(log: str, on_processors: bool) -> Occupation | None:
+    """When a job ran on which card, as its log says; one whose log names none may be known to have run `on_processors`.
+    None where it is not known."""
+    times, card = [datetime.strptime(time, TIME_FORMAT) for time in _LINE.findall(log)], _CARD.search(log)
+    if card:
+        return Occupation(card[2], datetime.strptime(card[1], TIME_FORMAT), times[-1])
+    return Occupation(PROCESSORS, times[0], times[-1]) if on_processors and times else None
+
+
 def _occupation(group: Group, result: Result, stage: str) -> Occupation | None:
-    """When a stage of a recipe ran on which card, as its log says; None where that is not known."""
+    """When a stage of a recipe ran on which card; None where that is not known."""
     try:
         log = group.log(result.recipe, result.seed, stage).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return None
-    times, card = [datetime.strptime(time, TIME_FORMAT) for time in _LINE.findall(log)], _CARD.search(log)
-    if card:
-        return Occupation(card[2], datetime.strptime(card[1], TIME_FORMAT), times[-1])
-    on_processors = result.result is not None and result.result["device"].startswith("cpu")
-    return Occupation(PROCESSORS, times[0], times[-1]) if on_processors and times else None
+    return occupation(log, on_processors=result.result is not None and result.result["device"].startswith("cpu"))
 
 
 def _shared(result: Result, held: Mapping[tuple[str, int, str], Occupation]) -> bool:
