@@ -58,36 +58,31 @@ class Occupation:
 
 def results_of(ended: Sequence[tuple[Group, Outcome]]) -> list[Result]:
     """What there is of every recipe with every seed of groups whose runs of Snakemake have ended, recipe by recipe."""
-    found = [(group, result) for group, outcome in ended for result in _of_group(group, outcome)]
+    found = [
+        (group, _result(group, recipe, seed, outcome))
+        for group, outcome in ended
+        for recipe in group.recipes
+        for seed in group.seeds
+    ]
     held = {
-        (result.recipe, result.seed, stage): occupation
+        (result.recipe, result.seed, stage): span
         for group, result in found
         for stage in ON_CARDS
-        if (occupation := _occupation(group, result, stage)) is not None
+        if (span := _occupation(group, result, stage)) is not None
     }
     return [dataclasses.replace(result, shared=_shared(result, held)) for _, result in found]
 
 
-def _of_group(group: Group, outcome: Outcome) -> list[Result]:
-    methods = [with_seed(recipe, seed) for recipe in group.recipes for seed in group.seeds]
-    expected = {method: group.plan.evaluation_stages(group.scene, [method]) for method in methods}
-    return [
-        _result(group, recipe, seed, outcome, expected[with_seed(recipe, seed)])
-        for recipe in group.recipes
-        for seed in group.seeds
-    ]
-
-
-def _result(group: Group, recipe: str, seed: int, outcome: Outcome, expected: dict[str, Any]) -> Result:
-    """The result of a recipe with a seed; none where what lies there was made otherwise than `expected`: a training
-    that failed leaves the figures of an earlier one in place."""
-    path = group.evaluation(recipe, seed)
-    missing = Result(recipe, seed, path, why=outcome.why(with_seed(recipe, seed)) or unexplained(group, recipe, seed))
+def _result(group: Group, recipe: str, seed: int, outcome: Outcome) -> Result:
+    """The result of a recipe with a seed; none where what lies there was made otherwise than the group's plan says: a
+    training that failed leaves the figures of an earlier one in place."""
+    path, method = group.evaluation(recipe, seed), with_seed(recipe, seed)
+    missing = Result(recipe, seed, path, why=outcome.why(method) or unexplained(group, recipe, seed))
     if not path.is_file():
         return missing
     try:
         evaluation = read_json(path, rule="evaluate")
-        stale = differences(expected, evaluation["provenance"]["stages"])
+        stale = differences(group.plan.evaluation_stages(group.scene, [method]), evaluation["provenance"]["stages"])
     except ResultError as error:
         return dataclasses.replace(missing, why=str(error))
     except (AttributeError, KeyError, TypeError) as error:
