@@ -103,3 +103,10 @@ def test_each_is_told_what_decides_it():
 def test_a_dataset_may_set_its_actors_for_itself():
     overrides = {"datasets": {"nuscenes": {"overrides": {"actors": {"min_points": 9}}}}}
     assert told("actors", **overrides)["actors"]["min_points"] == 9
+
+
+def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
+    made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
+    of_scene = {*SCENE_STAGES} - {"scene_metrics"}
+    assert made.evaluation_stages("a1", ["vanilla"]).keys() == {*of_scene, "vanilla/train", "vanilla/evaluate"}
+    assert made.evaluation_stages("a1", ["mine"]).keys() == {*of_scene, "actors", "mine/train", "mine/evaluate"}

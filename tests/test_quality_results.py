@@ -1,14 +1,21 @@
 """What is taken for a result of a recipe once Snakemake has ended, and what is said where there is none."""
 
 import json
+import logging
+import tempfile
+import time
+from datetime import datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hand_made_recipes import evaluation, recipe_file, write_evaluation
 
 from drivesplat.errors import ConfigError
-from drivesplat.quality.results import Result, results_of
+from drivesplat.job import job
+from drivesplat.quality.results import Result, occupation, results_of
 from drivesplat.quality.runs import Outcome, outcome, passed_on
+from drivesplat.settings.device import DeviceSettings
 
 WELL = Outcome(0, None, {})
 FAILED = """\
@@ -144,6 +151,35 @@ def write_log(group, recipe: str, seed: int, began: str, finished: str, card: st
         f"2026-11-21 {finished},000 INFO drivesplat.job: {name} ends\n"
     )
     return path
+
+
+@pytest.fixture
+def own_logging():
+    """A root logger without handlers, which a script configures for its process, and afterwards the one there was."""
+    root = logging.getLogger()
+    handlers, level, root.handlers[:] = root.handlers[:], root.level, []
+    yield
+    logging.captureWarnings(False)
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+def test_the_log_of_a_job_says_which_card_it_had_and_when(tmp_path, monkeypatch, own_logging):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-8f2e")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    path = tmp_path / "train.log"
+    empty = SimpleNamespace(input=None, output=None, wildcards=SimpleNamespace(scene="0061", method="a-seed0"))
+    resources = SimpleNamespace(device=DeviceSettings().model_dump_json())
+    before = datetime.now()
+    with job(
+        SimpleNamespace(**vars(empty), threads=1, rule="train", params=None, resources=resources, log=[path])
+    ) as at:
+        at.device()
+        time.sleep(0.02)
+    held = occupation(path.read_text(), on_processors=False)
+    assert held.card == "GPU-8f2e"
+    millisecond = timedelta(milliseconds=1)
+    assert before - millisecond <= held.began < held.ended - 10 * millisecond < datetime.now()
 
 
 @pytest.mark.parametrize(

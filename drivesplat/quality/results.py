@@ -58,36 +58,31 @@ class Occupation:
 
 def results_of(ended: Sequence[tuple[Group, Outcome]]) -> list[Result]:
     """What there is of every recipe with every seed of groups whose runs of Snakemake have ended, recipe by recipe."""
-    found = [(group, result) for group, outcome in ended for result in _of_group(group, outcome)]
+    found = [
+        (group, _result(group, recipe, seed, outcome))
+        for group, outcome in ended
+        for recipe in group.recipes
+        for seed in group.seeds
+    ]
     held = {
-        (result.recipe, result.seed, stage): occupation
+        (result.recipe, result.seed, stage): span
         for group, result in found
         for stage in ON_CARDS
-        if (occupation := _occupation(group, result, stage)) is not None
+        if (span := _occupation(group, result, stage)) is not None
     }
     return [dataclasses.replace(result, shared=_shared(result, held)) for _, result in found]
 
 
-def _of_group(group: Group, outcome: Outcome) -> list[Result]:
-    methods = [with_seed(recipe, seed) for recipe in group.recipes for seed in group.seeds]
-    expected = {method: group.plan.evaluation_stages(group.scene, [method]) for method in methods}
-    return [
-        _result(group, recipe, seed, outcome, expected[with_seed(recipe, seed)])
-        for recipe in group.recipes
-        for seed in group.seeds
-    ]
-
-
-def _result(group: Group, recipe: str, seed: int, outcome: Outcome, expected: dict[str, Any]) -> Result:
-    """The result of a recipe with a seed; none where what lies there was made otherwise than `expected`: a training
-    that failed leaves the figures of an earlier one in place."""
-    path = group.evaluation(recipe, seed)
-    missing = Result(recipe, seed, path, why=outcome.why(with_seed(recipe, seed)) or unexplained(group, recipe, seed))
+def _result(group: Group, recipe: str, seed: int, outcome: Outcome) -> Result:
+    """The result of a recipe with a seed; none where what lies there was made otherwise than the group's plan says: a
+    training that failed leaves the figures of an earlier one in place."""
+    path, method = group.evaluation(recipe, seed), with_seed(recipe, seed)
+    missing = Result(recipe, seed, path, why=outcome.why(method) or unexplained(group, recipe, seed))
     if not path.is_file():
         return missing
     try:
         evaluation = read_json(path, rule="evaluate")
-        stale = differences(expected, evaluation["provenance"]["stages"])
+        stale = differences(group.plan.evaluation_stages(group.scene, [method]), evaluation["provenance"]["stages"])
     except ResultError as error:
         return dataclasses.replace(missing, why=str(error))
     except (AttributeError, KeyError, TypeError) as error:
@@ -98,17 +93,22 @@ def _result(group: Group, recipe: str, seed: int, outcome: Outcome, expected: di
     return Result(recipe, seed, path, evaluation)
 
 
+def occupation(log: str, on_processors: bool) -> Occupation | None:
+    """When a job ran on which card, as its log says; one whose log names none may be known to have run `on_processors`.
+    None where it is not known."""
+    times, card = [datetime.strptime(time, TIME_FORMAT) for time in _LINE.findall(log)], _CARD.search(log)
+    if card:
+        return Occupation(card[2], datetime.strptime(card[1], TIME_FORMAT), times[-1])
+    return Occupation(PROCESSORS, times[0], times[-1]) if on_processors and times else None
+
+
 def _occupation(group: Group, result: Result, stage: str) -> Occupation | None:
-    """When a stage of a recipe ran on which card, as its log says; None where that is not known."""
+    """When a stage of a recipe ran on which card; None where that is not known."""
     try:
         log = group.log(result.recipe, result.seed, stage).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return None
-    times, card = [datetime.strptime(time, TIME_FORMAT) for time in _LINE.findall(log)], _CARD.search(log)
-    if card:
-        return Occupation(card[2], datetime.strptime(card[1], TIME_FORMAT), times[-1])
-    on_processors = result.result is not None and result.result["device"].startswith("cpu")
-    return Occupation(PROCESSORS, times[0], times[-1]) if on_processors and times else None
+    return occupation(log, on_processors=result.result is not None and result.result["device"].startswith("cpu"))
 
 
 def _shared(result: Result, held: Mapping[tuple[str, int, str], Occupation]) -> bool:
