@@ -17,6 +17,7 @@ from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.readers import layout
 from drivesplat.rerun import code_digest
+from drivesplat.scene import REFINED
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.stages import (
@@ -102,7 +103,7 @@ class Plan:
 
     def scene(self, wildcards: Any) -> str:
         """The record of a scene that all stages take: with refined poses, where they are wanted."""
-        name = "scene_refined.json" if refines_poses(self.config, wildcards.scene) else "scene.json"
+        name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
 
     def triangulated(self, wildcards: Any) -> list[str]:
