@@ -6,6 +6,7 @@ from typing import Any
 
 from drivesplat.config import Config, for_scene
 from drivesplat.readers import layout
+from drivesplat.scene import REFINED
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.stages import refines_poses, training_inputs
 from drivesplat.truth import TRUTH_FILE
@@ -47,7 +48,7 @@ class Inputs:
 
     def scene(self, wildcards: Any) -> str:
         """The record of a scene that all stages take: with refined poses, where they are wanted."""
-        name = "scene_refined.json" if refines_poses(self.config, wildcards.scene) else "scene.json"
+        name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
 
     def triangulated(self, wildcards: Any) -> list[str]:

@@ -16,6 +16,8 @@ from drivesplat.errors import DatasetError
 from drivesplat.storage import read_json, unreadable, write_json
 
 SCHEMA = 1
+REFINED = "scene_refined.json"
+"""What the record is called once its poses are refined."""
 
 
 @dataclass(frozen=True)
@@ -154,13 +156,14 @@ def write_scene(path: str | Path, scene: Scene) -> None:
 
 def read_scene(path: str | Path) -> Scene:
     """Reads `scene.json`. Raises ResultError where the file is not one, naming it and the rule that makes it."""
-    content = read_json(path, rule="extract")
+    rule = "refine_poses" if Path(path).name == REFINED else "extract"
+    content = read_json(path, rule)
     try:
         if content.pop("schema") != SCHEMA:
             raise ValueError("it has another schema")
         return _from_plain(Scene, content)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, "extract", f"not a scene record ({error})") from error
+        raise unreadable(path, rule, f"not a scene record ({error})") from error
 
 
 def _to_plain(record: Any) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 def job(holdout: dict[str, int] = HELD_OUT) -> LidarDepthJob:
     return LidarDepthJob.model_validate(
         {
-            "holdout": holdout, "images": {"width": None}, "own_car_radius": 2.5, "own_car_polygons": {},
+            "holdout": holdout, "images": {"width": None}, "own_car_radius": 2.5,
             "ray_spacing": (1.5, 1.65), "box_margin": 0.1,
         }
     )  # fmt: skip

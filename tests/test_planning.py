@@ -9,7 +9,7 @@ import pytest
 
 from drivesplat.config import load
 from drivesplat.planning import Plan
-from drivesplat.stages import SCENE_STAGES, stage_settings
+from drivesplat.stages import ALL_SCENE_STAGES, SCENE_STAGES, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 ACTORS = ["background", "actors"]
@@ -78,6 +78,43 @@ def test_a_report_expects_them_where_a_method_of_the_scene_takes_them(methods, m
         for stage in stages:
             assert expected[scene][stage]["code"] == made.code(stage)
             assert expected[scene][stage]["settings"] == json.loads(stage_settings(made.config, stage, scene))
+
+
+REFINED = {"refine_poses": {"enabled": True}}
+
+
+def test_all_stages_take_the_refined_scene_where_poses_are_refined():
+    made = plan(b=REFINED)
+    scenes = {name: made.scene(SimpleNamespace(scene=name)) for name in ("a1", "b1")}
+    assert scenes == {"a1": "elsewhere/a1/scene.json", "b1": "elsewhere/b1/scene_refined.json"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "taken"),
+    [
+        ({}, []),
+        (REFINED, ["elsewhere/a1/triangulated.pkl"]),
+        ({**REFINED, "lidar_seed": {"triangulated": False}}, []),
+        ({"lidar_seed": {"triangulated": True}}, []),
+    ],
+)
+def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_they_are_wanted(settings, taken):
+    assert plan(**settings).triangulated(SimpleNamespace(scene="a1")) == taken
+
+
+def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
+    made = plan(methods={"vanilla": {}}, b=REFINED)
+    expected = json.loads(made.expected_stages())
+    assert {name for name in expected["a1"] if "/" not in name} == set(SCENE_STAGES)
+    assert {name for name in expected["b1"] if "/" not in name} == set(ALL_SCENE_STAGES)
+    assert expected["b1"]["refine_poses"]["code"] == made.code("refine_poses")
+    assert expected["b1"]["refine_poses"]["settings"]["refine_poses"]["enabled"] is True
+
+
+def test_the_refinement_is_told_what_decides_it_and_no_more():
+    job = told("refine_poses", random_seed=3, refine_poses={"rounds": 5})
+    assert job.keys() == {"refine_poses", "random_seed"}
+    assert (job["refine_poses"]["rounds"], job["random_seed"]) == (5, 3)
 
 
 def told(stage: str, **values: Any) -> dict[str, Any]:

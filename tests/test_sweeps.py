@@ -107,7 +107,7 @@ def spoil(path: str, random: np.random.Generator) -> None:
 
 def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
     """All that a training of the scene starts from, each as bytes."""
-    plain = {"holdout": holdout, "images": {"width": 64}, "own_car_radius": 2.5, "own_car_polygons": {}}
+    plain = {"holdout": holdout, "images": {"width": 64}, "own_car_radius": 2.5}
     seed = seed_points(scene, SeedJob(lidar_seed={"far_points": 200}, random_seed=0, holdout=holdout, images={}))
     actors = actors_record(scene, ActorSeedJob(actors={"min_points": 0}, random_seed=0, **plain))
     images = MaskJob(masks={}, holdout=holdout, images={})
@@ -202,7 +202,7 @@ def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
     """Five times as many moments as key frames alone give, each in the car's own frame where it then is."""
     job = ActorSeedJob(
         actors={"min_points": 0, "box_margin": 0.0}, holdout=HELD_OUT, images={}, own_car_radius=2.5,
-        own_car_polygons={}, random_seed=0,
+        random_seed=0,
     )  # fmt: skip
     scene = scene_at(rich_root, **EVERYTHING)
     few, many = (actors_record(s, job)["actors"][0]["points"] for s in (scene_at(rich_root), scene))
@@ -218,7 +218,7 @@ def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
 def test_an_image_sees_the_training_sweep_of_its_moment(rich_root):
     """Of the sweeps alone that is nearest in time, what moves is carried on by at most half a sweep's time."""
     scene = scene_at(rich_root, **EVERYTHING)
-    job = LidarDepthJob(holdout=HELD_OUT, images={}, own_car_radius=2.5, own_car_polygons={}, box_margin=0.1)
+    job = LidarDepthJob(holdout=HELD_OUT, images={}, own_car_radius=2.5, box_margin=0.1, ray_spacing=(1.5, 1.65))
     whole = lidar_depths(scene, job)
     training = [s for s in scene.sweeps if seconds_of(s.timestamp) in training_seconds(scene)]
     groups = frame_groups(scene, job.holdout)

@@ -42,7 +42,7 @@ MARGIN = 0.1
 GREY = (0.45, 0.5, 0.4)
 HOLDOUT = HoldoutSettings(every_nth=4, offset=2, last_block=1)
 LIDAR = LidarDepthJob(
-    holdout=HOLDOUT, images=ImageSettings(), own_car_radius=2.5, own_car_polygons={}, ray_spacing=(0.33, 1.33),
+    holdout=HOLDOUT, images=ImageSettings(), own_car_radius=2.5, ray_spacing=(0.33, 1.33),
     box_margin=0.2,
 )  # fmt: skip
 OWN_CAR_ROWS = 12

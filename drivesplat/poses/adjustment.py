@@ -1,8 +1,9 @@
 """Points from matched features and given poses, and both adjusted to what the images show.
 
 Bundle adjustment by pycolmap and Ceres, with three kinds of residuals: reprojection errors (pixels, Cauchy's loss); how
-far poses are from the given ones; and how much that changes from one image to the next. Pose residuals are in the own
-car's frame, where a prior knows which way is up.
+far poses are from the given ones; and how far motions from one image to the next are from the given ones. The latter
+two are in the own car's frame, where a prior knows which way is up: rotation vector and translation of refined @
+inverse(given), of world to ego and of ego to ego (pycolmap.cost_functions).
 """
 
 from collections.abc import Iterable
@@ -36,15 +37,15 @@ class Priors:
     settings: PriorSettings
     feature_noise: float
 
-    def attach(self, problem: pyceres.Problem, poses: list[np.ndarray]) -> None:
-        """Adds its residuals on `poses`, the parameters of world to ego in the order of the given ones."""
-        given = [to_pycolmap(inverse(pose)) for pose in self.given]
+    def attach(self, problem: pyceres.Problem, poses: dict[int, np.ndarray]) -> None:
+        """Adds its residuals on `poses`, the parameters of world to ego by the images' positions among the given."""
+        given = {i: to_pycolmap(inverse(self.given[i])) for i in sorted(poses)}
         deviations = self._deviations()
         covariance = np.diag(deviations**2)
-        for pose, prior in zip(poses, given, strict=True):
+        for i, prior in given.items():
             cost = cost_functions.AbsolutePosePriorCost(covariance, prior)
-            problem.add_residual_block(cost, pyceres.TrivialLoss(), [pose])
-        for i, j in pairwise(range(len(poses))):
+            problem.add_residual_block(cost, pyceres.TrivialLoss(), [poses[i]])
+        for i, j in pairwise(given):
             passed = max(LEAST_SECONDS, float(self.seconds[j] - self.seconds[i]))
             covariance = np.diag((self.settings.drift * deviations) ** 2 * passed)
             cost = cost_functions.RelativePosePriorCost(covariance, given[i] * given[j].inverse())
@@ -63,10 +64,15 @@ def priors_of(images: RigImages, settings: RefinePosesSettings) -> Priors:
 
 
 def triangulated(
-    reconstruction: pycolmap.Reconstruction, database: Path, job: RefinePosesJob
+    reconstruction: pycolmap.Reconstruction, database: Path, job: RefinePosesJob, threads: int
 ) -> pycolmap.Reconstruction:
-    """The reconstruction with points made anew from all matches, its poses as they are."""
-    options = pycolmap.IncrementalPipelineOptions(random_seed=job.random_seed, extract_colors=False)
+    """A copy with points made anew from all matches, its poses as they are."""
+    copy = pycolmap.Reconstruction(reconstruction)
+    if len(copy.images) < 2:
+        return copy
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=job.random_seed, num_threads=threads, extract_colors=False
+    )
     options.triangulation.random_seed = job.random_seed
     options.triangulation.min_angle = job.refine_poses.min_angle
     options.triangulation.complete_max_reproj_error = WORST_PIXELS
@@ -74,18 +80,19 @@ def triangulated(
     options.mapper.filter_max_reproj_error = WORST_PIXELS
     folder = database.parent / "model"
     folder.mkdir(exist_ok=True)
-    return pycolmap.triangulate_points(reconstruction, database, database.parent, folder, True, options, False)
+    return pycolmap.triangulate_points(copy, database, database.parent, folder, True, options, False)
 
 
 def adjust(reconstruction: pycolmap.Reconstruction, priors: Priors | None, robust_pixels: float, threads: int) -> None:
-    """Moves points and poses in place to where residuals are least; without `priors` the points alone."""
+    """Moves points and poses in place to where residuals are least; without `priors` the points alone. Images that see
+    no points stay where they are."""
     config = pycolmap.BundleAdjustmentConfig()
-    for image in reconstruction.images:
-        config.add_image(image)
+    for number in _with_points(reconstruction):
+        config.add_image(number)
     for camera in reconstruction.cameras:
         config.set_constant_cam_intrinsics(camera)
     if priors is None:
-        for moment in reconstruction.frames:
+        for moment in _with_points(reconstruction):
             config.set_constant_rig_from_world_pose(moment)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_sensor_from_rig=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -95,10 +102,16 @@ def adjust(reconstruction: pycolmap.Reconstruction, priors: Priors | None, robus
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
     problem = adjuster.problem  # owns what is attached to it: it has to outlive the solver's work
     if priors is not None:
-        poses = [reconstruction.frames[number].rig_from_world.params for number in sorted(reconstruction.frames)]
-        priors.attach(problem, poses)
+        moments = {number - 1: reconstruction.frames[number] for number in _with_points(reconstruction)}
+        priors.attach(problem, {i: moment.rig_from_world.params for i, moment in moments.items()})
     adjuster.solve()
     del problem
+
+
+def _with_points(reconstruction: pycolmap.Reconstruction) -> list[int]:
+    """The numbers of images (and of their moments) that see points: only these have residuals of their own, and only
+    their poses' rotations are known as rotations to the solver."""
+    return sorted(number for number, image in reconstruction.images.items() if image.num_points3D)
 
 
 def with_poses_of(reconstruction: pycolmap.Reconstruction, ego_to_world: np.ndarray) -> pycolmap.Reconstruction:

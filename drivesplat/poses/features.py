@@ -1,6 +1,6 @@
 """Features of images, outside of all that moves, and which of them are the same: a pycolmap database."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from pathlib import Path
@@ -25,6 +25,19 @@ def find_features(images: RigImages, job: RefinePosesJob, database: Path, thread
 
     Raises DatasetError where an image cannot be read.
     """
+
+    def features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        return _features(images, frame, job)
+
+    with ThreadPoolExecutor(threads) as pool:
+        return write_images(images, pool.map(features, images.frames), database)
+
+
+def write_images(
+    images: RigImages, found: Iterable[tuple[np.ndarray, np.ndarray]], database: Path
+) -> pycolmap.Reconstruction:
+    """Writes cameras, rig, and per image what was `found` (keypoints (n, 4), descriptors (n, 128)) into a new database;
+    returns the same as a reconstruction without points."""
     reconstruction = pycolmap.Reconstruction()
     store = pycolmap.Database.open(database)
     for camera in images.pycolmap_cameras():
@@ -33,28 +46,20 @@ def find_features(images: RigImages, job: RefinePosesJob, database: Path, thread
     rig = images.rig()
     store.write_rig(rig, use_rig_id=True)
     reconstruction.add_rig(rig)
-
-    def features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        return _features(images, frame, job)
-
-    with ThreadPoolExecutor(threads) as pool:
-        found = pool.map(features, images.frames)
-        for number, (frame, (keypoints, descriptors)) in enumerate(zip(images.frames, found, strict=True), start=1):
-            image = pycolmap.Image(
-                name=image_name(number),
-                keypoints=keypoints[:, :2].astype(np.float64),
-                camera_id=images.camera_id(frame),
-                image_id=number,
-            )
-            store.write_image(image, use_image_id=True)
-            store.write_frame(images.moment(number), use_frame_id=True)
-            store.write_keypoints(number, keypoints)
-            store.write_descriptors(
-                number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors)
-            )
-            reconstruction.add_frame(images.moment(number))
-            image.frame_id = number
-            reconstruction.add_image(image)
+    for number, (frame, (keypoints, descriptors)) in enumerate(zip(images.frames, found, strict=True), start=1):
+        image = pycolmap.Image(
+            name=image_name(number),
+            keypoints=keypoints[:, :2].astype(np.float64),
+            camera_id=images.camera_id(frame),
+            image_id=number,
+        )
+        store.write_image(image, use_image_id=True)
+        store.write_frame(images.moment(number), use_frame_id=True)
+        store.write_keypoints(number, keypoints)
+        store.write_descriptors(number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))
+        reconstruction.add_frame(images.moment(number))
+        image.frame_id = number
+        reconstruction.add_image(image)
     store.close()
     return reconstruction
 
@@ -134,8 +139,8 @@ def meets_box(origin: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> 
 
 
 def _features(images: RigImages, frame: Frame, job: RefinePosesJob) -> tuple[np.ndarray, np.ndarray]:
-    """Keypoints (n, 4) or (n, 6) float32, x and y first, in continuous pixels of the recorded image, and descriptors
-    (n, 128) uint8; those of the largest scale where there are too many."""
+    """Keypoints (n, 4: x, y, scale, orientation) float32, x and y in continuous pixels of the recorded image, and
+    descriptors (n, 128) uint8; those of the largest scale where there are too many."""
     settings = job.refine_poses.features
     reduction = min(1.0, settings.max_image_size / max(frame.width, frame.height))
     size = (round(frame.width * reduction), round(frame.height * reduction))
@@ -146,7 +151,13 @@ def _features(images: RigImages, frame: Frame, job: RefinePosesJob) -> tuple[np.
     found, described = extractor.extract(pycolmap.Bitmap.from_array(grey))
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)
     keypoints[:, :2] *= np.array([frame.width, frame.height], dtype=np.float32) / size
-    kept = shows_what_stands(
-        images.scene, frame, keypoints[:, :2], images.own_car, job.refine_poses.features.box_margin
-    )
+    stands = shows_what_stands(images.scene, frame, keypoints[:, :2], images.own_car, settings.box_margin)
+    usable = np.flatnonzero(stands)
+    kept = usable[largest(keypoints[usable], settings.max_features)]
     return keypoints[kept], np.ascontiguousarray(np.asarray(described.data)[kept])
+
+
+def largest(keypoints: np.ndarray, count: int) -> np.ndarray:
+    """The positions, increasing, of the `count` keypoints (n, 4: x, y, scale, orientation) of largest scale: pycolmap
+    bounds their number only roughly, by whole levels of scale."""
+    return np.sort(np.argsort(-keypoints[:, 2], kind="stable")[:count])

@@ -1,6 +1,5 @@
 """Which images see which points."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +17,6 @@ class Observations:
     positions: np.ndarray
     numbers: np.ndarray
 
-    def of_points(self, numbers: Iterable[int]) -> np.ndarray:
+    def of_points(self, numbers: np.ndarray) -> np.ndarray:
         """Which observations (o,) bool are of points of these numbers."""
-        return np.isin(self.numbers[self.point], list(numbers)) if len(self.point) else np.zeros(0, dtype=bool)
+        return np.isin(self.numbers[self.point], numbers)

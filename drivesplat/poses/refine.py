@@ -69,26 +69,41 @@ def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, t
     images = RigImages.of(scene, key_frames, own_car)
     with tempfile.TemporaryDirectory(prefix="drivesplat-poses-") as folder:
         database = Path(folder) / "features.db"
-        reconstruction = find_features(images, job, database, threads)
+        start = find_features(images, job, database, threads)
         match_features(images, job, database, threads)
-        priors = priors_of(images, job.refine_poses)
-        for _ in range(job.refine_poses.rounds):
-            reconstruction = triangulated(reconstruction, database, job)
-            untouched = pycolmap.Reconstruction(reconstruction)
-            adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
+        return refined_by_matches(images, start, database, job, threads)
+
+
+def refined_by_matches(
+    images: RigImages, start: pycolmap.Reconstruction, database: Path, job: RefinePosesJob, threads: int = 1
+) -> Refinement:
+    """The refinement of a scene whose images and features are in `start`, and their matches in `database`."""
+    scene, reconstruction = images.scene, start
+    priors = priors_of(images, job.refine_poses)
+    for _ in range(job.refine_poses.rounds):
+        reconstruction = triangulated(reconstruction, database, job, threads)
+        untouched = pycolmap.Reconstruction(reconstruction)
+        adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
     seen = observations(reconstruction)
-    refined = poses_of(reconstruction)
+    corrections = _corrections(images, seen, priors.given, poses_of(reconstruction))
     trial = _trial(untouched, priors, job, threads) if len(seen.positions) else None
-    changes = inverse(priors.given) @ refined
+    changes = corrections.at(images.timestamps)
     fault = doubt(images, seen, changes, trial, job.refine_poses.limits)
     verdict = {"schema": SCHEMA, "scene": scene.name, "refined": fault is None, "kept_because": fault}
     record = {**verdict, **_record(images, seen, changes, trial)}
     if fault is not None:
         log.warning("scene %s: poses stay as they are: %s", scene.name, fault)
         return Refinement(scene, record, no_points())
-    times = np.array([frame.timestamp for frame in images.frames])
-    corrections = Corrections.between(times, priors.given, refined)
     return Refinement(corrected(scene, corrections), record, triangulated_record(images.indices, seen))
+
+
+def _corrections(images: RigImages, seen: Observations, given: np.ndarray, refined: np.ndarray) -> Corrections:
+    """From given to refined ego_to_world (n, 4, 4), at the times of the images that see points: the others follow. None
+    at all where no image does."""
+    held = np.unique(seen.image)
+    if not len(held):
+        return Corrections.between(images.timestamps[:1], given[:1], given[:1])
+    return Corrections.between(images.timestamps[held], given[held], refined[held])
 
 
 def poses_of(reconstruction: pycolmap.Reconstruction) -> np.ndarray:

@@ -50,6 +50,11 @@ class RigImages:
         """(n,)."""
         return np.array([self.scene.seconds(frame.timestamp) for frame in self.frames])
 
+    @property
+    def timestamps(self) -> np.ndarray:
+        """(n,), microseconds."""
+        return np.array([frame.timestamp for frame in self.frames], dtype=np.int64)
+
     def camera_id(self, frame: Frame) -> int:
         return self.cameras.index(frame.camera) + 1
 
