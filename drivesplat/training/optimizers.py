@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.train import TrainSettings
 
 Optimizers = dict[str, torch.optim.Optimizer]
 
@@ -51,11 +52,14 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
-def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, iterations: int) -> None:
-    """Sets the learning rates of `step`: those of positions and exposures decay exponentially, the rest stay."""
-    left = DECAY ** (step / iterations)
+def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
+    """Sets the learning rates of `step`: those of positions and exposures decay exponentially, exposures' being 0 until
+    they start; the rest stay."""
+    done = step / settings.iterations
+    left = DECAY**done
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         if "means" in group:
             group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * left
     for camera, optimizer in optimizers.beside_parts.get("exposure", {}).items():
-        optimizer.param_groups[0]["lr"] = model.exposure.learning_rates()[camera] * left
+        rate = model.exposure.learning_rates()[camera] if done >= settings.exposure.start else 0.0
+        optimizer.param_groups[0]["lr"] = rate * left
