@@ -16,6 +16,7 @@ from drivesplat.settings.world import WorldSettings
 
 RIG = {sensor.channel: sensor for sensor in SENSORS}
 START_US = 1_000_000_000
+KEY_FRAMES = 14
 
 
 def recorder_of(**world: Any) -> Recorder:
@@ -23,7 +24,7 @@ def recorder_of(**world: Any) -> Recorder:
     return Recorder(WorldSettings(**{"width": 160, "samples_per_pixel": 1, "vehicles": 1, "pedestrians": 0, **world}))
 
 
-def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = 12, **world: Any) -> Scene:
+def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = KEY_FRAMES, **world: Any) -> Scene:
     """The key frames of a drive by `cameras` and the LiDAR, their files in `folder`."""
     recorder = recorder_of(**world)
     frames, sweeps = [], []

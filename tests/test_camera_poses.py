@@ -199,7 +199,7 @@ def test_a_checkpoint_holds_corrections_and_their_times(learned):
 
 def test_corrections_are_learned_ever_more_slowly_and_logged(learned):
     optimizers = make_optimizers(learned)
-    schedule(learned, optimizers, 50, 100)
+    schedule(learned, optimizers, 50, TrainSettings(iterations=100))
     group = optimizers.beside_parts["camera_poses"]["FRONT"].param_groups[0]
     assert group["lr"] == pytest.approx(0.1 * LOOSE["learning_rate"])
     figures = learned.camera_poses.figures()

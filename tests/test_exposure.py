@@ -37,7 +37,7 @@ from drivesplat.training.views import TrainingView, view_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-AFFINE = ExposureSettings(kind="affine", learning_rate=3e-2)
+AFFINE = ExposureSettings(kind="affine", sigma_offset=0.05, learning_rate=0.1)
 GAINS = torch.tensor([1.25, 1.1, 0.8])
 OFFSET = 0.03
 
@@ -70,7 +70,7 @@ def test_a_camera_shows_gains_and_offsets_and_the_reference_does_not():
     image = torch.rand(4, 5, 3)
     torch.testing.assert_close(exposures.shown(image, "BACK"), image)
     with torch.no_grad():
-        exposures.params["BACK"][0], exposures.params["BACK"][1] = GAINS.log(), OFFSET
+        exposures.params["BACK"][0], exposures.params["BACK"][1] = GAINS.log() / 0.2, OFFSET / 0.05
     torch.testing.assert_close(exposures.shown(image, "BACK"), image * GAINS + OFFSET)
     for camera in ("FRONT", None):
         assert exposures.shown(image, camera) is image
@@ -94,7 +94,7 @@ def test_the_picture_is_exposed_after_the_sky_and_the_splats_are_not():
     model = exposed(settings)
     model.sky = untrained(settings, sky=True).sky
     with torch.no_grad():
-        model.exposure.params["BACK"][0] = math.log(2.0)
+        model.exposure.params["BACK"][0] = math.log(2.0) / 0.2
     front, back = (model.render(dataclasses.replace(rig_views()[0].view, camera=c)) for c in ("FRONT", "BACK"))
     torch.testing.assert_close(back.image, 2.0 * front.image)
     torch.testing.assert_close(back.splats, front.splats)
@@ -128,7 +128,7 @@ def test_gains_of_a_camera_are_recovered(learned):
     """What is learned is what leads from the reference's colours to the camera's."""
     figures = learned["affine"].exposure.figures()
     gains = [figures[f"BACK/gain_{channel}"] for channel in ("red", "green", "blue")]
-    np.testing.assert_allclose(gains, GAINS, rtol=0.06)
+    np.testing.assert_allclose(gains, GAINS, rtol=0.1)
     assert abs(figures["BACK/offset_green"] - OFFSET) < 0.03
 
 
@@ -174,15 +174,15 @@ def test_a_resumed_training_of_exposures_is_the_same_training(tmp_path):
     )
 
 
-def test_exposures_learn_ever_more_slowly():
-    settings = settings_of(exposure=AFFINE)
+def test_exposures_learn_once_there_is_a_scene_and_ever_more_slowly():
+    settings = settings_of(iterations=100, exposure=AFFINE)
     model = exposed(settings)
     optimizers = make_optimizers(model)
     rates = []
-    for step in (0, 50, 100):
-        schedule(model, optimizers, step, 100)
+    for step in (0, 9, 10, 50, 100):
+        schedule(model, optimizers, step, settings)
         rates.append(optimizers.beside_parts["exposure"]["BACK"].param_groups[0]["lr"])
-    assert rates == pytest.approx([3e-2, 3e-3, 3e-4])
+    assert rates == pytest.approx([0.0, 0.0, 0.1 * 0.01**0.1, 0.01, 0.001])
 
 
 # ---- which cameras

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from rig_drives import rig_drive, true_body
+from rig_drives import KEY_FRAMES, rig_drive, true_body
 
 from drivesplat import own_car_search
 from drivesplat.errors import ResultError
@@ -30,7 +30,7 @@ JOB = OwnCarJob(polygons={}, search=LOOKING)
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory) -> Scene:
-    """A drive of 12 key frames, 48 m, in which CAM_BACK sees the own car's rear."""
+    """A drive of 14 key frames, 50 m, in which CAM_BACK sees the own car's rear."""
     return rig_drive(tmp_path_factory.mktemp("seen"), CAMERAS, own_car=True)
 
 
@@ -88,35 +88,38 @@ def test_a_car_that_no_camera_sees_is_not_found(unseen):
 
 def test_a_body_under_changing_light_is_found(seen, tmp_path):
     """The light on the body, and on nothing else, goes up and down by a quarter."""
-    body, light = true_body("CAM_BACK")[..., None], np.random.default_rng(0).uniform(0.75, 1.25, 12)
+    body, light = true_body("CAM_BACK")[..., None], np.random.default_rng(0).uniform(0.75, 1.25, KEY_FRAMES)
     lit = painted(seen, tmp_path, lambda pixels, number: np.where(body, 0.8 * light[number] * pixels, pixels))
     assert_is_the_body(body_in(lit))
 
 
 def test_held_out_images_and_sweeps_contribute_nothing(seen, tmp_path):
-    """What is held out becomes noise and garbage on the body: not a pixel changes."""
-    search = LOOKING.model_copy(update={"holdout": HoldoutSettings(every_nth=8, offset=4, last_block=1)})
+    """What is held out becomes noise, and garbage on the body: not a pixel changes. Two training sweeps are missing, so
+    that held-out ones are the nearest to their images, by when the car has driven on for 4 m."""
+    search = LOOKING.model_copy(update={"holdout": HoldoutSettings(every_nth=6, offset=3, last_block=0)})
     groups = frame_groups(seen, search.holdout)
     held_out = {f.sample_index for f, group in zip(seen.frames, groups, strict=True) if group != "train"}
-    assert held_out == {4, 11}
-    noise = np.random.default_rng(0).uniform(0, 255, (90, 160, 3))
-    spoilt = painted(seen, tmp_path, lambda pixels, number: noise if number in held_out else pixels)
-    on_body = np.column_stack([np.full((400, 3), (-2.6, 0.0, -0.9)), np.ones((400, 2))]).astype(np.float32)
-    on_body.tofile(tmp_path / "garbage.bin")
+    assert held_out == {3, 9}
+    sweeps = [sweep for sweep in seen.sweeps if sweep.sample_index not in (4, 10)]
+    before = body_in(dataclasses.replace(seen, sweeps=tuple(sweeps)), search=search)
+    assert before.any()
+    on_body = np.random.default_rng(0).uniform((-3, -5.2, -4.1, 1, 1), (3, -4.7, -3.8, 1, 1), (900, 5))
+    on_body.astype(np.float32).tofile(tmp_path / "garbage.bin")
     sweeps = [
         dataclasses.replace(sweep, path=str(tmp_path / "garbage.bin")) if sweep.sample_index in held_out else sweep
-        for sweep in seen.sweeps
+        for sweep in sweeps
     ]
-    before = body_in(seen, search=search)
-    assert before.any()
+    noise = np.random.default_rng(0).uniform(0, 255, (90, 160, 3))
+    spoilt = painted(seen, tmp_path, lambda pixels, number: noise if number in held_out else pixels)
     np.testing.assert_array_equal(body_in(dataclasses.replace(spoilt, sweeps=tuple(sweeps)), search=search), before)
+    assert (body_in(dataclasses.replace(seen, sweeps=tuple(sweeps))) != before).any(), "training sweeps do contribute"
 
 
 # ---- what is refused
 
 
 def test_a_car_that_stands_is_refused(tmp_path):
-    assert why_not(rig_drive(tmp_path, ["CAM_BACK"], 12, own_car=True, ego="stands")).startswith("the car hardly moves")
+    assert why_not(rig_drive(tmp_path, ["CAM_BACK"], own_car=True, ego="stands")).startswith("the car hardly moves")
 
 
 def test_few_images_are_refused(seen):
@@ -129,7 +132,7 @@ def test_a_car_that_waits_is_judged_by_the_images_of_its_way(seen):
     waited = [frame for frame in seen.frames if frame.camera == "CAM_BACK" and frame.sample_index == 5]
     more = [dataclasses.replace(waited[0], timestamp=waited[0].timestamp + i) for i in range(1, 31)]
     scene = dataclasses.replace(seen, frames=(*seen.frames, *more))
-    assert len(Drive.of(scene, "CAM_BACK", LOOKING).frames) == 12
+    assert len(Drive.of(scene, "CAM_BACK", LOOKING).frames) == KEY_FRAMES
     np.testing.assert_array_equal(body_in(scene), body_in(seen))
 
 

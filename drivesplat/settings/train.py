@@ -76,11 +76,17 @@ class ExposureSettings(Settings):
     kind: Literal["none", "affine"] = "none"
     """'affine': for every camera but eval_camera, which is the reference, a gain and an offset of each colour channel
     are learned and applied to what it shows. With one camera there is nothing to learn."""
-    learning_rate: float = Field(2e-3, gt=0)
-    """Learning rate of log gains and offsets; decays exponentially to a hundredth."""
-    weight: float = Field(0.1, ge=0)
-    """Weight of the mean square of a camera's log gains and offsets (1 = full scale) in the loss: what exposure need
+    sigma_gain: float = Field(0.2, gt=0)
+    """By how much (natural logarithm) the gains of cameras are expected to differ."""
+    sigma_offset: float = Field(0.02, gt=0)
+    """By how much (1 = full scale) their offsets are."""
+    weight: float = Field(0.002, ge=0)
+    """Weight of the mean square of a camera's log gains and offsets, in units of these, in the loss: what exposure need
     not explain it does not."""
+    start: float = Field(0.1, ge=0, le=1)
+    """Exposures are learned after this fraction of the iterations: before, the scene is what is wrong."""
+    learning_rate: float = Field(1e-2, gt=0)
+    """Learning rate of log gains and offsets, in the same units; decays exponentially to a hundredth."""
 
 
 class TrainSettings(Settings):

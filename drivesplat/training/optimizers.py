@@ -6,12 +6,12 @@ import torch
 from torch import nn
 
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.train import TrainSettings
 
 Optimizers = dict[str, torch.optim.Optimizer]
 
 DECAY = 0.01
 """Positions, and what is learned of cameras, learn at the end at this fraction of their initial rate."""
-OF_CAMERAS = ("exposure", "camera_poses")
 
 
 @dataclass
@@ -52,12 +52,16 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
-def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, iterations: int) -> None:
-    """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, the rest stay."""
-    left = DECAY ** (step / iterations)
+def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
+    """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, exposures' being 0 until
+    they start; the rest stay."""
+    done = step / settings.iterations
+    left = DECAY**done
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         if "means" in group:
             group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * left
-    for name in OF_CAMERAS:
+    begins = {"exposure": settings.exposure.start, "camera_poses": 0.0}
+    for name, start in begins.items():
         for camera, optimizer in optimizers.beside_parts.get(name, {}).items():
-            optimizer.param_groups[0]["lr"] = model.beside_parts[name].learning_rates()[camera] * left
+            rate = model.beside_parts[name].learning_rates()[camera] if done >= start else 0.0
+            optimizer.param_groups[0]["lr"] = rate * left

@@ -74,7 +74,7 @@ class Trainer:
     def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
         """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
         view = self.views[order(len(self.views), self.step, self.seed)]
-        schedule(self.model, self.optimizers, self.step, self.settings.iterations)
+        schedule(self.model, self.optimizers, self.step, self.settings)
         by_gradient = self.settings.strategy == "default"
         picture = self.model.render(
             view.view,
