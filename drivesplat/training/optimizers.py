@@ -53,8 +53,8 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
 
 
 def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
-    """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, exposures' being 0 until
-    they start; the rest stay."""
+    """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, exposures' being 0
+    until they start; the rest stay."""
     done = step / settings.iterations
     left = DECAY**done
     for part, group in zip(model.parts, optimizers.parts, strict=True):
