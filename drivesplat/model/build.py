@@ -1,7 +1,7 @@
 """A method's settings into a model: the only place that knows parts and skies by name."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.seeding.actors import motion_of
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
-EXPOSED = "exposure.params."
-"""What the names of exposures begin with in a model's state; the camera follows."""
+EXPOSED = "exposure.first."
+"""What the names of exposures' first gains begin with in a model's state; the camera follows."""
 FEW = 4
 """An actor keeps so many points of its seed whatever the cap: a Gaussian's first size is by its three neighbours."""
 
@@ -27,13 +27,13 @@ FEW = 4
 class Beginnings:
     """What a model starts from: the scene's parser record, the records of its `actors` (empty where none are wanted),
     the mean colour (3,) in [0, 1] of its sky, how many classes are told apart (0: none), and the cameras whose exposure
-    is learned."""
+    is learned, each with the gains (3,) that it is found to have."""
 
     parser: dict[str, Any]
     actors: list[dict[str, Any]]
     sky_color: np.ndarray
     classes: int = 0
-    exposed: tuple[str, ...] = ()
+    exposed: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
@@ -73,7 +73,7 @@ def rebuild_model(
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         made.append(makers[definition["part"]](params, definition, settings))
-    exposed = [key.removeprefix(EXPOSED) for key in state if key.startswith(EXPOSED)]
+    exposed = {key.removeprefix(EXPOSED): gains for key, gains in state.items() if key.startswith(EXPOSED)}
     model = SplatModel(made, _sky(sky, settings, np.full(3, 0.5)), settings.antialiased, _exposures(exposed, settings))
     model.load_state_dict(state)
     return model
@@ -139,8 +139,9 @@ def _actors_again(params: dict[str, torch.Tensor], definition: dict[str, Any], s
     return Actors(params, tracks, settings.actors, settings.gaussians)
 
 
-def _exposures(cameras: Sequence[str], settings: TrainSettings) -> Exposures | None:
-    return Exposures(cameras, settings.exposure) if cameras else None
+def _exposures(first: Mapping[str, Any], settings: TrainSettings) -> Exposures | None:
+    gains = {camera: torch.as_tensor(values).float().clone() for camera, values in first.items()}
+    return Exposures(gains, settings.exposure) if gains else None
 
 
 def _sky(kind: SkyKind, settings: TrainSettings, color: np.ndarray) -> Sky | None:

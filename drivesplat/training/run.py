@@ -22,6 +22,7 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
+from drivesplat.training.first_exposure import first_gains
 from drivesplat.training.train import Workspace, train
 from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
 
@@ -124,9 +125,9 @@ def run_training(
         with telling_out_of_memory(lambda: 0):
             views = load_views(inputs.parser, inputs.guides(job), device)
         settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
-        beginnings = Beginnings(
-            inputs.parser, inputs.actors, mean_sky_color(views), inputs.told_apart(job), inputs.exposed(job)
-        )
+        exposed = inputs.exposed(job)
+        gains = first_gains(inputs.parser, views, exposed, job.reference_camera) if exposed else {}
+        beginnings = Beginnings(inputs.parser, inputs.actors, mean_sky_color(views), inputs.told_apart(job), gains)
         if not learns_from_sky_masks(job):
             views = [dataclasses.replace(view, sky=None) for view in views]
         model = build_model(beginnings, job.parts, job.sky, settings)
