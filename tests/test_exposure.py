@@ -1,18 +1,20 @@
 """Cameras that expose each in their own way: what is learned of it, what it is worth, and what keeps it."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from rig_drives import RIG, recorder_of
+from rig_drives import RIG, recorder_of, rig_drive
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_training import (
     CHECKPOINT_AT,
     CPU,
     ITERATIONS,
+    PROVENANCE,
     EndedError,
     EndingViews,
     mean_psnr,
@@ -28,16 +30,24 @@ from drivesplat.config import load
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.parser import parser_dict
+from drivesplat.seeding.seed import seed_points
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
+from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
 from drivesplat.stages import stage_settings
+from drivesplat.training.first_exposure import first_gains, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, schedule
-from drivesplat.training.run import TrainingInputs
-from drivesplat.training.views import TrainingView, view_of
+from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
+from drivesplat.training.views import Guides, TrainingView, load_views, view_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-AFFINE = ExposureSettings(kind="affine", sigma_offset=0.05, learning_rate=0.1)
+AFFINE = ExposureSettings(kind="affine", sigma_gain=0.2, sigma_offset=0.05, learning_rate=0.1)
 GAINS = torch.tensor([1.25, 1.1, 0.8])
 OFFSET = 0.03
 
@@ -58,7 +68,12 @@ def rig_views(count: int = 6) -> list[TrainingView]:
 def exposed(settings: TrainSettings) -> SplatModel:
     """An untrained model that learns how BACK exposes."""
     model = untrained(settings)
-    return SplatModel(list(model.parts), None, exposure=Exposures(["BACK"], settings.exposure))
+    return SplatModel(list(model.parts), None, exposure=exposures_of("BACK", settings=settings.exposure))
+
+
+def exposures_of(*cameras: str, settings: ExposureSettings) -> Exposures:
+    """Of cameras that are found to be as the reference."""
+    return Exposures({camera: torch.ones(3) for camera in cameras}, settings)
 
 
 def of(camera: str, views: list[TrainingView]) -> list[TrainingView]:
@@ -66,7 +81,7 @@ def of(camera: str, views: list[TrainingView]) -> list[TrainingView]:
 
 
 def test_a_camera_shows_gains_and_offsets_and_the_reference_does_not():
-    exposures = Exposures(["BACK"], AFFINE)
+    exposures = exposures_of("BACK", settings=AFFINE)
     image = torch.rand(4, 5, 3)
     torch.testing.assert_close(exposures.shown(image, "BACK"), image)
     with torch.no_grad():
@@ -77,16 +92,19 @@ def test_a_camera_shows_gains_and_offsets_and_the_reference_does_not():
     figures = exposures.figures()
     assert figures["BACK/gain_blue"] == pytest.approx(0.8) and figures["BACK/offset_red"] == pytest.approx(OFFSET)
     assert len(figures) == 6
+    found = Exposures({"BACK": GAINS}, AFFINE)
+    torch.testing.assert_close(found.shown(image, "BACK"), image * GAINS)
+    assert not found.penalty("BACK").any(), "what was found is free"
 
 
 def test_the_penalty_is_the_weighted_mean_square_of_the_camera_that_is_seen():
-    exposures = Exposures(["BACK", "LEFT"], ExposureSettings(weight=0.4))
+    exposures = exposures_of("BACK", "LEFT", settings=ExposureSettings(weight=0.4))
     with torch.no_grad():
         exposures.params["BACK"][0] = 0.3
     assert float(exposures.penalty("BACK").detach()) == pytest.approx(0.4 * 0.5 * 0.09)
     assert float(exposures.penalty("LEFT").detach()) == 0.0
     assert exposures.penalty("FRONT") is None and exposures.penalty(None) is None
-    assert Exposures(["BACK"], ExposureSettings(weight=0.0)).penalty("BACK") is None
+    assert exposures_of("BACK", settings=ExposureSettings(weight=0.0)).penalty("BACK") is None
 
 
 def test_the_picture_is_exposed_after_the_sky_and_the_splats_are_not():
@@ -183,6 +201,54 @@ def test_exposures_learn_once_there_is_a_scene_and_ever_more_slowly():
         schedule(model, optimizers, step, settings)
         rates.append(optimizers.beside_parts["exposure"]["BACK"].param_groups[0]["lr"])
     assert rates == pytest.approx([0.0, 0.0, 0.1 * 0.01**0.1, 0.01, 0.001])
+
+
+# ---- what is known before
+
+
+def test_gains_of_a_rig_are_found_from_colours_of_shared_surfaces():
+    """The second camera shares surfaces with the first, the third with the second alone, the fourth with none."""
+    rng = np.random.default_rng(0)
+    true = np.log([[1.0, 1.0, 1.0], [1.3, 1.1, 0.8], [0.7, 1.2, 1.5], [2.0, 2.0, 2.0]])
+    shades = rng.uniform(-2.0, -0.5, (900, 3)) + true[:, None] + rng.normal(0.0, 0.05, (4, 900, 3))
+    shades[1, rng.random(900) < 0.2] += 1.5  # in some places something else stands before the surface
+    for camera, (first, last) in enumerate(((0, 400), (300, 700), (600, 800), (800, 900))):
+        shades[camera, :first], shades[camera, last:] = np.nan, np.nan
+    found = log_gains(shades)
+    np.testing.assert_allclose(found[:3], true[:3], atol=0.06)
+    assert not found[3].any()
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory) -> TrainingInputs:
+    """A drive by FRONT and BACK of the demo's rig, whose BACK takes in other light; nothing is held out."""
+    folder = tmp_path_factory.mktemp("rig")
+    scene = rig_drive(folder, ["CAM_FRONT", "CAM_BACK"], exposures={"CAM_BACK": (1.4, 1.1, 0.75)})
+    holdout, images = HoldoutSettings(every_nth=0, last_block=0), ImageSettings()
+    settings = LidarSeedSettings(max_points=20_000, far_points=2_000)
+    seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0))
+    return TrainingInputs(parser_dict(scene, seed, ParserJob(holdout=holdout, images=images)), folder, [], [])
+
+
+def test_gains_of_the_demos_rig_are_found_before_the_training(rig):
+    """Images are gamma encoded: a gain of light becomes its 2.2th root."""
+    views = load_views(rig.parser, Guides({}, {}, {}), CPU)
+    found = first_gains(rig.parser, views, ["CAM_BACK"], "CAM_FRONT")
+    np.testing.assert_allclose(found["CAM_BACK"], np.power([1.4, 1.1, 0.75], 1 / 2.2), rtol=0.03)
+    hidden = [dataclasses.replace(v, own_car=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]
+    np.testing.assert_array_equal(first_gains(rig.parser, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
+
+
+def test_a_training_begins_with_what_was_found_and_its_checkpoint_holds_it(rig, tmp_path):
+    train = settings_of(iterations=4, checkpoint_every=10, pixels_per_gaussian=0, exposure=AFFINE)
+    job = TrainJob(parts=("background",), sky="none", train=train, random_seed=0, reference_camera="CAM_FRONT")
+    files = TrainingFiles(tmp_path / "it/checkpoint.pt", tmp_path / "it/train.json")
+    run_training(rig, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
+    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    told = json.loads(files.summary.read_text())["exposure"]
+    assert told == pytest.approx(model.exposure.figures()) and told["CAM_BACK/gain_red"] > 1.1
+    assert model.exposure.first["CAM_BACK"][0] == pytest.approx(1.4 ** (1 / 2.2), rel=0.03)
+    assert not model.exposure.first["CAM_BACK"].requires_grad
 
 
 # ---- which cameras

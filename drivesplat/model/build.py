@@ -18,8 +18,8 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.seeding.actors import motion_of
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
-EXPOSED = "exposure.params."
-"""What the names of exposures begin with in a model's state; the camera follows."""
+EXPOSED = "exposure.first."
+"""What the names of exposures' first gains begin with in a model's state; the camera follows."""
 POSED = "camera_poses." + TIMES
 """And those of the times of corrected camera poses."""
 FEW = 4
@@ -30,13 +30,14 @@ FEW = 4
 class Beginnings:
     """What a model starts from: the scene's parser record, the records of its `actors` (empty where none are wanted),
     the mean colour (3,) in [0, 1] of its sky, how many classes are told apart (0: none), the cameras whose exposure is
-    learned, and those whose poses are: the seconds of their training images."""
+    learned, each with the gains (3,) that it is found to have, and those whose poses are corrected: the seconds of
+    their training images."""
 
     parser: dict[str, Any]
     actors: list[dict[str, Any]]
     sky_color: np.ndarray
     classes: int = 0
-    exposed: tuple[str, ...] = ()
+    exposed: dict[str, np.ndarray] = field(default_factory=dict)
     posed: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
 
@@ -78,7 +79,7 @@ def rebuild_model(
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         made.append(makers[definition["part"]](params, definition, settings))
-    exposed = [key.removeprefix(EXPOSED) for key in state if key.startswith(EXPOSED)]
+    exposed = {key.removeprefix(EXPOSED): gains for key, gains in state.items() if key.startswith(EXPOSED)}
     posed = {key.removeprefix(POSED): at.tolist() for key, at in state.items() if key.startswith(POSED)}
     model = SplatModel(
         made,
@@ -151,8 +152,9 @@ def _actors_again(params: dict[str, torch.Tensor], definition: dict[str, Any], s
     return Actors(params, tracks, settings.actors, settings.gaussians)
 
 
-def _exposures(cameras: Sequence[str], settings: TrainSettings) -> Exposures | None:
-    return Exposures(cameras, settings.exposure) if cameras else None
+def _exposures(first: Mapping[str, Any], settings: TrainSettings) -> Exposures | None:
+    gains = {camera: torch.as_tensor(values).float().clone() for camera, values in first.items()}
+    return Exposures(gains, settings.exposure) if gains else None
 
 
 def _camera_poses(times: Mapping[str, Sequence[float]], settings: TrainSettings) -> CameraPoses | None:

@@ -1,6 +1,6 @@
 """How the cameras of a rig show colours: each exposes and white-balances by itself."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Float
@@ -12,23 +12,27 @@ CHANNELS = ("red", "green", "blue")
 
 
 class Exposures(nn.Module):
-    """For each of `cameras` an affine map of every colour channel: c is shown as exp(g) c + o. `params` hold log gains
-    (row 0) and offsets (row 1), (2, 3) a camera, in units of how much they are expected to be. They begin at 0.
+    """For each of some cameras an affine map of every colour channel: c is shown as f exp(g) c + o. `first` holds the
+    gains f (3,) that a camera was found to have before the training, `params` what is learned: log gains g (row 0) and
+    offsets o (row 1), (2, 3) a camera, in units of how much they are expected to be. They begin at 0.
 
     Any other camera shows colours as they are: the reference, without which gains and the brightness of the scene could
     trade places, and cameras that recorded no training image.
     """
 
-    def __init__(self, cameras: Iterable[str], settings: ExposureSettings):
+    def __init__(self, first: Mapping[str, Tensor], settings: ExposureSettings):
         super().__init__()
-        self.params = nn.ParameterDict({camera: nn.Parameter(torch.zeros(2, 3)) for camera in cameras})
+        self.first = nn.ParameterDict(
+            {camera: nn.Parameter(gains, requires_grad=False) for camera, gains in first.items()}
+        )
+        self.params = nn.ParameterDict({camera: nn.Parameter(torch.zeros(2, 3)) for camera in first})
         self._settings = settings
 
     def shown(self, image: Float[Tensor, "h w 3"], camera: str | None) -> Float[Tensor, "h w 3"]:
         """An image in the model's colours as `camera` shows it."""
         if camera not in self.params:
             return image
-        gains, offsets = self._map(self.params[camera])
+        gains, offsets = self._map(camera)
         return image * gains + offsets
 
     def penalty(self, camera: str | None) -> Float[Tensor, ""] | None:
@@ -37,10 +41,11 @@ class Exposures(nn.Module):
             return None
         return self._settings.weight * self.params[camera].square().mean()
 
-    def _map(self, params: Float[Tensor, "*c 2 3"]) -> tuple[Float[Tensor, "*c 3"], Float[Tensor, "*c 3"]]:
-        """Gains and offsets."""
-        log_gains, offsets = params.unbind(dim=-2)
-        return torch.exp(self._settings.sigma_gain * log_gains), self._settings.sigma_offset * offsets
+    def _map(self, camera: str) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Gains and offsets of a camera."""
+        log_gains, offsets = self.params[camera]
+        gains = self.first[camera] * torch.exp(self._settings.sigma_gain * log_gains)
+        return gains, self._settings.sigma_offset * offsets
 
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every camera's entry of `params`."""
@@ -50,6 +55,6 @@ class Exposures(nn.Module):
         """Every gain and offset by its name: 'CAM_BACK/gain_red'. Waits for the device."""
         if not len(self.params):
             return {}
-        values = torch.stack(self._map(torch.stack([*self.params.values()]).detach()), dim=1).reshape(-1).tolist()
+        values = torch.stack([torch.stack(self._map(camera)) for camera in self.params]).detach().reshape(-1).tolist()
         names = (f"{camera}/{name}_{c}" for camera in self.params for name in ("gain", "offset") for c in CHANNELS)
         return dict(zip(names, values, strict=True))

@@ -75,11 +75,12 @@ class ExposureSettings(Settings):
 
     kind: Literal["none", "affine"] = "none"
     """'affine': for every camera but eval_camera, which is the reference, a gain and an offset of each colour channel
-    are learned and applied to what it shows. With one camera there is nothing to learn."""
-    sigma_gain: float = Field(0.2, gt=0)
-    """By how much (natural logarithm) the gains of cameras are expected to differ."""
+    are applied to what it shows: found from surfaces that several cameras recorded, then learned. With one camera there
+    is nothing to learn."""
+    sigma_gain: float = Field(0.1, gt=0)
+    """By how much (natural logarithm) a camera's gains are expected to differ from what was found."""
     sigma_offset: float = Field(0.02, gt=0)
-    """By how much (1 = full scale) their offsets are."""
+    """By how much (1 = full scale) its offsets are from 0."""
     weight: float = Field(0.002, ge=0)
     """Weight of the mean square of a camera's log gains and offsets, in units of these, in the loss: what exposure need
     not explain it does not."""

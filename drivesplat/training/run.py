@@ -23,6 +23,7 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
+from drivesplat.training.first_exposure import first_gains
 from drivesplat.training.surfaces import surroundings_of
 from drivesplat.training.train import Workspace, train
 from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
@@ -133,12 +134,13 @@ def run_training(
         with telling_out_of_memory(lambda: 0):
             views = load_views(inputs.parser, inputs.guides(job), device)
         settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
+        exposed = inputs.exposed(job)
         beginnings = Beginnings(
             inputs.parser,
             inputs.actors,
             mean_sky_color(views),
             inputs.told_apart(job),
-            inputs.exposed(job),
+            first_gains(inputs.parser, views, exposed, job.reference_camera) if exposed else {},
             _times_by_camera(views) if job.train.camera_poses.corrected else {},
         )
         if not learns_from_sky_masks(job):
