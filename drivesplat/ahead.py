@@ -7,7 +7,7 @@ from typing import TypeVar
 
 A = TypeVar("A")
 B = TypeVar("B")
-THREADS = 8
+THREADS = 4
 """Decoding and numpy leave Python's lock to others for most of their time."""
 
 
