@@ -19,13 +19,16 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
 from drivesplat.settings.extract import ExtractSettings
+from drivesplat.settings.free_space import FreeSpaceSettings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.looks import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings
 from drivesplat.settings.overrides import merged
+from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.scene_name import require_text
 from drivesplat.settings.train import SkyKind, TrainSettings
@@ -34,8 +37,8 @@ from drivesplat.settings.world import WorldSettings
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 DATASET_OVERRIDES = (
-    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "lidar_seed", "actors", "masks", "sky", "train",
-    "render", "ghosts", "removal", "export", "device",
+    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
+    "lidar_depth", "free_space", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
 )  # fmt: skip
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
@@ -135,12 +138,16 @@ class Config(Settings):
     eval_camera: str = "CAM_FRONT"
     """The camera whose held-out images are measured; one of cameras."""
     sweeps: bool = False
-    """Train on the 12 Hz images between key frames, too."""
+    """Train on the 12 Hz images between key frames, too, but for those nearer than half a key-frame interval to a
+    held-out one. LiDAR between key frames: lidar_seed.sweeps. docs/real_logs.md"""
     images: ImageSettings = ImageSettings()
     holdout: HoldoutSettings = HoldoutSettings()
     extract: ExtractSettings = ExtractSettings()
+    refine_poses: RefinePosesSettings = RefinePosesSettings()
     lidar_seed: LidarSeedSettings = LidarSeedSettings()
     actors: ActorSeedSettings = ActorSeedSettings()
+    lidar_depth: LidarDepthSettings = LidarDepthSettings()
+    free_space: FreeSpaceSettings = FreeSpaceSettings()
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
     """Behind the Gaussians: 'cubemap' (learned, by direction), 'mask' (one learned colour, Gaussians kept out of sky

@@ -17,7 +17,8 @@ from tqdm import tqdm
 from drivesplat.device import telling_out_of_memory
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmFormat, FilmJob, TrajectorySettings

@@ -1,25 +1,27 @@
 """The stage `masks`: what is static, moving or sky in every image, as PNGs that a person can look at.
 
-- masks/masks.json: what was made, from what
+- masks/masks.json: what was made, from what, and which cameras see the own car
 - masks/regions/{camera}/{timestamp}.png: labels of `drivesplat.regions.LABELS`
 - masks/sky/{camera}/{timestamp}.png: 255 where the sky is
 - masks/semantic/{camera}/{timestamp}.png: the user's classes, where there are any
 """
 
 import logging
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivesplat.errors import DatasetError
+from drivesplat.holdout import Group, frame_groups
 from drivesplat.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
-from drivesplat.regions import LABELS, label_image, own_car_pixels
-from drivesplat.rigid import apply
-from drivesplat.scene import Frame, Scene
-from drivesplat.seeding.sweeps import read_sweep
+from drivesplat.own_car import NOWHERE, OwnCar
+from drivesplat.regions import LABELS, label_image
+from drivesplat.scene import Frame, Scene, Sweep
+from drivesplat.seeding.nearest_sweep import nearest_returns
+from drivesplat.seeding.sweeps import training_sweeps
 from drivesplat.settings.masks import MaskJob
 from drivesplat.sky_mask import sky_mask
 from drivesplat.storage import read_json, unreadable
@@ -28,41 +30,49 @@ log = logging.getLogger(__name__)
 
 UNLABELLED = 255
 """The value of pixels that a user's map of classes says nothing of."""
+LEAST_SKY = 0.005
+"""Where the heuristic finds less sky than this share of all pixels, it has found none: it looks for what is bright."""
+NO_SKY = (
+    "scene %s: no sky was found, as by night or in a tunnel: losses about the sky are left out; "
+    "masks.sky_folder takes masks of your own"
+)
 
 
-def make_masks(scene: Scene, job: MaskJob, folder: Path) -> dict[str, Any]:
-    """Writes the masks of every image below `folder`; returns the record for masks.json.
+def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
+    """Writes the masks of every image below `folder`; returns the record for masks.json. The own car's body is a region
+    of its own, no sky, and of no class. The sky of a training image is told by sweeps that a training may see alone.
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
+    groups, training = frame_groups(scene, job.holdout), training_sweeps(scene, job.holdout)
 
-    def one(frame: Frame) -> tuple[float, int]:
+    def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
         size = target_size(frame, job.images)
-        sky = _sky(frame, job, size, _nearest_returns(scene, frame))
+        labels = _regions(scene, frame, job, size)
+        labels[own_car.pixels(frame.camera, size)] = LABELS["own_car"]
+        body = labels == LABELS["own_car"]
+        sweeps = training if group == "train" else scene.sweeps
+        sky = _sky(sweeps, frame, job, size, scene.key_frame_interval) & ~body
         write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
-        write_png(folder / mask_name("regions", frame.camera, frame.timestamp), _regions(scene, frame, job, size))
-        return float(sky.mean()), _semantic(frame, job, size, folder)
+        write_png(folder / mask_name("regions", frame.camera, frame.timestamp), labels)
+        return float(sky.mean()), _semantic(frame, job, body, folder), bool(body.any())
 
     with ThreadPoolExecutor() as pool:
-        sky_shares, classes = zip(*pool.map(one, scene.frames), strict=True)
+        sky_shares, classes, bodies = zip(*pool.map(one, scene.frames, groups), strict=True)
+    seeing = {frame.camera for frame, body in zip(scene.frames, bodies, strict=True) if body}
+    sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= LEAST_SKY
+    if not sky_known:
+        log.warning(NO_SKY, scene.name)
     return {
         "labels": LABELS,
         "images": len(scene.frames),
         "regions": "masks" if job.masks.regions_folder else "boxes",
         "sky": "masks" if job.masks.sky_folder else "heuristic",
         "sky_share": float(np.mean(sky_shares)),
+        "sky_known": sky_known,
         "semantic_classes": max(classes),
+        "own_car": {camera: own_car.source.get(camera, "masks") for camera in sorted(seeing)},
     }
-
-
-def _nearest_returns(scene: Scene, frame: Frame) -> np.ndarray | None:
-    """World points (n, 3) of the readable sweep nearest to a frame; None where none is within a key-frame interval."""
-    for sweep in sorted(scene.sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp)):
-        if abs(sweep.timestamp - frame.timestamp) >= scene.key_frame_interval:
-            break
-        with suppress(DatasetError):  # the stage lidar_seed is the one that complains
-            return apply(sweep.sensor_to_world, read_sweep(sweep))
-    return None
 
 
 def mask_name(kind: str, camera: str, timestamp: int) -> str:
@@ -101,13 +111,16 @@ def read_classes(folder: Path, camera: str, timestamp: int, size: tuple[int, int
     return _made_mask(folder, "semantic", camera, timestamp, size)
 
 
-def _semantic(frame: Frame, job: MaskJob, size: tuple[int, int], folder: Path) -> int:
-    """Writes the user's classes of an image, where there are any; returns how many there are at least."""
+def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int:
+    """Writes the user's classes of an image, where there are any, none of them for the own car's `body` (h, w) bool;
+    returns how many there are at least."""
     if not job.masks.semantic_folder:
         return 0
-    classes = _users_mask(job.masks.semantic_folder, frame, size)
+    classes = _users_mask(job.masks.semantic_folder, frame, (body.shape[1], body.shape[0])).copy()
+    classes[body] = UNLABELLED
     write_png(folder / mask_name("semantic", frame.camera, frame.timestamp), classes)
-    return int(classes[classes != UNLABELLED].max(initial=-1)) + 1
+    labelled = classes[classes != UNLABELLED]
+    return int(labelled.max()) + 1 if len(labelled) else 0
 
 
 def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
@@ -118,25 +131,25 @@ def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple
         raise unreadable(path, "masks", str(error)) from error
 
 
-def _sky(frame: Frame, job: MaskJob, size: tuple[int, int], lidar: np.ndarray | None) -> np.ndarray:
+def _sky(sweeps: Sequence[Sweep], frame: Frame, job: MaskJob, size: tuple[int, int], interval: float) -> np.ndarray:
+    """The sky (h, w) bool of a frame; the one of `sweeps` that is nearest, within `interval` microseconds, helps."""
     if job.masks.sky_folder:
         return _users_mask(job.masks.sky_folder, frame, size) > 127
+    lidar = nearest_returns(sweeps, frame.timestamp, interval)
     return sky_mask(
         read_image(frame.image_path, size), continuous_intrinsics(frame, size), frame.camera_to_world, lidar
     )
 
 
 def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) -> np.ndarray:
-    if job.masks.regions_folder:
-        labels = _users_mask(job.masks.regions_folder, frame, size).copy()
-        if labels.max() > max(LABELS.values()):
-            raise DatasetError(
-                f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; "
-                f"they end at {max(LABELS.values())}"
-            )
-    else:
-        labels = label_image(scene, frame, size)
-    labels[own_car_pixels(job.masks.own_car_polygons.get(frame.camera), size)] = LABELS["own_car"]
+    if not job.masks.regions_folder:
+        return label_image(scene, frame, size)
+    labels = _users_mask(job.masks.regions_folder, frame, size).copy()
+    if labels.max() > max(LABELS.values()):
+        raise DatasetError(
+            f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; "
+            f"they end at {max(LABELS.values())}"
+        )
     return labels
 
 

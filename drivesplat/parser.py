@@ -18,8 +18,8 @@ from drivesplat.settings.parser import ParserJob
 from drivesplat.storage import read_plain_pickle, unreadable
 
 _KEYS = {
-    "Ks", "camtoworlds", "image_paths", "image_names", "image_sizes", "camera_names", "camera_indices", "timestamps",
-    "sample_indices", "is_key_frame", "points", "points_rgb", "scene_scale", "splits",
+    "Ks", "camtoworlds", "ego_to_world", "image_paths", "image_names", "image_sizes", "camera_names", "camera_indices",
+    "timestamps", "sample_indices", "is_key_frame", "points", "points_rgb", "scene_scale", "splits",
     "held_out_frames", "scene", "seed",
 }  # fmt: skip
 
@@ -27,10 +27,10 @@ _KEYS = {
 def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any]:
     """The training record of a scene with N images and P seed points.
 
-    `Ks` (N, 3, 3), `camtoworlds` (N, 4, 4), `image_sizes` (N, 2) width and height, `camera_indices` (N,) of cameras,
-    `timestamps` (N,) microseconds, `points` (P, 3), `points_rgb` (P, 3) uint8, `scene_scale` metres (the farthest
-    training camera from their mean), `splits`: indices of images by group. Raises DatasetError where no training image
-    is left.
+    `Ks` (N, 3, 3), `camtoworlds` and `ego_to_world` (N, 4, 4), `image_sizes` (N, 2) width and height, `camera_indices`
+    (N,) of cameras, `timestamps` (N,) microseconds, `points` (P, 3), `points_rgb` (P, 3) uint8, `scene_scale` metres
+    (the farthest training camera from their mean), `splits`: indices of images by group. Raises DatasetError where no
+    training image is left.
     """
     frames = scene.frames
     sizes = [target_size(frame, job.images) for frame in frames]
@@ -47,6 +47,7 @@ def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any
     return {
         "Ks": np.stack([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)]),
         "camtoworlds": camera_to_world,
+        "ego_to_world": np.stack([frame.ego_to_world for frame in frames]),
         "image_paths": [frame.image_path for frame in frames],
         "image_names": [Path(frame.image_path).name for frame in frames],
         "image_sizes": np.array(sizes, dtype=np.int64),

@@ -12,26 +12,24 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from drivesplat.config import Config, for_scene, load
+from drivesplat.config import for_scene, load
 from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
-from drivesplat.readers import layout
+from drivesplat.inputs import Inputs
 from drivesplat.rerun import code_digest
-from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.stages import (
     METHOD_STAGES,
-    SCENE_STAGES,
     SIDE_BY_SIDE,
     idle_variants,
     no_such_edit,
     no_such_film,
     scene_edits,
+    scene_stages,
     stage_settings,
     training_inputs,
 )
 from drivesplat.storage import canonical_json
-from drivesplat.truth import TRUTH_FILE
 
 SCRIPTS = "workflow_scripts"
 PARTS_FILM = "parts"
@@ -45,11 +43,11 @@ def let_scripts_import(folder: str) -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join([folder, *([inherited] if inherited else [])])
 
 
-class Plan:
+class Plan(Inputs):
     """The validated config as the rules ask for it; `basedir` is the Snakefile's folder."""
 
     def __init__(self, values: Mapping[str, Any], basedir: str):
-        self.config: Config = load(values)
+        super().__init__(load(values))
         self._scripts = Path(basedir) / SCRIPTS
         self._held_lock: Any = None
 
@@ -66,62 +64,9 @@ class Plan:
         """The digest of all code a stage runs."""
         return code_digest(self._scripts / f"{stage}.py")
 
-    def tables(self, wildcards: Any) -> list[str]:
-        """The dataset files that decide a scene's scene.json."""
-        dataset = self.config.datasets[self.config.dataset_of(wildcards.scene)]
-        files = layout(dataset.reader)
-        if dataset.world:
-            return [f"{dataset.world_root}/{dataset.version}/{table}.json" for table in files.TABLES]
-        return [
-            str(file) for file in files.table_files(files.find_root(dataset.dataroot, dataset.version), dataset.version)
-        ]
-
-    @property
-    def worlds(self) -> dict[str, str]:
-        """The scenes of synthetic worlds, by the names of their datasets."""
-        return {name: dataset.scenes[0] for name, dataset in self.config.datasets.items() if dataset.world}
-
-    def world_tables(self, dataset: str) -> list[str]:
-        """The files that a synthetic world consists of, as far as rules know them."""
-        return self.tables(SimpleNamespace(scene=self.worlds[dataset]))
-
     def world_settings(self, dataset: str) -> str:
         """The settings of a dataset's synthetic world."""
         return stage_settings(self.config, "demo_world", self.worlds[dataset])
-
-    def truth_file(self, dataset: str) -> str:
-        """Where the truth of a synthetic world is stated."""
-        return f"{self.config.datasets[dataset].world_root}/{TRUTH_FILE}"
-
-    def truth(self, wildcards: Any) -> list[str]:
-        """The truth of a scene: recorded drives have none."""
-        name = self.config.dataset_of(wildcards.scene)
-        return [self.truth_file(name)] if name in self.worlds else []
-
-    def points_file(self, wildcards: Any) -> list[str]:
-        """The user's extra seed points, where given."""
-        path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
-        return [str(Path(path).expanduser())] if path else []
-
-    def actors(self, wildcards: Any) -> list[str]:
-        """What the actors of a training are made of, where its method has any."""
-        return self._training_input("actors", wildcards)
-
-    def lidar_depth(self, wildcards: Any) -> list[str]:
-        """LiDAR's depth in the training images, where a training is held to it."""
-        return self._training_input("lidar_depth", wildcards)
-
-    def _training_input(self, stage: str, wildcards: Any) -> list[str]:
-        taken = training_inputs(self.config, wildcards.scene, wildcards.method)
-        return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.pkl"] if stage in taken else []
-
-    def lpips_record(self, _: Any) -> list[str]:
-        """The record of LPIPS's backbone, where LPIPS is wanted."""
-        return [BACKBONE_RECORD] if self.config.lpips.enabled else []
-
-    def backbone_file(self, _: Any) -> list[str]:
-        """The backbone itself, where it is there already: its arrival reruns what lacked it."""
-        return [BACKBONE] if Path(BACKBONE).is_file() else []
 
     def device(self, wildcards: Any) -> str:
         """Where a scene's jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
@@ -187,7 +132,8 @@ class Plan:
     def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
         """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
         taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
-        stages = {(stage, None): stage for stage in (*SCENE_STAGES, *sorted(taken)) if stage != SIDE_BY_SIDE}
+        made = (*scene_stages(self.config, scene), *sorted(taken))
+        stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
         stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in METHOD_STAGES}
         return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
 

@@ -8,7 +8,7 @@ from typing import Any
 from drivesplat.errors import ResultError
 from drivesplat.storage import canonical_json, sha256_file, sha256_text
 
-VERSIONS_OF = ("torch", "gsplat", "numpy", "nuscenes-devkit", "lpips")
+VERSIONS_OF = ("torch", "gsplat", "numpy", "nuscenes-devkit", "lpips", "pycolmap")
 
 
 def provenance(

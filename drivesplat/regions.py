@@ -13,8 +13,6 @@ from drivesplat.rigid import inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.tracks import Box, boxes_at
 
-Outline = tuple[tuple[float, float], ...]
-"""Corners x, y."""
 NEAR_PLANE = 0.1
 FARTHEST = 80.0
 LEAST_PIXELS = 100
@@ -128,14 +126,6 @@ def owner_image(hulls: list[Hull], size: tuple[int, int]) -> tuple[np.ndarray, l
         owners[mask] = position
         covered.append(int(mask.sum()))
     return owners, covered
-
-
-def own_car_pixels(outline: Outline | None, size: tuple[int, int]) -> np.ndarray:
-    """The pixels (h, w) bool of the own car's body, whose `outline` is in fractions of `size` (width, height)."""
-    pixels = np.zeros((size[1], size[0]), dtype=np.uint8)
-    if outline:
-        cv2.fillPoly(pixels, [np.round(np.array(outline) * size).astype(np.int32)], 1)
-    return pixels.astype(bool)
 
 
 def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:

@@ -26,7 +26,7 @@ def gap_report(paths: list[str], expected: dict[str, dict[str, Any]]) -> dict[st
     for path in paths:
         try:
             record = read_json(path, rule="scene_metrics")
-            scene, protocol = record["scene"], record["protocol"]
+            scene = record["scene"]
             reasons = _mismatches(record, expected, measured)
             scene_rows = [_row(record, method) for method in record["methods"]]
         except ResultError as error:
@@ -39,7 +39,7 @@ def gap_report(paths: list[str], expected: dict[str, dict[str, Any]]) -> dict[st
         if reasons:
             left_out.append({"scene": scene, "why": "; ".join(reasons)})
             continue
-        measured[scene] = protocol
+        measured[scene] = _comparable(record)
         rows += scene_rows
     named = {*measured, *(item["scene"] for item in left_out)}
     missing = [{"scene": scene, "why": "not measured"} for scene in expected if scene not in named]
@@ -81,8 +81,9 @@ def _mismatches(record: dict[str, Any], expected: dict[str, Any], measured: dict
     if scene not in expected:
         return ["not in the config"]
     reasons = differences(expected[scene], record["provenance"]["stages"])
+    own = _comparable(record)
     for other, protocol in measured.items():
-        unlike = [key for key in _COMPARABLE if protocol[key] != record["protocol"][key]]
+        unlike = [key for key in _COMPARABLE if protocol[key] != own[key]]
         if unlike:
             reasons.append(f"its protocol differs from that of scene {other}: {', '.join(unlike)}")
         break
@@ -90,6 +91,13 @@ def _mismatches(record: dict[str, Any], expected: dict[str, Any], measured: dict
 
 
 _COMPARABLE = ("cameras", "eval_camera", "width", "height", "sweeps", "holdout", "poses", "regions")
+
+
+def _comparable(record: dict[str, Any]) -> dict[str, Any]:
+    """What of a protocol has to be the same for figures to stand side by side. A scene whose refinement was not
+    believed keeps its poses (`protocol.poses` says so) and stands beside those that have refined ones."""
+    poses = {"poses": "refined"} if "refine_poses" in record["provenance"]["stages"] else {}
+    return {key: record["protocol"][key] for key in _COMPARABLE} | poses
 
 
 def _row(record: dict[str, Any], method: str) -> dict[str, Any]:

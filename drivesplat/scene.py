@@ -16,6 +16,8 @@ from drivesplat.errors import DatasetError
 from drivesplat.storage import read_json, unreadable, write_json
 
 SCHEMA = 1
+REFINED = "scene_refined.json"
+"""What the record is called once its poses are refined."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,12 @@ class Scene:
         return int(np.argmin(np.abs(self.key_frame_timestamps - timestamp)))
 
 
+def place_of(recording: Frame | Sweep) -> str:
+    """Which recording it is, for messages: its key frame, or the nearest one, and its token."""
+    where = "" if recording.is_key_frame else "between key frames, nearest "
+    return f"{where}key frame {recording.sample_index}, sample_data {recording.token}"
+
+
 _ARRAYS = {
     "intrinsics": np.float64,
     "camera_to_world": np.float64,
@@ -148,13 +156,14 @@ def write_scene(path: str | Path, scene: Scene) -> None:
 
 def read_scene(path: str | Path) -> Scene:
     """Reads `scene.json`. Raises ResultError where the file is not one, naming it and the rule that makes it."""
-    content = read_json(path, rule="extract")
+    rule = "refine_poses" if Path(path).name == REFINED else "extract"
+    content = read_json(path, rule)
     try:
         if content.pop("schema") != SCHEMA:
             raise ValueError("it has another schema")
         return _from_plain(Scene, content)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, "extract", f"not a scene record ({error})") from error
+        raise unreadable(path, rule, f"not a scene record ({error})") from error
 
 
 def _to_plain(record: Any) -> dict[str, Any]:

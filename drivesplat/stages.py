@@ -17,22 +17,27 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.looks import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.masks import MaskJob
+from drivesplat.settings.own_car import OwnCarJob, OwnCarSearch
 from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.refine_poses import RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import MOVING_PARTS, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.storage import canonical_json
 
-SCENE_STAGES = ("extract", "lidar_seed", "parser", "masks", "scene_metrics")
+SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
+ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
+"""And that behind those of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The one of them that no eval.json comes from."""
-TRAINING_INPUTS = ("actors", "lidar_depth")
+TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
 
 
@@ -67,10 +72,24 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
     return canonical_json(_RECORDS[stage](place).model_dump(mode="json"))
 
 
+def refines_poses(config: Config, scene: str) -> bool:
+    """Whether a scene's poses are refined before anything else is made of it."""
+    return for_scene(config, scene).refine_poses.enabled
+
+
+def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
+    """The stages of a scene behind its metrics.json."""
+    return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES
+
+
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     """Which of TRAINING_INPUTS a method's training on a scene takes."""
     train = for_scene(config, scene, method).train
-    taken = {"actors": "actors" in config.all_methods[method].parts, "lidar_depth": train.depth_weight > 0}
+    taken = {
+        "actors": "actors" in config.all_methods[method].parts,
+        "lidar_depth": train.depth_weight > 0,
+        "free_space": train.floaters.free_space,
+    }
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
 
@@ -93,8 +112,22 @@ def _extract(place: Place) -> SceneSource:
         frames=dataset.frames.get(place.scene),
         cameras=config.cameras,
         sweeps=config.sweeps,
+        lidar_sweeps=config.lidar_seed.sweeps,
         on_missing=config.extract.on_missing,
     )
+
+
+def _refine_poses(place: Place) -> RefinePosesJob:
+    return RefinePosesJob(refine_poses=place.config.refine_poses, random_seed=place.config.random_seed)
+
+
+def _own_car(place: Place) -> OwnCarJob:
+    config, kind = place.config, place.config.masks.own_car
+    polygons = config.masks.own_car_polygons if kind != "none" else {}
+    spared = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
+    cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *spared})
+    search = OwnCarSearch(cameras=cameras, holdout=config.holdout, own_car_radius=config.lidar_seed.own_car_radius)
+    return OwnCarJob(polygons=polygons, search=search if cameras else None)
 
 
 def _lidar_seed(place: Place) -> SeedJob:
@@ -111,7 +144,6 @@ def _actors(place: Place) -> ActorSeedJob:
         holdout=config.holdout,
         images=config.images,
         own_car_radius=config.lidar_seed.own_car_radius,
-        own_car_polygons=config.masks.own_car_polygons,
         random_seed=config.random_seed,
     )
 
@@ -119,10 +151,20 @@ def _actors(place: Place) -> ActorSeedJob:
 def _lidar_depth(place: Place) -> LidarDepthJob:
     config = place.config
     return LidarDepthJob(
+        ray_spacing=config.lidar_depth.ray_spacing,
         holdout=config.holdout,
         images=config.images,
         own_car_radius=config.lidar_seed.own_car_radius,
-        own_car_polygons=config.masks.own_car_polygons,
+        box_margin=config.lidar_seed.box_margin,
+    )
+
+
+def _free_space(place: Place) -> FreeSpaceJob:
+    config = place.config
+    return FreeSpaceJob(
+        free_space=config.free_space,
+        holdout=config.holdout,
+        own_car_radius=config.lidar_seed.own_car_radius,
         box_margin=config.lidar_seed.box_margin,
     )
 
@@ -130,7 +172,10 @@ def _lidar_depth(place: Place) -> LidarDepthJob:
 def _train(place: Place) -> TrainJob:
     config, parts = place.config, place.config.all_methods[place.method].parts
     train = config.train if set(parts) & MOVING_PARTS else config.train.of_what_stands_still()
-    return TrainJob(parts=parts, sky=config.sky, train=train, random_seed=config.random_seed)
+    reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
+    return TrainJob(
+        parts=parts, sky=config.sky, train=train, random_seed=config.random_seed, reference_camera=reference
+    )
 
 
 def _evaluate(place: Place) -> EvaluateJob:
@@ -140,6 +185,7 @@ def _evaluate(place: Place) -> EvaluateJob:
         cameras=config.cameras,
         sweeps=config.sweeps,
         holdout=config.holdout,
+        lidar=_lidar_depth(place),
         lpips=config.lpips.enabled,
         removal=config.removal if place.dataset.world else None,
     )
@@ -199,11 +245,14 @@ def _remove_actor(place: Place) -> RemovalJob:
 _RECORDS: dict[str, Callable[[Place], Settings]] = {
     "demo_world": lambda at: WorldJob(scene=at.scene, version=at.dataset.version, world=at.dataset.world),
     "extract": _extract,
+    "own_car": _own_car,
+    "refine_poses": _refine_poses,
     "lidar_seed": _lidar_seed,
     "parser": lambda at: ParserJob(holdout=at.config.holdout, images=at.config.images),
-    "masks": lambda at: MaskJob(masks=at.config.masks, images=at.config.images),
+    "masks": lambda at: MaskJob(masks=at.config.masks, holdout=at.config.holdout, images=at.config.images),
     "actors": _actors,
     "lidar_depth": _lidar_depth,
+    "free_space": _free_space,
     "train": _train,
     "evaluate": _evaluate,
     "scene_metrics": lambda _: Settings(),

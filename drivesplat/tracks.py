@@ -1,6 +1,6 @@
 """Where an annotated object is at a time between its annotations."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,10 +87,15 @@ def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
     return None
 
 
+def boxes_of(tracks: Iterable[Track], timestamp: int, interval: float) -> list[Box]:
+    """The boxes of some tracks that are there at `timestamp`; `interval` between key frames, both in microseconds."""
+    boxes = (box_at(track, timestamp, interval) for track in tracks)
+    return [box for box in boxes if box is not None]
+
+
 def boxes_at(scene: Scene, timestamp: int) -> list[Box]:
     """All boxes that are there at `timestamp` (microseconds)."""
-    boxes = (box_at(track, timestamp, scene.key_frame_interval) for track in scene.tracks)
-    return [box for box in boxes if box is not None]
+    return boxes_of(scene.tracks, timestamp, scene.key_frame_interval)
 
 
 def moves_at_all(track: Track) -> bool:
@@ -100,6 +105,11 @@ def moves_at_all(track: Track) -> bool:
         if any(box_at(track, int(time), 0.0).moves for time in times[first:last]):
             return True
     return False
+
+
+def tracks_that_move(scene: Scene) -> list[Track]:
+    """The tracks that ever move in a scene: they leave nothing behind that stands still."""
+    return [track for track in scene.tracks if moves_at_all(track)]
 
 
 def runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:

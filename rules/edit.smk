@@ -12,7 +12,7 @@ rule edit:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
     output:
         film=report(
             "<results>/{scene}/{method}/edits/{edit}.mp4",

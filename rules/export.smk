@@ -12,7 +12,7 @@ rule export:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
     output:
         splat="<results>/{scene}/{method}/splat.ply",
@@ -41,7 +41,7 @@ rule export_usd:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
     output:
         usd="<results>/{scene}/{method}/scene.usdz",
     log:
@@ -66,7 +66,7 @@ rule export_viewer:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
     output:
         viewer="<results>/{scene}/{method}/viewer.html",
     log:

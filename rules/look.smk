@@ -13,7 +13,7 @@ rule tracks:
     ids by which settings name them.
     """
     input:
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
     output:
@@ -47,7 +47,7 @@ rule film:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
     output:
         film=report(
             "<results>/{scene}/{method}/{trajectory}.mp4",
@@ -82,7 +82,7 @@ rule film_parts:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
     output:
         film=report(
             "<results>/{scene}/{method}/parts.mp4",
@@ -120,7 +120,7 @@ rule ghost_panel:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
     output:
@@ -158,7 +158,7 @@ rule remove_actor:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
     output:

@@ -32,7 +32,7 @@ rule evaluate:
     on a synthetic world also the view from the side and the street without the car ahead, against the truth.
     """
     input:
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
         truth=plan.truth,
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
         summary="<results>/{scene}/{method}/train.json",

@@ -1,8 +1,9 @@
 # From a dataset's tables to what a training needs.
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
-# OUTPUTS: <results>/{scene}/scene.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it); where a method
-# asks for them, actors.pkl and lidar_depth.pkl.
+# OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
+# where poses are refined, scene_refined.json, poses.json and triangulated.pkl; where a method asks for them, actors.pkl,
+# lidar_depth.pkl and free_space.pkl. The scene of all rules after these (plan.scene) is the refined one where there is one.
 
 
 rule extract:
@@ -30,14 +31,70 @@ rule extract:
         "../workflow_scripts/extract.py"
 
 
-rule lidar_seed:
+rule own_car:
     """
-    Starts the Gaussians where LiDAR of the training key frames found something that stands still, coloured from
-    training images, with random far points along pixels that LiDAR does not reach.
+    Says where each camera sees the recording car's own body: by the outlines that the user gave, or where images stay
+    as they are while the car drives.
     """
     input:
         scene="<results>/{scene}/scene.json",
+    output:
+        own_car="<results>/{scene}/own_car.json",
+    log:
+        "<logs>/{scene}/own_car.log",
+    benchmark:
+        "<benchmarks>/{scene}/own_car.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("own_car"),
+        code=plan.code("own_car"),
+    script:
+        "../workflow_scripts/own_car.py"
+
+
+rule refine_poses:
+    """
+    Corrects the poses by what the images show: features triangulated between key frames, bundle adjustment with the
+    given poses as priors. Keeps the given ones, with a warning, where images cannot improve them.
+    """
+    input:
+        scene="<results>/{scene}/scene.json",
+        own_car="<results>/{scene}/own_car.json",
+    output:
+        scene="<results>/{scene}/scene_refined.json",
+        poses="<results>/{scene}/poses.json",
+        points="<results>/{scene}/triangulated.pkl",
+    log:
+        "<logs>/{scene}/refine_poses.log",
+    benchmark:
+        "<benchmarks>/{scene}/refine_poses.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 4
+    resources:
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("refine_poses"),
+        code=plan.code("refine_poses"),
+    script:
+        "../workflow_scripts/refine_poses.py"
+
+
+rule lidar_seed:
+    """
+    Starts the Gaussians where LiDAR of the training sweeps found something that stands still, coloured from
+    training images, with random far points along pixels that LiDAR does not reach.
+    """
+    input:
+        scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
         points_file=plan.points_file,
+        triangulated=plan.triangulated,
     output:
         seed="<results>/{scene}/seed.ply",
     log:
@@ -61,7 +118,7 @@ rule parser:
     Packs cameras, splits and seed into the dict that users of gsplat's example trainer will recognise.
     """
     input:
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
         seed="<results>/{scene}/seed.ply",
     output:
         parser="<results>/{scene}/parser.pkl",
@@ -86,7 +143,8 @@ rule masks:
     Labels every pixel of every image: static, parked, moving, left out (from the annotated boxes), and sky.
     """
     input:
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
     output:
         masks="<results>/{scene}/masks/masks.json",
     log:
@@ -111,7 +169,8 @@ rule actors:
     with random points in its box where LiDAR is thin.
     """
     input:
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
     output:
         actors="<results>/{scene}/actors.pkl",
     log:
@@ -135,7 +194,8 @@ rule lidar_depth:
     Projects the LiDAR sweep nearest in time into every training image, what moves carried along to the image's moment.
     """
     input:
-        scene="<results>/{scene}/scene.json",
+        scene=plan.scene,
+        own_car="<results>/{scene}/own_car.json",
     output:
         depth="<results>/{scene}/lidar_depth.pkl",
     log:
@@ -152,3 +212,28 @@ rule lidar_depth:
         code=plan.code("lidar_depth"),
     script:
         "../workflow_scripts/lidar_depth.py"
+
+
+rule free_space:
+    """
+    Follows every LiDAR ray of the training key frames from sensor to return: the voxels that rays passed, and near
+    which none ended, are empty.
+    """
+    input:
+        scene=plan.scene,
+    output:
+        free_space="<results>/{scene}/free_space.pkl",
+    log:
+        "<logs>/{scene}/free_space.log",
+    benchmark:
+        "<benchmarks>/{scene}/free_space.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("free_space"),
+        code=plan.code("free_space"),
+    script:
+        "../workflow_scripts/free_space.py"

@@ -1,7 +1,7 @@
 # The training of one method on one scene.
 #
-# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.pkl and lidar_depth.pkl where the method
-# has actors, and where it is held to LiDAR's depth.
+# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.pkl, lidar_depth.pkl and free_space.pkl
+# where the method has actors, is held to LiDAR's depth, and keeps Gaussians out of space proven empty.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.pt and train.json; tensorboard/ beside them. While it runs,
 # resume/ holds what a killed training goes on from; no rule declares it, so that Snakemake leaves it alone.
 
@@ -15,6 +15,7 @@ rule train:
         masks="<results>/{scene}/masks/masks.json",
         actors=plan.actors,
         lidar_depth=plan.lidar_depth,
+        free_space=plan.free_space,
     output:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
         summary="<results>/{scene}/{method}/train.json",

@@ -13,8 +13,8 @@ from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.parameters import SH_C0
 from drivesplat.model.part import Part
-from drivesplat.model.splat_model import View
 from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import View
 from drivesplat.motion import Motion
 from drivesplat.parser import parser_dict
 from drivesplat.point_cloud import PointCloud

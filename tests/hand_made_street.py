@@ -14,8 +14,9 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.build import definitions
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import View
 from drivesplat.motion import Motion
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene, Track

@@ -27,13 +27,13 @@ class Speeding(Thing):
         return super().at(seconds) + 0.5 * seconds**2 * np.array([*self.gain, 0.0])
 
 
-def scene_at(root: Path, sweeps: bool = True) -> Scene:
-    """The tiny drive in `root`, with the images between key frames unless told otherwise."""
+def scene_at(root: Path, sweeps: bool = True, **changes) -> Scene:
+    """The tiny drive in `root`, with the images between key frames unless told otherwise; `changes` of the source."""
     source = SceneSource(
         dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None, cameras=("CAM_FRONT",),
         sweeps=sweeps, on_missing="stop",
     )  # fmt: skip
-    return extract_scene(source, root)
+    return extract_scene(source.model_copy(update=changes), root)
 
 
 def drive(root: Path, *things: Thing, **world) -> Scene:

@@ -128,6 +128,7 @@ def test_only_what_has_actors_takes_actors_and_only_what_is_held_to_depth_takes_
     taken = {name: training_inputs(load({}), "0061", name) for name in names(seeds=[1])}
     for name, inputs in taken.items():
         expected = {"actors": "without-actors" not in name, "lidar_depth": "without-depth" not in name}
+        expected["free_space"] = False  # asked for by no default
         assert {stage: stage in inputs for stage in TRAINING_INPUTS} == expected, name
 
 
@@ -464,7 +465,9 @@ def test_asking_for_it_plans_exactly_the_trainings_of_all_variants_with_all_seed
     for name, files in trainings.items():
         assert ("results/0001/actors.pkl" in files) == ("without-actors" not in name), name
         assert ("results/0001/lidar_depth.pkl" in files) == ("without-depth" not in name), name
-    once = dict.fromkeys(("extract", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "ablation"), 1)
+    once = dict.fromkeys(
+        ("extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "ablation"), 1
+    )
     assert plain == {**once, "train": 27, "evaluate": 27}
     assert sorted(compared[""]) == sorted(f"results/0001/{name}/eval.json" for name in names())
     assert sorted(metrics) == ["street", "vanilla"]

@@ -12,7 +12,8 @@ import torch
 from hand_made import about_z, looking_at, motion_through, track_of
 
 from drivesplat.model.actors import Actors
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.motion import Motion
 from drivesplat.rasterize import rasterize
 from drivesplat.settings.actors import ActorSettings, TrackSettings
@@ -109,17 +110,22 @@ def distances(actors: Actors, thing: Thing, pose: np.ndarray, time: float) -> np
 
 
 def test_an_object_is_found_in_its_own_frame_from_images_of_it_passing_by():
-    """Places from 0.08 m off to within half a centimetre and colours from grey to within 1 % on the whole, none of them
-    far off; the track, which is right, stays so."""
+    """Places from 0.08 m off to within half a centimetre of each other and colours from grey to within 1 % on the
+    whole, none of them far off. The object as a whole and its track, which is right, may lean against each other by a
+    centimetre or two: images cannot tell, and the track's penalty draws them back slowly. In the world it is there."""
     thing, motion = a_thing(), passing_by()
     actors = guessed(thing, motion, ActorSettings(sh_degree=0, fourier=1))
     assert np.linalg.norm(actors.params["means"].detach().numpy() - thing.places, axis=1).mean() > 0.08
     fit(actors, recorded(thing, motion, from_the_kerb()), 300)
-    off = np.linalg.norm(actors.params["means"].detach().numpy() - thing.places, axis=1)
+    leaning = actors.params["means"].detach().numpy() - thing.places
+    off = np.linalg.norm(leaning - leaning.mean(axis=0), axis=1)
     colors = 0.5 + C0 * actors.params["sh0"].detach().numpy()[:, 0, 0]
     assert off.mean() < 0.005 and off.max() < 0.02
     assert np.abs(colors - thing.colors).mean() < 0.01 and np.abs(colors - thing.colors).max() < 0.04
-    assert all(float(value.detach().abs().max()) < 0.01 for value in actors.shared.values())
+    assert np.linalg.norm(leaning.mean(axis=0)) < 0.02
+    assert all(float(value.detach().abs().max()) < 0.02 for value in actors.shared.values())
+    for i in (0, 4, 8):
+        assert distances(actors, thing, motion.object_to_world[i], KEY_FRAMES[i]).mean() < 0.01
 
 
 def shifted(pose: np.ndarray) -> np.ndarray:
@@ -137,7 +143,7 @@ def turned(pose: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("mistake", [pytest.param(shifted, id="0.3 m off"), pytest.param(turned, id="0.25 rad off")])
 def test_a_wrong_annotation_among_right_ones_is_corrected(mistake: Callable[[np.ndarray], np.ndarray]):
     """Less than a third of the error at its key frame is left, and nine tenths of it without corrections. Elsewhere the
-    object stays where it is. Annotations are trusted little here: by the default weights they hardly move."""
+    object stays where it is. Annotations are trusted little here: so few iterations hardly move them otherwise."""
     thing, motion = a_thing(), passing_by()
     poses, wrong = motion.object_to_world, motion.object_to_world.copy()
     wrong[4] = mistake(poses[4])

@@ -26,6 +26,7 @@ from drivesplat.errors import ResultError
 from drivesplat.extract import extract_scene
 from drivesplat.holdout import frame_groups, sweep_groups
 from drivesplat.motion import Motion
+from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.scene import Frame, Scene
 from drivesplat.seeding.actor_points import actors_record
 from drivesplat.seeding.actors import motion_of, read_actors
@@ -39,7 +40,7 @@ ONCOMING = Thing("vehicle.car", (4.4, 1.8, 1.5), (32.0, 3.5, 0.75), (-3.0, 0.0),
 FLOOR = 0.1
 
 
-def job(holdout=HELD_OUT, width=None, random_seed=0, radius=2.5, outline=None, **settings) -> ActorSeedJob:
+def job(holdout=HELD_OUT, width=None, random_seed=0, radius=2.5, **settings) -> ActorSeedJob:
     """Without random points, unless told otherwise."""
     return ActorSeedJob.model_validate(
         {
@@ -47,18 +48,17 @@ def job(holdout=HELD_OUT, width=None, random_seed=0, radius=2.5, outline=None, *
             "holdout": holdout,
             "images": {"width": width},
             "own_car_radius": radius,
-            "own_car_polygons": {"CAM_FRONT": outline} if outline else {},
             "random_seed": random_seed,
         }
     )
 
 
-def actors_of(scene: Scene, settings: ActorSeedJob) -> list[dict[str, Any]]:
-    return actors_record(scene, settings)["actors"]
+def actors_of(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> list[dict[str, Any]]:
+    return actors_record(scene, settings, own_car)["actors"]
 
 
-def the_actor(scene: Scene, settings: ActorSeedJob) -> dict[str, Any]:
-    (actor,) = actors_of(scene, settings)
+def the_actor(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
+    (actor,) = actors_of(scene, settings, own_car)
     return actor
 
 
@@ -123,13 +123,11 @@ def test_a_margin_grows_the_box_at_its_sides_and_leaves_the_road_out(tiny_scene,
     assert actor["points"][:, 2].min() > FLOOR - 0.8
 
 
-def test_sweeps_that_are_missing_or_between_key_frames_give_nothing(root):
+def test_sweeps_that_are_missing_or_corrupt_give_nothing(root):
     scene = scene_at(root)
-    between = dataclasses.replace(scene.sweeps[0], is_key_frame=False)
     (root / "samples/LIDAR_TOP/0001__0001.pcd.bin").unlink()
     (root / "samples/LIDAR_TOP/0001__0003.pcd.bin").write_bytes(b"no sweep")
-    actor = the_actor(dataclasses.replace(scene, sweeps=(*scene.sweeps, between)), job())
-    np.testing.assert_allclose(actor["points"], returns_of(World(), CAR, (0, 4, 5, 7)), atol=1e-4)
+    np.testing.assert_allclose(the_actor(scene, job())["points"], returns_of(World(), CAR, (0, 4, 5, 7)), atol=1e-4)
 
 
 def test_few_lidar_points_are_filled_up_with_random_ones_in_the_box(tiny_scene):
@@ -313,10 +311,10 @@ WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 def test_the_own_cars_body_lends_no_colour_and_hides(tmp_path):
     scene = drive(tmp_path, CAR)
     painted(scene, lambda frame: np.where(np.arange(96)[:, None] <= 48, (255, 0, 0), (0, 0, 255)))
-    colors = the_actor(scene, job(outline=LEFT_HALF))["points_rgb"]
+    colors = the_actor(scene, job(), OwnCar({"CAM_FRONT": (LEFT_HALF,)}))["points_rgb"]
     assert {tuple(color) for color in colors} == {(0, 0, 255)}
     assert {tuple(color) for color in the_actor(scene, job())["points_rgb"]} == {(0, 0, 255), (255, 0, 0)}
-    assert actors_of(scene, job(outline=WHOLE)) == []
+    assert actors_of(scene, job(), OwnCar({"CAM_FRONT": (WHOLE,)})) == []
 
 
 def test_an_actor_that_is_seen_but_shows_no_point_is_grey(tmp_path):
@@ -327,7 +325,7 @@ def test_an_actor_that_is_seen_but_shows_no_point_is_grey(tmp_path):
         dataclasses.replace(sweep, path=_left_half(Path(sweep.path), tmp_path / f"left{number}.bin"))
         for number, sweep in enumerate(scene.sweeps)
     ]
-    actor = the_actor(dataclasses.replace(scene, sweeps=tuple(left)), job(outline=outline))
+    actor = the_actor(dataclasses.replace(scene, sweeps=tuple(left)), job(), OwnCar({"CAM_FRONT": (outline,)}))
     assert len(actor["points"]) > 50
     assert {tuple(color) for color in actor["points_rgb"]} == {(127, 127, 127)}
 

@@ -11,8 +11,8 @@ pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("demo_workflow")]
 
 TARGET = "results/demo/metrics.json"
 AFTER_THE_WORLD = {
-    "extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "actors": 1, "lidar_depth": 1, "train": 2, "evaluate": 2,
-    "scene_metrics": 1,
+    "extract": 1, "own_car": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "actors": 1, "lidar_depth": 1, "train": 2,
+    "evaluate": 2, "scene_metrics": 1,
 }  # fmt: skip
 
 
@@ -45,6 +45,8 @@ def test_metrics_come_from_nothing_on_the_cpu(finished):
     assert metrics["methods"].keys() == {"vanilla", "street"}
     for method, result in metrics["methods"].items():
         assert result["interpolation"]["all"]["psnr"] > 8.0
+        depth = result["interpolation"]["depth"]
+        assert 0.0 < depth["median_relative_error"] < 0.5 and depth["pixels"] > 1000
         assert finished.read(f"results/demo/{method}/train.json")["device"].startswith("cpu")
 
 

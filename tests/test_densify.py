@@ -12,7 +12,8 @@ from hand_made import actors_of, motion_through, round_gaussians, track_of
 
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
-from drivesplat.model.splat_model import Picture, SplatModel, View
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings

@@ -24,7 +24,8 @@ from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import actors_of, appearances
 from drivesplat.film import Shot, film_frame
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.rigid import rigid
 from drivesplat.scene import Scene
 from drivesplat.settings.edit import Edit

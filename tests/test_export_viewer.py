@@ -22,7 +22,8 @@ from drivesplat.model.build import definitions
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
 from drivesplat.model.sky import CubemapSky
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.rigid import rigid
 from drivesplat.scene import Frame
 from drivesplat.settings.export import ViewerJob

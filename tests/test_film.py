@@ -23,7 +23,8 @@ from drivesplat.errors import DatasetError, ResultError
 from drivesplat.film import Shot, film_frame, render_film
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings

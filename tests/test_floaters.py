@@ -7,7 +7,8 @@ import torch
 from drivesplat.model.background import Background
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings
-from drivesplat.training.floaters import LARGEST_STEP, camera_path, fade_floaters, near_path
+from drivesplat.training.cells import Cells
+from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, camera_path, fade_floaters, near_path
 
 
 def distance_to_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
@@ -58,7 +59,7 @@ def test_only_floaters_near_the_path_fade_and_the_rest_stays():
     positions = np.array([[0.0, 0.3, 0.0], [2.0, 0.0, 0.5], [2.0, 3.0, 0.0], [9.0, 0.0, 0.0]])
     part = Background.from_points(positions, np.full((4, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     before = {name: value.detach().clone() for name, value in part.params.items()}
-    fade_floaters(part, *camera_path(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])), 1.0)
+    fade_floaters(part, EmptySpace(*camera_path(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])), 1.0))
     opacities = part.at(0.0).opacities.detach()
     assert (opacities[:2] < 1e-3).all()
     torch.testing.assert_close(opacities[2:], torch.tensor([0.6, 0.6]))
@@ -68,7 +69,7 @@ def test_only_floaters_near_the_path_fade_and_the_rest_stays():
 
 def test_a_faded_gaussian_is_under_what_the_strategies_take_for_dead():
     part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
-    fade_floaters(part, *camera_path(torch.zeros(1, 3)), 1.0)
+    fade_floaters(part, EmptySpace(*camera_path(torch.zeros(1, 3)), 1.0))
     opacity = float(part.at(0.0).opacities.detach())
     assert opacity < min(McmcSettings().min_opacity, DefaultSettings().prune_opacity)
 
@@ -77,12 +78,35 @@ def test_fading_never_brightens():
     part = Background.from_points(np.zeros((2, 3)), np.full((2, 3), 0.5), GaussianSettings(), 1.0)
     with torch.no_grad():
         part.params["opacities"].copy_(torch.tensor([-30.0, 2.0]))
-    fade_floaters(part, *camera_path(torch.zeros(1, 3)), 1.0)
+    fade_floaters(part, EmptySpace(*camera_path(torch.zeros(1, 3)), 1.0))
     assert float(part.params["opacities"].detach()[0]) == -30.0
 
 
 def test_a_faded_parameter_can_still_learn():
     part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
     before = part.params["opacities"]
-    fade_floaters(part, *camera_path(torch.zeros(1, 3)), 1.0)
+    fade_floaters(part, EmptySpace(*camera_path(torch.zeros(1, 3)), 1.0))
     assert part.params["opacities"] is before and before.requires_grad and before.is_leaf
+
+
+def free_cells() -> Cells:
+    """Two voxels of a grid of 0.5 m that begins at (-1, -1, -1): those at (0, 0, 0) and (3.5, 0, 0)."""
+    return Cells.of(np.full(3, -1.0), 0.5, np.array([10, 4, 4]), np.array([(2 * 4 + 2) * 4 + 2, (9 * 4 + 2) * 4 + 2]))
+
+
+@pytest.mark.parametrize(("radius", "faded"), [(0.0, [0, 2]), (1.0, [0, 1, 2])])
+def test_gaussians_fade_whose_centres_lie_in_space_proven_empty(radius, faded):
+    """However large they are, and whether they are near the path or not."""
+    positions = np.array([[0.2, 0.1, 0.3], [0.7, 0.2, 0.2], [3.6, 0.1, 0.1], [-0.9, -0.9, -0.9], [30.0, 0.0, 0.0]])
+    part = Background.from_points(positions, np.full((5, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
+    with torch.no_grad():
+        part.params["scales"][3:] += 5.0
+    fade_floaters(part, EmptySpace(*camera_path(torch.tensor([[0.0, 0.0, 0.0]])), radius, free_cells()))
+    opacities = part.at(0.0).opacities.detach()
+    assert (opacities < 1e-3).nonzero()[:, 0].tolist() == faded
+
+
+def test_nothing_is_known_to_be_empty_without_a_radius_and_free_space():
+    path = camera_path(torch.zeros(1, 3))
+    assert not EmptySpace(*path, 0.0).known
+    assert EmptySpace(*path, 1.0).known and EmptySpace(*path, 0.0, free_cells()).known

@@ -33,7 +33,8 @@ from drivesplat.film import film_frame
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.rasterize import rasterize
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings

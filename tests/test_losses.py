@@ -11,7 +11,8 @@ from skimage.metrics import structural_similarity
 
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky, CubemapSky
-from drivesplat.model.splat_model import Picture, SplatModel, View
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.losses import (
@@ -408,3 +409,90 @@ def test_only_what_moves_is_made_sure_of():
     still, actors = (part.params for part in model.parts)
     assert all(value.grad is None or not value.grad.any() for value in still.values())
     assert actors["opacities"].grad[actors["owner"] == 0].any()
+
+
+# ---- what the own car hides
+
+
+def beneath(seen: TrainingView) -> TrainingView:
+    """A view at whose lower left the own car's body is seen, told as the masks tell it."""
+    own_car = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    own_car[9:, :12] = True
+    columns, rows = seen.lidar.pixels % WIDTH, seen.lidar.pixels // WIDTH
+    clear = ~own_car[rows, columns]
+    lidar = LidarDepth(seen.lidar.pixels[clear], seen.lidar.depth[clear])
+    classes = torch.where(own_car, 255, torch.randint(0, 3, (HEIGHT, WIDTH), generator=torch.manual_seed(0)))
+    return dataclasses.replace(
+        seen,
+        own_car=own_car,
+        sky=seen.sky & ~own_car,
+        moving=seen.moving & ~own_car,
+        lidar=lidar,
+        classes=classes.to(torch.uint8),
+    )
+
+
+EVERYTHING = TrainSettings(
+    **dict.fromkeys(WEIGHTS.values(), 0.3), semantic_weight=0.3, gaussians=GaussianSettings(init_opacity=0.6)
+)
+
+
+def image_terms(picture: Picture, view: TrainingView, model: SplatModel) -> dict[str, torch.Tensor]:
+    """The terms that ask something of pixels."""
+    terms = loss_terms(picture, view, model, EVERYTHING)
+    return {name: term for name, term in terms.items() if not name.endswith("_reg") and not name.startswith("track")}
+
+
+def test_no_term_pulls_on_what_the_own_car_hides():
+    """Colours, opacities and depths of its pixels get no gradient; those of all others get that of the picture with
+    the recorded body in its place."""
+    model, picture, seen = street()
+    view = beneath(seen)
+    leaves = {name: getattr(picture, name).detach().clone().requires_grad_() for name in ("image", "alpha", "depth")}
+    terms = image_terms(dataclasses.replace(picture, **leaves), view, model)
+    assert terms.keys() == {"l1", "ssim", "sky_alpha", "sky_bce", "depth", "entropy", "dynamic"}
+    sum(term for name, term in terms.items() if name != "entropy").backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad.abs().sum() > 0.0, name
+        assert not leaf.grad[view.own_car].any(), name
+    beside = torch.zeros_like(view.own_car)
+    beside[7:9, :12] = True
+    assert leaves["image"].grad[beside].abs().min() > 0.0, "what is seen beside the body still counts"
+
+
+def test_what_the_own_car_hides_changes_no_term():
+    model, picture, seen = street()
+    view = beneath(seen)
+    hidden = dataclasses.replace(
+        picture,
+        image=torch.where(view.own_car[..., None], 0.1, picture.image),
+        alpha=torch.where(view.own_car, 0.4, picture.alpha),
+        depth=torch.where(view.own_car, 90.0, picture.depth),
+    )
+    before, after = (image_terms(p, view, model) for p in (picture, hidden))
+    for name, term in before.items():
+        assert torch.equal(term, after[name]), name
+    plain = dataclasses.replace(view, own_car=None)
+    assert not torch.equal(*(image_terms(p, plain, model)["ssim"] for p in (picture, hidden)))
+
+
+def test_pixels_beside_the_own_car_weigh_what_they_do_elsewhere():
+    """L1 and SSIM are means over all pixels of the picture with the recorded body before it."""
+    picture, plain = a_case(model := a_model())
+    own_car = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    own_car[9:] = True
+    terms = loss_terms(picture, dataclasses.replace(plain, own_car=own_car), model, TrainSettings(ssim_weight=0.3))
+    recorded = plain.pixels.numpy() / 255.0
+    shown = np.where(own_car[..., None], recorded, picture.image.numpy())
+    assert float(terms["l1"]) == pytest.approx(0.7 * np.abs(shown - recorded).mean(), rel=1e-5)
+    assert float(terms["ssim"]) == pytest.approx(0.3 * (1.0 - zero_padded_ssim(shown, recorded)), abs=1e-4)
+
+
+def test_actors_behind_the_own_car_are_not_made_sure_of():
+    """The body fills the image: of the entropy nothing is left, and no opacity is pulled."""
+    model, picture, seen = street()
+    view = dataclasses.replace(seen, own_car=torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
+    term = loss_terms(picture, view, model, TrainSettings())["entropy"]
+    assert float(term.detach()) == pytest.approx(0.0, abs=2e-4)
+    term.backward()
+    assert not model.parts[1].params["opacities"].grad.any()

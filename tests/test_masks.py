@@ -13,7 +13,17 @@ from tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.extract import extract_scene
 from drivesplat.images import project, read_image
-from drivesplat.masks import make_masks, mask_name, read_labels, read_masks_record, read_sky_mask
+from drivesplat.masks import (
+    NO_SKY,
+    UNLABELLED,
+    make_masks,
+    mask_name,
+    read_classes,
+    read_labels,
+    read_masks_record,
+    read_sky_mask,
+)
+from drivesplat.own_car import OwnCar
 from drivesplat.regions import LABELS, label_image, region_mask
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene
@@ -25,8 +35,16 @@ from drivesplat.sky_mask import sky_mask
 SIZE = (96, 54)
 
 
+WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+
+
+def seen_in_front(outline: tuple) -> OwnCar:
+    """The own car within an outline of CAM_FRONT's images."""
+    return OwnCar({"CAM_FRONT": (outline,)}, {"CAM_FRONT": "polygons"})
+
+
 def job(width=None, **masks) -> MaskJob:
-    return MaskJob.model_validate({"masks": masks, "images": {"width": width}})
+    return MaskJob.model_validate({"masks": masks, "holdout": {}, "images": {"width": width}})
 
 
 @pytest.fixture(scope="module")
@@ -158,6 +176,25 @@ def test_masks_are_made_though_a_lidar_file_is_bad(tiny_root, tmp_path, damage):
     assert make_masks(scene, job(), tmp_path / "masks")["images"] == len(scene.frames)
 
 
+def test_the_sky_of_a_training_image_is_told_by_no_held_out_sweep(tiny_scene, tmp_path):
+    """There is one sweep, that of key frame 2, with a return in the middle of every image's sky. It is 465 ms from the
+    image of key frame 3, and 285 from the one before its own."""
+    frames = [tiny_scene.frames[i] for i in (3, 4, 6)]
+    at = np.concatenate([[f.camera_to_world @ [0.0, -8.0, 30.0, 1.0]] for f in frames])
+    sweep = tiny_scene.sweeps[2]
+    returns = np.zeros((len(frames), 5), dtype=np.float32)
+    returns[:, :3] = (at @ inverse(sweep.sensor_to_world).T)[:, :3]
+    returns.tofile(tmp_path / "one.pcd.bin")
+    only = dataclasses.replace(sweep, path=str(tmp_path / "one.pcd.bin"))
+    scene = dataclasses.replace(tiny_scene, frames=tuple(frames), sweeps=(only,))
+    row, column = int(27.0 - 0.62 * 96 * 8.0 / 30.0), 48
+    for every_nth, open_sky in ((0, [False, False, False]), (8, [True, False, True])):
+        holdout = {"every_nth": every_nth, "offset": 2, "last_block": 0}
+        make_masks(scene, MaskJob.model_validate({"masks": {}, "holdout": holdout, "images": {}}), tmp_path)
+        skies = [read_sky_mask(tmp_path, f.camera, f.timestamp, SIZE) for f in frames]
+        assert [sky[row, column] for sky in skies] == open_sky
+
+
 def extracted(root: Path) -> Scene:
     source = SceneSource(
         dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=(0, 2), cameras=("CAM_FRONT",),
@@ -189,10 +226,31 @@ def test_the_users_own_masks_are_used(two_images, tmp_path):
     )
     record = make_masks(two_images, settings, tmp_path / "masks")
     assert (record["regions"], record["sky"]) == ("masks", "masks")
-    assert record["sky_share"] == pytest.approx((labels > 4).mean())
+    sky[labels == LABELS["own_car"]] = 0
+    assert record["sky_share"] == pytest.approx((sky > 0).mean())
+    assert record["own_car"] == {"CAM_FRONT": "masks"}
     for frame in two_images.frames:
         np.testing.assert_array_equal(read_labels(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), labels)
         np.testing.assert_array_equal(read_sky_mask(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), sky > 0)
+
+
+@pytest.mark.parametrize(
+    ("light", "sky", "known"),
+    [(1.0, None, True), (0.2, None, False), (1.0, 0, True)],
+    ids=["day", "night", "the user's, without sky"],
+)
+def test_where_no_sky_is_found_none_is_known_unless_the_user_says_so(two_images, tmp_path, caplog, light, sky, known):
+    dimmed = []
+    for frame in two_images.frames:
+        path = tmp_path / "images" / Path(frame.image_path).name
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray((light * read_image(frame.image_path)).astype(np.uint8)).save(path, quality=95)
+        dimmed.append(dataclasses.replace(frame, image_path=str(path)))
+    scene = dataclasses.replace(two_images, frames=tuple(dimmed))
+    mine = None if sky is None else str(users_masks(scene, tmp_path / "mine", np.full((54, 96), sky, np.uint8)))
+    record = make_masks(scene, job(sky_folder=mine), tmp_path / "masks")
+    assert record["sky_known"] is known
+    assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
 
 
 def test_the_users_masks_at_another_size_are_brought_to_that_of_the_images(two_images, tmp_path):
@@ -230,7 +288,8 @@ def test_a_label_that_there_is_none_is_refused_naming_setting_and_file(two_image
 def test_the_own_cars_outline_is_left_out_of_every_region(two_images, tmp_path):
     """The lower right quarter of the image, in fractions of its width and height; one pixel of rounding."""
     outline = ((0.5, 0.5), (1.0, 0.5), (1.0, 1.0), (0.5, 1.0))
-    make_masks(two_images, job(own_car_polygons={"CAM_FRONT": outline, "CAM_BACK": ((0, 0), (1, 0), (1, 1))}), tmp_path)
+    own_car = OwnCar({"CAM_FRONT": (outline,), "CAM_BACK": (WHOLE,)}, {"CAM_FRONT": "polygons", "CAM_BACK": "images"})
+    assert make_masks(two_images, job(), tmp_path, own_car)["own_car"] == {"CAM_FRONT": "polygons"}
     for frame in two_images.frames:
         labels = read_labels(tmp_path, "CAM_FRONT", frame.timestamp, SIZE)
         everything = region_mask(labels, "all")
@@ -245,11 +304,29 @@ def test_the_own_cars_outline_is_left_out_of_every_region(two_images, tmp_path):
 
 def test_the_own_cars_outline_is_left_out_of_the_users_masks_too(two_images, tmp_path):
     folder = users_masks(two_images, tmp_path / "mine", np.full((54, 96), LABELS["moving_car"], dtype=np.uint8))
-    outline = {"CAM_FRONT": ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0))}
-    make_masks(two_images, job(regions_folder=str(folder), own_car_polygons=outline), tmp_path / "masks")
+    outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0))
+    make_masks(two_images, job(regions_folder=str(folder)), tmp_path / "masks", seen_in_front(outline))
     labels = read_labels(tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
     assert set(np.unique(labels)) == {LABELS["moving_car"], LABELS["own_car"]}
     assert (labels[50:] == LABELS["own_car"]).all() and (labels[:47] == LABELS["moving_car"]).all()
+
+
+def test_the_own_car_is_no_sky_and_of_no_class(two_images, tmp_path):
+    """The user's masks say that all is sky, and of class 3."""
+    full = users_masks(two_images, tmp_path / "full", np.full((54, 96), 255, dtype=np.uint8))
+    classes = users_masks(two_images, tmp_path / "classes", np.full((54, 96), 3, dtype=np.uint8))
+    settings = job(sky_folder=str(full), semantic_folder=str(classes))
+    outline = ((0.0, 0.5), (1.0, 0.5), (1.0, 1.0), (0.0, 1.0))
+    record = make_masks(two_images, settings, tmp_path / "masks", seen_in_front(outline))
+    assert (record["semantic_classes"], record["sky_share"]) == (4, 0.5)
+    at = (tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
+    sky, found = read_sky_mask(*at), read_classes(*at)
+    assert sky[:27].all() and not sky[27:].any()
+    assert (found[:27] == 3).all() and (found[27:] == UNLABELLED).all()
+
+
+def test_a_drive_that_shows_no_own_car_says_so(made):
+    assert made[1]["own_car"] == {}
 
 
 @pytest.mark.parametrize("kind", ["sky", "regions"])

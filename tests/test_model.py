@@ -18,8 +18,9 @@ from drivesplat.model.build import Beginnings, actor_cap, build_model, definitio
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky, CubemapSky
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import View
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings

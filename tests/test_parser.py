@@ -34,7 +34,8 @@ def test_the_record_has_the_keys_and_shapes_of_gsplats_example_trainer(tiny_scen
     record = parser_dict(tiny_scene, seed, job())
     images, points = 19, 50
     shapes = {
-        "Ks": (images, 3, 3), "camtoworlds": (images, 4, 4), "image_sizes": (images, 2), "camera_indices": (images,),
+        "Ks": (images, 3, 3), "camtoworlds": (images, 4, 4), "ego_to_world": (images, 4, 4),
+        "image_sizes": (images, 2), "camera_indices": (images,),
         "timestamps": (images,), "sample_indices": (images,), "is_key_frame": (images,), "points": (points, 3),
         "points_rgb": (points, 3),
     }  # fmt: skip
@@ -54,6 +55,7 @@ def test_images_keep_their_order_paths_times_and_poses(tiny_scene, seed):
         assert record["sample_indices"][i] == frame.sample_index
         assert record["is_key_frame"][i] == frame.is_key_frame
         np.testing.assert_array_equal(record["camtoworlds"][i], frame.camera_to_world)
+        np.testing.assert_array_equal(record["ego_to_world"][i], frame.ego_to_world)
     np.testing.assert_array_equal(record["points"], seed.positions)
     np.testing.assert_array_equal(record["points_rgb"], seed.colors)
 

@@ -9,11 +9,12 @@ import pytest
 
 from drivesplat.config import load
 from drivesplat.planning import Plan
-from drivesplat.stages import SCENE_STAGES, stage_settings
+from drivesplat.stages import ALL_SCENE_STAGES, SCENE_STAGES, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 ACTORS = ["background", "actors"]
 HELD = {"train": {"depth_weight": 0.01}}
+KEPT_OUT = {"train": {"floaters": {"free_space": True}}}
 
 
 def plan(**values: Any) -> Plan:
@@ -23,7 +24,7 @@ def plan(**values: Any) -> Plan:
 
 def taken(made: Plan, scene: str, method: str) -> list[str]:
     at = SimpleNamespace(scene=scene, method=method)
-    return [*made.actors(at), *made.lidar_depth(at)]
+    return [*made.actors(at), *made.lidar_depth(at), *made.free_space(at)]
 
 
 def test_actors_are_an_input_of_methods_with_that_part_alone():
@@ -36,6 +37,12 @@ def test_actors_are_an_input_of_methods_with_that_part_alone():
 def test_depth_is_an_input_where_a_training_is_held_to_it():
     made = plan(methods={"vanilla": {}, "held": {"overrides": HELD}})
     assert taken(made, "a1", "held") == ["elsewhere/a1/lidar_depth.pkl"]
+    assert taken(made, "a1", "vanilla") == []
+
+
+def test_free_space_is_an_input_where_a_training_keeps_gaussians_out_of_it():
+    made = plan(methods={"vanilla": {}, "kept_out": {"overrides": KEPT_OUT}})
+    assert taken(made, "a1", "kept_out") == ["elsewhere/a1/free_space.pkl"]
     assert taken(made, "a1", "vanilla") == []
 
 
@@ -55,6 +62,7 @@ def test_depth_follows_the_overrides_of_dataset_and_method():
         ({"vanilla": {}}, {"a1": set(), "b1": {"lidar_depth"}}),
         ({"vanilla": {}, "mine": {"parts": ACTORS}}, {"a1": {"actors"}, "b1": {"actors", "lidar_depth"}}),
         ({"vanilla": {}, "held": {"overrides": HELD}}, {"a1": {"lidar_depth"}, "b1": {"lidar_depth"}}),
+        ({"vanilla": {}, "kept": {"overrides": KEPT_OUT}}, {"a1": {"free_space"}, "b1": {"free_space", "lidar_depth"}}),
         (
             {"mine": {"parts": ACTORS, "overrides": {"train": {"depth_weight": 0}}}},
             {"a1": {"actors"}, "b1": {"actors"}},
@@ -72,22 +80,61 @@ def test_a_report_expects_them_where_a_method_of_the_scene_takes_them(methods, m
             assert expected[scene][stage]["settings"] == json.loads(stage_settings(made.config, stage, scene))
 
 
+REFINED = {"refine_poses": {"enabled": True}}
+
+
+def test_all_stages_take_the_refined_scene_where_poses_are_refined():
+    made = plan(b=REFINED)
+    scenes = {name: made.scene(SimpleNamespace(scene=name)) for name in ("a1", "b1")}
+    assert scenes == {"a1": "elsewhere/a1/scene.json", "b1": "elsewhere/b1/scene_refined.json"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "taken"),
+    [
+        ({}, []),
+        (REFINED, ["elsewhere/a1/triangulated.pkl"]),
+        ({**REFINED, "lidar_seed": {"triangulated": False}}, []),
+        ({"lidar_seed": {"triangulated": True}}, []),
+    ],
+)
+def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_they_are_wanted(settings, taken):
+    assert plan(**settings).triangulated(SimpleNamespace(scene="a1")) == taken
+
+
+def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
+    made = plan(methods={"vanilla": {}}, b=REFINED)
+    expected = json.loads(made.expected_stages())
+    assert {name for name in expected["a1"] if "/" not in name} == set(SCENE_STAGES)
+    assert {name for name in expected["b1"] if "/" not in name} == set(ALL_SCENE_STAGES)
+    assert expected["b1"]["refine_poses"]["code"] == made.code("refine_poses")
+    assert expected["b1"]["refine_poses"]["settings"]["refine_poses"]["enabled"] is True
+
+
+def test_the_refinement_is_told_what_decides_it_and_no_more():
+    job = told("refine_poses", random_seed=3, refine_poses={"rounds": 5})
+    assert job.keys() == {"refine_poses", "random_seed"}
+    assert (job["refine_poses"]["rounds"], job["random_seed"]) == (5, 3)
+
+
 def told(stage: str, **values: Any) -> dict[str, Any]:
     return json.loads(stage_settings(load(values), stage, "0061"))
 
 
 def test_each_is_told_what_decides_it():
-    outline = {"CAM_FRONT": [[0, 0.9], [1, 0.9], [1, 1]]}
     values = {
         "actors": {"humans": True}, "holdout": {"last_block": 2}, "images": {"width": 320}, "random_seed": 7,
-        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3}, "masks": {"own_car_polygons": outline},
+        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3},
     }  # fmt: skip
-    actors, depth = told("actors", **values), told("lidar_depth", **values)
+    values |= {"free_space": {"voxel": 0.4}, "lidar_depth": {"ray_spacing": [0.2, 0.4]}}
+    actors, depth, free = (told(stage, **values) for stage in ("actors", "lidar_depth", "free_space"))
     for record in (actors, depth):
         assert (record["holdout"]["last_block"], record["images"]["width"], record["own_car_radius"]) == (2, 320, 3.0)
-        assert record["own_car_polygons"] == outline
     assert (actors["actors"]["humans"], actors["random_seed"]) == (True, 7)
     assert depth["box_margin"] == 0.3 and "actors" not in depth and "random_seed" not in depth
+    assert depth["ray_spacing"] == [0.2, 0.4] and told("evaluate", **values)["lidar"] == depth
+    assert (free["free_space"]["voxel"], free["holdout"]["last_block"]) == (0.4, 2)
+    assert (free["own_car_radius"], free["box_margin"]) == (3.0, 0.3) and "images" not in free
 
 
 def test_a_dataset_may_set_its_actors_for_itself():

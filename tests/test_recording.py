@@ -32,7 +32,7 @@ def labels() -> np.ndarray:
 @pytest.fixture(scope="module")
 def masks(labels, tiny_scene, tmp_path_factory):
     folder = write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
-    write_json(folder / "masks.json", {"regions": "boxes", "provenance": {"made": "masks"}})
+    write_json(folder / "masks.json", {"regions": "boxes", "own_car": {}, "provenance": {"made": "masks"}})
     return folder
 
 
@@ -86,6 +86,7 @@ def test_held_out_groups_are_measured_over_the_regions_of_the_labels(tiny_scene,
     model = SplatModel([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2)).requires_grad_(False)
     groups = evaluate_groups(model, recording, "CAM_FRONT", None, torch.device("cpu"))
     json.dumps(groups, allow_nan=False)
+    assert not any("depth" in group for group in groups.values()), "of no image does LiDAR tell anything"
     for group, key_frames in (("interpolation", (2, 6)), ("extrapolation", (8, 9))):
         images = np.stack([recording.image(2 * key_frame) for key_frame in key_frames])
         for region, mask in (("static", labels == LABELS["static"]), ("all", labels != LABELS["own_car"])):

@@ -218,6 +218,26 @@ def test_what_differs_from_scene_to_scene_by_nature_is_no_other_protocol(write):
     assert len(report["rows"]) == 2 and report["left_out"] == []
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_scene_that_kept_its_poses_stands_beside_those_with_refined_ones(write, order):
+    """All were to be refined, and one was refused: that is the scene's nature, not another protocol."""
+    made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
+    results = {"0061": ("refined", made), "0103": ("nuscenes", made)}
+    paths = [write(metrics(scene, {"vanilla": VANILLA_A}, stages, poses=poses))
+             for scene, (poses, stages) in list(results.items())[::order]]  # fmt: skip
+    report = gap_report(paths, {"0061": made, "0103": made})
+    assert {row["scene"] for row in report["rows"]} == {"0061", "0103"} and report["left_out"] == []
+
+
+def test_a_scene_that_was_never_to_be_refined_does_not(write):
+    made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A}, made, poses="refined")),
+             write(metrics("0103", {"vanilla": VANILLA_A}))]  # fmt: skip
+    report = gap_report(paths, {"0061": made, "0103": stages()})
+    (left_out,) = report["left_out"]
+    assert left_out["scene"] == "0103" and "poses" in left_out["why"]
+
+
 def test_a_stale_result_sets_no_protocol_for_the_others(write):
     stale = metrics("0061", {"vanilla": VANILLA_A}, stages(iterations=7000), width=320)
     paths = [write(stale), write(metrics("0103", {"vanilla": VANILLA_A}))]

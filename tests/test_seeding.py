@@ -15,6 +15,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.extract import extract_scene
 from drivesplat.holdout import frame_groups, sweep_groups
 from drivesplat.images import project
+from drivesplat.own_car import OwnCar
 from drivesplat.point_cloud import PointCloud
 from drivesplat.regions import fill, hull_of
 from drivesplat.rigid import inverse, rigid
@@ -22,12 +23,12 @@ from drivesplat.scene import Scene
 from drivesplat.seeding.coloring import ColorView, color_by_visibility
 from drivesplat.seeding.far_points import far_points
 from drivesplat.seeding.seed import color_view, lidar_points, seed_points
-from drivesplat.seeding.sweeps import moving_boxes, outside_boxes, read_sweep, thin, without_own_car
+from drivesplat.seeding.sweeps import outside_boxes, read_sweep, thin, without_own_car
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
-from drivesplat.tracks import Box, box_at
+from drivesplat.tracks import Box, box_at, tracks_that_move
 
 HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}
 """Of the tiny drive's 10 key frames: 2, 6; 8, 9."""
@@ -94,16 +95,6 @@ def test_static_returns_of_training_sweeps_stay_and_no_others(tiny_scene):
         assert rows(found) == rows(everything[kept])
 
 
-def test_sweeps_between_key_frames_are_not_read(tiny_scene):
-    between = dataclasses.replace(tiny_scene.sweeps[0], path="absent.pcd.bin", is_key_frame=False)
-    with_it = dataclasses.replace(tiny_scene, sweeps=(*tiny_scene.sweeps, between))
-    points, times, missing = lidar_points(with_it, job())
-    expected_points, expected_times, _ = lidar_points(tiny_scene, job())
-    np.testing.assert_array_equal(points, expected_points)
-    np.testing.assert_array_equal(times, expected_times)
-    assert missing == 0
-
-
 def test_a_larger_margin_takes_more_around_moving_objects(tiny_scene):
     none, wide = (lidar_points(tiny_scene, job(voxel_size=0.0, box_margin=margin))[0] for margin in (0.0, 2.0))
     assert rows(wide) < rows(none)
@@ -144,10 +135,15 @@ def test_a_track_that_moves_later_leaves_no_points_while_it_stands(tiny_scene):
     (truck,) = [track for track in tiny_scene.tracks if track.category == "vehicle.truck"]
     poses = truck.object_to_world.copy()
     poses[6:, 0, 3] += 3.0 * np.arange(1, 5)
-    scene = dataclasses.replace(tiny_scene, tracks=(dataclasses.replace(truck, object_to_world=poses),))
-    assert not box_at(scene.tracks[0], START_US, 500_000.0).moves
-    assert [box.category for box in moving_boxes(scene, START_US)] == ["vehicle.truck"]
-    assert moving_boxes(dataclasses.replace(tiny_scene, tracks=(truck,)), START_US) == []
+    later = dataclasses.replace(truck, object_to_world=poses)
+    stays, leaves = (dataclasses.replace(tiny_scene, tracks=(track,)) for track in (truck, later))
+    assert not box_at(later, START_US, 500_000.0).moves
+    assert tracks_that_move(leaves) == [later] and tracks_that_move(stays) == []
+    on_truck = [
+        within(points[times == START_US], "vehicle.truck", 0.0, 0.1).sum()
+        for points, times, _ in (lidar_points(scene, job(voxel_size=0.0)) for scene in (stays, leaves))
+    ]
+    assert on_truck[0] > 20 and on_truck[1] == 0
 
 
 @pytest.mark.parametrize("voxel", [0.1, 0.5, 3.0])
@@ -516,3 +512,19 @@ def test_the_real_scene_is_seeded_from_the_one_sweep_there_is_and_from_points_of
     assert (seed.note["lidar_missing"], seed.note["extra_points"]) == (38, "sfm_points_global.ply")
     assert 1_000 < seed.note["points_file"] <= 2_403
     assert seed.note["lidar"] > 1_000
+
+
+def test_the_own_cars_body_lends_no_colour(root):
+    """The left half of every image is the own car's body, and red: no seed point is, near or far, nor lies there."""
+    scene = scene_at(root)
+    for frame in scene.frames:
+        pixels = np.full((54, 96, 3), (0, 0, 255), dtype=np.uint8)
+        pixels[:, :49] = (255, 0, 0)
+        Image.fromarray(pixels).save(frame.image_path, quality=100, subsampling=0)
+    half = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
+    red = {}
+    for name, seen in (("whole", {}), ("half", {"CAM_FRONT": (half,)})):
+        cloud = seed_points(scene, job(), OwnCar(seen))
+        red[name] = int((cloud.colors[:, 0] > 150).sum())
+        assert len(cloud.positions) > 200 and cloud.note["far"] > 100
+    assert red["whole"] > 100 and red["half"] == 0

@@ -22,13 +22,16 @@ from drivesplat.extract import extract_scene
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import Picture, SplatModel, View
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
 from drivesplat.regions import LABELS, is_dynamic
 from drivesplat.rigid import rigid
 from drivesplat.scene import Frame
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.looks import RemovalSettings
 from drivesplat.tracks import Box, box_at, boxes_at
 from drivesplat.training.views import view_of
@@ -38,6 +41,10 @@ CPU = torch.device("cpu")
 MARGIN = 0.1
 GREY = (0.45, 0.5, 0.4)
 HOLDOUT = HoldoutSettings(every_nth=4, offset=2, last_block=1)
+LIDAR = LidarDepthJob(
+    holdout=HOLDOUT, images=ImageSettings(), own_car_radius=2.5, ray_spacing=(0.33, 1.33),
+    box_margin=0.2,
+)  # fmt: skip
 OWN_CAR_ROWS = 12
 """So many of the lowest rows of the masks are the own car's."""
 
@@ -341,7 +348,7 @@ def inputs_of(known: KnownTruth, truth: Path | None) -> EvaluationInputs:
 
 def job_of(camera: str, synthetic: bool = True) -> EvaluateJob:
     return EvaluateJob(
-        eval_camera=camera, cameras=("CAM_FRONT", "CAM_BACK"), sweeps=False, holdout=HOLDOUT, lpips=False,
+        eval_camera=camera, cameras=("CAM_FRONT", "CAM_BACK"), sweeps=False, holdout=HOLDOUT, lpips=False, lidar=LIDAR,
         removal=RemovalSettings(margin=MARGIN) if synthetic else None,
     )  # fmt: skip
 

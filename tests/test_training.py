@@ -26,8 +26,9 @@ from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.masks import mask_name
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import View
 from drivesplat.rasterize import rasterize
 from drivesplat.regions import LABELS
 from drivesplat.settings.actors import ActorSettings
@@ -43,8 +44,10 @@ from drivesplat.settings.train import (
     TrainSettings,
 )
 from drivesplat.training import checkpoint
+from drivesplat.training.cells import Cells
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.road import driven_road
 from drivesplat.training.run import (
     TrainingFiles,
     TrainingInputs,
@@ -53,6 +56,7 @@ from drivesplat.training.run import (
     run_training,
     trained_model,
 )
+from drivesplat.training.surfaces import Surroundings
 from drivesplat.training.train import Trainer, TrainingSummary, Workspace, train
 from drivesplat.training.views import Guides, LidarDepth, TrainingView, load_views, order, view_of
 
@@ -301,6 +305,36 @@ def test_actors_are_no_floaters(tmp_path):
     assert (still < 1e-3).any() and not (actors < 1e-3).any()
 
 
+def all_around(lower: float = -10.0, edge: float = 20.0) -> Cells:
+    """A grid of one cell that holds everything."""
+    return Cells.of(np.full(3, lower), edge, np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64))
+
+
+@pytest.mark.parametrize("free", [None, all_around()], ids=["unknown", "all free"])
+def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
+    settings = settings_of(iterations=7, refine_start=1.0, floaters=FloaterSettings(every=7, radius=0))
+    model = untrained_street(settings)
+    workspace = workspace_of(tmp_path, "of this training")
+    train(model, recorded_views(), settings, 0, CPU, workspace, Surroundings(free=free))
+    still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
+    assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
+
+
+def test_a_training_is_held_to_flatness_and_the_road():
+    """The terms are among those of an iteration, and pull on the background."""
+    settings = settings_of(flatness_weight=0.2, road_weight=0.3)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, 2, 3], poses[:, 0, 3] = 4.5, [-1.0, 1.0]
+    surroundings = Surroundings(road=driven_road(poses, settings.road))
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, surroundings)
+    before = trainer.model.gaussians_at(0.0)
+    terms, *_ = trainer.fit_one()
+    torch.testing.assert_close(terms["flatness"], 0.2 * before.scales.amin(dim=1).mean())
+    assert float(terms["road"].detach()) > 0.0
+    plain = Trainer.begin(untrained(settings_of()), recorded_views(), settings_of(), 0, CPU)
+    assert plain.fit_one()[0].keys() == terms.keys() - {"flatness", "road"}
+
+
 def test_what_stands_still_knows_no_settings_of_what_moves():
     """So that a change of these leaves trainings without moving parts as they are."""
     changed = {"iterations": 70, "depth_weight": 0.2, "sky_bce_weight": 0.3, "opacity_reg": 0.5}
@@ -315,7 +349,7 @@ def test_positions_learn_ever_more_slowly(step, factor):
     model = untrained(settings_of())
     optimizers = make_optimizers(model)
     before = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
-    schedule(model, optimizers, step, 100)
+    schedule(model, optimizers, step, settings_of(iterations=100))
     after = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
     assert after.pop("0.means") == pytest.approx(2e-3 * factor)
     assert after == {name: rate for name, rate in before.items() if name != "0.means"}
@@ -355,6 +389,7 @@ def parser_record(folder: Path, views: list[TrainingView]) -> dict[str, Any]:
     return {
         "Ks": np.stack([v.view.K.double().numpy() for v in views]),
         "camtoworlds": np.stack([v.view.camera_to_world.double().numpy() for v in views]),
+        "ego_to_world": np.stack([v.view.camera_to_world.double().numpy() for v in views]),
         "image_paths": paths,
         "image_sizes": np.array([[WIDTH, HEIGHT]] * n, dtype=np.int64),
         "camera_names": ["CAM_FRONT"],
@@ -412,10 +447,12 @@ def test_the_sky_starts_at_the_mean_colour_of_its_pixels():
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_without_sky_pixels_the_sky_starts_grey(known):
-    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) if known else None
-    (color,) = set(mean_sky_color([TrainingView(v.view, v.pixels, mask) for v in recorded_views(2)]))
-    assert 0.0 < color < 1.0
+def test_without_sky_pixels_the_sky_starts_at_the_mean_colour_of_all(known):
+    """By night that is dark: what no image shows of the sky stays as it starts."""
+    mask, views = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) if known else None, recorded_views(2)
+    everything = np.concatenate([view.pixels.reshape(-1, 3) for view in views]) / 255.0
+    found = mean_sky_color([TrainingView(v.view, v.pixels, mask) for v in views])
+    np.testing.assert_allclose(found, everything.mean(axis=0), atol=1e-6)
 
 
 # ---- what it survives
@@ -788,6 +825,25 @@ def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
     assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
 
 
+EVERYWHERE = {"lower": np.full(3, -10.0), "voxel": 20.0, "shape": np.ones(3, np.int64), "keys": np.zeros(1, np.int64)}
+"""Free space that holds all there is."""
+
+
+def test_a_training_keeps_gaussians_out_of_the_free_space_that_it_is_given(tmp_path):
+    """Where that is everywhere, none is left."""
+    inputs = dataclasses.replace(inputs_in(tmp_path), free_space=EVERYWHERE)
+    job = job_of(floaters=FloaterSettings(every=7, radius=0, free_space=True))
+    with pytest.raises(TrainingError, match="no Gaussian is left"):
+        run_training(inputs, job, DeviceSettings(kind="cpu"), files_in(tmp_path / "vanilla"), PROVENANCE, "train")
+
+
+def test_the_terms_about_surfaces_are_logged(tmp_path):
+    files = run(tmp_path, job_of(flatness_weight=0.1, road_weight=0.1))
+    board = EventAccumulator(str(files.checkpoint.parent / "tensorboard"))
+    board.Reload()
+    assert {"loss/flatness", "loss/road"} < set(board.Tags()["scalars"])
+
+
 def test_a_finished_training_of_actors_can_be_rendered_from_its_checkpoint_alone(tmp_path):
     job = job_of(("background", "actors"), "cubemap", sky_resolution=4, **ALL_TERMS)
     model, again = trained_model(read_checkpoint(run(tmp_path, job, actors=True).checkpoint))
@@ -820,6 +876,15 @@ def test_only_what_a_training_asks_for_is_read(tmp_path, parts, changes, known):
 
 def test_a_sky_that_is_modelled_is_read(tmp_path):
     assert inputs_in(tmp_path, actors=True).guides(job_of(sky="cubemap")).sky
+
+
+def test_masks_that_know_no_sky_hold_no_pixel_to_be_none(tmp_path):
+    """By night the heuristic finds none: the cross entropy would fill the dark sky with Gaussians."""
+    inputs = dataclasses.replace(inputs_in(tmp_path, actors=True), sky_known=False)
+    guides = inputs.guides(job_of(("background", "actors"), sky="cubemap", sky_bce_weight=0.1, dynamic_weight=0.1))
+    assert not guides.sky and guides.moving
+    views = load_views(inputs.parser, guides, CPU)
+    assert all(view.sky is None for view in views)
 
 
 def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):

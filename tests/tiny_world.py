@@ -53,7 +53,8 @@ def default_things() -> list[Thing]:
 
 @dataclass
 class World:
-    """What is written: `speed` of the own car in m/s, images of `width` x `height` pixels."""
+    """What is written: `speed` of the own car in m/s, images of `width` x `height` pixels, dimmed by `light`, so many
+    of them and of LiDAR sweeps between two key frames."""
 
     scenes: tuple[str, ...] = ("0001",)
     key_frames: int = 10
@@ -61,6 +62,8 @@ class World:
     height: int = 54
     speed: float = 4.0
     sweeps_between: int = 1
+    lidar_between: int = 0
+    light: float = 1.0
     version: str = "v1.0-mini"
     things: list[Thing] = field(default_factory=default_things)
 
@@ -141,7 +144,7 @@ def _write_scene(root: Path, tables: dict[str, list[dict]], world: World, scene:
             {**_linked(samples, i), "timestamp": START_US + i * KEY_FRAME_US, "scene_token": f"scene {scene}"}
         )
     _write_sensor(root, tables, world, scene, "CAM_FRONT", CAMERA_DELAY_US, world.sweeps_between)
-    _write_sensor(root, tables, world, scene, "LIDAR_TOP", 0, 0)
+    _write_sensor(root, tables, world, scene, "LIDAR_TOP", 0, world.lidar_between)
     for number, thing in enumerate(world.things):
         _annotate(tables, world, scene, thing, number)
 
@@ -218,7 +221,7 @@ def cast_image(world: World, seconds: float) -> np.ndarray:
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(world.intrinsics).T @ CAMERA_TO_EGO.T
     distance, color = cast(world, world.ego_at(seconds) + CAMERA_AT, rays.reshape(-1, 3), seconds)
     color[~np.isfinite(distance)] = SKY
-    return color.reshape(world.height, world.width, 3).astype(np.uint8)
+    return (world.light * color).reshape(world.height, world.width, 3).astype(np.uint8)
 
 
 def cast_lidar(world: World, seconds: float) -> np.ndarray:

@@ -1,12 +1,14 @@
-"""scene.json into lidar_depth.pkl."""
+"""scene.json and own_car.json into lidar_depth.pkl."""
 
 from drivesplat.job import job
+from drivesplat.own_car import read_own_car
 from drivesplat.scene import read_scene
 from drivesplat.seeding.depth_points import lidar_depths
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.storage import write_plain_pickle
 
 with job(snakemake) as current:
-    scene = read_scene(current.input.scene)
-    images = lidar_depths(scene, current.settings(LidarDepthJob))
-    write_plain_pickle(current.output.depth, {"images": images, "provenance": current.provenance(scene.provenance)})
+    scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
+    images = lidar_depths(scene, current.settings(LidarDepthJob), own_car)
+    provenance = current.provenance(scene.provenance, upstream)
+    write_plain_pickle(current.output.depth, {"images": images, "provenance": provenance})

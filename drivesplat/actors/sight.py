@@ -12,7 +12,8 @@ from torch import Tensor
 from drivesplat.device import telling_out_of_memory
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.splat_model import Picture, SplatModel, View
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
 from drivesplat.recording import Recording
 from drivesplat.scene import Frame
 from drivesplat.settings.device import DeviceSettings

@@ -152,6 +152,15 @@ def van(size: Numbers, color: Color) -> Body:
     return joined([*parts, *_wheels(size, 0.33 * length), *_lights(size, 0.38 * height)])
 
 
+def tail() -> Body:
+    """The upper rear of the own car in its ego frame, as the camera on the roof looks down on it: an arc at the lower
+    edge of CAM_BACK's images, about as in nuScenes; the other cameras do not see it."""
+    lip = [(-0.78, 0.0, 1.27), (-0.76, 0.4, 1.25), (-0.7, 0.75, 1.18), (-0.62, 0.85, 1.08)]
+    edge = [(x, side * y, z) for x, y, z in lip for side in (-1, 1)]
+    inner = [(x + 0.5, y, z) for x, y, z in edge]
+    return hull([*edge, *inner, (-0.8, -0.8, 0.6), (-0.8, 0.8, 0.6)], Material.PLAIN, (0.4, 0.41, 0.42))
+
+
 def _wheels(size: Numbers, axle: float) -> list[Body]:
     half, radius = size[1] / 2, 0.33
     tyres = [

@@ -19,12 +19,14 @@ SPREAD = np.array([0.7548776662466927, 0.5698402909980532])
 
 @dataclass(frozen=True)
 class Camera:
-    """`intrinsics` (3, 3), OpenCV's convention; `camera_to_street` (4, 4), OpenCV's axes."""
+    """`intrinsics` (3, 3), OpenCV's convention; `camera_to_street` (4, 4), OpenCV's axes; `gains`: how much of the red,
+    green and blue light it takes in."""
 
     intrinsics: np.ndarray
     camera_to_street: np.ndarray
     width: int
     height: int
+    gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def rays(self, rows: slice, samples: int) -> np.ndarray:
         """Unit directions (rows * width * samples, 3) in street coordinates, `samples` a pixel; one is its centre."""
@@ -48,13 +50,13 @@ class Camera:
 
 
 def photograph(stage: Stage, light: Light, camera: Camera, samples: int) -> np.ndarray:
-    """Radiance (h, w, 3) float64, the mean of `samples` rays a pixel."""
+    """Radiance (h, w, 3) float64 as the camera takes it in, the mean of `samples` rays a pixel."""
     image = np.empty((camera.height, camera.width, 3))
     for rows in camera.chunks(samples):
         directions = camera.rays(rows, samples)
         radiance = _radiance(stage, light, camera, directions, samples)
         image[rows] = radiance.reshape(-1, camera.width, samples, 3).mean(axis=2)
-    return image
+    return image * camera.gains
 
 
 def _radiance(stage: Stage, light: Light, camera: Camera, directions: np.ndarray, samples: int) -> np.ndarray:

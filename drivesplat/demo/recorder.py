@@ -13,7 +13,6 @@ from drivesplat.demo.lighting import Light, daylight, lamplight
 from drivesplat.demo.raycast import Layer, Stage
 from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor, height_of
 from drivesplat.demo.street import Street, Thing, build_street
-from drivesplat.demo.traffic import ego_pose
 from drivesplat.images import project
 from drivesplat.rigid import apply, inverse, rigid
 from drivesplat.settings.world import WorldSettings
@@ -45,7 +44,7 @@ class Recorder:
 
     def ego_to_street(self, seconds: float) -> np.ndarray:
         """(4, 4)."""
-        return ego_pose(self.street.ego, seconds)
+        return self.street.ego.pose_at(seconds)
 
     def light(self, seconds: float) -> Light:
         """What shines at a time."""
@@ -56,8 +55,9 @@ class Recorder:
     def camera(self, sensor: Sensor, seconds: float, left: float = 0.0) -> Camera:
         """The camera as it fires at a time, moved `left` metres to the own car's left."""
         sensor_to_ego = rigid(np.eye(3), np.array([0.0, left, 0.0])) @ sensor.sensor_to_ego
-        width = self.world.width
-        return Camera(sensor.intrinsics(width), self.ego_to_street(seconds) @ sensor_to_ego, width, height_of(width))
+        width, pose = self.world.width, self.ego_to_street(seconds) @ sensor_to_ego
+        gains = self.world.exposures.get(sensor.channel, (1.0, 1.0, 1.0))
+        return Camera(sensor.intrinsics(width), pose, width, height_of(width), gains)
 
     def image(self, sensor: Sensor, time_us: int) -> np.ndarray:
         """What the camera records (h, w, 3) uint8."""
@@ -133,9 +133,11 @@ class Recorder:
         return result
 
     def box_to_global(self, thing: Thing, seconds: float) -> np.ndarray:
-        """The pose (4, 4) of the centre of a thing's box."""
+        """The pose (4, 4) of the centre of a thing's box that the tables state: boxes are annotated as seen from the
+        own car, and are as far off as its pose."""
         center = rigid(np.eye(3), np.array([0.0, 0.0, thing.body.size[2] / 2]))
-        return STREET_TO_GLOBAL @ thing.motion.pose_at(seconds) @ center
+        box_to_ego = inverse(self.ego_to_street(seconds)) @ thing.motion.pose_at(seconds) @ center
+        return self.ego_to_global(seconds) @ box_to_ego
 
     def _random(self, *name: str | int) -> np.random.Generator:
         words = [n if isinstance(n, int) else sum(ord(c) * 31**i for i, c in enumerate(n)) for n in name]

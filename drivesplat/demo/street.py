@@ -12,6 +12,7 @@ from drivesplat.settings.world import WorldSettings
 
 LENGTH = (-80.0, 260.0)
 """From where to where (metres along the road) the street is built up."""
+OWN_CAR = "own car"
 CONES = ((57.0, -4.6), (59.5, -4.3), (62.0, -4.0))
 PAINTS: tuple[Color, ...] = (
     (0.5, 0.5, 0.52), (0.55, 0.06, 0.05), (0.05, 0.12, 0.35), (0.03, 0.03, 0.04), (0.7, 0.7, 0.68), (0.08, 0.22, 0.14),
@@ -70,8 +71,9 @@ def build_street(world: WorldSettings) -> Street:
     vehicles = _vehicles(vehicle_motions(world.vehicles, world.ego == "drives"), random)
     walkers = _walkers(pedestrian_motions(world.pedestrians, random))
     lamps = np.column_stack([lamp_places - np.sign(lamp_places) * [0.0, 1.5], np.full(len(lamp_places), 6.6)])
-    leading = vehicles[0].name if vehicles else None
-    return Street((*things, *vehicles, *walkers), lamps, ego_motion(world.ego == "drives"), leading)
+    leading, ego = vehicles[0].name if vehicles else None, ego_motion(world.ego == "drives")
+    own_car = [Thing(OWN_CAR, bodies.tail(), ego)] if world.own_car else []
+    return Street((*things, *vehicles, *walkers, *own_car), lamps, ego, leading)
 
 
 def _walkers(motions: list[Motion]) -> list[Thing]:

@@ -39,19 +39,23 @@ class Motion:
         return rigid(Rotation.from_euler("z", heading).as_matrix(), np.array([x, y, 0.0]))
 
 
+@dataclass(frozen=True)
+class SprungMotion(Motion):
+    """A way with the pitch, roll and heave of springs while the car drives."""
+
+    def pose_at(self, seconds: float) -> np.ndarray:
+        """Ego to street (4, 4)."""
+        pose = super().pose_at(seconds)
+        if self.speed:
+            pitch, roll = 0.25 * math.sin(5.1 * seconds), 0.2 * math.sin(3.7 * seconds + 1.0)
+            pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("yx", [pitch, roll], degrees=True).as_matrix()
+            pose[2, 3] = 0.012 * math.sin(6.3 * seconds + 0.5)
+        return pose
+
+
 def ego_motion(drives: bool) -> Motion:
     """The own car's way."""
-    return Motion(0.0, -LANE_CENTER, 8.0, 0.6, 0.12, 9.0) if drives else Motion(12.0, -LANE_CENTER)
-
-
-def ego_pose(motion: Motion, seconds: float) -> np.ndarray:
-    """Ego to street (4, 4): `motion` with the pitch, roll and heave of springs where the car drives."""
-    pose = motion.pose_at(seconds)
-    if motion.speed:
-        pitch, roll = 0.25 * math.sin(5.1 * seconds), 0.2 * math.sin(3.7 * seconds + 1.0)
-        pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("yx", [pitch, roll], degrees=True).as_matrix()
-        pose[2, 3] = 0.012 * math.sin(6.3 * seconds + 0.5)
-    return pose
+    return SprungMotion(0.0, -LANE_CENTER, 8.0, 0.6, 0.12, 9.0) if drives else SprungMotion(12.0, -LANE_CENTER)
 
 
 def vehicle_motions(count: int, ego_drives: bool) -> list[Motion]:

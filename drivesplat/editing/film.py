@@ -15,7 +15,8 @@ from drivesplat.errors import ConfigError, ResultError
 from drivesplat.film import Shot, film_frame, write_film
 from drivesplat.images import write_png
 from drivesplat.model.part import Appearance
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.rigid import inverse
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings

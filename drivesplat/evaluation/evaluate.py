@@ -1,23 +1,29 @@
 """The stage `evaluate`: held-out images against renderings, split into static and moving pixels."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
 
 from drivesplat.device import telling_out_of_memory
 from drivesplat.errors import DatasetError
+from drivesplat.evaluation.depth import DepthErrors
+from drivesplat.evaluation.drive import drive_record
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
-from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
+from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size
 from drivesplat.recording import Recording
 from drivesplat.regions import region_masks
+from drivesplat.seeding.depth_points import Depths, clouds_of, depths_in
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
+from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.training.run import open_model
 from drivesplat.training.views import view_of
 from drivesplat.truth import read_truth
@@ -46,13 +52,15 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
     parser, summary = inputs.recording.parser, inputs.summary
     with telling_out_of_memory(lambda: len(model)):
-        groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device)
+        depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
+        groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
         against = against_truth(model, inputs, job, lpips_map, device)
     return {
         "schema": 1,
         "scene": parser["scene"]["name"],
         "dataset": parser["scene"]["dataset"],
         "protocol": protocol(parser, inputs.masks_record, job),
+        "drive": drive_record(inputs.recording, job.eval_camera, measured_images(parser, job.eval_camera)),
         "result": {
             **groups,
             **against,
@@ -82,7 +90,7 @@ def against_truth(
 
 def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
     """What every figure must be read with."""
-    measured = [i for group in HELD_OUT_GROUPS for i in held_out_images(parser, group, job.eval_camera)]
+    measured = [i for images in measured_images(parser, job.eval_camera).values() for i in images]
     width, height = image_size(parser, measured[0] if measured else 0)
     return {
         "version": parser["scene"]["version"],
@@ -96,6 +104,7 @@ def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: Evaluate
         "train_images": len(parser["splits"]["train"]),
         "poses": parser["scene"]["poses"],
         "regions": masks_record["regions"],
+        "own_car": masks_record["own_car"].get(job.eval_camera),
         "extra_points": parser["seed"]["extra_points"],
         "lidar_missing": parser["seed"]["lidar_missing"],
         "images_missing": parser["scene"]["missing_images"],
@@ -116,6 +125,16 @@ def findings(group: dict[str, Any]) -> dict[str, bool | None]:
     }
 
 
+def held_out_depths(recording: Recording, camera: str, job: LidarDepthJob) -> dict[int, Depths]:
+    """What LiDAR says of the images that are measured, by their numbers: each by the sweep of its own key frame; those
+    whose sweep is missing are left out."""
+    scene = recording.scene
+    clouds = {cloud.sample_index: cloud for cloud in clouds_of(scene, job, HELD_OUT_GROUPS)}
+    images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.parser, group, camera)]
+    owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
+    return {i: depths_in(scene, scene.frames[i], cloud, job, recording.own_car(i)) for i, cloud in owned.items()}
+
+
 def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int]:
     """The images of `group` that are measured: key frames of the evaluated camera.
 
@@ -131,15 +150,28 @@ def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int
     ]
 
 
+def measured_images(parser: dict[str, Any], camera: str) -> dict[str, list[int]]:
+    """The images that are measured, by held-out group. Raises what `held_out_images` raises."""
+    return {group: held_out_images(parser, group, camera) for group in HELD_OUT_GROUPS}
+
+
 def evaluate_groups(
-    model: SplatModel, recording: Recording, camera: str, lpips_map: LpipsMap | None, device: torch.device
+    model: SplatModel,
+    recording: Recording,
+    camera: str,
+    lpips_map: LpipsMap | None,
+    device: torch.device,
+    depths: Mapping[int, Depths] = MappingProxyType({}),
 ) -> dict[str, dict[str, Any]]:
-    """The metrics of every held-out group, by region."""
+    """The metrics of every held-out group, by region, and `depth` where LiDAR tells the `depths` of held-out images, by
+    their numbers."""
     groups = {}
-    for group in HELD_OUT_GROUPS:
-        metrics = RegionMetrics(lpips_map)
-        for index in held_out_images(recording.parser, group, camera):
-            image = rendered(model, view_of(recording.parser, index, device))
+    for group, images in measured_images(recording.parser, camera).items():
+        metrics, depth = RegionMetrics(lpips_map), DepthErrors()
+        for index in images:
+            image, metres = rendered_with_depth(model, view_of(recording.parser, index, device))
             metrics.add(image, recording.image(index), region_masks(recording.labels(index)))
-        groups[group] = with_gap(metrics.summary())
+            if index in depths:
+                depth.add(metres, depths[index])
+        groups[group] = {**with_gap(metrics.summary()), **depth.summary()}
     return groups

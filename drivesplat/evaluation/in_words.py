@@ -4,16 +4,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from drivesplat.circumstances import DARK
 from drivesplat.comparison import WHERE
 from drivesplat.errors import DriveSplatError
 from drivesplat.storage import read_json
 
 LOOKS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
+SAME_PLACE = 0.1
+"""Metres. A point 10 m away is then seen, at nuScenes' focal length, within a dozen pixels of where it was."""
 
 
 def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
     """A sentence per method and group of held-out frames, more where there is truth, and where to look."""
-    lines = []
+    lines = _circumstances(metrics["drive"]) if "drive" in metrics else []
     for name, method in metrics["methods"].items():
         for group, where in WHERE.items():
             gap = method[group].get("gap_db")
@@ -38,6 +41,25 @@ def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
         there += ["edits/"] if (folder / name / "edits").is_dir() else []
         if there:
             lines.append(f"To look at, in {folder / name}: {', '.join(there)}")
+    return lines
+
+
+def _circumstances(drive: dict[str, Any]) -> list[str]:
+    """What makes the figures say less than they seem to, a sentence each."""
+    lines = []
+    for group, where in WHERE.items():
+        held_out = drive[group] or {}
+        distance, flat = held_out.get("from_training_m"), held_out.get("flat_psnr")
+        if distance is not None and distance < SAME_PLACE:
+            lines.append(
+                f"Frames {where} were taken {distance:.2f} m from training frames: a PSNR there tells what was "
+                "remembered, not what can be seen from elsewhere"
+            )
+        if flat is not None and held_out["luminance"] < DARK:
+            lines.append(
+                f"Frames {where} are dark (mean luminance {held_out['luminance']:.2f}): their mean colour alone has "
+                f"{flat:.1f} dB static; read the figures against that"
+            )
     return lines
 
 

@@ -25,5 +25,6 @@ def side_by_side(evals: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "scene": first["scene"],
         "dataset": first["dataset"],
         "protocol": first["protocol"],
+        "drive": first["drive"],
         "methods": {name: record["result"] for name, record in evals.items()},
     }

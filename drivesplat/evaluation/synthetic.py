@@ -14,7 +14,8 @@ from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics
 from drivesplat.images import continuous_intrinsics, read_image
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
-from drivesplat.model.splat_model import SplatModel, View
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
 from drivesplat.recording import Recording
 from drivesplat.regions import fill, hull_of, label_image, region_masks
 from drivesplat.rigid import inverse
@@ -62,6 +63,13 @@ class KnownTruth:
 def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
     """What the model shows (h, w, 3) float32, not clamped; with `gaussians` in place of its own where given."""
     return model.render(view, gaussians=gaussians).image.float().cpu().numpy()
+
+
+@torch.no_grad()
+def rendered_with_depth(model: SplatModel, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """What the model shows, as `rendered`, and how far away it is (h, w), metres along the camera's axis."""
+    picture = model.render(view, with_depth=True)
+    return picture.image.float().cpu().numpy(), picture.depth.float().cpu().numpy()
 
 
 def lateral_metrics(

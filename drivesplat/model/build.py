@@ -1,7 +1,7 @@
 """A method's settings into a model: the only place that knows parts and skies by name."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,8 @@ import torch
 
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
+from drivesplat.model.camera_poses import TIMES, CameraPoses
+from drivesplat.model.exposure import Exposures
 from drivesplat.model.part import Part, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
@@ -16,6 +18,10 @@ from drivesplat.model.timeline import ActorTrack
 from drivesplat.seeding.actors import motion_of
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
+EXPOSED = "exposure.params."
+"""What the names of exposures begin with in a model's state; the camera follows."""
+POSED = "camera_poses." + TIMES
+"""And those of the times of corrected camera poses."""
 FEW = 4
 """An actor keeps so many points of its seed whatever the cap: a Gaussian's first size is by its three neighbours."""
 
@@ -23,12 +29,15 @@ FEW = 4
 @dataclass(frozen=True)
 class Beginnings:
     """What a model starts from: the scene's parser record, the records of its `actors` (empty where none are wanted),
-    the mean colour (3,) in [0, 1] of its sky, and how many classes are told apart (0: none)."""
+    the mean colour (3,) in [0, 1] of its sky, how many classes are told apart (0: none), the cameras whose exposure is
+    learned, and those whose poses are: the seconds of their training images."""
 
     parser: dict[str, Any]
     actors: list[dict[str, Any]]
     sky_color: np.ndarray
     classes: int = 0
+    exposed: tuple[str, ...] = ()
+    posed: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
 
 def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
@@ -46,7 +55,11 @@ def build_model(
     makers = {"background": _background, "actors": _actors}
     made = (makers[name](beginnings, settings) for name in parts)
     return SplatModel(
-        [part for part in made if part is not None], _sky(sky, settings, beginnings.sky_color), settings.antialiased
+        [part for part in made if part is not None],
+        _sky(sky, settings, beginnings.sky_color),
+        settings.antialiased,
+        _exposures(beginnings.exposed, settings),
+        _camera_poses(beginnings.posed, settings),
     )
 
 
@@ -65,7 +78,15 @@ def rebuild_model(
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         made.append(makers[definition["part"]](params, definition, settings))
-    model = SplatModel(made, _sky(sky, settings, np.full(3, 0.5)), settings.antialiased)
+    exposed = [key.removeprefix(EXPOSED) for key in state if key.startswith(EXPOSED)]
+    posed = {key.removeprefix(POSED): at.tolist() for key, at in state.items() if key.startswith(POSED)}
+    model = SplatModel(
+        made,
+        _sky(sky, settings, np.full(3, 0.5)),
+        settings.antialiased,
+        _exposures(exposed, settings),
+        _camera_poses(posed, settings),
+    )
     model.load_state_dict(state)
     return model
 
@@ -128,6 +149,14 @@ def _some(count: int, limit: int) -> np.ndarray:
 def _actors_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
     tracks = [ActorTrack.from_plain(plain) for plain in definition["tracks"]]
     return Actors(params, tracks, settings.actors, settings.gaussians)
+
+
+def _exposures(cameras: Sequence[str], settings: TrainSettings) -> Exposures | None:
+    return Exposures(cameras, settings.exposure) if cameras else None
+
+
+def _camera_poses(times: Mapping[str, Sequence[float]], settings: TrainSettings) -> CameraPoses | None:
+    return CameraPoses(times, settings.camera_poses) if times else None
 
 
 def _sky(kind: SkyKind, settings: TrainSettings, color: np.ndarray) -> Sky | None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import accumulate
 from typing import Any
 
@@ -11,39 +10,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.errors import ResultError
+from drivesplat.model.camera_poses import CameraPoses
+from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Appearance, Part, Piece, Sky
+from drivesplat.model.view import View
 from drivesplat.rasterize import Rendering, rasterize
 
 
 @dataclass(frozen=True)
-class View:
-    """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image."""
-
-    K: Float[Tensor, "3 3"]
-    camera_to_world: Float[Tensor, "4 4"]
-    width: int
-    height: int
-    time: float
-
-    @cached_property
-    def viewmat(self) -> Float[Tensor, "4 4"]:
-        """World to camera."""
-        return torch.linalg.inv(self.camera_to_world)
-
-    def rays(self) -> Float[Tensor, "h w 3"]:
-        """The unit viewing direction of every pixel's centre in world coordinates."""
-        x = torch.arange(self.width, device=self.K.device) + 0.5
-        y = torch.arange(self.height, device=self.K.device) + 0.5
-        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-        directions = torch.cat([(grid - self.K[:2, 2]) / self.K.diagonal()[:2], torch.ones_like(grid[..., :1])], dim=-1)
-        return torch.nn.functional.normalize(directions @ self.camera_to_world[:3, :3].T, dim=-1)
-
-
-@dataclass(frozen=True)
 class Picture:
-    """What a view shows of `gaussians`: `image` with the sky behind, `splats` without it (premultiplied by their
-    `alpha`), `depth` in metres or None."""
+    """What a view shows of `gaussians`: `image` with the sky behind, as the view's camera exposes it; `splats` without
+    sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or None."""
 
     gaussians: Gaussians
 
@@ -55,16 +33,31 @@ class Picture:
 
 
 class SplatModel(nn.Module):
-    """Parts and a sky (None: black)."""
+    """Parts, a sky (None: black), how cameras expose (None: all alike), and where they were (None: as recorded)."""
 
-    def __init__(self, parts: Sequence[Part], sky: Sky | None, antialiased: bool = False):
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        sky: Sky | None,
+        antialiased: bool = False,
+        exposure: Exposures | None = None,
+        camera_poses: CameraPoses | None = None,
+    ):
         super().__init__()
         self.parts = nn.ModuleList(parts)
         self.sky = sky
+        self.exposure = exposure
+        self.camera_poses = camera_poses
         self.antialiased = antialiased
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
+
+    @property
+    def beside_parts(self) -> dict[str, Sky | Exposures | CameraPoses]:
+        """What else is learned, by name: modules with `params` and their `learning_rates()`."""
+        named = {"sky": self.sky, "exposure": self.exposure, "camera_poses": self.camera_poses}
+        return {name: module for name, module in named.items() if module is not None}
 
     def gaussians_at(self, time: float) -> Gaussians:
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
@@ -122,18 +115,26 @@ class SplatModel(nn.Module):
         `gaussians` stand in for `gaussians_at(view.time)`; `rays` (h, w, 3) saves computing `view.rays()` again.
         """
         shown = self.gaussians_at(view.time) if gaussians is None else gaussians
+        seen_from = self.seen_from(view)
         rendering = rasterize(
             shown.means, shown.quats, shown.scales, shown.opacities, shown.sh,
-            view.viewmat[None], view.K[None], view.width, view.height,
+            seen_from.viewmat[None], view.K[None], view.width, view.height,
             sh_degree=shown.sh_degree if sh_degree is None else min(sh_degree, shown.sh_degree),
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
         )  # fmt: skip
         splats, alpha = rendering.image[0], rendering.alpha[0]
         image = splats
         if self.sky is not None:
-            image = splats + (1.0 - alpha) * self.sky.colors(view.rays() if rays is None else rays)
+            directions = seen_from.rays() if rays is None or seen_from is not view else rays
+            image = splats + (1.0 - alpha) * self.sky.colors(directions)
+        if self.exposure is not None:
+            image = self.exposure.shown(image, view.camera)
         depth = rendering.depth[0, ..., 0] if rendering.depth is not None else None
         return Picture(shown, image, splats, alpha[..., 0], depth, rendering.info)
+
+    def seen_from(self, view: View) -> View:
+        """A view from where its camera really was, as far as this model knows."""
+        return view if self.camera_poses is None else self.camera_poses.corrected(view)
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
         """How opaque the parts that move are by themselves in a picture of this model; None without such parts."""
@@ -153,5 +154,5 @@ class SplatModel(nn.Module):
     def _composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
         return rasterize(
             gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, values,
-            view.viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
+            self.seen_from(view).viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
         )  # fmt: skip

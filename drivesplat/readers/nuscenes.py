@@ -14,18 +14,19 @@ from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import checked_intrinsics, checked_pose, checked_size, require_increasing
 from drivesplat.rigid import rigid
 from drivesplat.scene import Frame, Scene, Sweep, Track
+from drivesplat.settings.extract import SceneSource
 
 LIDAR = "LIDAR_TOP"
 
 
-def read(
-    root: Path, version: str, name: str, cameras: tuple[str, ...], sweeps: bool, frames: tuple[int, int] | None
-) -> Scene:
-    """The scene called `name` ("0103").
+def read(root: Path, source: SceneSource) -> Scene:
+    """The scene that `source` names, its dataset's name aside; `root` holds the folder of tables.
 
-    `sweeps` adds the images and LiDAR sweeps between key frames. `frames` = (first, last + 1) keeps some key frames,
-    which are then counted from 0. Image files are not opened. Raises DatasetError naming the offending token.
+    `source.sweeps` adds the images between key frames, `source.lidar_sweeps` the LiDAR sweeps there. `source.frames` =
+    (first, last + 1) keeps some key frames, which are then counted from 0, and what lies between them. Image files are
+    not opened. Raises DatasetError naming the offending token.
     """
+    version, name, cameras, frames = source.version, source.scene, source.cameras, source.frames
     tables = _load(root, version)
     record = next((s for s in tables.scene if s["name"] == f"scene-{name}"), None)
     if record is None:
@@ -53,8 +54,10 @@ def read(
     return Scene(
         **{
             **vars(scene),
-            "frames": tuple(f for camera in cameras for f in _frames(tables, root, samples, camera, sweeps, scene)),
-            "sweeps": tuple(_sweeps(tables, root, samples, sweeps, scene)),
+            "frames": tuple(
+                f for camera in cameras for f in _frames(tables, root, samples, camera, source.sweeps, scene)
+            ),
+            "sweeps": tuple(_sweeps(tables, root, samples, source.lidar_sweeps, scene)),
             "tracks": tuple(_tracks(tables, samples, origin)),
         }
     )

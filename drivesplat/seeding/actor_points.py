@@ -1,6 +1,6 @@
 """The stage `actors`: which vehicles become actors, and where their Gaussians start.
 
-LiDAR of the training key frames that lies in an actor's box, gathered over the drive in the actor's own frame; random
+LiDAR of the training sweeps that lies in an actor's box, gathered over the drive in the actor's own frame; random
 points in the box where that is little (Street Gaussians, Yan et al. 2024, arXiv 2401.01339). Colours are those of
 training images in whose pixels the actor is seen. Held-out images and sweeps contribute nothing.
 """
@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.ahead import ahead
 from drivesplat.holdout import frame_groups
 from drivesplat.images import continuous_intrinsics, read_image, target_size
-from drivesplat.regions import LEAST_PIXELS, hulls_in, own_car_pixels, owner_image
+from drivesplat.own_car import NOWHERE, OwnCar
+from drivesplat.regions import LEAST_PIXELS, hulls_in, owner_image
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene, Sweep, Track
 from drivesplat.seeding.coloring import in_image
@@ -29,7 +31,7 @@ UNSEEN = 127
 """Grey of an actor that no pixel shows."""
 
 
-def actors_record(scene: Scene, job: ActorSeedJob) -> dict[str, Any]:
+def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
     """The record of `drivesplat.seeding.actors`, provenance aside. A mover that no training image sees is left out."""
     sweeps = training_returns(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
@@ -38,7 +40,7 @@ def actors_record(scene: Scene, job: ActorSeedJob) -> dict[str, Any]:
         if may_be_actor(mover.track, job.actors):
             random = np.random.default_rng((job.random_seed, order[mover.track.id]))
             seeds.append(Seed(mover, *gathered_points(scene, mover, sweeps, job.actors, random)))
-    for sight in training_sights(scene, job):
+    for sight in training_sights(scene, job, own_car):
         for seed in seeds:
             seed.look(sight)
     unseen = [seed.mover.track.id for seed in seeds if not seed.seen]
@@ -91,19 +93,19 @@ class Sight:
     seen: set[str]
 
 
-def training_sights(scene: Scene, job: ActorSeedJob) -> Iterator[Sight]:
+def training_sights(scene: Scene, job: ActorSeedJob, own_car: OwnCar) -> Iterator[Sight]:
     """The training images, one by one."""
-    for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
-        if group == "train":
-            yield sight_of(scene, frame, job)
+    groups = frame_groups(scene, job.holdout)
+    frames = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
+    return ahead(lambda frame: sight_of(scene, frame, job, own_car), frames)
 
 
-def sight_of(scene: Scene, frame: Frame, job: ActorSeedJob) -> Sight:
+def sight_of(scene: Scene, frame: Frame, job: ActorSeedJob, own_car: OwnCar) -> Sight:
     """A frame, with what is seen in it: of LEAST_PIXELS pixels and not hidden by nearer boxes and the own car."""
     size = target_size(frame, job.images)
     hulls = hulls_in(scene, frame, size)
     owners, covered = owner_image(hulls, size)
-    owners[own_car_pixels(job.own_car_polygons.get(frame.camera), size)] = -1
+    owners[own_car.pixels(frame.camera, size)] = -1
     tracks = {hull.box.track_id: number for number, hull in enumerate(hulls)}
     shown = np.bincount(owners[owners >= 0], minlength=len(hulls))
     seen = {track for track, number in tracks.items() if shown[number] and covered[number] >= LEAST_PIXELS}

@@ -27,6 +27,11 @@ OCCLUSION = 1.05
 """A point is hidden where something in its cell is nearer by this factor and half a metre."""
 
 
+def hidden_behind(depth: np.ndarray, nearest: np.ndarray) -> np.ndarray:
+    """Whether what is at `depth` (m,) metres is hidden where something is seen at `nearest` (m,): (m,) bool."""
+    return depth > nearest * OCCLUSION + 0.5
+
+
 def color_by_visibility(
     points: np.ndarray, times: np.ndarray, views: Iterable[ColorView]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +69,7 @@ def visible(
     cells = (rows // CELL) * (width // CELL + 1) + columns // CELL
     nearest = np.full((height // CELL + 1) * (width // CELL + 1), np.inf)
     np.minimum.at(nearest, cells, depth)
-    front = depth <= nearest[cells] * OCCLUSION + 0.5
+    front = ~hidden_behind(depth, nearest[cells])
     return index[front], rows[front], columns[front], depth[front]
 
 

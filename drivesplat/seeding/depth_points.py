@@ -9,14 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.holdout import frame_groups
+from drivesplat.holdout import Group, frame_groups
 from drivesplat.images import continuous_intrinsics, target_size
-from drivesplat.regions import fill, hulls_in, own_car_pixels
+from drivesplat.own_car import NOWHERE, OwnCar
+from drivesplat.regions import fill, hulls_in
 from drivesplat.rigid import apply, inverse
-from drivesplat.scene import Frame, Scene
+from drivesplat.scene import Frame, Scene, Sweep
 from drivesplat.seeding.coloring import visible
 from drivesplat.seeding.movers import Mover, movers
-from drivesplat.seeding.sweeps import training_returns
+from drivesplat.seeding.occlusion import patches, unhidden
+from drivesplat.seeding.sweeps import returns_of
 from drivesplat.settings.lidar_depth import LidarDepthJob
 
 log = logging.getLogger(__name__)
@@ -27,37 +29,46 @@ Depths = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Cloud:
-    """A sweep taken apart: returns of what stands still (n, 3) in world coordinates, and what moves, each with its
-    returns (m, 3) in its own frame."""
+    """A sweep taken apart: the sensor's place `origin` (3,), returns of what stands still (n, 3) in world coordinates,
+    and what moves, each with its returns (m, 3) in its own frame."""
 
     timestamp: int
+    sample_index: int
+    origin: np.ndarray
     still: np.ndarray
     moving: list[tuple[Mover, np.ndarray]]
 
 
-def lidar_depths(scene: Scene, job: LidarDepthJob) -> list[Depths]:
-    """What LiDAR says of each of the scene's frames; nothing of those that no training sees."""
-    moving = movers(scene)
-    clouds = [
-        taken_apart(points, sweep.timestamp, scene.seconds(sweep.timestamp), moving, job.box_margin)
-        for sweep, points in training_returns(scene, job.holdout, job.own_car_radius)
-    ]
-    images = []
+def lidar_depths(scene: Scene, job: LidarDepthJob, own_car: OwnCar = NOWHERE) -> list[Depths]:
+    """What LiDAR says of each of the scene's frames, the own car's body left out; nothing of those that no training
+    sees."""
+    clouds, images = clouds_of(scene, job, ("train",)), []
     for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
         cloud = nearest_cloud(clouds, frame.timestamp, scene.key_frame_interval) if group == "train" else None
-        images.append(depths_in(scene, frame, cloud, job) if cloud else _depths(np.empty((0, 3))))
+        body = own_car.pixels(frame.camera, target_size(frame, job.images))
+        images.append(depths_in(scene, frame, cloud, job, body) if cloud else _depths(np.empty((0, 3))))
     known = [len(image["depth"]) for image in images if len(image["depth"])]
     log.info("%d depths in %d of %d images", sum(known), len(known), len(images))
     return images
 
 
-def taken_apart(points: np.ndarray, timestamp: int, seconds: float, moving: list[Mover], margin: float) -> Cloud:
-    """The world points (n, 3) of a sweep at a time; what may be road as well as wheel is left out."""
+def clouds_of(scene: Scene, job: LidarDepthJob, groups: tuple[Group, ...]) -> list[Cloud]:
+    """The key-frame sweeps of some groups, taken apart, in time order."""
+    moving = movers(scene)
+    return [
+        taken_apart(sweep, points, scene.seconds(sweep.timestamp), moving, job.box_margin)
+        for sweep, points in returns_of(scene, job.holdout, job.own_car_radius, groups)
+    ]
+
+
+def taken_apart(sweep: Sweep, points: np.ndarray, seconds: float, moving: list[Mover], margin: float) -> Cloud:
+    """A sweep's returns (n, 3) in world coordinates, at its time in `seconds`; what may be road as well as wheel is
+    left out."""
     still = np.ones(len(points), dtype=bool)
     for mover in moving:
         still &= ~mover.near(points, seconds, margin)
     own = [(mover, mover.own(points, seconds, margin)) for mover in moving]
-    return Cloud(timestamp, points[still], own)
+    return Cloud(sweep.timestamp, sweep.sample_index, sweep.sensor_to_world[:3, 3], points[still], own)
 
 
 def nearest_cloud(clouds: list[Cloud], timestamp: int, interval: float) -> Cloud | None:
@@ -66,17 +77,21 @@ def nearest_cloud(clouds: list[Cloud], timestamp: int, interval: float) -> Cloud
     return nearest if nearest and abs(nearest.timestamp - timestamp) < interval else None
 
 
-def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob) -> Depths:
-    """The returns of a cloud that a frame sees, the nearest of a pixel. What is absent by then is left out."""
+def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body: np.ndarray) -> Depths:
+    """The returns of a cloud that a frame sees, the nearest of a pixel. What is absent by then is left out, and so is
+    what lies behind the own car's `body` (h, w) bool."""
     size, seconds = target_size(frame, job.images), scene.seconds(frame.timestamp)
     posed = [(mover.pose(seconds), own) for mover, own in cloud.moving]
     carried = [apply(pose, own) for pose, own in posed if pose is not None]
     points = np.concatenate([cloud.still, *carried])
-    camera = inverse(frame.camera_to_world), continuous_intrinsics(frame, size)
-    index, rows, columns, depth = visible(points, *camera, (size[1], size[0]))
+    shape, intrinsics = (size[1], size[0]), continuous_intrinsics(frame, size)
+    index, rows, columns, depth = visible(points, inverse(frame.camera_to_world), intrinsics, shape)
+    ranges = np.linalg.norm(points[index] - cloud.origin, axis=1)
+    front = unhidden(rows, columns, depth, patches(ranges, depth, intrinsics, job.ray_spacing), shape)
+    index, rows, columns, depth = index[front], rows[front], columns[front], depth[front]
     boxes = box_depths(scene, frame, size, {mover.track.id for mover, _ in cloud.moving})
     kept = (index >= len(cloud.still)) | (depth < boxes[rows, columns])
-    kept &= ~own_car_pixels(job.own_car_polygons.get(frame.camera), size)[rows, columns]
+    kept &= ~body[rows, columns]
     return _depths(np.column_stack([rows, columns, depth])[kept])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from drivesplat.motion import Motion
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Scene, Track
-from drivesplat.tracks import in_box, moves_at_all
+from drivesplat.tracks import in_box, tracks_that_move
 
 CLEARANCE = 0.1
 """What lies lower over a box's floor than this (metres) may be road as well as wheel."""
@@ -43,4 +43,4 @@ class Mover:
 
 def movers(scene: Scene) -> list[Mover]:
     """Every vehicle and person that ever moves in a scene, by the measuring protocol's thresholds."""
-    return [Mover(track, Motion.of_track(scene, track)) for track in scene.tracks if moves_at_all(track)]
+    return [Mover(track, Motion.of_track(scene, track)) for track in tracks_that_move(scene)]

@@ -1,59 +1,72 @@
 """The stage `lidar_seed`: where the Gaussians start.
 
-LiDAR of the training key frames in world coordinates, without the own car and without what moves, thinned, coloured
-from training images; then points of a file, if given; then far points along pixels that none of these cover. Held-out
-images and sweeps contribute nothing, neither position (of LiDAR) nor colour, and a point that no training image sees is
-left out.
+LiDAR of the training sweeps in world coordinates, without the own car and without what moves, thinned, coloured
+from training images; points that the refinement of poses triangulated, if two training images see them; points of a
+file, if given; then far points along pixels that none of these cover. Held-out images and sweeps contribute nothing,
+neither position (of LiDAR) nor colour, and a point that no training image sees is left out.
 """
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from plyfile import PlyParseError
 
+from drivesplat.ahead import ahead
 from drivesplat.errors import DatasetError
 from drivesplat.holdout import frame_groups, sweep_groups
 from drivesplat.images import continuous_intrinsics, read_image, target_size
+from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.point_cloud import PointCloud, read_positions
+from drivesplat.poses.triangulated import mean_over_views, seen_in
 from drivesplat.regions import fill, hulls_in
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.seeding.coloring import ColorView, color_by_visibility
 from drivesplat.seeding.far_points import far_points
-from drivesplat.seeding.sweeps import moving_boxes, outside_boxes, read_sweep, thin, without_own_car
+from drivesplat.seeding.sweeps import outside_boxes, read_sweep, thin, without_own_car
 from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
+from drivesplat.settings.lidar_seed import SeedJob
+from drivesplat.tracks import boxes_of, tracks_that_move
 
 log = logging.getLogger(__name__)
 
 
-def seed_points(scene: Scene, job: SeedJob) -> PointCloud:
-    """The seed of a scene. Its note counts points by source, missing sweeps, and names the points file.
+def seed_points(
+    scene: Scene, job: SeedJob, own_car: OwnCar = NOWHERE, triangulated: dict[str, Any] | None = None
+) -> PointCloud:
+    """The seed of a scene, to which the own car's body lends nothing; `triangulated` is the content of its
+    triangulated.pkl. Its note counts points by source, missing sweeps, and names the points file.
 
     Raises DatasetError where a LiDAR file is missing (unless told to go on) or nothing is left to start from.
     """
     random = np.random.default_rng(job.random_seed)
-    views = training_views(scene, job)
-    if not views:
+    frames = training_frames(scene, job)
+    if not frames:
         raise DatasetError(
             f"scene {scene.name}: the hold-out leaves none of its {len(scene.key_frame_timestamps)} key frames to "
             "train on; lower holdout.last_block, or set holdout.every_nth: 0"
         )
     lidar, times, missing = lidar_points(scene, job)
+    middle = float(np.median(scene.key_frame_timestamps))
     extra = extra_points(scene, job.lidar_seed.points_file)
-    positions = np.concatenate([lidar, extra])
-    times = np.concatenate([times, np.full(len(extra), np.median(scene.key_frame_timestamps))])
-    from_file = np.arange(len(positions)) >= len(lidar)
-    colors, seen = color_by_visibility(positions, times, [view for _, view in views])
+    sources = {
+        "lidar": (lidar, times),
+        "triangulated": triangulated_points(scene, job, triangulated) if triangulated else (np.empty((0, 3)), []),
+        "points_file": (extra, np.full(len(extra), middle)),
+    }
+    positions, times = (np.concatenate(columns) for columns in zip(*sources.values(), strict=True))
+    source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
+    colors, seen = color_by_visibility(positions, times, color_views(scene, frames, job.images, own_car))
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
-    positions, colors, from_file = positions[kept], colors[kept], from_file[kept]
-    far, far_colors = _far_points(views, positions, job.lidar_seed, random)
+    positions, colors, source = positions[kept], colors[kept], source[kept]
+    far, far_colors = _far_points(scene, frames, positions, job, own_car, random)
     note = {
-        "lidar": int((~from_file).sum()),
-        "points_file": int(from_file.sum()),
+        **{name: int((source == i).sum()) for i, name in enumerate(sources)},
         "far": len(far),
         "lidar_missing": missing,
         "extra_points": Path(job.lidar_seed.points_file).name if job.lidar_seed.points_file else None,
@@ -68,8 +81,7 @@ def seed_points(scene: Scene, job: SeedJob) -> PointCloud:
 
 
 def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, int]:
-    """Static LiDAR points (n, 3) of the training key frames in world coordinates, their times (n,), and the sweeps
-    missing.
+    """Static LiDAR points (n, 3) of the training sweeps in world coordinates, their times (n,), and the sweeps missing.
 
     Raises DatasetError where the scene has no LiDAR at all and on_missing is 'stop'.
     """
@@ -79,9 +91,8 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
             f"scene {scene.name} has no LiDAR sweeps; set lidar_seed.on_missing: warn to seed from images alone"
         )
     positions, times, missing = [np.empty((0, 3))], [np.empty(0)], 0
+    moving = tracks_that_move(scene)
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
-        if not sweep.is_key_frame:
-            continue
         try:
             points = read_sweep(sweep)
         except DatasetError as error:
@@ -93,12 +104,12 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
         if group != "train":
             continue
         points = apply(sweep.sensor_to_world, without_own_car(points, settings.own_car_radius))
-        points = points[outside_boxes(points, moving_boxes(scene, sweep.timestamp), settings.box_margin)]
+        boxes = boxes_of(moving, sweep.timestamp, scene.key_frame_interval)
+        points = points[outside_boxes(points, boxes, settings.box_margin)]
         positions.append(points)
         times.append(np.full(len(points), sweep.timestamp, dtype=np.float64))
     if missing:
-        key_sweeps = sum(sweep.is_key_frame for sweep in scene.sweeps)
-        log.warning("%d of %d LiDAR sweeps are missing; seeding without them", missing, key_sweeps)
+        log.warning("%d of %d LiDAR sweeps are missing; seeding without them", missing, len(scene.sweeps))
     merged, merged_times = np.concatenate(positions), np.concatenate(times)
     kept = thin(merged, settings.voxel_size)
     return merged[kept], merged_times[kept], missing
@@ -114,19 +125,33 @@ def extra_points(scene: Scene, path: str | None) -> np.ndarray:
         raise DatasetError(f"lidar_seed.points_file {path} is no readable PLY of points ({error})") from error
 
 
-def training_views(scene: Scene, job: SeedJob) -> list[tuple[Frame, ColorView]]:
-    """The training images as sources of colour; pixels of moving boxes are not usable."""
+def triangulated_points(scene: Scene, job: SeedJob, record: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The triangulated points (n, 3) that enough training images see, in world coordinates, and the times (n,) at which
+    they do, on average."""
     groups = frame_groups(scene, job.holdout)
-    return [
-        (frame, color_view(scene, frame, job.images))
-        for frame, group in zip(scene.frames, groups, strict=True)
-        if group == "train"
-    ]
+    training = np.array([i for i, group in enumerate(groups) if group == "train"])
+    times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
+    chosen = seen_in(record, training)
+    return record["points"][chosen], mean_over_views(record, training, times)[chosen]
 
 
-def color_view(scene: Scene, frame: Frame, images: ImageSettings) -> ColorView:
+def training_frames(scene: Scene, job: SeedJob) -> list[Frame]:
+    """The images that colours may come from."""
+    groups = frame_groups(scene, job.holdout)
+    return [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
+
+
+def color_views(
+    scene: Scene, frames: list[Frame], images: ImageSettings, own_car: OwnCar = NOWHERE
+) -> Iterator[ColorView]:
+    """The frames one by one as sources of colour: at 12 Hz all of them would not fit into memory."""
+    return ahead(lambda frame: color_view(scene, frame, images, own_car), frames)
+
+
+def color_view(scene: Scene, frame: Frame, images: ImageSettings, own_car: OwnCar = NOWHERE) -> ColorView:
+    """A frame as a source of colour; pixels of moving boxes and of the own car are not usable."""
     size = target_size(frame, images)
-    usable = np.ones((size[1], size[0]), dtype=bool)
+    usable = ~own_car.pixels(frame.camera, size)
     for hull in hulls_in(scene, frame, size):
         if hull.box.moves:
             usable[fill(hull.polygon, size)] = False
@@ -140,11 +165,17 @@ def color_view(scene: Scene, frame: Frame, images: ImageSettings) -> ColorView:
 
 
 def _far_points(
-    views: list[tuple[Frame, ColorView]], covered: np.ndarray, settings: LidarSeedSettings, random: np.random.Generator
+    scene: Scene,
+    frames: list[Frame],
+    covered: np.ndarray,
+    job: SeedJob,
+    own_car: OwnCar,
+    random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
+    settings = job.lidar_seed
     positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
-    for i, (frame, view) in enumerate(views):
-        count = settings.far_points * (i + 1) // len(views) - settings.far_points * i // len(views)
+    shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
+    for frame, view, count in zip(frames, color_views(scene, frames, job.images, own_car), shares, strict=True):
         ground_z = float(frame.ego_to_world[2, 3])
         p, c = far_points(view, ground_z, covered, count, settings.far_depths, random)
         positions.append(p)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.holdout import sweep_groups
+from drivesplat.holdout import Group, sweep_groups
 from drivesplat.rigid import apply
-from drivesplat.scene import Scene, Sweep
+from drivesplat.scene import Scene, Sweep, place_of
 from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.tracks import Box, box_at, moves_at_all
+from drivesplat.tracks import Box
 
 log = logging.getLogger(__name__)
 
@@ -25,25 +25,38 @@ def read_sweep(sweep: Sweep) -> np.ndarray:
     Raises DatasetError naming the sample_data token and the path where the file is missing, truncated or empty.
     """
     path = Path(sweep.path)
-    where = f"key frame {sweep.sample_index}, sample_data {sweep.token}: LiDAR file {path}"
+    where = f"{place_of(sweep)}: LiDAR file {path}"
+    leave_out = "" if sweep.is_key_frame else "lidar_seed.sweeps: false to do without all between key frames, or "
+    remedy = f"restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it"
     if not path.is_file():
-        raise DatasetError(f"{where} is missing; restore it, or set lidar_seed.on_missing: warn to go on without it")
+        raise DatasetError(f"{where} is missing; {remedy}")
     size = path.stat().st_size
     if size == 0 or size % (4 * _RECORD):
-        raise DatasetError(
-            f"{where} is corrupt ({size} bytes are no whole number of returns); "
-            "restore it, or set lidar_seed.on_missing: warn"
-        )
+        raise DatasetError(f"{where} is corrupt ({size} bytes are no whole number of returns); {remedy}")
     points = np.fromfile(path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
     return points[np.isfinite(points).all(axis=1)].astype(np.float64)
 
 
+def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:
+    """The sweeps that a training may see, of key frames and, where the scene holds any, between them."""
+    groups = sweep_groups(scene, holdout)
+    return [sweep for sweep, group in zip(scene.sweeps, groups, strict=True) if group == "train"]
+
+
 def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
-    """The key-frame sweeps that a training may see, each with its returns (n, 3) in world coordinates, the own car's
-    left out. A sweep whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
+    """The sweeps that a training may see, as `returns_of` gives them."""
+    return returns_of(scene, holdout, own_car_radius, ("train",))
+
+
+def returns_of(
+    scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...]
+) -> list[tuple[Sweep, np.ndarray]]:
+    """The sweeps of some groups, of key frames and, where the scene holds any, between them, each with its returns (n,
+    3) in world coordinates, the own car's left out. A sweep whose file is missing or corrupt is left out: the stage
+    lidar_seed is the one that complains."""
     found = []
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, holdout), strict=True):
-        if sweep.is_key_frame and group == "train":
+        if group in groups:
             with suppress(DatasetError):
                 points = without_own_car(read_sweep(sweep), own_car_radius)
                 found.append((sweep, apply(sweep.sensor_to_world, points)))
@@ -53,12 +66,6 @@ def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: flo
 def without_own_car(points: np.ndarray, radius: float) -> np.ndarray:
     """Sensor-frame returns (n, 3) farther than `radius` metres (horizontally) from the sensor."""
     return points[np.hypot(points[:, 0], points[:, 1]) > radius]
-
-
-def moving_boxes(scene: Scene, timestamp: int) -> list[Box]:
-    """The boxes, at `timestamp`, of every track that ever moves in the scene: they leave no static points behind."""
-    boxes = (box_at(track, timestamp, scene.key_frame_interval) for track in scene.tracks if moves_at_all(track))
-    return [box for box in boxes if box is not None]
 
 
 def outside_boxes(points: np.ndarray, boxes: list[Box], margin: float) -> np.ndarray:

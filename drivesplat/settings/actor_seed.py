@@ -32,5 +32,4 @@ class ActorSeedJob(Settings):
     holdout: HoldoutSettings
     images: ImageSettings
     own_car_radius: float
-    own_car_polygons: dict[str, tuple[tuple[float, float], ...]]
     random_seed: int

@@ -14,11 +14,12 @@ class TrackSettings(Settings):
     """Learning rate of the corrections of position (metres)."""
     lr_yaw: float = Field(5e-4, gt=0)
     """Learning rate of the corrections of heading (radians)."""
-    size_weight: float = Field(0.01, ge=0)
+    size_weight: float = Field(0.001, ge=0)
     """Weight of the mean square of the corrections, in units of `sigma`s: annotations are trusted so far."""
-    bend_weight: float = Field(0.1, ge=0)
+    bend_weight: float = Field(0.001, ge=0)
     """Weight of the mean square of their second differences, in the same units: corrections change slowly, and carry
-    over to the held-out frames between."""
+    over to the held-out frames between. On scene 0061 what moves measures 25.1 dB with it, held out, 22 dB with a
+    hundred times as much, which allows no correction, and 20 dB with none, which lets them fit one image each."""
     sigma_translation: float = Field(0.1, gt=0)
     """How far off (metres) an annotated position is expected to be."""
     sigma_yaw: float = Field(0.03, gt=0)

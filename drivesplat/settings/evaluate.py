@@ -4,6 +4,7 @@ from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.looks import RemovalSettings
 
 BACKBONE = "resources/lpips/alexnet.pth"
@@ -30,6 +31,8 @@ class EvaluateJob(Settings):
     cameras: tuple[str, ...]
     sweeps: bool
     holdout: HoldoutSettings
+    lidar: LidarDepthJob
+    """What LiDAR of held-out sweeps says of depth is found out as it is for training images."""
     lpips: bool
     removal: RemovalSettings | None
     """For synthetic worlds: recorded drives have no truth that a removal could be held to."""

@@ -9,7 +9,8 @@ OnMissing = Literal["stop", "warn"]
 
 class ExtractSettings(Settings):
     on_missing: OnMissing = "stop"
-    """A missing or corrupt image: 'stop' names it and fails; 'warn' leaves it out and counts it."""
+    """A missing or corrupt image, of a key frame or between two: 'stop' names it and fails; 'warn' leaves it out and
+    counts it."""
 
 
 class SceneSource(Settings):
@@ -22,4 +23,5 @@ class SceneSource(Settings):
     frames: tuple[int, int] | None
     cameras: tuple[str, ...]
     sweeps: bool
+    lidar_sweeps: bool = False
     on_missing: OnMissing

@@ -13,10 +13,16 @@ from drivesplat.settings.images import ImageSettings
 class LidarSeedSettings(Settings):
     on_missing: OnMissing = "stop"
     """A missing or corrupt LiDAR file: 'stop' names it and fails; 'warn' goes on without it and counts it."""
+    sweeps: bool = False
+    """Use the LiDAR sweeps between key frames, too (nuScenes: at 20 Hz, ten times the returns): for this seed, for what
+    actors start from, and for LiDAR's depth in training images, which then see the sweep of their own moment. Those
+    nearer than half a key-frame interval to a held-out key frame contribute nothing. docs/real_logs.md"""
     points_file: str | None = None
     """A PLY of extra points in the dataset's global frame (metres), recoloured from training images. null = none."""
+    triangulated: bool = True
+    """Whether points that refine_poses triangulated, and two training images see, join the seed."""
     max_points: int = Field(400_000, ge=100, le=10_000_000)
-    """Most points from LiDAR and the points file; beyond it they are thinned at random."""
+    """Most points from LiDAR, triangulation and the points file; beyond it they are thinned at random."""
     voxel_size: float = Field(0.1, ge=0, le=10)
     """Edge in metres of the voxels that keep one LiDAR point each. 0 = no thinning."""
     own_car_radius: float = Field(2.5, ge=0, le=10)

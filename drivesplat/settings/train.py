@@ -6,7 +6,9 @@ from pydantic import AfterValidator, Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.actors import ActorSettings
+from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.road import RoadSettings
 
 PartName = Literal["background", "actors"]
 MOVING_PARTS = frozenset({"actors"})
@@ -62,8 +64,29 @@ class FloaterSettings(Settings):
     radius: float = Field(1.0, ge=0, le=10)
     """Gaussians whose centre is nearer than this (metres) to the path of a training camera are faded out: the
     recording car drove there, so it is empty. Worth 1.5 dB of static PSNR on scene 0061. 0 = off."""
+    free_space: bool = False
+    """Whether those are faded out, too, whose centre lies where LiDAR's rays prove space empty (`free_space`)."""
     every: int = Field(100, ge=1)
     """Iterations between prunings."""
+
+
+class ExposureSettings(Settings):
+    """Cameras of one rig expose and white-balance by themselves, which shows as seams where their images meet."""
+
+    kind: Literal["none", "affine"] = "none"
+    """'affine': for every camera but eval_camera, which is the reference, a gain and an offset of each colour channel
+    are learned and applied to what it shows. With one camera there is nothing to learn."""
+    sigma_gain: float = Field(0.2, gt=0)
+    """By how much (natural logarithm) the gains of cameras are expected to differ."""
+    sigma_offset: float = Field(0.02, gt=0)
+    """By how much (1 = full scale) their offsets are."""
+    weight: float = Field(0.002, ge=0)
+    """Weight of the mean square of a camera's log gains and offsets, in units of these, in the loss: what exposure need
+    not explain it does not."""
+    start: float = Field(0.1, ge=0, le=1)
+    """Exposures are learned after this fraction of the iterations: before, the scene is what is wrong."""
+    learning_rate: float = Field(1e-2, gt=0)
+    """Learning rate of log gains and offsets, in the same units; decays exponentially to a hundredth."""
 
 
 class TrainSettings(Settings):
@@ -81,6 +104,8 @@ class TrainSettings(Settings):
     mcmc: McmcSettings = McmcSettings()
     default: DefaultSettings = DefaultSettings()
     floaters: FloaterSettings = FloaterSettings()
+    exposure: ExposureSettings = ExposureSettings()
+    camera_poses: CameraPoseSettings = CameraPoseSettings()
     refine_start: float = Field(0.0167, ge=0, le=1)
     """Densification starts after this fraction of the iterations."""
     refine_stop: float = Field(0.833, ge=0, le=1)
@@ -93,6 +118,13 @@ class TrainSettings(Settings):
     """Weight of the mean opacity in the loss: what is not needed fades."""
     scale_reg: float = Field(0.01, ge=0)
     """Weight of the mean scale (metres) in the loss: what is large must earn it."""
+    flatness_weight: float = Field(0.0, ge=0)
+    """Weight of the background Gaussians' mean thickness (metres, their smallest scale) in the loss: surfaces are
+    flat."""
+    road_weight: float = Field(0.0, ge=0)
+    """Weight of how far (metres) the mass of Gaussians under the car's path lies from the road there, whose height and
+    slope the car's poses tell."""
+    road: RoadSettings = RoadSettings()
     sky_alpha_weight: float = Field(0.05, ge=0)
     """Weight of -log(1 - alpha) on sky pixels with `sky: mask`: no Gaussian in the sky. A cube map does without:
     it cost 0.5 dB of static PSNR on scene 0061, where masks and tree tops disagree."""
@@ -134,3 +166,5 @@ class TrainJob(Settings):
     sky: SkyKind
     train: TrainSettings
     random_seed: int
+    reference_camera: str | None = None
+    """The camera whose exposure is that of the model, where exposures are learned; None where they are not."""

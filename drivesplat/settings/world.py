@@ -1,6 +1,6 @@
 """What a synthetic world may be told."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -9,6 +9,8 @@ from drivesplat.settings import Settings
 Channel = Literal[
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT", "LIDAR_TOP"
 ]  # fmt: skip
+
+Gain = Annotated[float, Field(gt=0, le=8)]
 
 
 class WorldSettings(Settings):
@@ -32,6 +34,11 @@ class WorldSettings(Settings):
     """Parked vehicles."""
     ego: Literal["drives", "stands"] = "drives"
     """Whether the own car moves."""
+    own_car: bool = False
+    """Whether the own car's rear is seen, at the lower edge of CAM_BACK's images."""
+    exposures: dict[Channel, tuple[Gain, Gain, Gain]] = Field(default_factory=dict)
+    """Per camera how much of the red, green and blue light it takes in, before its images are gamma encoded; others
+    take in all, 1. {CAM_BACK: [1.3, 1.2, 1.0]}: as cameras do that expose and white-balance by themselves."""
     night: bool = False
     """Street lamps, headlights and sensor noise instead of the sun."""
     pose_noise: bool = False

@@ -103,8 +103,7 @@ def restore(
     restore_model(model, state["model"])
     parameters = [(part.params, group) for part, group in zip(model.parts, optimizers.parts, strict=True)]
     parameters += [(part.shared, group) for part, group in zip(model.parts, optimizers.shared, strict=True)]
-    if model.sky is not None:
-        parameters.append((model.sky.params, optimizers.sky))
+    parameters += [(it.params, optimizers.beside_parts[name]) for name, it in model.beside_parts.items()]
     for params, group in parameters:
         for key, optimizer in group.items():
             optimizer.param_groups[0]["params"] = [params[key]]

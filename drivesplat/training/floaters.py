@@ -1,10 +1,13 @@
-"""Floaters before the cameras: the recording car drove where they are, so nothing is there."""
+"""Floaters: Gaussians where nothing is, since the recording car drove there, or rays went through."""
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from drivesplat.model.part import Part
+from drivesplat.training.cells import Cells
 
 LARGEST_STEP = 15.0
 """Camera positions farther apart than this (metres) are not joined into a path."""
@@ -32,7 +35,34 @@ def near_path(
     return near
 
 
+@dataclass(frozen=True)
+class EmptySpace:
+    """Where nothing stands: within `radius` metres (0: nowhere) of the cameras' path from `starts` to `ends` (m, 3),
+    and in the cells of `free`, world metres (None: in none)."""
+
+    starts: Float[Tensor, "m 3"]
+    ends: Float[Tensor, "m 3"]
+    radius: float
+    free: Cells | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether there is any such place."""
+        return self.radius > 0 or self.free is not None
+
+    def holds(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """Which points lie there."""
+        segments = (self.starts, self.ends) if self.radius > 0 else (self.starts[:0], self.ends[:0])
+        near = near_path(points, *segments, self.radius)
+        return near if self.free is None else near | self.free.find(points)[1]
+
+
 @torch.no_grad()
-def fade_floaters(part: Part, starts: Float[Tensor, "m 3"], ends: Float[Tensor, "m 3"], radius: float) -> None:
-    """Fades the Gaussians of a part that stands still within `radius` metres of the camera path."""
-    part.fade(near_path(part.params["means"], starts, ends, radius))
+def fade_floaters(part: Part, empty: EmptySpace) -> None:
+    """Fades the Gaussians of a part that stands still whose centres lie in empty space.
+
+    Centres decide, whatever a Gaussian's size: one that is large and flat has its centre in what it shows. Where rays
+    leave room around what they met, a wall's Gaussians do not reach; one whose centre is that far out shows something
+    in the air, whatever it covers behind.
+    """
+    part.fade(empty.holds(part.params["means"]))

@@ -1,5 +1,7 @@
 """The terms of the training loss, each named, so that each can be logged and blamed."""
 
+import dataclasses
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
@@ -20,8 +22,10 @@ def loss_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
     """The weighted terms whose sum is minimised; what is absent from the picture is not regularised either, since
-    nothing in it could hold against that."""
+    nothing in it could hold against that. Of what the own car's body hides nothing is asked."""
     target, shown = view.target(), picture.gaussians
+    if view.own_car is not None:
+        picture = behind(view.own_car, picture, target)
     terms = {
         "l1": (1.0 - settings.ssim_weight) * F.l1_loss(picture.image, target),
         "ssim": settings.ssim_weight * (1.0 - ssim(picture.image, target)),
@@ -40,19 +44,35 @@ def loss_terms(
     logits = model.class_logits(picture, view.view) if view.classes is not None else None
     if logits is not None:
         terms["semantic"] = settings.semantic_weight * class_cross_entropy(logits, view.classes)
-    return {**terms, **_moving_terms(picture, view, model, settings)}
+    for name, learned in (("exposure", model.exposure), ("camera_poses", model.camera_poses)):
+        paid = learned.penalty(view.view.camera) if learned is not None else None
+        if paid is not None:
+            terms[name] = paid
+    return {**terms, **_moving_terms(picture, target, view, model, settings)}
+
+
+def behind(own_car: Bool[Tensor, "h w"], picture: Picture, target: Float[Tensor, "h w 3"]) -> Picture:
+    """The picture with the own car's body before it: there it is as it was recorded, and opaque.
+
+    So nothing in the picture is pulled by these pixels. A window of SSIM that reaches over the body's edge finds both
+    images alike beyond it and judges by the rest, and every other pixel weighs what it does in an image without a body.
+    Were the target made like the picture instead, such windows would still pull on what lies behind the body.
+    """
+    image = torch.where(own_car[..., None], target, picture.image)
+    return dataclasses.replace(picture, image=image, alpha=picture.alpha.masked_fill(own_car, 1.0))
 
 
 def _moving_terms(
-    picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
+    picture: Picture, target: Float[Tensor, "h w 3"], view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
     """The terms about parts that move; none for a model without."""
     terms = {name: term for part in model.parts for name, term in part.penalties().items()}
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
-        terms["entropy"] = settings.entropy_weight * entropy(alpha)
+        seen = alpha if view.own_car is None else alpha.masked_fill(view.own_car, 1.0)
+        terms["entropy"] = settings.entropy_weight * entropy(seen)
     if view.moving is not None and settings.dynamic_weight:
-        terms["dynamic"] = settings.dynamic_weight * masked_l1(picture.image, view.target(), view.moving)
+        terms["dynamic"] = settings.dynamic_weight * masked_l1(picture.image, target, view.moving)
     return terms
 
 

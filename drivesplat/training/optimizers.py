@@ -6,26 +6,28 @@ import torch
 from torch import nn
 
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.train import TrainSettings
 
 Optimizers = dict[str, torch.optim.Optimizer]
 
-MEANS_DECAY = 0.01
-"""Positions learn at the end at this fraction of their initial rate."""
+DECAY = 0.01
+"""Positions, and what is learned of cameras, learn at the end at this fraction of their initial rate."""
 
 
 @dataclass
 class ModelOptimizers:
-    """`parts[i]` belongs to the Gaussians of part i of the model, `shared[i]` to what they share, `sky` to its sky."""
+    """`parts[i]` belongs to the Gaussians of part i of the model, `shared[i]` to what they share, `beside_parts`, by
+    name, to what the model learns beside them: its sky, its cameras' exposure and poses."""
 
     parts: list[Optimizers]
     shared: list[Optimizers]
-    sky: Optimizers
+    beside_parts: dict[str, Optimizers]
 
     def all(self) -> list[tuple[str, torch.optim.Optimizer]]:
         return [
             *((f"{i}.{k}", o) for i, group in enumerate(self.parts) for k, o in group.items()),
             *((f"{i}.shared.{k}", o) for i, group in enumerate(self.shared) for k, o in group.items()),
-            *((f"sky.{k}", o) for k, o in self.sky.items()),
+            *((f"{name}.{k}", o) for name, group in self.beside_parts.items() for k, o in group.items()),
         ]
 
     def step(self) -> None:
@@ -38,7 +40,7 @@ def make_optimizers(model: SplatModel) -> ModelOptimizers:
     return ModelOptimizers(
         parts=[_adams(part.params, part.learning_rates()) for part in model.parts],
         shared=[_adams(part.shared, part.learning_rates()) for part in model.parts],
-        sky=_adams(model.sky.params, model.sky.learning_rates()) if model.sky is not None else {},
+        beside_parts={name: _adams(it.params, it.learning_rates()) for name, it in model.beside_parts.items()},
     )
 
 
@@ -50,8 +52,16 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
-def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, iterations: int) -> None:
-    """Sets the learning rates of `step`: positions decay exponentially, the rest stay."""
+def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
+    """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, exposures' being 0
+    until they start; the rest stay."""
+    done = step / settings.iterations
+    left = DECAY**done
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         if "means" in group:
-            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * MEANS_DECAY ** (step / iterations)
+            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * left
+    begins = {"exposure": settings.exposure.start, "camera_poses": 0.0}
+    for name, start in begins.items():
+        for camera, optimizer in optimizers.beside_parts.get(name, {}).items():
+            rate = model.beside_parts[name].learning_rates()[camera] if done >= start else 0.0
+            optimizer.param_groups[0]["lr"] = rate * left

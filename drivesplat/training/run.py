@@ -15,36 +15,45 @@ from drivesplat.masks import read_classes, read_labels, read_masks_record, read_
 from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size, read_parser
-from drivesplat.regions import region_mask
+from drivesplat.regions import LABELS, region_mask
 from drivesplat.seeding.actors import read_actors
+from drivesplat.seeding.free_space import read_free_space
 from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
+from drivesplat.training.surfaces import surroundings_of
 from drivesplat.training.train import Workspace, train
-from drivesplat.training.views import Guides, TrainingView, load_views
+from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
 
 
 @dataclass(frozen=True)
 class TrainingInputs:
     """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
-    has no use for them), the folder of masks, and how many `classes` the user's maps there tell apart (0: none)."""
+    has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), the
+    cameras that see the own car, `sky_known` (where no sky was found, it is not known of any pixel that it is none),
+    and the record of free_space.pkl (None where the method has no use for it)."""
 
     parser: dict[str, Any]
     masks: Path
     actors: list[dict[str, Any]]
     lidar_depth: list[dict[str, np.ndarray]]
     classes: int = 0
+    seeing_own_car: frozenset[str] = frozenset()
+    sky_known: bool = True
+    free_space: dict[str, Any] | None = None
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
         images = [int(i) for i in self.parser["splits"]["train"]]
+        sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         return Guides(
-            sky={i: self._sky(i) for i in images} if job.sky != "none" or job.train.sky_bce_weight else {},
+            sky={i: self._sky(i) for i in images} if sky_wanted else {},
             moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
             classes={i: read_classes(self.masks, *self._image(i)) for i in images} if self.told_apart(job) else {},
+            own_car={i: self._own_car(i) for i in images if camera_of(self.parser, i) in self.seeing_own_car},
         )
 
     def told_apart(self, job: TrainJob) -> int:
@@ -54,33 +63,46 @@ class TrainingInputs:
     def _sky(self, index: int) -> np.ndarray:
         return read_sky_mask(self.masks, *self._image(index))
 
+    def exposed(self, job: TrainJob) -> tuple[str, ...]:
+        """The cameras with training images whose exposure `job` learns: all but the reference."""
+        if job.reference_camera is None:
+            return ()
+        seen = {camera_of(self.parser, int(i)) for i in self.parser["splits"]["train"]}
+        return tuple(sorted(seen - {job.reference_camera}))
+
+    def _own_car(self, index: int) -> np.ndarray:
+        return read_labels(self.masks, *self._image(index)) == LABELS["own_car"]
+
     def _moving(self, index: int) -> np.ndarray:
         labels = read_labels(self.masks, *self._image(index))
         return region_mask(labels, "moving_vehicle") | region_mask(labels, "moving_human")
 
     def _image(self, index: int) -> tuple[str, int, tuple[int, int]]:
         """Camera, timestamp and size of an image."""
-        camera = self.parser["camera_names"][self.parser["camera_indices"][index]]
-        return camera, int(self.parser["timestamps"][index]), image_size(self.parser, index)
+        return camera_of(self.parser, index), int(self.parser["timestamps"][index]), image_size(self.parser, index)
 
 
 def read_inputs(
-    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str]
+    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str], free_space: Sequence[str]
 ) -> tuple[TrainingInputs, list[dict[str, Any]]]:
-    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl and lidar_depth.pkl,
-    with the provenances of these files."""
+    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl, lidar_depth.pkl and
+    free_space.pkl, with the provenances of these files."""
     folder = Path(masks).parent
     packed, made = read_parser(parser), read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
+    spaces = [read_free_space(path) for path in free_space]
     inputs = TrainingInputs(
         packed,
         folder,
         [actor for record in moving for actor in record["actors"]],
         [image for record in depths for image in record["images"]],
         made["semantic_classes"],
+        frozenset(made["own_car"]),
+        made["sky_known"],
+        next(iter(spaces), None),
     )
-    records = [packed, made, *moving, *depths]
+    records = [packed, made, *moving, *depths, *spaces]
     return inputs, [record["provenance"] for record in records]
 
 
@@ -111,13 +133,23 @@ def run_training(
         with telling_out_of_memory(lambda: 0):
             views = load_views(inputs.parser, inputs.guides(job), device)
         settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
-        beginnings = Beginnings(inputs.parser, inputs.actors, mean_sky_color(views), inputs.told_apart(job))
+        beginnings = Beginnings(
+            inputs.parser,
+            inputs.actors,
+            mean_sky_color(views),
+            inputs.told_apart(job),
+            inputs.exposed(job),
+            _times_by_camera(views) if job.train.camera_poses.corrected else {},
+        )
+        if not learns_from_sky_masks(job):
+            views = [dataclasses.replace(view, sky=None) for view in views]
         model = build_model(beginnings, job.parts, job.sky, settings)
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
         workspace = Workspace(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
-        summary = train(model, views, settings, job.random_seed, device, workspace)
+        surroundings = surroundings_of(inputs.parser, inputs.free_space, settings)
+        summary = train(model, views, settings, job.random_seed, device, workspace, surroundings)
         content = {
             "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
             "job": job.model_dump_json(),
@@ -154,11 +186,27 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
         return model.to(device).requires_grad_(False), device
 
 
+def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
+    """By camera the seconds of its training images, increasing."""
+    times: dict[str, set[float]] = {}
+    for view in views:
+        times.setdefault(view.view.camera, set()).add(view.view.time)
+    return {camera: sorted(at) for camera, at in sorted(times.items())}
+
+
+def learns_from_sky_masks(job: TrainJob) -> bool:
+    """Whether a term of the loss looks at sky masks; otherwise only the sky's first colour does, and the device need
+    not hold them, a byte a pixel, while it trains."""
+    return job.sky == "mask" or job.train.sky_bce_weight > 0
+
+
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:
-    """The mean colour (3,) in [0, 1] of the sky pixels of the training images; light grey where there are none."""
+    """The mean colour (3,) in [0, 1] of the sky pixels of the training images, of all pixels where there are none."""
     sums, count = np.zeros(3), 0
     for view in views:
         if view.sky is not None:
             sums += (view.target() * view.sky[..., None]).sum(dim=(0, 1)).cpu().numpy()
             count += int(view.sky.sum())
-    return sums / count if count else np.full(3, 0.75)
+    if count:
+        return sums / count
+    return np.mean([view.target().mean(dim=(0, 1)).double().cpu().numpy() for view in views], axis=0)

@@ -14,10 +14,11 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.densify import Densifier
-from drivesplat.training.floaters import camera_path, fade_floaters
+from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard, Monitor
 from drivesplat.training.optimizers import ModelOptimizers, make_optimizers, schedule
+from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
 from drivesplat.training.views import TrainingView, order
 
 log = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ class Trainer:
     optimizers: ModelOptimizers
     densifiers: list[Densifier]
     guard: FiniteGuard
+    surroundings: Surroundings
     step: int = 0
 
     @classmethod
@@ -62,15 +64,17 @@ class Trainer:
         settings: TrainSettings,
         seed: int,
         device: torch.device,
+        surroundings: Surroundings = NOTHING_KNOWN,
     ) -> "Trainer":
         torch.manual_seed(seed)
         densifiers = [Densifier(part, settings) for part in model.parts]
-        return cls(model, views, settings, seed, device, make_optimizers(model), densifiers, FiniteGuard(device))
+        optimizers, known = make_optimizers(model), surroundings.to(device)
+        return cls(model, views, settings, seed, device, optimizers, densifiers, FiniteGuard(device), known)
 
     def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
         """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
         view = self.views[order(len(self.views), self.step, self.seed)]
-        schedule(self.model, self.optimizers, self.step, self.settings.iterations)
+        schedule(self.model, self.optimizers, self.step, self.settings)
         by_gradient = self.settings.strategy == "default"
         picture = self.model.render(
             view.view,
@@ -79,6 +83,7 @@ class Trainer:
             with_depth=view.lidar is not None,
         )
         terms = loss_terms(picture, view, self.model, self.settings)
+        terms |= surface_terms(picture, self.model, self.surroundings, self.settings)
         if by_gradient:
             picture.info["means2d"].retain_grad()
         torch.stack(list(terms.values())).sum().backward()
@@ -117,7 +122,8 @@ class Trainer:
 class TrainingSummary:
     """What `train.json` says of a finished training.
 
-    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too.
+    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too; `of_cameras` has what was learned of
+    each camera, by name: gains and offsets, how far poses were corrected.
     """
 
     iterations: int
@@ -127,6 +133,7 @@ class TrainingSummary:
     device: str
     random_seed: int
     resumed_at: list[int]
+    of_cameras: dict[str, float]
 
 
 def train(
@@ -136,6 +143,7 @@ def train(
     seed: int,
     device: torch.device,
     workspace: Workspace,
+    surroundings: Surroundings = NOTHING_KNOWN,
 ) -> TrainingSummary:
     """Fits `model` in place, resuming where an earlier run of the same training was ended.
 
@@ -143,7 +151,7 @@ def train(
     memory is exhausted. The last good checkpoint survives both.
     """
     with telling_out_of_memory(lambda: len(model)):
-        trainer = Trainer.begin(model.to(device), views, settings, seed, device)
+        trainer = Trainer.begin(model.to(device), views, settings, seed, device, surroundings)
         run = Run.begin(trainer, workspace)
         monitor = Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label)
         try:
@@ -209,12 +217,22 @@ class Run:
         if on_gpu:
             torch.cuda.synchronize(t.device)
         peak = torch.cuda.max_memory_allocated(t.device) / 1e9 if on_gpu else None
-        return TrainingSummary(t.step, self.seconds, len(t.model), peak, device_name(t.device), t.seed, self.resumed_at)
+        return TrainingSummary(
+            iterations=t.step,
+            seconds=self.seconds,
+            gaussians=len(t.model),
+            peak_gpu_memory_gb=peak,
+            device=device_name(t.device),
+            random_seed=t.seed,
+            resumed_at=self.resumed_at,
+            of_cameras=learned_of_cameras(t.model),
+        )
 
 
 def _iterate(run: Run, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
-    starts, ends = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
+    path = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
+    empty = EmptySpace(*path, settings.floaters.radius, trainer.surroundings.free)
     while trainer.step < settings.iterations:
         terms, picture, view = trainer.fit_one()
         if trainer.densifies():
@@ -224,9 +242,9 @@ def _iterate(run: Run, monitor: Monitor) -> None:
         trainer.densify(picture)
         if len(trainer.model) == 0:
             run.check()
-        if settings.floaters.radius and trainer.step % settings.floaters.every == 0:
+        if empty.known and trainer.step % settings.floaters.every == 0:
             for part in (part for part in trainer.model.parts if not part.moves):
-                fade_floaters(part, starts, ends, settings.floaters.radius)
+                fade_floaters(part, empty)
         if trainer.step % settings.log_every == 0:
             run.check()
             monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
@@ -239,4 +257,16 @@ def _iterate(run: Run, monitor: Monitor) -> None:
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
     losses = {f"loss/{name}": float(value.detach()) for name, value in terms.items()}
-    return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model))}
+    of_cameras = learned_of_cameras(trainer.model)
+    return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model)), **of_cameras}
+
+
+def learned_of_cameras(model: SplatModel) -> dict[str, float]:
+    """What a model has learned of cameras, by name: 'exposure/CAM_BACK/gain_red', 'camera_poses/CAM_FRONT/shift_m'."""
+    learned = {"exposure": model.exposure, "camera_poses": model.camera_poses}
+    return {
+        f"{kind}/{name}": value
+        for kind, module in learned.items()
+        if module is not None
+        for name, value in module.figures().items()
+    }

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from drivesplat.ahead import ahead
 from drivesplat.images import read_image
-from drivesplat.model.splat_model import View
+from drivesplat.model.view import View
 from drivesplat.parser import image_size
 
 
@@ -25,7 +26,8 @@ class LidarDepth:
 @dataclass(frozen=True)
 class TrainingView:
     """A camera and what it recorded; `sky` and `moving` are True where the sky is and where something moves, None where
-    that is unknown or not wanted; so are `lidar` and the `classes` of its pixels (UNLABELLED: none)."""
+    that is unknown or not wanted; so are `lidar`, the `classes` of its pixels (UNLABELLED: none) and the pixels of the
+    `own_car`, which are neither sky nor moving, have no class and no depth, and of which nothing is to be learned."""
 
     view: View
     pixels: UInt8[Tensor, "h w 3"]
@@ -33,6 +35,7 @@ class TrainingView:
     moving: Bool[Tensor, "h w"] | None = None
     lidar: LidarDepth | None = None
     classes: UInt8[Tensor, "h w"] | None = None
+    own_car: Bool[Tensor, "h w"] | None = None
 
     def target(self) -> Float[Tensor, "h w 3"]:
         """The recorded colours in [0, 1]."""
@@ -49,41 +52,68 @@ def view_of(parser: dict[str, Any], index: int, device: torch.device) -> View:
         width=width,
         height=height,
         time=seconds,
+        camera=camera_of(parser, index),
     )
+
+
+def camera_of(parser: dict[str, Any], index: int) -> str:
+    """The name of the camera that recorded image `index` of a parser record."""
+    return parser["camera_names"][parser["camera_indices"][index]]
 
 
 @dataclass(frozen=True)
 class Guides:
     """What is known of training images beside their pixels, by their number: masks (h, w) bool of the `sky` and of what
-    is `moving`, `classes` (h, w) uint8, and the records of `lidar` (rows, columns, depth); an empty mapping where a
-    guide is not wanted."""
+    is `moving`, of the `own_car`, `classes` (h, w) uint8, and the records of `lidar` (rows, columns, depth); an empty
+    mapping where a guide is not wanted."""
 
     sky: Mapping[int, np.ndarray]
     moving: Mapping[int, np.ndarray]
     lidar: Mapping[int, dict[str, np.ndarray]]
     classes: Mapping[int, np.ndarray] = field(default_factory=dict)
+    own_car: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> list[TrainingView]:
-    """The training images of a parser record, with all masks at training resolution."""
-    views = []
-    for index in map(int, parser["splits"]["train"]):
+    """The training images of a parser record, with all masks at training resolution; a camera's images share the mask
+    of the own car."""
+    views: list[TrainingView] = []
+    bodies: dict[bytes, Tensor] = {}
+    images = [int(i) for i in parser["splits"]["train"]]
+    recorded = ahead(lambda i: read_image(parser["image_paths"][i], image_size(parser, i)), images)
+    for index, image in zip(images, recorded, strict=True):
         size = image_size(parser, index)
-        pixels = torch.from_numpy(read_image(parser["image_paths"][index], size).copy()).to(device)
+        pixels = torch.from_numpy(image.copy()).to(device)
         sky, moving, classes = (
             torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
             for masks in (guides.sky, guides.moving, guides.classes)
         )
-        lidar = _lidar_depth(guides.lidar[index], size[0], device) if index in guides.lidar else None
-        views.append(TrainingView(view_of(parser, index, device), pixels, sky, moving, lidar, classes))
+        body = guides.own_car.get(index)
+        lidar = _lidar_depth(guides.lidar[index], size[0], body, device) if index in guides.lidar else None
+        own_car = _shared(body, bodies, device) if body is not None and body.any() else None
+        views.append(TrainingView(view_of(parser, index, device), pixels, sky, moving, lidar, classes, own_car))
     return views
 
 
-def _lidar_depth(record: dict[str, np.ndarray], width: int, device: torch.device) -> LidarDepth | None:
-    if len(record["depth"]) == 0:
+def _shared(mask: np.ndarray, known: dict[bytes, Tensor], device: torch.device) -> Tensor:
+    """A mask (h, w) on the device, once for all that are the same."""
+    key = np.packbits(mask).tobytes()
+    if key not in known:
+        known[key] = torch.from_numpy(mask.copy()).to(device)
+    return known[key]
+
+
+def _lidar_depth(
+    record: dict[str, np.ndarray], width: int, body: np.ndarray | None, device: torch.device
+) -> LidarDepth | None:
+    rows, columns, depth = (record[key] for key in ("rows", "columns", "depth"))
+    if body is not None:
+        seen = ~body[rows, columns]
+        rows, columns, depth = rows[seen], columns[seen], depth[seen]
+    if len(depth) == 0:
         return None
-    pixels = record["rows"].astype(np.int64) * width + record["columns"]
-    return LidarDepth(torch.from_numpy(pixels).to(device), torch.from_numpy(record["depth"]).float().to(device))
+    pixels = rows.astype(np.int64) * width + columns
+    return LidarDepth(torch.from_numpy(pixels).to(device), torch.from_numpy(depth).float().to(device))
 
 
 def order(count: int, step: int, seed: int) -> int:

@@ -1,0 +1,36 @@
+"""A camera at a time."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image. `camera` names the one of
+    the rig whose colours it shows; None: the reference's, which are the model's own."""
+
+    K: Float[Tensor, "3 3"]
+    camera_to_world: Float[Tensor, "4 4"]
+    width: int
+    height: int
+    time: float
+    camera: str | None = None
+
+    @cached_property
+    def viewmat(self) -> Float[Tensor, "4 4"]:
+        """World to camera."""
+        rotation_t = self.camera_to_world[:3, :3].T
+        upper = torch.cat([rotation_t, -rotation_t @ self.camera_to_world[:3, 3:]], dim=1)
+        return torch.cat([upper, torch.eye(4, device=upper.device, dtype=upper.dtype)[3:]])
+
+    def rays(self) -> Float[Tensor, "h w 3"]:
+        """The unit viewing direction of every pixel's centre in world coordinates."""
+        x = torch.arange(self.width, device=self.K.device) + 0.5
+        y = torch.arange(self.height, device=self.K.device) + 0.5
+        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+        directions = torch.cat([(grid - self.K[:2, 2]) / self.K.diagonal()[:2], torch.ones_like(grid[..., :1])], dim=-1)
+        return torch.nn.functional.normalize(directions @ self.camera_to_world[:3, :3].T, dim=-1)

@@ -1,0 +1,62 @@
+"""Short synthetic drives of some of the rig's cameras, recorded straight into a Scene."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from drivesplat.demo.imaging import central_hits
+from drivesplat.demo.recorder import Recorder
+from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor
+from drivesplat.demo.street import OWN_CAR
+from drivesplat.scene import Frame, Scene, Sweep
+from drivesplat.settings.world import WorldSettings
+
+RIG = {sensor.channel: sensor for sensor in SENSORS}
+START_US = 1_000_000_000
+KEY_FRAMES = 14
+
+
+def recorder_of(**world: Any) -> Recorder:
+    """A small street with little traffic; `world` is laid over it."""
+    return Recorder(WorldSettings(**{"width": 160, "samples_per_pixel": 1, "vehicles": 1, "pedestrians": 0, **world}))
+
+
+def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = KEY_FRAMES, **world: Any) -> Scene:
+    """The key frames of a drive by `cameras` and the LiDAR, their files in `folder`."""
+    recorder = recorder_of(**world)
+    frames, sweeps = [], []
+    for index in range(key_frames):
+        frames += [_frame(folder, recorder, RIG[camera], index) for camera in cameras]
+        sweeps.append(_sweep(folder, recorder, index))
+    times = START_US + KEY_FRAME_US * np.arange(key_frames)
+    zero = np.zeros(3)
+    return Scene("rig", "demo", "v1.0-mini", "", zero, times, tuple(frames), tuple(sweeps), (), poses="nuscenes")
+
+
+def _frame(folder: Path, recorder: Recorder, sensor: Sensor, index: int) -> Frame:
+    time_us = index * KEY_FRAME_US + sensor.delay_us
+    camera = recorder.camera(sensor, time_us * 1e-6)
+    path = folder / f"{sensor.channel}_{index:02}.png"
+    Image.fromarray(recorder.image(sensor, time_us)).save(path)
+    return Frame(
+        sensor.channel, START_US + time_us, str(path), camera.width, camera.height, camera.intrinsics,
+        camera.camera_to_street, recorder.ego_to_street(time_us * 1e-6), True, index, path.stem,
+    )  # fmt: skip
+
+
+def _sweep(folder: Path, recorder: Recorder, index: int) -> Sweep:
+    sensor, path = RIG["LIDAR_TOP"], folder / f"{index:02}.pcd.bin"
+    points, _ = recorder.sweep(sensor, index * KEY_FRAME_US)
+    points.tofile(path)
+    sensor_to_world = recorder.ego_to_street(index * KEY_FRAME_US * 1e-6) @ sensor.sensor_to_ego
+    return Sweep(str(path), START_US + index * KEY_FRAME_US, sensor_to_world, True, index, path.stem)
+
+
+def true_body(camera: str, width: int = 160, seconds: float = 1.0) -> np.ndarray:
+    """The pixels (h, w) bool in which a camera sees the own car."""
+    recorder = recorder_of(width=width, own_car=True)
+    number = [thing.name for thing in recorder.things].index(OWN_CAR)
+    return central_hits(recorder.stage(seconds), recorder.camera(RIG[camera], seconds))[1] == number
