@@ -16,7 +16,7 @@ PROTOCOL = {
     "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4},
     "held_out_frames": {"interpolation": [4, 12, 20, 28], "extrapolation": [35, 36, 37, 38]}, "train_images": 31,
     "poses": "nuscenes", "regions": "boxes", "extra_points": None, "lidar_missing": 38, "images_missing": 0,
-    "key_frame_range": None,
+    "key_frame_range": None, "own_car": None,
 }  # fmt: skip
 
 

@@ -295,7 +295,7 @@ def measured(static: float | None, moving: float | None, beyond: tuple = (None, 
 
     result = {"interpolation": group(static, moving), "extrapolation": group(*beyond)}
     return {
-        "scene": "0061", "dataset": "nuscenes", "protocol": PROTOCOL,
+        "scene": "0061", "dataset": "nuscenes", "protocol": PROTOCOL, "drive": {},
         "result": {**result, "gaussians": 1000, "train_seconds": 60.0, **more},
     }  # fmt: skip
 

@@ -18,7 +18,8 @@ FIGURES: Figures = {
 """What is compared in each group of held-out frames; the depth's error where it was measured."""
 COSTS = ("gaussians", "train_seconds", "peak_gpu_memory_gb")
 MEASURED_BY = (
-    "version", "eval_camera", "width", "height", "holdout", "held_out_frames", "regions", "key_frame_range",
+    "version", "eval_camera", "width", "height", "holdout", "held_out_frames", "regions", "own_car",
+    "key_frame_range",
 )  # fmt: skip
 """What of the protocol figures are measured by: where it differs they do not compare. The rest is the recipe's own."""
 
