@@ -134,7 +134,7 @@ def test_sweeps_and_boxes_stay_where_the_car_saw_them():
         np.testing.assert_allclose(in_lidar[1], in_lidar[0], atol=1e-9)
     for given, now, box, moved in zip(GIVEN, refined, SCENE.tracks[0].object_to_world,
                                       REFINED.tracks[0].object_to_world, strict=True):  # fmt: skip
-        distances = [np.linalg.norm((pose[:3, 3] - ego[:3, 3])) for ego, pose in ((given, box), (now, moved))]
+        distances = [np.linalg.norm(pose[:3, 3] - ego[:3, 3]) for ego, pose in ((given, box), (now, moved))]
         assert distances[1] == pytest.approx(distances[0], abs=1e-9)
         assert not np.allclose(box, moved, atol=1e-3)
 

@@ -6,7 +6,17 @@ import logging
 import numpy as np
 import pytest
 from hand_made_views import (
-    HEADINGS, SIZE, Drive, drive_of, ego_at, error_at, job_of, recorded, street_points, views, write_database
+    HEADINGS,
+    SIZE,
+    Drive,
+    drive_of,
+    ego_at,
+    error_at,
+    job_of,
+    recorded,
+    street_points,
+    views,
+    write_database,
 )  # fmt: skip
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -238,7 +248,7 @@ def test_images_without_features_or_matches_leave_the_poses(tmp_path, key_frames
 def test_a_broken_image_is_named(tmp_path):
     drive = painted(tmp_path, drive_of(2, size=SMALL), pattern)
     (tmp_path / "1.png").write_bytes(b"no image")
-    with pytest.raises(DatasetError, match="1.png cannot be read"):
+    with pytest.raises(DatasetError, match=r"1\.png cannot be read"):
         refine_poses(drive.scene, job_of())
 
 
