@@ -94,8 +94,8 @@ _COMPARABLE = ("cameras", "eval_camera", "width", "height", "sweeps", "holdout",
 
 
 def _comparable(record: dict[str, Any]) -> dict[str, Any]:
-    """What of a protocol has to be the same for figures to stand side by side. A scene whose refinement was not
-    believed keeps its poses (`protocol.poses` says so) and stands beside those that have refined ones."""
+    """What of a protocol has to be the same for figures to stand side by side. A scene whose refinement was refused
+    keeps its poses (`protocol.poses` says so) and stands beside those that have refined ones."""
     poses = {"poses": "refined"} if "refine_poses" in record["provenance"]["stages"] else {}
     return {key: record["protocol"][key] for key in _COMPARABLE} | poses
 

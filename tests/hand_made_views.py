@@ -29,7 +29,6 @@ FIELDS = {name: 110.0 if name == "CAM_BACK" else 70.0 for name in HEADINGS}
 DELAYS_US = dict(zip(HEADINGS, (-35_000, -26_000, -18_000, -9_000, -44_000, -40_000), strict=True))
 """When they fire, from the key frame's LiDAR on."""
 FRONT = ("CAM_FRONT",)
-MIRRORED = 1e-6
 FEATURE_NOISE = 0.3
 
 
@@ -43,10 +42,8 @@ def ego_at(seconds: float) -> np.ndarray:
 def error_at(seconds: float) -> np.ndarray:
     """What is wrong with recorded poses of nuScenes' kind (4, 4), in the car's frame, its height aside: roll and pitch
     by half a degree and more, centimetres."""
-    waves = np.sin(
-        2 * np.pi * seconds / np.array([[7.0], [9.0], [6.0], [8.0]]) + np.array([[0.3], [1.9], [4.0], [2.5]])
-    )
-    roll, pitch, ahead, left = waves[:, 0] * [0.6, 0.6, 0.03, 0.03] + [0.2, 0.4, 0.0, 0.0]
+    waves = np.sin(2 * np.pi * seconds / np.array([7.0, 9.0, 6.0, 8.0]) + [0.3, 1.9, 4.0, 2.5])
+    roll, pitch, ahead, left = waves * [0.6, 0.6, 0.03, 0.03] + [0.2, 0.4, 0.0, 0.0]
     return rigid(Rotation.from_euler("xy", [roll, pitch], degrees=True).as_matrix(), np.array([ahead, left, 0.0]))
 
 

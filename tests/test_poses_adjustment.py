@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.adjustment import Priors, adjust, observations, priors_of, triangulated, with_poses_of
 from drivesplat.poses.refine import Refinement, poses_of, refined_by_matches
-from drivesplat.poses.rig import RigImages, from_pycolmap, to_pycolmap
+from drivesplat.poses.rig import RigImages, from_pycolmap, sensor, to_pycolmap
 from drivesplat.rigid import inverse, rigid
 from drivesplat.scene import Scene
 from drivesplat.settings.refine_poses import PriorSettings
@@ -183,17 +183,27 @@ def test_adjusting_leaves_an_image_without_points_where_it_was(tmp_path, front):
     assert moved[4] < 1e-12 and (np.delete(moved, 4) > 1e-3).all()
 
 
+def test_adjusting_leaves_cameras_and_their_mounts_as_calibrated(tmp_path):
+    case = case_of(tmp_path, drive_of(4, ("CAM_FRONT", "CAM_FRONT_LEFT")), points=800)
+    reconstruction = triangulated(case.start, case.database, job_of(), 1)
+    adjust(reconstruction, priors_of(case.images, job_of().refine_poses), 1.0, 1)
+    rig, made = case.images.rig(), reconstruction.rigs[1]
+    for camera in case.images.pycolmap_cameras():
+        mounts = (r.sensor_from_rig(sensor(camera.camera_id)).matrix() for r in (rig, made))
+        np.testing.assert_array_equal(*mounts)
+        np.testing.assert_array_equal(reconstruction.cameras[camera.camera_id].params, camera.params)
+
+
 def test_the_absolute_prior_holds_the_whole_drive_in_place(front):
     """Points and poses that are moved together fit as well as before: only the prior knows where they belong."""
     images = front.images
     given = priors_of(images, job_of().refine_poses)
     aside = with_poses_of(front.start, rigid(np.eye(3), np.array([0.5, -0.4, 0.3])) @ given.given)
     reconstruction = triangulated(aside, front.database, job_of(), 1)
-    np.testing.assert_allclose(
-        (poses_of(reconstruction) - given.given).mean(axis=0)[:3, 3], [0.5, -0.4, 0.3], atol=1e-6
-    )
+    before = (poses_of(reconstruction) - given.given)[:, :3, 3].mean(axis=0)
+    np.testing.assert_allclose(before, [0.5, -0.4, 0.3], atol=1e-6)
     adjust(reconstruction, given, 1.0, 1)
-    assert np.linalg.norm((poses_of(reconstruction) - given.given).mean(axis=0)[:3, 3]) < 0.05
+    assert np.linalg.norm((poses_of(reconstruction) - given.given)[:, :3, 3].mean(axis=0)) < 0.05
 
 
 def test_priors_weigh_more_where_features_are_found_worse(front, front_refined):
