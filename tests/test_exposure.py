@@ -245,8 +245,9 @@ def test_a_training_begins_with_what_was_found_and_its_checkpoint_holds_it(rig, 
     files = TrainingFiles(tmp_path / "it/checkpoint.pt", tmp_path / "it/train.json")
     run_training(rig, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
     model, _ = trained_model(read_checkpoint(files.checkpoint))
-    told = json.loads(files.summary.read_text())["exposure"]
-    assert told == pytest.approx(model.exposure.figures()) and told["CAM_BACK/gain_red"] > 1.1
+    told = json.loads(files.summary.read_text())["of_cameras"]
+    figures = {f"exposure/{name}": value for name, value in model.exposure.figures().items()}
+    assert told == pytest.approx(figures) and told["exposure/CAM_BACK/gain_red"] > 1.1
     assert model.exposure.first["CAM_BACK"][0] == pytest.approx(1.4 ** (1 / 2.2), rel=0.03)
     assert not model.exposure.first["CAM_BACK"].requires_grad
 

@@ -90,7 +90,7 @@ def test_only_points_of_two_training_images_become_seeds(tiny_scene):
     np.testing.assert_array_equal(chosen, points[[0, 3]])
     moments = {i: tiny_scene.frames[key_frame(tiny_scene, i)].timestamp for i in range(10)}
     np.testing.assert_allclose(times, [(moments[0] + moments[1]) / 2, (moments[3] + moments[4]) / 2])
-    seed = seed_points(tiny_scene, job(), record_of(points, seen_by))
+    seed = seed_points(tiny_scene, job(), triangulated=record_of(points, seen_by))
     assert seed.note["triangulated"] == 2
     for point, expected in zip(points, (True, False, False, True), strict=True):
         assert (np.abs(seed.positions - point).max(axis=1) < 1e-4).any() == expected
@@ -98,15 +98,15 @@ def test_only_points_of_two_training_images_become_seeds(tiny_scene):
 
 def test_another_hold_out_chooses_others(tiny_scene):
     record = record_of(wall(19.0), [frames_of(tiny_scene, 2, 6)])
-    assert seed_points(tiny_scene, job(NOTHING_HELD_OUT), record).note["triangulated"] == 1
-    assert seed_points(tiny_scene, job(), record).note["triangulated"] == 0
+    assert seed_points(tiny_scene, job(NOTHING_HELD_OUT), triangulated=record).note["triangulated"] == 1
+    assert seed_points(tiny_scene, job(), triangulated=record).note["triangulated"] == 0
     none = {"every_nth": 0, "last_block": 4}
     late = record_of(wall(40.0), [frames_of(tiny_scene, 6, 7, 8, 9)])
-    assert seed_points(tiny_scene, job(none), late).note["triangulated"] == 0
+    assert seed_points(tiny_scene, job(none), triangulated=late).note["triangulated"] == 0
 
 
 def test_without_them_the_seed_is_as_it_was(tiny_scene):
-    plain, none = (seed_points(tiny_scene, job(voxel_size=0.5), record) for record in (None, no_points()))
+    plain, none = (seed_points(tiny_scene, job(voxel_size=0.5), triangulated=record) for record in (None, no_points()))
     np.testing.assert_array_equal(plain.positions, none.positions)
     np.testing.assert_array_equal(plain.colors, none.colors)
     assert plain.note == none.note and plain.note["triangulated"] == 0 < plain.note["lidar"]
@@ -121,7 +121,7 @@ def test_their_colours_are_those_of_training_images(tiny_root, tmp_path):
         Image.new("RGB", (frame.width, frame.height), (255, 0, 255)).save(frame.image_path)
     along = np.arange(15.0, 30.0, 2.0)
     record = record_of(wall(*along), [frames_of(scene, 1, 2, 3)] * len(along))
-    seed = seed_points(scene, job(), record)
+    seed = seed_points(scene, job(), triangulated=record)
     assert seed.note["triangulated"] == len(along)
     own = np.array([np.abs(seed.positions - point).max(axis=1).argmin() for point in record["points"]])
     empty = World(things=[])
