@@ -181,9 +181,10 @@ ONE_TRAINING_AND_AFTER = {
 }  # fmt: skip
 STREETS_TRAINING_AND_AFTER = ONE_TRAINING_AND_AFTER | OF_ACTORS
 TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
-EVERYTHING = {
-    "extract": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
+AFTER_EXTRACTION = {
+    "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
 }  # fmt: skip
+EVERYTHING = {"extract": 1, **AFTER_EXTRACTION}
 
 
 @pytest.mark.parametrize(
@@ -200,6 +201,8 @@ EVERYTHING = {
         ({"holdout": {"last_block": 3}},
          {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
         ({"extract": {"on_missing": "warn"}}, EVERYTHING),
+        ({"refine_poses": {"rounds": 2}}, {}),
+        ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
         ({"render": {"fps": 5}}, {"film": 4, **OF_ACTORS}),
         ({"render": {"edited_frames": True}}, {"edit": 2}),
         ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2}),
@@ -314,6 +317,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/editing/veering.py", "STANDS, DRIVES = 1.0", "STANDS, DRIVES = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report.py", "SCHEMA = 1", "SCHEMA = 2", {"gap_report": 1}),
+        ("drivesplat/poses/refine.py", "SCHEMA = 1", "SCHEMA = 2", {}),
     ],
 )  # fmt: skip
 def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, old, new, expected):
