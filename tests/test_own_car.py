@@ -10,6 +10,7 @@ from PIL import Image
 from rig_drives import KEY_FRAMES, rig_drive, true_body
 
 from drivesplat import own_car_search
+from drivesplat.config import load
 from drivesplat.errors import ResultError
 from drivesplat.extract import extract_scene
 from drivesplat.holdout import frame_groups
@@ -19,6 +20,7 @@ from drivesplat.scene import Scene
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.own_car import OwnCarJob, OwnCarSearch
+from drivesplat.stages import stage_settings
 from drivesplat.storage import write_json
 
 CAMERAS = ("CAM_BACK", "CAM_BACK_RIGHT", "CAM_FRONT")
@@ -212,6 +214,31 @@ def test_the_users_outline_wins_and_other_cameras_are_looked_at(seen):
     assert (cameras["CAM_BACK"]["source"], cameras["CAM_BACK"]["outlines"]) == ("polygons", (outline,))
     assert cameras["CAM_BACK"]["share"] == pytest.approx(0.05, abs=0.002) and cameras["CAM_BACK"]["why_null"] is None
     assert cameras["CAM_FRONT"]["why_null"] and "not looked for" in cameras["CAM_BACK_RIGHT"]["why_null"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "outlined", "searched"),
+    [
+        ("none", [], None),
+        ("polygons", ["CAM_BACK"], None),
+        ("auto", ["CAM_BACK"], ("CAM_BACK_RIGHT",)),
+        ("auto_measured", ["CAM_BACK"], ("CAM_FRONT", "CAM_BACK_RIGHT")),
+    ],
+)
+def test_a_setting_says_where_it_is_looked_for(kind, outlined, searched):
+    """CAM_FRONT is measured; of CAM_BACK an outline is given."""
+    masks = {"own_car": kind, "own_car_polygons": {"CAM_BACK": [[0, 1], [1, 1], [0.5, 0.9]]}}
+    values = {"cameras": ["CAM_FRONT", "CAM_BACK", "CAM_BACK_RIGHT"], "masks": masks}
+    job = OwnCarJob.model_validate_json(stage_settings(load(values), "own_car", "0061"))
+    assert list(job.polygons) == outlined
+    assert (job.search.cameras if job.search else None) == searched
+
+
+def test_the_camera_that_is_measured_is_spared_by_default():
+    """So that figures hang on no guess; where it is the only one, on no setting of the search either."""
+    default = load({})
+    assert default.masks.own_car == "auto"
+    assert stage_settings(default, "own_car", "0061") == '{"polygons":{},"search":null}'
 
 
 def test_a_record_returns_as_it_was_written(seen, tmp_path):

@@ -181,10 +181,16 @@ ONE_TRAINING_AND_AFTER = {
 }  # fmt: skip
 STREETS_TRAINING_AND_AFTER = ONE_TRAINING_AND_AFTER | OF_ACTORS
 TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
+<<<<<<< .merge_file_qFUVtR
 EVERYTHING = {
     "extract": 1, "own_car": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS,
     **TRAINING_AND_AFTER
+=======
+AFTER_EXTRACTION = {
+    "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
+>>>>>>> .merge_file_nY0luB
 }  # fmt: skip
+EVERYTHING = {"extract": 1, **AFTER_EXTRACTION}
 
 
 @pytest.mark.parametrize(
@@ -202,6 +208,8 @@ EVERYTHING = {
          {"lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
         ({"lidar_seed": {"sweeps": True}}, EVERYTHING),
         ({"extract": {"on_missing": "warn"}}, EVERYTHING),
+        ({"refine_poses": {"rounds": 2}}, {}),
+        ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
         ({"render": {"fps": 5}}, {"film": 4, **OF_ACTORS}),
         ({"render": {"edited_frames": True}}, {"edit": 2}),
         ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2}),
@@ -316,6 +324,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/editing/veering.py", "STANDS, DRIVES = 1.0", "STANDS, DRIVES = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report.py", "SCHEMA = 1", "SCHEMA = 2", {"gap_report": 1}),
+        ("drivesplat/poses/refine.py", "SCHEMA = 1", "SCHEMA = 2", {}),
     ],
 )  # fmt: skip
 def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, old, new, expected):
