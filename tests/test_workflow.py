@@ -181,16 +181,10 @@ ONE_TRAINING_AND_AFTER = {
 }  # fmt: skip
 STREETS_TRAINING_AND_AFTER = ONE_TRAINING_AND_AFTER | OF_ACTORS
 TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
-<<<<<<< .merge_file_qFUVtR
-EVERYTHING = {
-    "extract": 1, "own_car": 1, "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS,
-    **TRAINING_AND_AFTER
-=======
 AFTER_EXTRACTION = {
     "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
->>>>>>> .merge_file_nY0luB
 }  # fmt: skip
-EVERYTHING = {"extract": 1, **AFTER_EXTRACTION}
+EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
 
 
 @pytest.mark.parametrize(
