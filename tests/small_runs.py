@@ -61,7 +61,12 @@ class Finished:
 
     def job(self, stage: str, kind: type[S], method: str | None = None, film: str | None = None) -> S:
         """The settings of a stage."""
-        return kind.model_validate_json(stage_settings(self.config, stage, SCENE, method, film))
+        return settings_of(self.config, stage, kind, method, film)
+
+
+def settings_of(config: Config, stage: str, kind: type[S], method: str | None = None, film: str | None = None) -> S:
+    """The settings that a stage of the tiny drive gets of a config."""
+    return kind.model_validate_json(stage_settings(config, stage, SCENE, method, film))
 
 
 def run(root: Path, folder: Path, **changes: Any) -> Finished:

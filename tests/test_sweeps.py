@@ -13,22 +13,27 @@ import numpy as np
 import pytest
 from PIL import Image
 from small_drives import scene_at, seconds_of
+from small_runs import S, settings_of
 from tiny_world import LIDAR_AT, START_US, World, cast_lidar, write_world
 
+from drivesplat.config import load
 from drivesplat.errors import DatasetError
 from drivesplat.holdout import frame_groups, sweep_groups
-from drivesplat.images import target_size
 from drivesplat.masks import make_masks, read_sky_mask
+from drivesplat.own_car_search import own_car_record
 from drivesplat.parser import parser_dict
 from drivesplat.scene import Scene
 from drivesplat.seeding.actor_points import actors_record
 from drivesplat.seeding.depth_points import lidar_depths
+from drivesplat.seeding.empty_space import free_space_record
 from drivesplat.seeding.seed import lidar_points, seed_points
 from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
+from drivesplat.settings.own_car import OwnCarJob
 from drivesplat.settings.parser import ParserJob
 
 HALF_AN_INTERVAL = 250_000
@@ -105,23 +110,28 @@ def spoil(path: str, random: np.random.Generator) -> None:
         random.uniform(-25.0, 25.0, (4000, 5)).astype(np.float32).tofile(path)
 
 
+def job(stage: str, kind: type[S], holdout: dict) -> S:
+    """The settings that a stage gets of the config, with nothing of what LiDAR gives thinned away."""
+    whole = {"lidar_seed": {"far_points": 200, "voxel_size": 0.0}, "actors": {"min_points": 0}}
+    return settings_of(load({"datasets": {"nuscenes": {"scenes": ["0001"]}}, "holdout": holdout, **whole}), stage, kind)
+
+
 def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
     """All that a training of the scene starts from, each as bytes."""
-    plain = {"holdout": holdout, "images": {"width": 64}, "own_car_radius": 2.5}
-    seed = seed_points(scene, SeedJob(lidar_seed={"far_points": 200}, random_seed=0, holdout=holdout, images={}))
-    actors = actors_record(scene, ActorSeedJob(actors={"min_points": 0}, random_seed=0, **plain))
-    images = MaskJob(masks={}, holdout=holdout, images={})
-    make_masks(scene, images, folder)
-    training = [
-        frame
-        for frame, group in zip(scene.frames, frame_groups(scene, HoldoutSettings(**holdout)), strict=True)
-        if group == "train"
-    ]
-    skies = [read_sky_mask(folder, f.camera, f.timestamp, target_size(f, images.images)) for f in training]
-    parser = parser_dict(scene, seed, ParserJob(holdout=holdout, images={}))
-    pixels = [Path(parser["image_paths"][i]).read_bytes() for i in parser["splits"]["train"]]
-    depths = lidar_depths(scene, LidarDepthJob(box_margin=0.1, **plain))
-    found = {"seed": seed, "actors": actors, "lidar_depth": depths, "sky": skies, "images": pixels}
+    groups = frame_groups(scene, HoldoutSettings(**holdout))
+    training = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
+    seed = seed_points(scene, job("lidar_seed", SeedJob, holdout))
+    parser = parser_dict(scene, seed, job("parser", ParserJob, holdout))
+    make_masks(scene, job("masks", MaskJob, holdout), folder)
+    found = {
+        "seed": seed,
+        "actors": actors_record(scene, job("actors", ActorSeedJob, holdout)),
+        "lidar_depth": lidar_depths(scene, job("lidar_depth", LidarDepthJob, holdout)),
+        "free_space": free_space_record(scene, job("free_space", FreeSpaceJob, holdout)),
+        "own_car": own_car_record(scene, job("own_car", OwnCarJob, holdout)),
+        "sky": [read_sky_mask(folder, f.camera, f.timestamp, (f.width, f.height)) for f in training],
+        "images": [Path(parser["image_paths"][i]).read_bytes() for i in parser["splits"]["train"]],
+    }
     return {name: pickle.dumps(value) for name, value in found.items()}
 
 
@@ -144,7 +154,7 @@ def test_what_lies_just_beyond_does(case, tmp_path):
     before = made(scene, holdout, tmp_path / "before")
     images, sweeps = [f.image_path for f in scene.frames], [s.path for s in scene.sweeps]
     random = np.random.default_rng(0)
-    for paths, reached in ((sweeps, {"seed", "lidar_depth", "sky"}), (images, {"seed", "images"})):
+    for paths, reached in ((sweeps, {"seed", "lidar_depth", "free_space", "sky"}), (images, {"seed", "images"})):
         beside = {
             path for other, path in [*pairwise(paths), *pairwise(reversed(paths))] if other in near and path not in near
         }
@@ -183,8 +193,8 @@ def training_seconds(scene: Scene) -> list[float]:
 
 def test_the_seed_has_the_static_returns_of_all_training_sweeps(rich_root):
     scene = scene_at(rich_root, **EVERYTHING)
-    job = SeedJob(lidar_seed={"voxel_size": 0.0}, holdout=HELD_OUT, images={}, random_seed=0)
-    points, times, missing = lidar_points(scene, job)
+    settings = SeedJob(lidar_seed={"voxel_size": 0.0}, holdout=HELD_OUT, images={}, random_seed=0)
+    points, times, missing = lidar_points(scene, settings)
     seconds = training_seconds(scene)
     assert missing == 0 and len(seconds) == 23 and {round(s % 0.5, 1) for s in seconds} == {0.0, 0.1, 0.2, 0.3, 0.4}
     assert set(seconds_of(times).round(6)) == set(np.round(seconds, 6))
@@ -200,12 +210,12 @@ def test_the_seed_has_the_static_returns_of_all_training_sweeps(rich_root):
 
 def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
     """Five times as many moments as key frames alone give, each in the car's own frame where it then is."""
-    job = ActorSeedJob(
+    settings = ActorSeedJob(
         actors={"min_points": 0, "box_margin": 0.0}, holdout=HELD_OUT, images={}, own_car_radius=2.5,
         random_seed=0,
     )  # fmt: skip
     scene = scene_at(rich_root, **EVERYTHING)
-    few, many = (actors_record(s, job)["actors"][0]["points"] for s in (scene_at(rich_root), scene))
+    few, many = (actors_record(s, settings)["actors"][0]["points"] for s in (scene_at(rich_root), scene))
     expected = []
     for moment in training_seconds(scene):
         own = cast_lidar(WORLD, moment)[:, :3].astype(float) + WORLD.ego_at(moment) + LIDAR_AT - CAR.at(moment)
@@ -218,16 +228,16 @@ def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
 def test_an_image_sees_the_training_sweep_of_its_moment(rich_root):
     """Of the sweeps alone that is nearest in time, what moves is carried on by at most half a sweep's time."""
     scene = scene_at(rich_root, **EVERYTHING)
-    job = LidarDepthJob(holdout=HELD_OUT, images={}, own_car_radius=2.5, box_margin=0.1, ray_spacing=(1.5, 1.65))
-    whole = lidar_depths(scene, job)
+    settings = LidarDepthJob(holdout=HELD_OUT, images={}, own_car_radius=2.5, box_margin=0.1, ray_spacing=(1.5, 1.65))
+    whole = lidar_depths(scene, settings)
     training = [s for s in scene.sweeps if seconds_of(s.timestamp) in training_seconds(scene)]
-    groups = frame_groups(scene, job.holdout)
+    groups = frame_groups(scene, settings.holdout)
     for number in np.flatnonzero([group == "train" for group in groups])[::5]:
         frame = scene.frames[number]
         nearest = min(training, key=lambda sweep: abs(sweep.timestamp - frame.timestamp))
         others = tuple(sweep for sweep in scene.sweeps if sweep is not nearest)
         alone, without = (
-            lidar_depths(dataclasses.replace(scene, sweeps=sweeps), job)[number] for sweeps in ((nearest,), others)
+            lidar_depths(dataclasses.replace(scene, sweeps=sweeps), settings)[number] for sweeps in ((nearest,), others)
         )
         assert abs(nearest.timestamp - frame.timestamp) <= 100_000
         assert pickle.dumps(alone) == pickle.dumps(whole[number]) != pickle.dumps(without)
@@ -264,11 +274,11 @@ def test_missing_images_between_key_frames_are_left_out_and_counted_where_told_t
 
 def test_a_missing_lidar_sweep_between_key_frames_stops_and_says_how_to_do_without(root):
     (path,) = delete(root, "LIDAR_TOP", 1)
-    job = SeedJob(lidar_seed={"far_points": 0}, holdout=HELD_OUT, images={}, random_seed=0)
+    settings = SeedJob(lidar_seed={"far_points": 0}, holdout=HELD_OUT, images={}, random_seed=0)
     with pytest.raises(DatasetError) as failure:
-        lidar_points(scene_at(root, **EVERYTHING), job)
+        lidar_points(scene_at(root, **EVERYTHING), settings)
     words = ("between key frames", "0001 LIDAR_TOP 1:", str(path), "lidar_seed.sweeps: false", "on_missing: warn")
     assert all(word in str(failure.value) for word in words), failure.value
-    assert lidar_points(scene_at(root), job)[2] == 0
-    going_on = job.model_copy(update={"lidar_seed": job.lidar_seed.model_copy(update={"on_missing": "warn"})})
+    assert lidar_points(scene_at(root), settings)[2] == 0
+    going_on = settings.model_copy(update={"lidar_seed": settings.lidar_seed.model_copy(update={"on_missing": "warn"})})
     assert lidar_points(scene_at(root, **EVERYTHING), going_on)[2] == 1

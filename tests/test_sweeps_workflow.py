@@ -7,6 +7,9 @@ from workflow_copy import WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("sweeps_workflow")]
 
+FROM_EXTRACTION_ON = {
+    "extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "train", "evaluate", "scene_metrics",
+}  # fmt: skip
 MISSING = "data/sweeps/CAM_FRONT/0001__0010.jpg"
 
 
@@ -59,19 +62,17 @@ def test_key_frames_alone_are_measured(finished):
     ("change", "expected"),
     [
         ({}, set()),
-        ({"sweeps": False}, {"extract", "lidar_seed", "parser", "masks", "actors", "lidar_depth"}),
-        ({"lidar_seed": {"sweeps": False, "max_points": 500, "far_points": 100}},
-         {"extract", "lidar_seed", "parser", "masks", "actors", "lidar_depth"}),
+        ({"sweeps": False}, FROM_EXTRACTION_ON),
+        ({"lidar_seed": {"sweeps": False, "max_points": 500, "far_points": 100}}, FROM_EXTRACTION_ON),
     ],
     ids=["nothing", "images", "LiDAR"],
-)  # fmt: skip
+)
 def test_a_change_of_what_is_used_reruns_what_depends_on_it(finished, change, expected):
     before = finished.config
     finished.config = {**before, **change}
     finished.write_config()
     try:
-        after = {"train", "evaluate", "scene_metrics"} if expected else set()
-        assert set(finished.planned("results/0001/metrics.json")) == expected | after
+        assert set(finished.planned("results/0001/metrics.json")) == expected
     finally:
         finished.config = before
         finished.write_config()
