@@ -121,7 +121,7 @@ class TestAmongTheOtherStages:
     def test_its_results_say_where_they_come_from(self, seeded):
         for name in ("poses", "scene_refined"):
             stages = seeded.read(f"results/0001/{name}.json")["provenance"]["stages"]
-            assert stages.keys() == {"extract", "refine_poses"}
+            assert stages.keys() == {"extract", "own_car", "refine_poses"}
             assert stages["refine_poses"]["settings"]["refine_poses"]["rounds"] == 1
 
     def test_all_later_rules_take_its_scene(self, seeded):
@@ -130,7 +130,7 @@ class TestAmongTheOtherStages:
         jobs = [block.partition("\n\n")[0] for block in done.stdout.split("\nrule ")[1:]]
         takes_scene = {job.split(":")[0] for job in jobs if "results/0001/scene.json" in _inputs(job)}
         takes_refined = {job.split(":")[0] for job in jobs if "results/0001/scene_refined.json" in _inputs(job)}
-        assert takes_scene == {"refine_poses"}
+        assert takes_scene == {"own_car", "refine_poses"}
         assert {"lidar_seed", "parser", "masks", "evaluate", "film", "ghost_panel", "remove_actor", "tracks", "export",
                 "export_usd", "export_viewer"} <= takes_refined  # fmt: skip
 
