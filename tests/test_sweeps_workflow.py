@@ -8,7 +8,8 @@ from workflow_copy import WorkflowCopy
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("sweeps_workflow")]
 
 FROM_EXTRACTION_ON = {
-    "extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "train", "evaluate", "scene_metrics",
+    "extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "train", "evaluate",
+    "scene_metrics",
 }  # fmt: skip
 MISSING = "data/sweeps/CAM_FRONT/0001__0010.jpg"
 
