@@ -39,8 +39,13 @@ def read_sweep(sweep: Sweep) -> np.ndarray:
 
 def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:
     """The sweeps that a training may see, of key frames and, where the scene holds any, between them."""
-    groups = sweep_groups(scene, holdout)
-    return [sweep for sweep, group in zip(scene.sweeps, groups, strict=True) if group == "train"]
+    return sweeps_of(scene, holdout, ("train",))
+
+
+def sweeps_of(scene: Scene, holdout: HoldoutSettings, groups: tuple[Group, ...]) -> list[Sweep]:
+    """The sweeps of some groups, of key frames and, where the scene holds any, between them."""
+    owners = sweep_groups(scene, holdout)
+    return [sweep for sweep, group in zip(scene.sweeps, owners, strict=True) if group in groups]
 
 
 def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
@@ -51,15 +56,13 @@ def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: flo
 def returns_of(
     scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...]
 ) -> list[tuple[Sweep, np.ndarray]]:
-    """The sweeps of some groups, of key frames and, where the scene holds any, between them, each with its returns (n,
-    3) in world coordinates, the own car's left out. A sweep whose file is missing or corrupt is left out: the stage
-    lidar_seed is the one that complains."""
+    """The sweeps of some groups, each with its returns (n, 3) in world coordinates, the own car's left out. A sweep
+    whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
     found = []
-    for sweep, group in zip(scene.sweeps, sweep_groups(scene, holdout), strict=True):
-        if group in groups:
-            with suppress(DatasetError):
-                points = without_own_car(read_sweep(sweep), own_car_radius)
-                found.append((sweep, apply(sweep.sensor_to_world, points)))
+    for sweep in sweeps_of(scene, holdout, groups):
+        with suppress(DatasetError):
+            points = without_own_car(read_sweep(sweep), own_car_radius)
+            found.append((sweep, apply(sweep.sensor_to_world, points)))
     return found
 
 
