@@ -44,6 +44,11 @@ def frame_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
     return _groups(scene, scene.frames, holdout)
 
 
+def training_images(scene: Scene, holdout: HoldoutSettings) -> np.ndarray:
+    """The numbers (n,) of the images, among `scene.frames`, that a training may see."""
+    return np.flatnonzero([group == "train" for group in frame_groups(scene, holdout)])
+
+
 def sweep_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
     """The group of every LiDAR sweep of the scene, in the order of `scene.sweeps`."""
     return _groups(scene, scene.sweeps, holdout)

@@ -51,11 +51,17 @@ class Inputs:
         name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
 
-    def triangulated(self, wildcards: Any) -> list[str]:
+    def triangulated_seeds(self, wildcards: Any) -> list[str]:
         """The points that the refinement of poses triangulated, where they are to be seeds."""
-        config = for_scene(self.config, wildcards.scene)
-        wanted = config.refine_poses.enabled and config.lidar_seed.triangulated
-        return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.pkl"] if wanted else []
+        return self._triangulated(wildcards, for_scene(self.config, wildcards.scene).lidar_seed.triangulated)
+
+    def triangulated_ends(self, wildcards: Any) -> list[str]:
+        """The same points, where rays to them are to prove space empty."""
+        return self._triangulated(wildcards, for_scene(self.config, wildcards.scene).free_space.triangulated)
+
+    def _triangulated(self, wildcards: Any, wanted: bool) -> list[str]:
+        made = wanted and refines_poses(self.config, wildcards.scene)
+        return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.pkl"] if made else []
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, where given."""

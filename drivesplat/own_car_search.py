@@ -24,13 +24,14 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import approximate_polygon, find_contours
 
-from drivesplat.holdout import frame_groups, sweep_groups
+from drivesplat.holdout import training_images
 from drivesplat.images import continuous_intrinsics, pixel_rays, read_image
 from drivesplat.own_car import Outline, enclosed
 from drivesplat.rigid import inverse
 from drivesplat.scene import Frame, Scene, Sweep
 from drivesplat.seeding.coloring import in_image
 from drivesplat.seeding.nearest_sweep import nearest_returns
+from drivesplat.seeding.sweeps import training_sweeps
 from drivesplat.settings.own_car import OwnCarJob, OwnCarSearch
 
 log = logging.getLogger(__name__)
@@ -93,11 +94,10 @@ class Drive:
     @classmethod
     def of(cls, scene: Scene, camera: str, search: OwnCarSearch) -> "Drive":
         """Of a scene's training images, and its training sweeps."""
-        groups = frame_groups(scene, search.holdout)
-        frames = [f for f, group in zip(scene.frames, groups, strict=True) if group == "train" and f.camera == camera]
-        swept = zip(scene.sweeps, sweep_groups(scene, search.holdout), strict=True)
-        sweeps = tuple(sweep for sweep, group in swept if group == "train")
-        return cls(tuple(on_the_move(frames)), sweeps, scene.key_frame_interval, search.own_car_radius)
+        frames = (scene.frames[i] for i in training_images(scene, search.holdout))
+        moving = on_the_move([frame for frame in frames if frame.camera == camera])
+        sweeps = tuple(training_sweeps(scene, search.holdout))
+        return cls(tuple(moving), sweeps, scene.key_frame_interval, search.own_car_radius)
 
     @property
     def way(self) -> float:

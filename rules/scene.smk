@@ -94,7 +94,7 @@ rule lidar_seed:
         scene=plan.scene,
         own_car="<results>/{scene}/own_car.json",
         points_file=plan.points_file,
-        triangulated=plan.triangulated,
+        triangulated=plan.triangulated_seeds,
     output:
         seed="<results>/{scene}/seed.ply",
     log:
@@ -216,11 +216,12 @@ rule lidar_depth:
 
 rule free_space:
     """
-    Follows every LiDAR ray of the training key frames from sensor to return: the voxels that rays passed, and near
-    which none ended, are empty.
+    Follows every LiDAR ray of the training key frames from sensor to return, and every ray from a training image to a
+    triangulated point: the voxels that rays passed, and near which none ended, are empty.
     """
     input:
         scene=plan.scene,
+        triangulated=plan.triangulated_ends,
     output:
         free_space="<results>/{scene}/free_space.pkl",
     log:

@@ -13,9 +13,9 @@ from small_drives import HELD_OUT, NOTHING_HELD_OUT, drive, scene_at, seconds_of
 from tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.holdout import sweep_groups
+from drivesplat.holdout import frame_groups, sweep_groups
 from drivesplat.scene import Scene
-from drivesplat.seeding.empty_space import Rays, free_space_record, lidar_rays, proven_empty, proving
+from drivesplat.seeding.empty_space import Rays, camera_rays, free_space_record, lidar_rays, proven_empty, proving
 from drivesplat.seeding.free_space import read_free_space
 from drivesplat.seeding.traversal import OCCUPIED, count_passing
 from drivesplat.settings.free_space import FreeSpaceJob, FreeSpaceSettings
@@ -269,6 +269,39 @@ def test_rays_start_at_their_own_sweeps_sensor_and_leave_the_own_car_out(tiny_sc
     assert {tuple(origin) for origin in rays.origins} < starts
     assert np.linalg.norm((rays.ends - rays.origins)[:, :2], axis=1).min() > 2.5
     assert 0.0 < (~rays.still).mean() < 0.2
+
+
+def triangulated(scene: Scene, point: np.ndarray, *seen_by: int) -> dict[str, np.ndarray]:
+    """A point (3,) that the images of these numbers see."""
+    return {"points": point[None], "seen_by": np.array(seen_by), "seen_point": np.zeros(len(seen_by), dtype=np.int64)}
+
+
+def test_training_images_prove_what_lies_before_triangulated_points_empty(tiny_scene):
+    """Of a scene without LiDAR: the point is seen by two training images, or by one and one that is held out."""
+    blind = dataclasses.replace(tiny_scene, sweeps=())
+    groups = frame_groups(blind, job().holdout)
+    seeing, held_out = (
+        [i for i, group in enumerate(groups) if (group == "train") is wanted] for wanted in (True, False)
+    )
+    first = blind.frames[seeing[0]].camera_to_world
+    point = first[:3, 3] + 12.0 * first[:3, 2]
+    rays = camera_rays(blind, job(), triangulated(blind, point, seeing[0], held_out[0], seeing[1]))
+    centres = [blind.frames[i].camera_to_world[:3, 3] for i in seeing[:2]]
+    np.testing.assert_allclose(rays.origins, centres)
+    np.testing.assert_allclose(rays.ends, [point, point])
+    assert rays.still.all()
+    assert len(camera_rays(blind, job(), triangulated(blind, point, seeing[0], held_out[0])).ends) == 0
+    y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-1.0, 1.0, 0.1), np.arange(-1.0, 1.0, 0.1)))
+    ends = point + np.column_stack([0.0 * y, y, z])
+    numbers = np.arange(len(ends))
+    many = {
+        "points": ends,
+        "seen_by": np.repeat(seeing[:2], len(ends)),
+        "seen_point": np.concatenate([numbers, numbers]),
+    }
+    record = free_space_record(blind, job(), many)
+    assert empty_at(record, point - 2.0 * first[:3, 2][None]).all() and not empty_at(record, point[None]).any()
+    assert len(free_space_record(blind, job())["keys"]) == 0
 
 
 def test_held_out_sweeps_prove_nothing(tiny_root, tmp_path):

@@ -99,7 +99,16 @@ def test_all_stages_take_the_refined_scene_where_poses_are_refined():
     ],
 )
 def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_they_are_wanted(settings, taken):
-    assert plan(**settings).triangulated(SimpleNamespace(scene="a1")) == taken
+    assert plan(**settings).triangulated_seeds(SimpleNamespace(scene="a1")) == taken
+
+
+@pytest.mark.parametrize(
+    ("settings", "taken"),
+    [({}, 0), (REFINED, 1), ({**REFINED, "free_space": {"triangulated": False}}, 0)],
+)
+def test_triangulated_points_are_an_input_of_free_space_where_there_are_any_and_they_are_wanted(settings, taken):
+    found = plan(**settings).triangulated_ends(SimpleNamespace(scene="a1"))
+    assert found == ["elsewhere/a1/triangulated.pkl"] * taken
 
 
 def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():

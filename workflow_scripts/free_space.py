@@ -1,6 +1,7 @@
-"""scene.json into free_space.pkl."""
+"""scene.json, and triangulated.pkl where poses are refined, into free_space.pkl."""
 
 from drivesplat.job import job
+from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.scene import read_scene
 from drivesplat.seeding.empty_space import free_space_record
 from drivesplat.settings.free_space import FreeSpaceJob
@@ -8,5 +9,6 @@ from drivesplat.storage import write_plain_pickle
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)
-    record = free_space_record(scene, current.settings(FreeSpaceJob))
+    triangulated = read_triangulated(current.input.triangulated[0]) if current.input.triangulated else None
+    record = free_space_record(scene, current.settings(FreeSpaceJob), triangulated)
     write_plain_pickle(current.output.free_space, {**record, "provenance": current.provenance(scene.provenance)})

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.ahead import ahead
-from drivesplat.holdout import frame_groups
+from drivesplat.holdout import training_images
 from drivesplat.images import continuous_intrinsics, read_image, target_size
 from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.regions import LEAST_PIXELS, hulls_in, owner_image
@@ -95,8 +95,7 @@ class Sight:
 
 def training_sights(scene: Scene, job: ActorSeedJob, own_car: OwnCar) -> Iterator[Sight]:
     """The training images, one by one."""
-    groups = frame_groups(scene, job.holdout)
-    frames = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
+    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
     return ahead(lambda frame: sight_of(scene, frame, job, own_car), frames)
 
 

@@ -8,6 +8,8 @@ still. Space is told in voxels. One is empty if enough rays passed it, and
 - rays passed the six voxels at its faces, too: a surface seen at a grazing angle lies in voxels that rays pass long
   before they end, and the voxels behind it are passed by none.
 
+Rays are LiDAR's, and those from training images to the points that the refinement of poses has triangulated.
+
 A ray that ends on something that moves proves as much as any other, but its end is no occupancy: the place is empty
 again. Held-out sweeps contribute nothing.
 """
@@ -20,6 +22,8 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import ConfigError
+from drivesplat.holdout import training_images
+from drivesplat.poses.triangulated import seen_in
 from drivesplat.scene import Scene
 from drivesplat.seeding.movers import movers
 from drivesplat.seeding.sweeps import training_returns
@@ -51,9 +55,12 @@ class Rays:
 _PLACES = ("origins", "ends")
 
 
-def free_space_record(scene: Scene, job: FreeSpaceJob) -> dict[str, Any]:
-    """The record of `drivesplat.seeding.free_space`, provenance aside, from the LiDAR of a scene."""
-    rays = lidar_rays(scene, job)
+def free_space_record(
+    scene: Scene, job: FreeSpaceJob, triangulated: dict[str, np.ndarray] | None = None
+) -> dict[str, Any]:
+    """The record of `drivesplat.seeding.free_space`, provenance aside, from the LiDAR of a scene, and from the content
+    of its triangulated.pkl where it has one."""
+    rays = Rays.joined([lidar_rays(scene, job), *([camera_rays(scene, job, triangulated)] if triangulated else [])])
     record = proven_empty(rays, job.free_space)
     log.info("%d rays prove %.0f cubic metres empty", len(rays.ends), len(record["keys"]) * record["voxel"] ** 3)
     return record
@@ -69,6 +76,16 @@ def lidar_rays(scene: Scene, job: FreeSpaceJob) -> Rays:
         origins = np.broadcast_to(sweep.sensor_to_world[:3, 3], points.shape)
         found.append(Rays(origins, points, still))
     return Rays.joined(found)
+
+
+def camera_rays(scene: Scene, job: FreeSpaceJob, triangulated: dict[str, np.ndarray]) -> Rays:
+    """The rays from the training images to the triangulated points that they see, if enough of them see a point. All
+    stand still: features on what moves are left out before anything is triangulated."""
+    training = training_images(scene, job.holdout)
+    counts = np.isin(triangulated["seen_by"], training) & seen_in(triangulated, training)[triangulated["seen_point"]]
+    centres = np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames])
+    ends = triangulated["points"][triangulated["seen_point"][counts]]
+    return Rays(centres[triangulated["seen_by"][counts]], ends, np.ones(len(ends), dtype=bool))
 
 
 def proven_empty(rays: Rays, settings: FreeSpaceSettings) -> dict[str, Any]:

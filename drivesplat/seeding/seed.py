@@ -16,7 +16,7 @@ from plyfile import PlyParseError
 
 from drivesplat.ahead import ahead
 from drivesplat.errors import DatasetError
-from drivesplat.holdout import frame_groups, sweep_groups
+from drivesplat.holdout import sweep_groups, training_images
 from drivesplat.images import continuous_intrinsics, read_image, target_size
 from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.point_cloud import PointCloud, read_positions
@@ -43,7 +43,7 @@ def seed_points(
     Raises DatasetError where a LiDAR file is missing (unless told to go on) or nothing is left to start from.
     """
     random = np.random.default_rng(job.random_seed)
-    frames = training_frames(scene, job)
+    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
     if not frames:
         raise DatasetError(
             f"scene {scene.name}: the hold-out leaves none of its {len(scene.key_frame_timestamps)} key frames to "
@@ -128,17 +128,10 @@ def extra_points(scene: Scene, path: str | None) -> np.ndarray:
 def triangulated_points(scene: Scene, job: SeedJob, record: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """The triangulated points (n, 3) that enough training images see, in world coordinates, and the times (n,) at which
     they do, on average."""
-    groups = frame_groups(scene, job.holdout)
-    training = np.array([i for i, group in enumerate(groups) if group == "train"])
+    training = training_images(scene, job.holdout)
     times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
     chosen = seen_in(record, training)
     return record["points"][chosen], mean_over_views(record, training, times)[chosen]
-
-
-def training_frames(scene: Scene, job: SeedJob) -> list[Frame]:
-    """The images that colours may come from."""
-    groups = frame_groups(scene, job.holdout)
-    return [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
 
 
 def color_views(

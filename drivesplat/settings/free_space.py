@@ -7,8 +7,10 @@ from drivesplat.settings.holdout import HoldoutSettings
 
 
 class FreeSpaceSettings(Settings):
-    """The space that LiDAR's rays prove empty, for trainings that ask for it (`train.floaters.free_space`)."""
+    """The space that rays prove empty, for trainings that ask for it (`train.floaters.free_space`)."""
 
+    triangulated: bool = True
+    """Whether rays from training images to the points that refine_poses triangulated count, beside LiDAR's."""
     voxel: float = Field(0.3, ge=0.05, le=5)
     """Edge in metres of the voxels that are told empty."""
     range: float = Field(30.0, gt=0, le=200)

@@ -28,7 +28,7 @@ def first_gains(
 ) -> dict[str, np.ndarray]:
     """The gain (3,) of every colour channel of each of `cameras` over the reference camera, by the seed points that lie
     on surfaces; 1 for a camera that shares too few with the others. `views` are the training images."""
-    surfaces = parser["points"][: parser["seed"]["lidar"] + parser["seed"]["points_file"]]
+    surfaces = parser["points"][: len(parser["points"]) - parser["seed"]["far"]]
     shades = log_colors(surfaces, views, [reference, *cameras])
     gains = np.exp(log_gains(shades))
     for camera, gain in zip(cameras, gains[1:], strict=True):
