@@ -1,5 +1,6 @@
 """Learned corrections of camera poses: bounded, smooth, and interpolated where no training image is."""
 
+import json
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 from hand_made import about_z, round_gaussians
 from scipy.spatial.transform import Rotation
+from test_training import PROVENANCE, parser_record, recorded_views, settings_of
 
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.camera_poses import CameraPoses, transform
@@ -14,9 +16,11 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rigid import rigid
 from drivesplat.settings.camera_poses import CameraPoseSettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
 from drivesplat.training.train import Trainer
 from drivesplat.training.views import TrainingView
 
@@ -204,3 +208,25 @@ def test_corrections_are_learned_ever_more_slowly_and_logged(learned):
     assert group["lr"] == pytest.approx(0.1 * LOOSE["learning_rate"])
     figures = learned.camera_poses.figures()
     assert 0.01 < figures["FRONT/shift_m"] < 0.2 and 0.3 < figures["FRONT/turn_deg"] < 3.0
+
+
+# ---- in a training
+
+
+@pytest.mark.parametrize("corrected", [True, False])
+def test_a_training_corrects_its_own_cameras_at_their_times_where_it_is_told_to(tmp_path, corrected):
+    """Of six images half a second apart the third is held out; train.json says how far poses were corrected."""
+    poses = CameraPoseSettings(corrected=corrected, learning_rate=0.05)
+    train = settings_of(iterations=20, checkpoint_every=50, pixels_per_gaussian=0, camera_poses=poses)
+    job = TrainJob(parts=("background",), sky="none", train=train, random_seed=0)
+    inputs = TrainingInputs(parser_record(tmp_path, recorded_views(6)), tmp_path, [], [])
+    files = TrainingFiles(tmp_path / "it/checkpoint.pt", tmp_path / "it/train.json")
+    run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
+    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    told = json.loads(files.summary.read_text())["of_cameras"]
+    if not corrected:
+        assert model.camera_poses is None and told == {}
+        return
+    figures = {f"camera_poses/{name}": value for name, value in model.camera_poses.figures().items()}
+    assert told == pytest.approx(figures) and told["camera_poses/CAM_FRONT/shift_m"] > 1e-4
+    assert len(model.camera_poses.params["CAM_FRONT"]) == 5, "one correction for every training image"
