@@ -1,7 +1,7 @@
 """The stage `refine_poses`: a scene's poses corrected by what its images show, or kept where that cannot be trusted.
 
 Key frames of all cameras take part, held-out ones among them (`protocol.poses` says so); images between key frames,
-sweeps and boxes follow. A trial without some of the points decides: they must fit refined poses better than given ones.
+sweeps and boxes follow. A trial without some of the points decides: refined poses must fit them clearly better.
 """
 
 import logging
@@ -144,10 +144,10 @@ def doubt(
     for largest, limit, unit in ((shift.max(), limits.max_shift, "m"), (turn.max(), limits.max_turn, "degrees")):
         if not largest <= limit:
             return f"one of them would be moved by {largest:.2f} {unit}, more than {limit:g}"
-    if not trial.after < trial.before:
+    if not trial.after < (1.0 - limits.min_gain) * trial.before:
         return (
-            f"points that took no part fit them better ({trial.before:.2f} pixels) than the refined ones "
-            f"({trial.after:.2f})"
+            f"points that took no part are off by {trial.after:.2f} pixels with the refined ones and by "
+            f"{trial.before:.2f} with these, a gain of less than {limits.min_gain:.0%}"
         )
     return None
 

@@ -46,6 +46,8 @@ class LimitSettings(Settings):
     """An image that sees fewer triangulated points than this has nothing to hold on to."""
     min_images: float = Field(0.7, ge=0, le=1)
     """So large a share of the images must have something to hold on to; the others follow their neighbours."""
+    min_gain: float = Field(0.05, ge=0, lt=1)
+    """By so large a share the median error of points that took no part must fall: less is the features' noise."""
 
 
 class RefinePosesSettings(Settings):
