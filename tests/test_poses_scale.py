@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.from_images import aligned, in_metres
-from drivesplat.poses.scale import depth_at, drift
+from drivesplat.poses.scale import depth_at, drift, strays, told_by_lidar
 from drivesplat.rigid import rigid
 from drivesplat.settings.refine_poses import PriorSettings
 
@@ -17,6 +17,20 @@ def test_drift_is_that_of_stretches_and_not_of_single_images():
     assert drift(steady) == 1.0
     assert drift(5.0 * np.linspace(1.0, 1.5, 40)) == pytest.approx((1.5 - 0.5 * 2 / 39) / (1 + 0.5 * 2 / 39))
     assert drift(np.array([2.0, 3.0])) == 1.0
+
+
+def test_single_images_stray_from_those_around_them_at_the_ends_too():
+    scales = np.linspace(1.0, 1.15, 40)
+    assert not strays(scales, 1.2).any()
+    scales[[0, 20, 38, 39]] = [0.7, 1.5, 0.5, 0.5]
+    scales[11] = np.nan
+    assert np.flatnonzero(strays(scales, 1.2)).tolist() == [0, 20, 38, 39]
+    assert not strays(np.full(3, np.nan), 1.2).any()
+
+
+def test_lidar_of_a_few_images_tells_no_scale():
+    assert told_by_lidar(np.array([1.0, np.nan, np.nan, np.nan]))
+    assert not told_by_lidar(np.array([1.0, *[np.nan] * 4]))
 
 
 def test_every_step_is_scaled_as_its_stretch():

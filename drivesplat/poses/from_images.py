@@ -16,10 +16,10 @@ from drivesplat.errors import DatasetError
 from drivesplat.poses.corrections import Corrections, corrected
 from drivesplat.poses.mapping import REMEDY, Model, mapped
 from drivesplat.poses.rig import RigImages
-from drivesplat.poses.scale import STRETCHES, by_lidar, by_positions, drift, moves, told_by_lidar
+from drivesplat.poses.scale import STRETCHES, by_lidar, by_positions, drift, moves, strays, told_by_lidar
 from drivesplat.rigid import inverse, rigid
 from drivesplat.scene import Scene
-from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob
+from drivesplat.settings.refine_poses import LimitSettings, PriorSettings, RefinePosesJob
 
 ROUNDS = 2
 """Sweeps are placed by the recorded poses first, and then by those that this has given."""
@@ -41,33 +41,44 @@ def placed_by_images(images: RigImages, database: Path, job: RefinePosesJob, thr
     Raises DatasetError where the drive does not allow to tell: too few images hang together, nothing gives a scale, or
     the scale drifts.
     """
-    model = mapped(images, database, job, threads)
-    recorded = np.stack([images.frames[i].ego_to_world for i in model.placed])
-    scene, follows = images.scene, moves(recorded)
+    model, limits = mapped(images, database, job, threads), job.refine_poses.limits
+    given, scene = np.stack([frame.ego_to_world for frame in images.frames]), images.scene
+    follows = moves(given[model.placed])
     for _ in range(ROUNDS):
         told_by, scales = _scales(scene, images, model, job)
+        misplaced = strays(scales, limits.max_scale_drift)
+        _require_steady(scene, told_by, scales, misplaced, limits)
+        model, scales = model.without(misplaced), scales[~misplaced]
+        recorded = given[model.placed]
         poses = aligned(recorded, _cars(images, model, scales), job.refine_poses.priors)
         corrections = Corrections.between(images.timestamps[model.placed], recorded, poses)
         if not follows:
             corrections = corrections.continued(scene.key_frame_interval)
         scene = corrected(images.scene, corrections)
-    drifts, limit = drift(scales), job.refine_poses.limits.max_scale_drift
-    if not drifts <= limit:
-        raise DatasetError(
-            f"scene {scene.name}: images alone give no poses: by {told_by} their scale changes by a factor of "
-            f"{drifts:.2f} along the drive, more than refine_poses.limits.max_scale_drift, {limit:g}, as it does where "
-            f"a car drives straight ahead; {REMEDY}"
-        )
     record = {
         "camera": model.camera,
         "images_placed": len(model.placed),
         "models": list(model.sizes),
         "scale_from": told_by,
         "scale": float(np.nanmedian(scales)),
-        "scale_drift": drifts,
+        "scale_drift": drift(scales),
         "aligned_to": "recorded poses" if follows else "first image",
     }
     return Placement(corrections, follows, record)
+
+
+def _require_steady(
+    scene: Scene, told_by: str, scales: np.ndarray, misplaced: np.ndarray, limits: LimitSettings
+) -> None:
+    where = f"scene {scene.name}: images alone give no poses: by {told_by}"
+    why = f"more than refine_poses.limits allows, as where a car drives straight ahead; {REMEDY}"
+    if misplaced.mean() > 1.0 - limits.min_images:
+        raise DatasetError(f"{where} {misplaced.sum()} of {len(misplaced)} images are misplaced (min_images), {why}")
+    factor = drift(scales[~misplaced])
+    if not factor <= limits.max_scale_drift:
+        raise DatasetError(
+            f"{where} their scale changes by a factor of {factor:.2f} along the drive (max_scale_drift), {why}"
+        )
 
 
 def _scales(scene: Scene, images: RigImages, model: Model, job: RefinePosesJob) -> tuple[str, np.ndarray]:

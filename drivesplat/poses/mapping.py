@@ -48,6 +48,11 @@ class Model:
     sightings: tuple[Sightings, ...]
     sizes: tuple[int, ...]
 
+    def without(self, strays: np.ndarray) -> "Model":
+        """The same without those of its images (n,) bool."""
+        sightings = tuple(seen for seen, stray in zip(self.sightings, strays, strict=True) if not stray)
+        return Model(self.camera, self.placed[~strays], self.camera_to_model[~strays], sightings, self.sizes)
+
 
 def mapped(images: RigImages, database: Path, job: RefinePosesJob, threads: int) -> Model:
     """The largest model of one camera's images, whose features and matches are in `database`.

@@ -6,6 +6,7 @@ time, which is up to 0.1 s from the image's.
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import median_filter
 from scipy.spatial import QhullError, cKDTree
 
 from drivesplat.images import continuous_intrinsics, project
@@ -103,6 +104,16 @@ def drift(scales: np.ndarray) -> float:
     stretches = np.array_split(known, np.clip(len(known) // LEAST_IMAGES, 1, STRETCHES))
     medians = [float(np.median(stretch)) for stretch in stretches]
     return max(medians) / min(medians)
+
+
+def strays(scales: np.ndarray, limit: float) -> np.ndarray:
+    """Which images (n,) bool have scales (n,) that differ from those around them, the running median over a quarter of
+    the drive, by more than a factor: the mapper has misplaced them."""
+    known = np.flatnonzero(np.isfinite(scales))
+    around = median_filter(scales[known], size=len(known) // 4 | 1, mode="mirror")
+    result = np.zeros(len(scales), dtype=bool)
+    result[known] = np.abs(np.log(scales[known] / around)) > np.log(limit)
+    return result
 
 
 def moves(poses: np.ndarray) -> bool:

@@ -54,7 +54,8 @@ class LimitSettings(Settings):
     min_gain: float = Field(0.05, ge=0, lt=1)
     """By so large a share the median error of points that took no part must fall: less is the features' noise."""
     max_scale_drift: float = Field(1.2, ge=1)
-    """With `start: images`, the largest factor by which the scale may change along the drive."""
+    """With `start: images`, the largest factor by which the scale may change along the drive; images whose own differs
+    more from those around them follow these."""
 
 
 class RefinePosesSettings(Settings):
