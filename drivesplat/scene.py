@@ -72,8 +72,8 @@ class Scene:
     """A recorded drive.
 
     `key_frame_timestamps` (n,): key frame i is `sample_index` i. `origin` (3,): global = world + origin. `poses` names
-    where the poses come from ('nuscenes', 'refined'); `key_frame_range` the dataset's key frames [first, last + 1) that
-    were read, None for all.
+    where the poses come from ('nuscenes', 'refined', 'images'); `key_frame_range` the dataset's key frames
+    [first, last + 1) that were read, None for all.
     """
 
     name: str

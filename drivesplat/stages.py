@@ -24,7 +24,7 @@ from drivesplat.settings.looks import PanelJob, RemovalJob, SubjectSettings, Tra
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.own_car import OwnCarJob, OwnCarSearch
 from drivesplat.settings.parser import ParserJob
-from drivesplat.settings.refine_poses import RefinePosesJob
+from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import MOVING_PARTS, TrainJob
 from drivesplat.settings.world import WorldJob
@@ -118,7 +118,10 @@ def _extract(place: Place) -> SceneSource:
 
 
 def _refine_poses(place: Place) -> RefinePosesJob:
-    return RefinePosesJob(refine_poses=place.config.refine_poses, random_seed=place.config.random_seed)
+    config, lidar = place.config, None
+    if config.refine_poses.start == "images":
+        lidar = LidarRays(ray_spacing=config.lidar_depth.ray_spacing, own_car_radius=config.lidar_seed.own_car_radius)
+    return RefinePosesJob(refine_poses=config.refine_poses, random_seed=config.random_seed, lidar=lidar)
 
 
 def _own_car(place: Place) -> OwnCarJob:

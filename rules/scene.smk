@@ -59,7 +59,8 @@ rule own_car:
 rule refine_poses:
     """
     Corrects the poses by what the images show: features triangulated between key frames, bundle adjustment with the
-    given poses as priors. Keeps the given ones, with a warning, where images cannot improve them.
+    given poses as priors. Keeps the given ones, with a warning, where images cannot improve them. Or makes them from
+    images and LiDAR alone, and fails where these do not tell.
     """
     input:
         scene="<results>/{scene}/scene.json",

@@ -122,8 +122,11 @@ def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
 
 def test_the_refinement_is_told_what_decides_it_and_no_more():
     job = told("refine_poses", random_seed=3, refine_poses={"rounds": 5})
-    assert job.keys() == {"refine_poses", "random_seed"}
+    assert job.keys() == {"refine_poses", "random_seed", "lidar"} and job["lidar"] is None
     assert (job["refine_poses"]["rounds"], job["random_seed"]) == (5, 3)
+    lidar = {"lidar_depth": {"ray_spacing": [0.2, 0.4]}, "lidar_seed": {"own_car_radius": 3.0}}
+    alone = told("refine_poses", refine_poses={"start": "images"}, **lidar)
+    assert alone["lidar"] == {"ray_spacing": [0.2, 0.4], "own_car_radius": 3.0}
 
 
 def told(stage: str, **values: Any) -> dict[str, Any]:

@@ -54,6 +54,24 @@ def test_between_images_they_change_steadily(share):
     np.testing.assert_allclose(between[:3, :3] @ between[:3, :3].T, np.eye(3), atol=1e-12)
 
 
+def test_a_large_turn_goes_the_shorter_way():
+    """From 170 degrees to 190: rotation vectors, linear in time, would pass 0."""
+    turned = np.stack([correction((0.0, 0.0, 170.0)), correction((0.0, 0.0, -170.0))])
+    (middle,) = Corrections.between(TIMES[:2], GIVEN[:2], GIVEN[:2] @ turned).at(TIMES[:2].mean(keepdims=True))
+    np.testing.assert_allclose(middle[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-9)
+
+
+def test_where_given_poses_stand_still_motion_goes_on_beyond_the_ends():
+    """8 m/s ahead, an image every half second and one 10 ms after the last, which is 1 m off: no motion of 100 m/s."""
+    times = np.array([0, 500_000, 1_000_000, 1_010_000])
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = [0.0, 4.0, 8.0, 9.08]
+    still = Corrections.between(times, np.tile(np.eye(4), (4, 1, 1)), poses)
+    there = still.continued(500_000.0).at(np.array([-900_000, -250_000, 250_000, 1_260_000]))[:, 0, 3]
+    np.testing.assert_allclose(there, [-4.0, -2.0, 2.0, 9.08 + 0.25 * 5.08 / 0.51], atol=1e-6)
+    assert still.continued(2_000_000.0) is still
+
+
 def test_beyond_the_ends_they_stay():
     early, late = CORRECTIONS.at(np.array([0, 9_000_000]))
     np.testing.assert_allclose([early, late], STEPS[[0, 2]], atol=1e-9)

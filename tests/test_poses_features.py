@@ -203,6 +203,19 @@ def test_features_lie_where_things_are_in_the_recorded_image_and_not_on_what_mov
     assert (apart.min(axis=0)[still & inside] < 1.5).mean() > 0.8
 
 
+def test_where_poses_come_from_images_every_box_is_left_out(tmp_path, dotted):
+    """No pose says which of them move."""
+    scene, _ = dotted
+    images = RigImages.of(dataclasses.replace(scene, tracks=(car(0.0),)), [0])
+    middle = np.array([scene.frames[0].width, scene.frames[0].height]) / 2
+    near = {}
+    for start in ("recorded", "images"):
+        found = find_features(images, job_of(start=start), tmp_path / f"{start}.db", 1).images[1]
+        near[start] = sum(np.abs(point.xy - middle).max() < 10 for point in found.points2D)
+        assert found.num_points2D() > 40
+    assert near["recorded"] > 0 == near["images"]
+
+
 def test_features_are_no_more_than_asked_for(tmp_path, dotted):
     scene, _ = dotted
     job = job_of(features={"max_features": 64})

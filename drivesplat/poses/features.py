@@ -114,15 +114,17 @@ def views_overlap(a: Frame, b: Frame) -> bool:
     return bool(abs(turn) < half_fields)
 
 
-def shows_what_stands(scene: Scene, frame: Frame, pixels: np.ndarray, own_car: OwnCar, box_margin: float) -> np.ndarray:
-    """Which pixels (n, 2), continuous, of a recorded image show neither a box that moves, grown by `box_margin` metres,
-    nor the own car: (n,) bool."""
+def shows_what_stands(
+    scene: Scene, frame: Frame, pixels: np.ndarray, own_car: OwnCar, box_margin: float, every_box: bool = False
+) -> np.ndarray:
+    """Which pixels (n, 2), continuous, of a recorded image show neither a box that moves (`every_box`: any, as where no
+    pose says which move), grown by `box_margin` metres, nor the own car: (n,) bool."""
     size = (frame.width, frame.height)
     columns, rows = (pixels[:, i].astype(int).clip(0, size[i] - 1) for i in (0, 1))
     stands = ~own_car.pixels(frame.camera, size)[rows, columns]
     in_camera = np.column_stack([pixels, np.ones(len(pixels))]) @ inv(continuous_intrinsics(frame, size)).T
     for box in boxes_at(scene, frame.timestamp):
-        if box.moves:
+        if box.moves or every_box:
             camera_to_object = inverse(box.object_to_world) @ frame.camera_to_world
             reach = box.size / 2 + box_margin
             stands &= ~meets_box(camera_to_object[:3, 3], in_camera @ camera_to_object[:3, :3].T, reach)
@@ -151,7 +153,8 @@ def _features(images: RigImages, frame: Frame, job: RefinePosesJob) -> tuple[np.
     found, described = extractor.extract(pycolmap.Bitmap.from_array(grey))
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)
     keypoints[:, :2] *= np.array([frame.width, frame.height], dtype=np.float32) / size
-    stands = shows_what_stands(images.scene, frame, keypoints[:, :2], images.own_car, settings.box_margin)
+    every_box = job.refine_poses.start == "images"
+    stands = shows_what_stands(images.scene, frame, keypoints[:, :2], images.own_car, settings.box_margin, every_box)
     usable = np.flatnonzero(stands)
     kept = usable[largest(keypoints[usable], settings.max_features)]
     return keypoints[kept], np.ascontiguousarray(np.asarray(described.data)[kept])

@@ -1,7 +1,8 @@
-"""The stage `refine_poses`: a scene's poses corrected by what its images show, or kept where that cannot be trusted.
+"""The stage `refine_poses`: a scene's poses corrected by what its images show, or kept where that cannot be trusted;
+or made from the images alone (`drivesplat.poses.from_images`), or nothing where these do not tell.
 
 Key frames of all cameras take part, held-out ones among them (`protocol.poses` says so); images between key frames,
-sweeps and boxes follow. A trial without some of the points decides: they must fit refined poses better than given ones.
+sweeps and boxes follow. A trial without some of the points decides: refined poses must fit them clearly better.
 """
 
 import logging
@@ -26,6 +27,7 @@ from drivesplat.poses.adjustment import (
 )
 from drivesplat.poses.corrections import Corrections, corrected
 from drivesplat.poses.features import find_features, match_features
+from drivesplat.poses.from_images import placed_by_images
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.rig import RigImages, from_pycolmap
 from drivesplat.poses.triangulated import no_points, triangulated_record
@@ -62,7 +64,8 @@ def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, t
     """The refinement of a scene; features on the own car do not count. Logs a warning, and keeps the given poses,
     where images cannot improve them.
 
-    Raises DatasetError where an image cannot be read, or a camera is not fixed to the car.
+    Raises DatasetError where an image cannot be read, or a camera is not fixed to the car; and where poses are to come
+    from images alone, and these do not tell them.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR
     key_frames = [i for i, frame in enumerate(scene.frames) if frame.is_key_frame]
@@ -71,6 +74,8 @@ def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, t
         database = Path(folder) / "features.db"
         start = find_features(images, job, database, threads)
         match_features(images, job, database, threads)
+        if job.refine_poses.start == "images":
+            return made_by_matches(images, start, database, job, threads)
         return refined_by_matches(images, start, database, job, threads)
 
 
@@ -78,23 +83,57 @@ def refined_by_matches(
     images: RigImages, start: pycolmap.Reconstruction, database: Path, job: RefinePosesJob, threads: int = 1
 ) -> Refinement:
     """The refinement of a scene whose images and features are in `start`, and their matches in `database`."""
-    scene, reconstruction = images.scene, start
-    priors = priors_of(images, job.refine_poses)
-    for _ in range(job.refine_poses.rounds):
-        reconstruction = triangulated(reconstruction, database, job, threads)
-        untouched = pycolmap.Reconstruction(reconstruction)
-        adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
+    scene, priors = images.scene, priors_of(images, job.refine_poses)
+    untouched, reconstruction = _adjusted(start, priors, database, job, threads)
     seen = observations(reconstruction)
     corrections = _corrections(images, seen, priors.given, poses_of(reconstruction))
     trial = _trial(untouched, priors, job, threads) if len(seen.positions) else None
     changes = corrections.at(images.timestamps)
     fault = doubt(images, seen, changes, trial, job.refine_poses.limits)
-    verdict = {"schema": SCHEMA, "scene": scene.name, "refined": fault is None, "kept_because": fault}
-    record = {**verdict, **_record(images, seen, changes, trial)}
+    record = {**_verdict(images, job, fault), **_record(images, seen, changes, trial)}
     if fault is not None:
         log.warning("scene %s: poses stay as they are: %s", scene.name, fault)
         return Refinement(scene, record, no_points())
     return Refinement(corrected(scene, corrections), record, triangulated_record(images.indices, seen))
+
+
+def made_by_matches(
+    images: RigImages, start: pycolmap.Reconstruction, database: Path, job: RefinePosesJob, threads: int = 1
+) -> Refinement:
+    """The same with poses from images alone: those that the mapper placed, the others after their neighbours, and all
+    adjusted as recorded ones are. Raises DatasetError where the drive does not allow it."""
+    placement = placed_by_images(images, database, job, threads)
+    scene = corrected(images.scene, placement.corrections)
+    priors = priors_of(RigImages.of(scene, images.indices, images.own_car), job.refine_poses)
+    _, reconstruction = _adjusted(with_poses_of(start, priors.given), priors, database, job, threads)
+    seen = observations(reconstruction)
+    recorded = np.stack([frame.ego_to_world for frame in images.frames])
+    corrections = _corrections(images, seen, recorded, poses_of(reconstruction))
+    described = _record(images, seen, corrections.at(images.timestamps), None)
+    if not placement.follows:
+        described |= {"shift_m": None, "turn_deg": None}
+        corrections = corrections.continued(images.scene.key_frame_interval)
+    record = {**_verdict(images, job, None), "placement": placement.record, **described}
+    made = corrected(images.scene, corrections, poses="images")
+    return Refinement(made, record, triangulated_record(images.indices, seen))
+
+
+def _adjusted(
+    start: pycolmap.Reconstruction, priors: Priors, database: Path, job: RefinePosesJob, threads: int
+) -> tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]:
+    """Points triangulated with the poses so far, and both adjusted, in rounds: before and after the last adjustment."""
+    reconstruction = start
+    for _ in range(job.refine_poses.rounds):
+        reconstruction = triangulated(reconstruction, database, job, threads)
+        untouched = pycolmap.Reconstruction(reconstruction)
+        adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
+    return untouched, reconstruction
+
+
+def _verdict(images: RigImages, job: RefinePosesJob, fault: str | None) -> dict[str, Any]:
+    """The head of poses.json."""
+    verdict = {"start": job.refine_poses.start, "refined": fault is None, "kept_because": fault}
+    return {"schema": SCHEMA, "scene": images.scene.name, **verdict}
 
 
 def _corrections(images: RigImages, seen: Observations, given: np.ndarray, refined: np.ndarray) -> Corrections:
@@ -144,10 +183,10 @@ def doubt(
     for largest, limit, unit in ((shift.max(), limits.max_shift, "m"), (turn.max(), limits.max_turn, "degrees")):
         if not largest <= limit:
             return f"one of them would be moved by {largest:.2f} {unit}, more than {limit:g}"
-    if not trial.after < trial.before:
+    if not trial.after < (1.0 - limits.min_gain) * trial.before:
         return (
-            f"points that took no part fit them better ({trial.before:.2f} pixels) than the refined ones "
-            f"({trial.after:.2f})"
+            f"points that took no part are off by {trial.after:.2f} pixels with the refined ones and by "
+            f"{trial.before:.2f} with these, a gain of less than {limits.min_gain:.0%}"
         )
     return None
 

@@ -1,8 +1,11 @@
 """What the stage `refine_poses` may be told."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.lidar_depth import Degrees
 
 
 class FeatureSettings(Settings):
@@ -36,7 +39,8 @@ class PriorSettings(Settings):
 
 
 class LimitSettings(Settings):
-    """When a refinement is not believed, and the given poses are kept, with a warning that says which limit it was."""
+    """When a refinement is not believed, and the given poses are kept, with a warning that says which limit it was. Of
+    these, `start: images` knows min_points, min_images and max_scale_drift, and stops there."""
 
     max_shift: float = Field(0.5, gt=0)
     """Largest correction of a position, in metres."""
@@ -45,7 +49,13 @@ class LimitSettings(Settings):
     min_points: int = Field(30, ge=3)
     """An image that sees fewer triangulated points than this has nothing to hold on to."""
     min_images: float = Field(0.7, ge=0, le=1)
-    """So large a share of the images must have something to hold on to; the others follow their neighbours."""
+    """So large a share of the images must have something to hold on to; the others follow their neighbours. With
+    `start: images`, of the key frames."""
+    min_gain: float = Field(0.05, ge=0, lt=1)
+    """By so large a share the median error of points that took no part must fall: less is the features' noise."""
+    max_scale_drift: float = Field(1.2, ge=1)
+    """With `start: images`, the largest factor by which the scale may change along the drive; images whose own differs
+    more from those around them follow these."""
 
 
 class RefinePosesSettings(Settings):
@@ -54,6 +64,9 @@ class RefinePosesSettings(Settings):
 
     enabled: bool = False
     """Whether every later stage takes the refined poses."""
+    start: Literal["recorded", "images"] = "recorded"
+    """Where poses start from: 'recorded' corrects those of the dataset; 'images' makes poses from images alone, for
+    drives that have none, and stops where the drive does not allow it. docs/poses.md"""
     features: FeatureSettings = FeatureSettings()
     priors: PriorSettings = PriorSettings()
     limits: LimitSettings = LimitSettings()
@@ -70,8 +83,17 @@ class RefinePosesSettings(Settings):
     serve them better than the given ones, the given ones are kept."""
 
 
+class LidarRays(Settings):
+    """What LiDAR's returns in an image are read by."""
+
+    ray_spacing: tuple[Degrees, Degrees]
+    own_car_radius: float
+
+
 class RefinePosesJob(Settings):
     """Everything that decides the content of one scene_refined.json, the scene aside."""
 
     refine_poses: RefinePosesSettings
     random_seed: int
+    lidar: LidarRays | None = None
+    """None where poses start from the recorded ones: nothing is asked of LiDAR."""

@@ -1,0 +1,72 @@
+"""The scale of what images alone have made, along a drive; and how it is laid onto recorded poses."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivesplat.poses.from_images import aligned, in_metres
+from drivesplat.poses.scale import depth_at, drift, strays, told_by_lidar
+from drivesplat.rigid import rigid
+from drivesplat.settings.refine_poses import PriorSettings
+
+
+def test_drift_is_that_of_stretches_and_not_of_single_images():
+    steady = np.full(40, 5.0)
+    assert drift(steady) == 1.0
+    steady[[3, 17, 30]] = [50.0, np.nan, 0.1]
+    assert drift(steady) == 1.0
+    assert drift(5.0 * np.linspace(1.0, 1.5, 40)) == pytest.approx((1.5 - 0.5 * 2 / 39) / (1 + 0.5 * 2 / 39))
+    assert drift(np.array([2.0, 3.0])) == 1.0
+
+
+def test_single_images_stray_from_those_around_them_at_the_ends_too():
+    scales = np.linspace(1.0, 1.15, 40)
+    assert not strays(scales, 1.2).any()
+    scales[[0, 20, 38, 39]] = [0.7, 1.5, 0.5, 0.5]
+    scales[11] = np.nan
+    assert np.flatnonzero(strays(scales, 1.2)).tolist() == [0, 20, 38, 39]
+    assert not strays(np.full(3, np.nan), 1.2).any()
+
+
+def test_lidar_of_a_few_images_tells_no_scale():
+    assert told_by_lidar(np.array([1.0, np.nan, np.nan, np.nan]))
+    assert not told_by_lidar(np.array([1.0, *[np.nan] * 4]))
+
+
+def test_every_step_is_scaled_as_its_stretch():
+    along = np.tile(np.eye(4), (40, 1, 1))
+    along[:, 0, 3] = np.arange(40.0)
+    scales = np.where(np.arange(40) < 20, 2.0, 3.0)
+    scales[[0, 7, 33]] = [np.nan, 100.0, np.nan]
+    places = in_metres(along, scales)[:, 0, 3]
+    np.testing.assert_allclose(np.diff(places), [*[2.0] * 19, 2.5, *[3.0] * 19])
+
+
+def plane(pixels: np.ndarray) -> np.ndarray:
+    """The inverse of depth (n,) at pixels (n, 2)."""
+    return 0.02 + pixels @ np.array([0.001, 0.0005])
+
+
+def test_depth_between_returns_is_that_of_the_plane_they_lie_on():
+    """Depth z of a plane n x = d at the pixel u, v is d / (n (u, v, 1)): its inverse is linear in the pixels."""
+    rng = np.random.default_rng(0)
+    pixels, wanted = rng.uniform(0.0, 100.0, (300, 2)), rng.uniform(20.0, 80.0, (50, 2))
+    depth = depth_at(wanted, pixels, 1.0 / plane(pixels), np.full((300, 2), 15.0))
+    np.testing.assert_allclose(depth, 1.0 / plane(wanted), rtol=1e-9)
+    far = depth_at(wanted, pixels, np.ones(300), np.full((300, 2), 1e-3))
+    assert np.isnan(far).all()
+    on_a_line = np.stack([np.arange(300.0)] * 2, axis=1)
+    assert np.isnan(depth_at(wanted, on_a_line, np.ones(300), np.full((300, 2), 15.0))).all()
+    assert np.isnan(depth_at(wanted, pixels[:5], np.ones(5), np.full((5, 2), 15.0))).all()
+
+
+def test_alignment_takes_the_roll_from_rotations_and_the_rest_from_positions():
+    """On a straight road positions say nothing of the roll; recorded pitch is biased by a degree, and positions say
+    so."""
+    straight = np.tile(np.eye(4), (20, 1, 1))
+    straight[:, 0, 3] = 8.0 * np.arange(20)
+    away = rigid(Rotation.from_euler("zyx", [70.0, 10.0, -25.0], degrees=True).as_matrix(), np.array([5.0, -80.0, 3.0]))
+    assert np.abs(aligned(straight, away @ straight, PriorSettings()) - straight).max() < 1e-9
+    pitched = straight @ rigid(Rotation.from_euler("y", 1.0, degrees=True).as_matrix(), np.zeros(3))
+    pose = aligned(pitched, away @ straight, PriorSettings())
+    assert np.abs(pose - straight).max() < 0.01, "its far end is not lifted"
