@@ -12,7 +12,6 @@ sys.path.insert(0, workflow.basedir)
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.planning import Plan, let_scripts_import
-from drivesplat.settings.report import PICTURES
 
 let_scripts_import(workflow.basedir)
 asked = get_argument_parser().parse_known_args()[0]

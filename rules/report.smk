@@ -12,7 +12,7 @@ rule gap_report:
     """
     input:
         metrics=plan.report(asked.targets).metrics,
-        pictures=plan.report(asked.targets).of_methods(PICTURES.values()),
+        pictures=plan.report(asked.targets).pictures,
         # linked, not read: a film that is made anew is no other report
         links=ancient(plan.report(asked.targets).links),
     output:

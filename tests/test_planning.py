@@ -9,7 +9,7 @@ import pytest
 
 from drivesplat.config import load
 from drivesplat.planning import Plan
-from drivesplat.settings.report import PICTURES
+from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
 from drivesplat.stages import ALL_SCENE_STAGES, SCENE_STAGES, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
@@ -163,35 +163,34 @@ def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
 
 
 @pytest.mark.parametrize(
-    ("targets", "alone", "wanted"),
+    ("targets", "scenes", "seen", "wanted"),
     [
-        ([], False, True),
-        (["all"], False, True),
-        (["metrics"], False, False),
-        (["report"], True, True),
-        (["gap_report", "elsewhere/gap_report.html"], True, True),
-        (["elsewhere/gap_report.csv", "metrics"], False, True),
-        (["elsewhere/a1/metrics.json"], False, False),
+        ([], 3, True, True),
+        (["all"], 3, True, True),
+        (["metrics"], 3, False, False),
+        (["report"], 0, False, True),
+        (["gap_report", "elsewhere/gap_report.html"], 0, False, True),
+        (["elsewhere/gap_report.csv", "metrics"], 3, False, True),
+        (["elsewhere/a1/metrics.json"], 3, False, False),
     ],
 )
-def test_a_report_is_of_what_is_there_only_where_nothing_else_is_asked_for(targets, alone, wanted):
+def test_a_report_waits_for_what_is_asked_for_with_it(targets, scenes, seen, wanted):
     report = plan().report(targets)
-    assert (report.alone, report.wanted) == (alone, wanted)
+    assert len(report.metrics) == scenes and report.wanted == wanted
+    assert len(report.pictures) == 2 * scenes * (len(PICTURES) if seen else len(HELD_OUT_PAIR))
+    assert bool(report.links) == seen
 
 
 def test_a_report_asked_for_alone_is_of_what_is_there(tmp_path):
     made = plan(results_dir=str(tmp_path))
-    there = ["b1/metrics.json", "b1/street/original.mp4", "b1/street/held_out_recorded.png", "a1/vanilla/viewer.html"]
-    for name in there:
+    there = ["b1/metrics.json", "b1/street/original.mp4", "b1/street/held_out_recorded.png", "b1/street/with_car.png"]
+    for name in (*there, "a1/vanilla/viewer.html"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     report = made.report(["report"])
-    assert report.metrics == [str(tmp_path / "b1/metrics.json")]
-    assert report.of_methods(PICTURES.values()) == [str(tmp_path / "b1/street/held_out_recorded.png")]
-    assert report.links == [str(tmp_path / "b1/street/original.mp4")]
-    everything = made.report(["all"])
-    assert len(everything.metrics) == 3 and len(everything.of_methods(PICTURES.values())) == 3 * 2 * len(PICTURES)
-    assert {Path(link).name for link in everything.links} >= {"original.mp4", "parts.mp4", "viewer.html"}
+    found = [*report.metrics, *report.links, *report.pictures]
+    assert found == [str(tmp_path / name) for name in there]
+    assert {Path(link).name for link in made.report([]).links} >= {"original.mp4", "parts.mp4", "viewer.html"}
 
 
 def test_the_reference_is_the_first_method_that_stands_still():

@@ -7,7 +7,7 @@ from drivesplat.errors import DriveSplatError
 from drivesplat.planning import Plan
 from drivesplat.report.files import ReportFiles, write_report
 from drivesplat.report_plan import REPORT_FILES, REPORT_RULES
-from drivesplat.settings.report import PICTURES, ReportJob
+from drivesplat.settings.report import ReportJob
 
 
 def write_partial_report(plan: Plan) -> None:
@@ -15,10 +15,9 @@ def write_partial_report(plan: Plan) -> None:
     on the console where it lies, or why there is none."""
     there, results = plan.report([*REPORT_RULES]), Path(plan.config.results_dir)
     page, record, table = (results / name for name in REPORT_FILES)
-    job = ReportJob.model_validate_json(there.settings)
+    files, job = ReportFiles(page, record, table, results / "logs"), ReportJob.model_validate_json(there.settings)
     try:
-        pictures = there.of_methods(PICTURES.values())
-        write_report(ReportFiles(page, record, table, results / "logs"), job, there.metrics, pictures, there.links)
+        write_report(files, job, there.metrics, there.pictures, there.links)
     except (DriveSplatError, OSError) as error:
         print(f"drivesplat: there is no report of what was finished: {error}", file=sys.stderr, flush=True)
         return

@@ -4,13 +4,11 @@ from typing import Any
 
 from drivesplat.settings import Settings
 
-PICTURES = {
-    "recorded": "held_out_recorded.png",
-    "rendered": "held_out_rendered.png",
-    "panel": "ghost_panel.png",
-    "with_car": "with_car.png",
-    "without_car": "without_car.png",
-}
+HELD_OUT_PAIR = {"recorded": "held_out_recorded.png", "rendered": "held_out_rendered.png"}
+"""A held-out image as it was recorded and as a method renders it, which come with the method's figures."""
+LOOKS = {"panel": "ghost_panel.png", "with_car": "with_car.png", "without_car": "without_car.png"}
+"""Further pictures of a method."""
+PICTURES = {**HELD_OUT_PAIR, **LOOKS}
 """What the page shows of a method on a scene, and where it lies in its folder."""
 
 
