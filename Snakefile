@@ -3,7 +3,7 @@
 #   snakemake --cores 1 results/0103/metrics.json     one scene, every configured method
 #   snakemake --cores 4                               all scenes: metrics, films, panels, exports, and the report
 #   snakemake --cores 4 metrics                       the figures alone; `films`, `edits`, `looks`, `exports` likewise
-#   snakemake --cores 1 gap_report                    the report over what has been measured
+#   snakemake --cores 1 report                        results/gap_report.html of what has been measured
 #   snakemake --cores 1 results/0061/ablation.csv     what each thing in the method `street` is worth, over three seeds
 #   snakemake --report report.zip                     all there is to look at, as a page that opens offline
 #
@@ -66,6 +66,11 @@ rule exports:
             folder=of_methods,
             asset=["splat.ply", "parts/parts.json", "scene.usdz", "viewer.html"],
         ),
+
+
+rule report:
+    input:
+        rules.gap_report.output,
 
 
 rule all:

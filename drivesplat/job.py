@@ -25,6 +25,7 @@ class Job:
         self.input = snakemake.input
         self.output = snakemake.output
         self.wildcards = snakemake.wildcards
+        self.log = Path(snakemake.log[0])
         self.threads: int = snakemake.threads
         self._rule: str = snakemake.rule
         self._params = snakemake.params
@@ -53,10 +54,6 @@ class Job:
         if settings.kind != "cpu" and self._card is None:  # a second lock would wait for the first
             self._card = hold_card(settings.jobs_per_card)
         return settings
-
-    def param(self, name: str) -> Any:
-        """A further parameter of the rule, given as JSON."""
-        return json.loads(self._params.get(name))
 
     def provenance(self, *upstream: dict[str, Any], inputs: dict[str, str] | None = None) -> dict[str, Any]:
         """The provenance of this rule's result, made from results with the provenances `upstream`."""

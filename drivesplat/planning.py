@@ -16,6 +16,7 @@ from drivesplat.config import for_scene, load
 from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.inputs import Inputs
+from drivesplat.report_plan import ReportPlan
 from drivesplat.rerun import code_digest
 from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.stages import (
@@ -78,12 +79,9 @@ class Plan(Inputs):
         """A wildcard constraint that admits these names only."""
         return "|".join(re.escape(name) for name in names) or "(?!)"
 
-    def report_scenes(self, targets: list[str]) -> list[str]:
-        """The scenes of a report: all, but where the report alone is asked for those that have been measured."""
-        reports = {"gap_report", *(f"{self.config.results_dir}/gap_report.{kind}" for kind in ("csv", "json"))}
-        if not targets or not set(targets) <= reports:
-            return self.config.batch_scenes
-        return [s for s in self.config.batch_scenes if Path(self.config.results_dir, s, "metrics.json").is_file()]
+    def report(self, targets: list[str]) -> ReportPlan:
+        """What the rule of the report across scenes asks, where `targets` are wanted."""
+        return ReportPlan(self, targets)
 
     @property
     def all_trajectories(self) -> list[str]:
@@ -120,12 +118,8 @@ class Plan(Inputs):
         edits = scene_edits(self.config, scene) if method in self.methods_with_actors else {}
         return [f"edits/{edit}" for edit in edits]
 
-    def expected_stages(self) -> str:
-        """For every scene of the report the settings and code that its metrics.json should come from, as JSON: what
-        else is stale."""
-        return canonical_json({scene: self._metrics_stages(scene) for scene in self.config.batch_scenes})
-
-    def _metrics_stages(self, scene: str) -> dict[str, Any]:
+    def metrics_stages(self, scene: str) -> dict[str, Any]:
+        """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
         methods = self.evaluation_stages(scene, self.config.methods)
         return {**methods, SIDE_BY_SIDE: self._stage(SIDE_BY_SIDE, scene)}
 
@@ -200,7 +194,7 @@ class Plan(Inputs):
         """The scenes that targets need; those of the batch where a target does not say."""
         scenes = [self._scene_of(target) for target in targets]
         if not scenes or any(scene is not None and scene not in self.config.scenes for scene in scenes):
-            return self.report_scenes(targets)
+            return self.report(targets).scenes
         return [scene for scene in scenes if scene is not None]
 
     def _scene_of(self, target: str) -> str | None:

@@ -1,7 +1,8 @@
 # What a trained method is worth on the images it has not seen.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, parser.pkl, masks/.
-# OUTPUTS: <results>/{scene}/{method}/eval.json, <results>/{scene}/metrics.json; resources/lpips/backbone.json.
+# OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;
+# <results>/{scene}/metrics.json; resources/lpips/backbone.json.
 
 
 rule lpips_backbone:
@@ -29,7 +30,8 @@ rule lpips_backbone:
 rule evaluate:
     """
     Renders the held-out images of the evaluated camera and measures PSNR, SSIM and LPIPS over static and moving pixels;
-    on a synthetic world also the view from the side and the street without the car ahead, against the truth.
+    on a synthetic world also the view from the side and the street without the car ahead, against the truth. One
+    held-out image is kept as it was recorded and as it is rendered.
     """
     input:
         scene=plan.scene,
@@ -41,6 +43,8 @@ rule evaluate:
         lpips=plan.lpips_record,
     output:
         metrics="<results>/{scene}/{method}/eval.json",
+        recorded="<results>/{scene}/{method}/held_out_recorded.png",
+        rendered="<results>/{scene}/{method}/held_out_rendered.png",
     log:
         "<logs>/{scene}/{method}/evaluate.log",
     benchmark:

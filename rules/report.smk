@@ -1,16 +1,27 @@
 # The gap between static and moving pixels, across scenes and methods.
 #
-# REQUIRED INPUTS: <results>/{scene}/metrics.json of all scenes; of those measured, where the report alone is asked for.
-# OUTPUTS: <results>/gap_report.csv and gap_report.json, and a table on the console.
+# REQUIRED INPUTS: <results>/{scene}/metrics.json of all scenes, with their pictures and films; of those measured, and
+# what there is of them, where the report alone is asked for.
+# OUTPUTS: <results>/gap_report.html, gap_report.json and gap_report.csv, and a table on the console.
 
 
 rule gap_report:
     """
-    A row per scene and method. Results of other settings or code than the config's are left out and named.
+    A row per scene and method, means with intervals, the gap as a plot, and a page to look at. Results of other
+    settings or code than the config's are left out and named.
     """
     input:
-        metrics=expand("<results>/{scene}/metrics.json", scene=plan.report_scenes(asked.targets)),
+        metrics=plan.report(asked.targets).metrics,
+        pictures=plan.report(asked.targets).pictures,
+        # linked, not read: a film that is made anew is no other report
+        links=ancient(plan.report(asked.targets).links),
     output:
+        page=report(
+            "<results>/gap_report.html",
+            caption="../report/gap_report.rst",
+            category="Across scenes",
+            labels={"what": "the gap, by scene and method: the page"},
+        ),
         table=report(
             "<results>/gap_report.csv",
             caption="../report/gap_report.rst",
@@ -25,7 +36,14 @@ rule gap_report:
     conda:
         "../envs/drivesplat.yaml"
     params:
-        expected=plan.expected_stages(),
+        settings=plan.report(asked.targets).settings,
         code=plan.code("gap_report"),
     script:
         "../workflow_scripts/gap_report.py"
+
+
+onerror:
+    if workflow.is_main_process and plan.report(asked.targets).wanted:
+        from drivesplat.report.partial import write_partial_report
+
+        write_partial_report(plan)

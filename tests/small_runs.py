@@ -86,7 +86,7 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
         run_training(inputs, made.job("train", TrainJob, method), CPU, files, PROVENANCE, method)
         checkpoint, summary = read_checkpoint(files.checkpoint), json.loads(files.summary.read_text())
         measured = EvaluationInputs(checkpoint, summary, recording, masks, None, None)
-        evals[method] = evaluate_method(measured, made.job("evaluate", EvaluateJob, method), CPU)
+        evals[method] = evaluate_method(measured, made.job("evaluate", EvaluateJob, method), CPU).record
         made.drives[method] = open_drive(checkpoint, recording, CPU)
     made.metrics.update(side_by_side(evals))
     return made

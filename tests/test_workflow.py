@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from workflow_copy import WorkflowCopy
 
+from drivesplat.settings.report import HELD_OUT_PAIR
 from drivesplat.video import read_footage
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("workflow")]
@@ -85,7 +86,7 @@ def test_the_report_has_a_row_per_scene_and_method(finished):
 
 def test_what_a_training_leaves_behind(finished):
     folder = finished.folder / "results/0001/vanilla"
-    trained = {"checkpoint.pt", "train.json", "eval.json", "tensorboard"}
+    trained = {"checkpoint.pt", "train.json", "eval.json", "tensorboard"} | set(HELD_OUT_PAIR.values())
     films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
     looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
     exports = {"splat.ply", "cameras.json", "parts", "scene.usdz", "viewer.html"}
@@ -163,6 +164,7 @@ def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
         names = {Path(name).name for name in report.namelist()}
         page = report.read("report/report.html").decode()
     pictures = {"ghost_panel.png", "removal.png", "original.mp4", "lateral_2m.mp4", "metrics.json", "gap_report.csv"}
+    pictures |= {"gap_report.html"}
     assert pictures | {"parts.mp4", "stop.mp4", "stop.png", "gone.mp4", "gone.png"} < names
     assert "Scene 0001" in page and "Across scenes" in page and "the moving vehicle that fills most pixels" in page
     assert "what moves, before plain grey" in page and "the frame in which both differ most" in page
@@ -206,8 +208,8 @@ EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
         ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
         ({"render": {"fps": 5}}, {"film": 4, **OF_ACTORS}),
         ({"render": {"edited_frames": True}}, {"edit": 2}),
-        ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2}),
-        ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2}),
+        ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2, "gap_report": 1}),
+        ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2, "gap_report": 1}),
         ({"export": {"viewer_gaussians": 100}}, {"export_viewer": 2}),
         ({"device": {"kind": "cpu", "min_free_gb": 1}}, {}),
         ({"lpips": {"enabled": False, "timeout_s": 3}}, {}),
@@ -237,8 +239,9 @@ LEFT_GONE = "results/0001/street/edits/gone.mp4"
     [
         ("at: 2}", "at: 2.5}", {"edit": 1}, {}),
         ("remove: {track: 0001 instance 0}", "reverse: {track: 0001 instance 0}", {"edit": 1}, {"edit": 1}),
-        ("  stop:", "  also_gone:\n    - remove: {track: 0001 instance 0}\n  stop:", {"edit": 1}, None),
-        ("  gone:\n    - remove: {track: 0001 instance 0}\n", "", {}, None),
+        ("  stop:", "  also_gone:\n    - remove: {track: 0001 instance 0}\n  stop:",
+         {"edit": 1, "gap_report": 1}, None),
+        ("  gone:\n    - remove: {track: 0001 instance 0}\n", "", {"gap_report": 1}, None),
         (EDITS, EDITS, {}, None),
         (EDITS, """# written otherwise
 edits: {stop: [{shift: {lateral: 1, "track": "0001 instance 0", yaw: 0.0, start: null}},
@@ -317,7 +320,8 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
         ("drivesplat/editing/veering.py", "STANDS, DRIVES = 1.0", "STANDS, DRIVES = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
-        ("drivesplat/report.py", "SCHEMA = 1", "SCHEMA = 2", {"gap_report": 1}),
+        ("drivesplat/report/gaps.py", "SCHEMA = 2", "SCHEMA = 3", {"gap_report": 1}),
+        ("drivesplat/report/page/page.js", "Sliders", "The sliders", {"gap_report": 1}),
         ("drivesplat/poses/refine.py", "SCHEMA = 1", "SCHEMA = 2", {}),
     ],
 )  # fmt: skip

@@ -1,8 +1,9 @@
-"""checkpoint.pt against held-out images, and against truth where there is any, into eval.json."""
+"""checkpoint.pt against held-out images, and against truth where there is any, into eval.json and a pair of images."""
 
 from pathlib import Path
 
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
+from drivesplat.images import write_image
 from drivesplat.job import job
 from drivesplat.masks import read_masks_record
 from drivesplat.recording import read_recording
@@ -19,5 +20,7 @@ with job(snakemake) as current:
     inputs = EvaluationInputs(checkpoint, summary, recording, record, lpips, truth)
     digests = {"truth": sha256_file(truth)} if truth else {}
     provenance = current.provenance(*upstream, checkpoint["provenance"], inputs=digests)
-    result = evaluate_method(inputs, current.settings(EvaluateJob), current.device())
-    write_json(current.output.metrics, {**result, "provenance": provenance})
+    evaluation = evaluate_method(inputs, current.settings(EvaluateJob), current.device())
+    write_image(current.output.recorded, evaluation.shown.recorded)
+    write_image(current.output.rendered, evaluation.shown.rendered)
+    write_json(current.output.metrics, {**evaluation.record, "provenance": provenance})

@@ -1,11 +1,12 @@
-"""All metrics.json into gap_report.csv, gap_report.json and a table on the console."""
+"""All metrics.json, and what there is to see, into gap_report.html, .csv, .json and a table on the console."""
+
+from pathlib import Path
 
 from drivesplat.job import job
-from drivesplat.report import console_table, gap_report, write_csv
-from drivesplat.storage import write_json
+from drivesplat.report.files import ReportFiles, write_report
+from drivesplat.settings.report import ReportJob
 
 with job(snakemake) as current:
-    report = gap_report(list(current.input.metrics), current.param("expected"))
-    write_csv(current.output.table, report)
-    write_json(current.output.report, report)
-    print(console_table(report), flush=True)
+    made = current.output
+    files = ReportFiles(Path(made.page), Path(made.report), Path(made.table), current.log.parent)
+    write_report(files, current.settings(ReportJob), current.input.metrics, current.input.pictures, current.input.links)

@@ -14,6 +14,7 @@ from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.drive import drive_record
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
+from drivesplat.evaluation.shown import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.model.splat_model import SplatModel
@@ -46,8 +47,16 @@ class EvaluationInputs:
     truth: Path | None
 
 
-def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings: DeviceSettings) -> dict[str, Any]:
-    """The content of one method's eval.json, provenance aside."""
+@dataclass(frozen=True)
+class Evaluation:
+    """A method measured on a scene: the content of its eval.json, provenance aside, and the image that is `shown`."""
+
+    record: dict[str, Any]
+    shown: Shown
+
+
+def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings: DeviceSettings) -> Evaluation:
+    """One method on the images that it has not seen, and against the truth where there is any."""
     model, device = open_model(inputs.checkpoint, device_settings)
     unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
     parser, summary = inputs.recording.parser, inputs.summary
@@ -55,7 +64,8 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
         groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
         against = against_truth(model, inputs, job, lpips_map, device)
-    return {
+        shown = held_out_pair(model, inputs.recording, job.eval_camera, device)
+    record = {
         "schema": 1,
         "scene": parser["scene"]["name"],
         "dataset": parser["scene"]["dataset"],
@@ -71,9 +81,11 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
             "device": summary["device"],
             "random_seed": summary["random_seed"],
             "findings": findings(groups["interpolation"]),
+            "shown": {"group": shown.group, "key_frame": inputs.recording.frame(shown.index).sample_index},
             **({"lpips_unavailable": unavailable} if unavailable else {}),
         },
     }
+    return Evaluation(record, shown)
 
 
 def against_truth(

@@ -11,6 +11,7 @@ import yaml
 from snakemake.cli import get_argument_parser
 
 from drivesplat.errors import ConfigError
+from drivesplat.job_logs import failures
 from drivesplat.quality.groups import Group
 from drivesplat.storage import atomic_write
 
@@ -19,8 +20,6 @@ CONFIG_FILE = "config.yaml"
 OUTPUT_FILE = "snakemake.log"
 DECIDED = {"configfile": "base", "config": "config", "targets": "recipes", "directory": "--out"}
 """What the recipes decide for Snakemake, and where."""
-_FAILURE = re.compile(r"ERROR drivesplat\.job: (\S+?)(?: \S+)?: (.*)")
-"""How a failed job ends its log (`drivesplat.job`): its stage, its scene where it has one, and why."""
 _JOB = re.compile(r"^(?:local)?(?:rule|checkpoint) \S+:$", re.MULTILINE)
 """How Snakemake announces a job."""
 
@@ -83,11 +82,8 @@ def run(group: Group, arguments: Sequence[str], workflow: Path) -> Outcome:
 
 def outcome(status: int, output: str) -> Outcome:
     """How a run ended, from its exit status and its output."""
-    failures: dict[str, str] = {}
-    for stage, why in _FAILURE.findall(output):
-        failures.setdefault(stage, why)
     refused = status != 0 and not _JOB.search(output)
-    return Outcome(status, _last_word(output) if refused else None, failures)
+    return Outcome(status, _last_word(output) if refused else None, failures(output))
 
 
 def _last_word(output: str) -> str:

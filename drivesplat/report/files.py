@@ -1,0 +1,36 @@
+"""The report as files: a page, a record and a table."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivesplat.report.console import console_table
+from drivesplat.report.gaps import gap_report, write_csv
+from drivesplat.report.html import report_page
+from drivesplat.report.looks import looks_of
+from drivesplat.settings.report import ReportJob
+from drivesplat.storage import atomic_write, write_json
+
+
+@dataclass(frozen=True)
+class ReportFiles:
+    """Where a report is written, in the folder of all results, and where the `logs` of their jobs lie."""
+
+    page: Path
+    record: Path
+    table: Path
+    logs: Path
+
+
+def write_report(
+    files: ReportFiles, job: ReportJob, metrics: Sequence[str], pictures: Sequence[str], links: Sequence[str]
+) -> None:
+    """Writes the report of these metrics.json, with these pictures in its page and links to these files, and prints its
+    table."""
+    report = gap_report(list(metrics), job, files.logs)
+    seen = looks_of([*pictures, *links], files.page.parent)
+    write_json(files.record, report)
+    write_csv(files.table, report)
+    with atomic_write(files.page) as page:
+        page.write(report_page(report, seen).encode())
+    print(console_table(report), flush=True)

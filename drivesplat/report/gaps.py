@@ -1,0 +1,189 @@
+"""The gap between static and moving pixels, a row per scene and method, and what that comes to over scenes.
+
+Means of gaps, and the fraction of them that a method closes, are over scenes in which vehicles move: where none does
+`gap_db` is that of parked vehicles, which no method has to close.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from drivesplat import storage
+from drivesplat.comparison import WHERE
+from drivesplat.errors import ResultError
+from drivesplat.holdout import HELD_OUT_GROUPS
+from drivesplat.provenance import differences
+from drivesplat.report.failures import why_missing
+from drivesplat.report.statistics import gap_closed, mean_over_scenes
+from drivesplat.settings.report import ReportJob
+from drivesplat.storage import read_json, unreadable
+
+SCHEMA = 2
+REGIONS = ("static", "vehicle", "moving_vehicle")
+
+
+def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
+    """The content of gap_report.json from the metrics.json files of measured scenes.
+
+    A result made of other settings or code than `job` expects, or measured under another protocol than the first, is
+    left out and named under `left_out`. `missing` names the configured scenes without a result, and why, as far as the
+    jobs' `logs` tell. `partial`: whether there are any of either.
+    """
+    rows: list[dict[str, Any]] = []
+    left_out: list[dict[str, str]] = []
+    measured: dict[str, Any] = {}
+    protocols: dict[str, Any] = {}
+    for path in paths:
+        try:
+            record = read_json(path, rule="scene_metrics")
+            scene = record["scene"]
+            reasons = _mismatches(record, job.expected, measured)
+            scene_rows = [_row(record, method) for method in record["methods"]]
+        except ResultError as error:
+            left_out.append({"scene": Path(path).parent.name, "why": str(error)})
+            continue
+        except (AttributeError, KeyError, TypeError) as error:
+            why = unreadable(path, "scene_metrics", f"not the metrics of a scene ({type(error).__name__}: {error})")
+            left_out.append({"scene": Path(path).parent.name, "why": str(why)})
+            continue
+        if reasons:
+            left_out.append({"scene": scene, "why": "; ".join(reasons)})
+            continue
+        measured[scene], protocols[scene] = _comparable(record), record["protocol"]
+        rows += scene_rows
+    named = {*measured, *(item["scene"] for item in left_out)}
+    missing = [{"scene": scene, "why": why_missing(logs, scene)} for scene in job.expected if scene not in named]
+    return {
+        "schema": SCHEMA,
+        "partial": bool(missing or left_out),
+        "reference": job.reference,
+        "rows": rows,
+        "means": _means(rows, job.random_seed),
+        "gap_closed": _closed(rows, job.reference, job.random_seed),
+        "left_out": left_out,
+        "missing": missing,
+        "protocols": protocols,
+    }
+
+
+def write_csv(path: str | Path, report: dict[str, Any]) -> None:
+    """The rows of a report as a table; empty cells where a figure is null."""
+    storage.write_csv(path, COLUMNS, ({column: row[column] for column in COLUMNS} for row in report["rows"]))
+
+
+COLUMNS = (
+    "scene", "dataset", "method",
+    *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", "lpips")),
+    "gaussians", "train_seconds",
+)  # fmt: skip
+
+
+def _mismatches(record: dict[str, Any], expected: dict[str, Any], measured: dict[str, Any]) -> list[str]:
+    scene = record["scene"]
+    if scene not in expected:
+        return ["not in the config"]
+    reasons = differences(expected[scene], record["provenance"]["stages"])
+    own = _comparable(record)
+    for other, protocol in measured.items():
+        unlike = [key for key in _COMPARABLE if protocol[key] != own[key]]
+        if unlike:
+            reasons.append(f"its protocol differs from that of scene {other}: {', '.join(unlike)}")
+        break
+    return reasons
+
+
+_COMPARABLE = ("cameras", "eval_camera", "width", "height", "sweeps", "holdout", "poses", "regions")
+
+
+def _comparable(record: dict[str, Any]) -> dict[str, Any]:
+    """What of a protocol has to be the same for figures to stand side by side. A scene whose refinement was refused
+    keeps its poses (`protocol.poses` says so) and stands beside those that have refined ones."""
+    poses = {"poses": "refined"} if "refine_poses" in record["provenance"]["stages"] else {}
+    return {key: record["protocol"][key] for key in _COMPARABLE} | poses
+
+
+def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
+    result = record["methods"][method]
+    row = {"scene": record["scene"], "dataset": record["dataset"], "method": method}
+    for group in HELD_OUT_GROUPS:
+        for region in REGIONS:
+            row[f"{group}_{region}"] = result[group][region]["psnr"] if result[group][region] else None
+        row[f"{group}_gap_db"] = result[group]["gap_db"]
+        row[f"{group}_lpips"] = result[group]["all"]["lpips"] if result[group]["all"] else None
+    costs = {"gaussians": result["gaussians"], "train_seconds": result["train_seconds"]}
+    return {**row, **costs, "shown": result.get("shown")}
+
+
+def _means(rows: list[dict[str, Any]], random_seed: int) -> list[dict[str, Any]]:
+    """The means of every figure over scenes, by method; null figures do not count."""
+    return [
+        {
+            "method": method,
+            "figures": {
+                column: mean_over_scenes([_counted(row, column) for row in own.values()], random_seed)
+                for column in COLUMNS[3:]
+            },
+        }
+        for method, own in _by_method(rows).items()
+    ]
+
+
+def _closed(rows: list[dict[str, Any]], reference: str | None, random_seed: int) -> list[dict[str, Any]]:
+    """What part of the reference's gap every other method closes, by group of held-out frames."""
+    methods = _by_method(rows)
+    given = methods.pop(reference, {}) if reference else {}
+    found = []
+    for method, own in methods.items():
+        both = [scene for scene in own if scene in given]
+        gaps = {
+            group: [[counted_gap(of[scene], group) for scene in both] for of in (given, own)]
+            for group in HELD_OUT_GROUPS
+        }
+        closed = {group: gap_closed(*pair, random_seed) for group, pair in gaps.items()}
+        if any(closed.values()):
+            found.append({"method": method, **closed})
+    return found
+
+
+def _by_method(rows: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
+    """The rows by method, then by scene, in the order of the rows."""
+    methods: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        methods.setdefault(row["method"], {})[row["scene"]] = row
+    return methods
+
+
+def counted_gap(row: dict[str, Any], group: str) -> float | None:
+    """The gap of a row to vehicles that move; None where none does."""
+    return None if row[f"{group}_moving_vehicle"] is None else row[f"{group}_gap_db"]
+
+
+def _counted(row: dict[str, Any], column: str) -> int | float | None:
+    """What of a row counts in a mean."""
+    group, _, name = column.partition("_")
+    return counted_gap(row, group) if name == "gap_db" else row[column]
+
+
+def in_words(report: dict[str, Any]) -> list[str]:
+    """What the report comes to: a sentence per method and group of held-out frames in which vehicles move."""
+    lines = []
+    closed = {item["method"]: item for item in report["gap_closed"]}
+    for mean in report["means"]:
+        for group in HELD_OUT_GROUPS:
+            gap = mean["figures"][f"{group}_gap_db"]
+            if gap is None:
+                continue
+            scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
+            width = _with_interval(gap, gap["mean"], "{:.1f}")
+            line = f"{mean['method']}, {WHERE[group]}: a gap of {width} dB, {scenes}"
+            part = closed.get(mean["method"], {}).get(group)
+            if part:
+                share = _with_interval(part, part["fraction"], "{:.0%}")
+                line += f"; it closes {share} of that of {report['reference']}"
+            lines.append(line)
+    return lines
+
+
+def _with_interval(found: dict[str, Any], value: float, spelling: str) -> str:
+    if found["low"] is None or found["high"] is None:
+        return spelling.format(value)
+    return f"{spelling} ({spelling} to {spelling})".format(value, found["low"], found["high"])

@@ -1,0 +1,202 @@
+"""gap_report.html: one page that needs a browser and no network. Pictures are in it, films and viewers are linked."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import PurePosixPath
+from typing import Any
+
+from drivesplat.comparison import WHERE
+from drivesplat.holdout import HELD_OUT_GROUPS
+from drivesplat.report.gaps import in_words
+from drivesplat.report.looks import Looks, data_address
+from drivesplat.report.page import filled_page
+from drivesplat.report.plot import gap_plot
+from drivesplat.storage import canonical_json
+
+Seen = Mapping[tuple[str, str], Looks]
+COLUMNS = {
+    "static": ("static", "{:.1f}"), "vehicle": ("vehicle", "{:.1f}"), "moving_vehicle": ("moving", "{:.1f}"),
+    "gap_db": ("gap", "{:.1f}"), "lpips": ("LPIPS", "{:.3f}"),
+}  # fmt: skip
+"""Of a group of held-out frames: a row's figures, their names on the page, and how they are spelled."""
+COSTS = {"gaussians": ("Gaussians", "{:,.0f}"), "train_seconds": ("training, s", "{:,.0f}")}
+NOTHING = "Nothing has been measured yet."
+
+
+def report_page(report: dict[str, Any], seen: Seen) -> str:
+    """The page of a report, with what is to be `seen` of scenes and methods; links count from the report's folder.
+
+    Raises ResultError where a picture cannot be read.
+    """
+    return filled_page(
+        introduction=_introduction(report),
+        plot=_in_card(gap_plot(report), "plot"),
+        table=_table(report),
+        absent=_absent(report),
+        scenes=_scenes(report, seen),
+        protocol=_protocol(report),
+        report=canonical_json(report).replace("<", "\\u003c"),
+    )
+
+
+def _introduction(report: dict[str, Any]) -> str:
+    measured = len(dict.fromkeys(row["scene"] for row in report["rows"]))
+    configured = measured + len(report["left_out"]) + len(report["missing"])
+    state = f"{measured} of {configured} configured scenes"
+    mark = f'<p class="partial">Partial: {state}; the others are named below.</p>' if report["partial"] else ""
+    sentences = "".join(f"<li>{escape(line)}</li>" for line in in_words(report))
+    return (
+        '<p class="soft">PSNR in dB on held-out images: pixels of what stands still against pixels of vehicles that '
+        f"move. {'' if report['partial'] else f'All {state}.'}</p>{mark}<ul>{sentences or f'<li>{NOTHING}</li>'}</ul>"
+    )
+
+
+def _in_card(content: str, kind: str) -> str:
+    return f'<div class="card {kind}">{content}</div>' if content else ""
+
+
+def _table(report: dict[str, Any]) -> str:
+    if not report["rows"]:
+        return f"<p>{NOTHING}</p>"
+    names, fields = ["scene", "method"], [(f"{g}_{key}", how) for g in HELD_OUT_GROUPS for key, how in COLUMNS.items()]
+    fields += list(COSTS.items())
+    groups = "".join(f'<th class="group" colspan="{len(COLUMNS)}">{WHERE[group]}</th>' for group in HELD_OUT_GROUPS)
+    heads = [_head(i, name, "name") for i, name in enumerate(names)]
+    heads += [_head(i, how[0], _border(key)) for i, (key, how) in enumerate(fields, start=len(names))]
+    lines = [
+        "".join(_cell(row[name], "{}", "name") for name in names)
+        + "".join(_cell(row[key], how[1], _border(key)) for key, how in fields)
+        for row in report["rows"]
+    ]
+    means = [
+        f'<td class="name">mean</td><td class="name">{escape(mean["method"])}</td>'
+        + "".join(_mean_cell(mean["figures"][key], how[1], _border(key)) for key, how in fields)
+        for mean in report["means"]
+    ]
+    body, foot = (f"<tr>{'</tr><tr>'.join(rows)}</tr>" for rows in (lines, means))
+    return (
+        '<div class="card wide"><table class="sortable"><thead>'
+        f'<tr><th class="name" colspan="2"></th>{groups}<th class="group" colspan="{len(COSTS)}"></th></tr>'
+        f"<tr>{''.join(heads)}</tr></thead><tbody>{body}</tbody><tfoot>{foot}</tfoot></table></div>"
+        '<p class="soft">A mean is over the scenes that have the figure; that of the gap over those in which vehicles '
+        "move: where none does, a row's gap is that of parked ones. Below it the 95 % interval of the mean, from "
+        "scenes drawn anew (percentile bootstrap). A dash: no such pixels, or not measured.</p>"
+    )
+
+
+def _border(key: str) -> str:
+    return "first" if key.endswith("_static") or key == "gaussians" else ""
+
+
+def _head(column: int, name: str, kind: str) -> str:
+    return f'<th class="{kind}" data-column="{column}"><button type="button">{escape(name)}</button></th>'
+
+
+def _cell(value: Any, spelling: str, kind: str) -> str:
+    sorted_by = "" if value is None else escape(str(value))
+    return f'<td class="{kind}" data-value="{sorted_by}">{_spelled(value, spelling)}</td>'
+
+
+def _mean_cell(found: dict[str, Any] | None, spelling: str, kind: str) -> str:
+    if found is None:
+        return f'<td class="{kind}">–</td>'
+    interval = ""
+    if found["low"] is not None and found["high"] is not None:
+        interval = f'<span class="soft">{spelling.format(found["low"])} to {spelling.format(found["high"])}</span>'
+    return f'<td class="{kind}">{spelling.format(found["mean"])}{interval}</td>'
+
+
+def _spelled(value: Any, spelling: str) -> str:
+    return "–" if value is None else escape(spelling.format(value))
+
+
+def _absent(report: dict[str, Any]) -> str:
+    lines = [(item["scene"], f"left out: {item['why']}") for item in report["left_out"]]
+    lines += [(item["scene"], item["why"]) for item in report["missing"]]
+    listed = "".join(f"<li><b>{escape(scene)}</b>: {escape(why)}</li>" for scene, why in lines)
+    return f'<h2>Not in the table</h2><div class="card"><ul>{listed}</ul></div>' if lines else ""
+
+
+def _scenes(report: dict[str, Any], seen: Seen) -> str:
+    scenes: dict[str, list[dict[str, Any]]] = {}
+    for row in report["rows"]:
+        scenes.setdefault(row["scene"], []).append(row)
+    return "".join(_scene(scene, rows, seen) for scene, rows in scenes.items()) or f"<p>{NOTHING}</p>"
+
+
+def _scene(scene: str, rows: Sequence[dict[str, Any]], seen: Seen) -> str:
+    looks = "".join(_method(row, seen.get((scene, row["method"]), Looks())) for row in rows)
+    title = f'{escape(scene)} <span class="soft">{escape(rows[0]["dataset"])}</span>'
+    inside = f'<h3>{title}</h3><div class="looks">{looks}</div>'
+    return f'<section class="card" id="scene-{escape(scene)}">{inside}</section>'
+
+
+def _method(row: dict[str, Any], looks: Looks) -> str:
+    pictures = looks.pictures
+    shown = []
+    if "recorded" in pictures and "rendered" in pictures:
+        what = f"{row['method']}: {_where(row['shown'])}"
+        shown.append(_compared(pictures["recorded"], pictures["rendered"], "recorded", row["method"], what))
+    if "with_car" in pictures and "without_car" in pictures:
+        sides = ("with the vehicle", "without")
+        what = f"{row['method']}: a vehicle taken out of the model"
+        shown.append(_compared(pictures["with_car"], pictures["without_car"], *sides, what))
+    if "panel" in pictures:
+        shown.append(
+            f'<figure><img class="panel" alt="ghost panel" src="{data_address(pictures["panel"])}">'
+            f"<figcaption>{escape(row['method'])}: what moves, recorded, rendered, and where they differ</figcaption>"
+            "</figure>"
+        )
+    links = "".join(f'<a href="{escape(link)}">{escape(_link_name(link))}</a>' for link in looks.links)
+    figures = [
+        f"{WHERE[g]}: static {_spelled(row[f'{g}_static'], '{:.1f}')}, moving "
+        f"{_spelled(row[f'{g}_moving_vehicle'], '{:.1f}')} dB"
+        for g in HELD_OUT_GROUPS
+    ]
+    return (
+        f'<div><p><b>{escape(row["method"])}</b> <span class="soft">{"; ".join(figures)}</span></p>'
+        f'{"".join(shown)}<p class="links">{links}</p></div>'
+    )
+
+
+def _where(shown: dict[str, Any] | None) -> str:
+    if shown is None:
+        return "an image"
+    if shown["group"] == "train":
+        return f"key frame {shown['key_frame']}, which was trained on"
+    return f"key frame {shown['key_frame']}, held out {WHERE[shown['group']]}"
+
+
+def _compared(below: Any, above: Any, left: str, right: str, what: str) -> str:
+    """Two pictures of one view with a slider between them."""
+    return (
+        f'<figure><div class="compare"><img alt="{escape(left)}" src="{data_address(below)}">'
+        f'<img class="over" alt="{escape(right)}" src="{data_address(above)}">'
+        f'<span class="side left">{escape(left)}</span><span class="side right">{escape(right)}</span>'
+        f'<input type="range" min="0" max="100" step="0.1" value="50" aria-label="{escape(left)} or {escape(right)}">'
+        f"</div><figcaption>{escape(what)}</figcaption></figure>"
+    )
+
+
+def _link_name(link: str) -> str:
+    """What a file is called on the page: 'original.mp4', 'edits/remove.mp4'."""
+    return "/".join(PurePosixPath(link).parts[2:])
+
+
+def _protocol(report: dict[str, Any]) -> str:
+    lines = "".join(
+        f"<li><b>{escape(scene)}</b>: {escape(_measured(protocol))}</li>"
+        for scene, protocol in report["protocols"].items()
+    )
+    return f'<div class="card"><ul>{lines or f"<li>{NOTHING}</li>"}</ul></div>'
+
+
+def _measured(protocol: dict[str, Any]) -> str:
+    held_out = protocol["held_out_frames"]
+    frames = "; ".join(f"{WHERE[group]} {', '.join(map(str, held_out[group])) or 'none'}" for group in HELD_OUT_GROUPS)
+    return (
+        f"{protocol['version']}, {protocol['eval_camera']} at {protocol['width']}x{protocol['height']}, "
+        f"{protocol['train_images']} training images of {len(protocol['cameras'])} "
+        f"camera{'s' * (len(protocol['cameras']) > 1)}, poses: {protocol['poses']}, regions: {protocol['regions']}, "
+        f"held-out key frames: {frames}"
+    )
