@@ -244,6 +244,16 @@ def test_a_scene_that_kept_its_poses_stands_beside_those_with_refined_ones(write
     assert {row["scene"] for row in report["rows"]} == {"0061", "0103"} and report["left_out"] == []
 
 
+def test_a_scene_whose_poses_come_from_images_alone_does_not(write):
+    made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
+    paths = [
+        write(metrics(scene, {"vanilla": VANILLA_A}, made, poses=poses))
+        for scene, poses in (("0061", "refined"), ("0103", "images"))
+    ]
+    report = gap_report(paths, told({"0061": made, "0103": made}), NO_LOGS)
+    assert "poses" in left_out(report, "0103")
+
+
 def test_a_scene_that_was_never_to_be_refined_does_not(write):
     made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
     paths = [write(metrics("0061", {"vanilla": VANILLA_A}, made, poses="refined")),

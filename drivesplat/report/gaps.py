@@ -96,9 +96,11 @@ _COMPARABLE = ("cameras", "eval_camera", "width", "height", "sweeps", "holdout",
 
 def _comparable(record: dict[str, Any]) -> dict[str, Any]:
     """What of a protocol has to be the same for figures to stand side by side. A scene whose refinement was refused
-    keeps its poses (`protocol.poses` says so) and stands beside those that have refined ones."""
-    poses = {"poses": "refined"} if "refine_poses" in record["provenance"]["stages"] else {}
-    return {key: record["protocol"][key] for key in _COMPARABLE} | poses
+    keeps its poses (`protocol.poses` says so) and stands beside those that have refined ones; one whose poses were made
+    from images alone does not."""
+    own = {key: record["protocol"][key] for key in _COMPARABLE}
+    refined = "refine_poses" in record["provenance"]["stages"] and own["poses"] != "images"
+    return own | ({"poses": "refined"} if refined else {})
 
 
 def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
