@@ -1,0 +1,84 @@
+"""Runs that are killed, and what they leave: the next run needs no flags, and no training runs twice."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from test_runs import VANILLA, told, training_process
+from workflow_copy import TINY_TRAINING, WorkflowCopy
+
+pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("killed")]
+
+TARGET = "results/0001/vanilla/train.json"
+PATIENCE = 120
+"""Seconds that anything here may take."""
+
+
+def until(happens: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not happens():
+        assert time.monotonic() < deadline, "it never came to this"
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Iterator[WorkflowCopy]:
+    """A workflow whose training lasts longer than any test."""
+    endless = TINY_TRAINING | {"iterations": 200_000, "checkpoint_every": 10}
+    made = WorkflowCopy.make(tmp_path_factory.mktemp("killed") / "workflow", methods=VANILLA, train=endless)
+    yield made
+    trainer = training_process(made)
+    if trainer is not None:
+        os.kill(trainer, signal.SIGKILL)
+
+
+def started(copy: WorkflowCopy) -> subprocess.Popen:
+    """Snakemake at work on the training, in a session of its own."""
+    return subprocess.Popen(
+        copy.command("--cores", "2", "--", TARGET), cwd=copy.folder, env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+
+
+def at_work(copy: WorkflowCopy) -> subprocess.Popen:
+    """The same, once it has written a resume state."""
+    state = copy.folder / "results/0001/vanilla/resume/state.pt"
+    state.unlink(missing_ok=True)
+    running = started(copy)
+    until(state.exists)
+    return running
+
+
+def test_a_training_that_outlives_a_killed_run_is_named_and_never_doubled(copy):
+    running = at_work(copy)
+    running.kill()
+    running.wait()
+    orphan = training_process(copy)
+    assert orphan is not None, "the training goes on"
+    line = told(copy.run(TARGET))
+    assert f"process {orphan} is still training" in line and f"kill {orphan}" in line
+    assert training_process(copy) == orphan
+    os.kill(orphan, signal.SIGKILL)
+    until(lambda: training_process(copy) is None)
+    done = copy.run("results/0001/parser.pkl")
+    assert done.returncode == 0 and "Nothing to be done" in done.stdout, "no lock is left, and nothing is broken"
+
+
+def test_an_interrupted_run_takes_its_training_along_and_the_next_one_goes_on(copy):
+    running = at_work(copy)
+    os.killpg(running.pid, signal.SIGINT)
+    assert running.wait(PATIENCE) != 0
+    until(lambda: training_process(copy) is None)
+    folder = copy.folder / "results/0001/vanilla"
+    assert not (folder / "checkpoint.pt").exists() and (folder / "resume/state.pt").exists()
+    log = copy.folder / "results/logs/0001/vanilla/train.log"
+    log.unlink()
+    again = started(copy)
+    try:
+        until(lambda: log.exists() and "resuming at iteration" in log.read_text())
+    finally:
+        os.killpg(again.pid, signal.SIGINT)
+        again.wait(PATIENCE)
