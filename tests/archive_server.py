@@ -100,7 +100,12 @@ def served(site: Site) -> Iterator[Site]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            site.answer(self)
+            if self.path == "/moved":
+                self.send_response(302)
+                self.send_header("Location", site.address)
+                self.end_headers()
+            else:
+                site.answer(self)
 
         def log_message(self, *_):
             pass

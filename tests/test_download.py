@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -207,6 +208,51 @@ def test_a_checksum_of_null_is_a_warning_and_the_size_counts(site, tmp_path, cap
     assert "size alone is checked" in caplog.text and is_there(site.job(tmp_path / "mini"))
 
 
+def in_a_process(call, *arguments) -> multiprocessing.Process:
+    process = multiprocessing.get_context("fork").Process(target=call, args=arguments)
+    process.start()
+    return process
+
+
+def wait_for(condition) -> None:
+    until = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def kill(process: multiprocessing.Process) -> None:
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+
+
+def test_a_run_killed_while_fetching_is_gone_on_with(site, world, tmp_path):
+    job, part = site.job(tmp_path / "mini"), tmp_path / "mini.download/v1.0-mini.tgz.part"
+    site.silent_after = len(site.content) // 2
+    process = in_a_process(download, job)
+    wait_for(lambda: fetching.size_of(part) == site.silent_after)
+    kill(process)
+    site.silent_after = None
+    download(job)
+    assert site.ranges_asked == [None, f"bytes={len(site.content) // 2}-"] and files(tmp_path / "mini") == files(world)
+
+
+def test_a_file_that_has_moved_is_gone_on_with_where_it_is(plain, tmp_path):
+    plain.cut_after = [400_000]
+    moved = plain.settings(url=plain.address.replace("v1.0-mini.tgz", "moved"))
+    fetch(moved, tmp_path / "file")
+    assert plain.ranges_asked == [None, "bytes=400000-"] and (tmp_path / "file").read_bytes() == CONTENT
+
+
+def test_a_proxy_in_the_environment_is_taken(plain, tmp_path, monkeypatch):
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(urllib.request, "_opener", None)  # it remembers the proxies of its first use
+    monkeypatch.setenv("http_proxy", plain.address.removesuffix("/v1.0-mini.tgz"))
+    fetch(plain.settings(url="http://nuscenes.invalid/v1.0-mini.tgz"), tmp_path / "file")
+    assert (tmp_path / "file").read_bytes() == CONTENT
+
+
 def slow_download(job) -> None:
     nuscenes_mini.unpack = lambda *_: time.sleep(60)
     download(job)
@@ -214,15 +260,10 @@ def slow_download(job) -> None:
 
 def test_a_run_killed_while_unpacking_unpacks_again_without_fetching(site, world, tmp_path):
     job = site.job(tmp_path / "mini")
-    process = multiprocessing.get_context("fork").Process(target=slow_download, args=(job,))
-    process.start()
-    archive = work_folder(job) / "v1.0-mini.tgz"
-    until = time.monotonic() + 10
-    while not archive.is_file() and time.monotonic() < until:
-        time.sleep(0.01)
+    process = in_a_process(slow_download, job)
+    wait_for((work_folder(job) / "v1.0-mini.tgz").is_file)
     refused("another run is downloading", call=lambda: download(job))
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
+    kill(process)
     assert not (tmp_path / "mini").exists()
     (work_folder(job) / "unpacked/v1.0-mini").mkdir(parents=True)
     (work_folder(job) / "unpacked/v1.0-mini/half").write_text("half")
