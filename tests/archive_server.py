@@ -38,14 +38,19 @@ class Site:
     silent_after: int | None = None
     status: int = 200
     wrong_range: bool = False
+    heeds_conditions: bool = True
+    """Whether it looks at If-Range."""
+    range_error: bool = False
+    """Whether it answers 416 to who asks for a part."""
     asked: list[dict[str, str]] = field(default_factory=list)
     address: str = ""
     ended: threading.Event = field(default_factory=threading.Event)
 
     def answer(self, handler: BaseHTTPRequestHandler) -> None:
         self.asked.append(dict(handler.headers.items()))
-        if self.status >= 400:
-            handler.send_error(self.status)
+        status = 416 if self.range_error and "Range" in handler.headers else self.status
+        if status >= 400:
+            handler.send_error(status)
             return
         start = self._start(handler)
         body = self.content[start:]
@@ -69,7 +74,7 @@ class Site:
         """Where its answer begins: a condition that does not hold makes it send all."""
         wanted = re.fullmatch(r"bytes=(\d+)-", handler.headers.get("Range", ""))
         condition = handler.headers.get("If-Range")
-        same = condition is None or condition in (self.tag, self.date)
+        same = condition is None or not self.heeds_conditions or condition in (self.tag, self.date)
         return int(wanted[1]) if wanted and self.ranges and same else 0
 
     @property

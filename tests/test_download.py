@@ -98,6 +98,13 @@ def test_what_is_there_already_is_left_alone_and_nothing_is_fetched(site, tmp_pa
     assert site.asked == [] and (tmp_path / "mini/mine.txt").read_text() == "mine"
 
 
+def test_where_another_run_was_faster_nothing_is_fetched(site, tmp_path, monkeypatch):
+    looks = [False, True]
+    monkeypatch.setattr(nuscenes_mini, "is_there", lambda _: looks.pop(0))
+    download(site.job(tmp_path / "mini"))
+    assert site.asked == [] and list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("part_only", [False, True])
 def test_other_data_are_not_touched(site, world, tmp_path, part_only):
     root = tmp_path / "mini"
@@ -183,11 +190,14 @@ def test_a_date_marks_a_file_where_there_is_no_tag(plain, tmp_path):
     assert plain.asked[0]["If-Range"] == plain.date and (tmp_path / "file").read_bytes() == CONTENT
 
 
-def test_bytes_that_nobody_asked_for_are_not_glued_on(plain, tmp_path):
+@pytest.mark.parametrize("kind", ["another part", "part of another file", "no such part"])
+def test_bytes_that_nobody_asked_for_are_not_glued_on(plain, tmp_path, kind):
     broken_off(plain, tmp_path / "file")
-    plain.wrong_range = True
+    plain.wrong_range, plain.range_error = kind == "another part", kind == "no such part"
+    if kind == "part of another file":
+        plain.tag, plain.content, plain.heeds_conditions = '"second"', CONTENT[::-1], False
     fetch(plain.settings(attempts=2), tmp_path / "file")
-    assert plain.ranges_asked == ["bytes=400000-", None] and (tmp_path / "file").read_bytes() == CONTENT
+    assert plain.ranges_asked == ["bytes=400000-", None] and (tmp_path / "file").read_bytes() == plain.content
 
 
 def test_a_file_that_came_whole_but_was_not_checked_yet_is_not_fetched_again(plain, tmp_path):

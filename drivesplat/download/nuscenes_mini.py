@@ -35,11 +35,12 @@ def download(job: DownloadJob) -> None:
         return
     folder = work_folder(job)
     try:
-        _require_space(job, folder)
         with _held(folder):
             if not is_there(job):  # another run may have been faster
+                shutil.rmtree(folder / UNPACKED, ignore_errors=True)  # of a run that was killed
+                _require_space(job, folder)
                 _bring(job, folder, root)
-                _clear(folder, job.nuscenes_mini.keep_archive)
+            _clear(folder, job.nuscenes_mini.keep_archive)
     except OSError as error:
         where = error.filename or folder
         raise DatasetError(
@@ -58,14 +59,11 @@ def _require_space(job: DownloadJob, folder: Path) -> None:
     source, archive = job.nuscenes_mini, folder / ARCHIVE
     have = size_of(archive) or size_of(part_of(archive))
     fetched = max(source.size_bytes - have, 0)
-    left = folder / UNPACKED  # of a run that was killed: it goes before anything is unpacked anew
-    freed = sum(file.stat().st_size for file in left.rglob("*") if file.is_file())
-    require_space(folder, fetched + round(source.max_unpacked_gb * 1e9) - freed, "nuScenes mini")
+    require_space(folder, fetched + round(source.max_unpacked_gb * 1e9), "nuScenes mini")
 
 
 def _bring(job: DownloadJob, folder: Path, root: Path) -> None:
     source, archive = job.nuscenes_mini, folder / ARCHIVE
-    shutil.rmtree(folder / UNPACKED, ignore_errors=True)
     if source.sha256 is None:
         log.warning(
             "nuscenes_mini.sha256 is null: of the archive from %s the size alone is checked, not the content",
@@ -96,8 +94,8 @@ def _held(folder: Path) -> Iterator[None]:
 
 
 def _clear(folder: Path, keep_archive: bool) -> None:
-    if keep_archive:
+    if keep_archive and (folder / ARCHIVE).is_file():
         tell(f"the archive is kept: {folder / ARCHIVE}")
         (folder / "lock").unlink()
     else:
-        shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)  # a run that was faster may have removed it

@@ -5,7 +5,6 @@ Python's own `data` filter (PEP 706) as a second pair of eyes.
 """
 
 import gzip
-import shutil
 import tarfile
 import zlib
 from collections.abc import Iterator
@@ -45,7 +44,7 @@ class _Stream(gzip.GzipFile):
 
 
 def unpack(archive: Path, folder: Path, limits: Limits, required: list[str]) -> None:
-    """Unpacks a .tgz, in which the files `required` have to be, into `folder`, which is emptied first.
+    """Unpacks a .tgz, in which the files `required` have to be, into `folder`, which is not there yet.
 
     Raises BadArchiveError where the archive is to blame, before anything is written; DatasetError where the disk is.
     """
@@ -56,7 +55,6 @@ def unpack(archive: Path, folder: Path, limits: Limits, required: list[str]) -> 
         size = _inspect(archive, limits, required)
     except CORRUPT as error:
         raise BadArchiveError(f"{archive.name} is damaged ({error})") from error
-    shutil.rmtree(folder, ignore_errors=True)
     require_space(folder, size, "unpacking nuScenes mini")
     folder.mkdir(parents=True)
     progress = Progress("unpacking", max(size, 1))

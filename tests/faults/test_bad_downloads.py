@@ -116,9 +116,10 @@ def test_a_full_disk_is_said_before_anything_is_fetched(archive, tmp_path, monke
 
     monkeypatch.setattr(shutil, "disk_usage", usage)
     with served(Site(archive)) as site:
+        (tmp_path / "disk").mkdir()
         message = refused(site.job(tmp_path / "disk/mini"))
         assert "make room" in message and str(tmp_path) in message
-        assert asked == [tmp_path] and site.asked == [] and list(tmp_path.iterdir()) == []
+        assert asked == [tmp_path / "disk/mini.download"] and site.asked == []
         monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 0, int(1e8) + len(archive)))
         download(site.job(tmp_path / "disk/mini"))
 
@@ -128,6 +129,16 @@ def test_what_has_come_already_needs_no_room_twice(archive, tmp_path, monkeypatc
         refused(site.job(tmp_path / "mini", attempts=1))
         monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 0, int(1e8) + len(archive) - 1000))
         download(site.job(tmp_path / "mini"))
+
+
+def test_a_disk_that_others_have_filled_meanwhile_is_said_before_anything_is_unpacked(archive, tmp_path, monkeypatch):
+    free = [10**9, 1000]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 0, free.pop(0)))
+    with served(Site(archive)) as site:
+        job = site.job(tmp_path / "mini")
+        with pytest.raises(DatasetError, match="unpacking nuScenes mini needs"):
+            download(job)
+    assert sorted(path.name for path in work_folder(job).iterdir()) == ["lock", "v1.0-mini.tgz"]
 
 
 def test_a_disk_that_fills_up_is_a_line_and_keeps_what_has_come(archive, tmp_path, monkeypatch):
