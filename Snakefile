@@ -8,7 +8,7 @@
 #   snakemake --report report.zip                     all there is to look at, as a page that opens offline
 #
 # The data, once you have accepted nuScenes' terms (docs/data.md):
-#   snakemake --cores 1 --config accept_nuscenes_terms=true -- download_nuscenes_mini
+#   snakemake --cores 1 --config accept_nuscenes_terms=True -- download_nuscenes_mini
 #
 # The demo world needs no dataset and no GPU:
 #   snakemake --cores 2 results/demo/metrics.json

@@ -171,6 +171,13 @@ class Config(Settings):
     results_dir: str = Field("results", min_length=1)
     """The folder of all output; keep experiments apart by giving each its own."""
 
+    @field_validator("accept_nuscenes_terms", mode="before")
+    @classmethod
+    def _text_on_the_command_line(cls, value: Any) -> Any:
+        if value in ("true", "false"):
+            raise ValueError(f"write {value.capitalize()}: Snakemake's --config takes {value} for text")
+        return value
+
     @field_validator("methods")
     @classmethod
     def _none_is_no_method(cls, value: dict[str, MethodSettings | None]) -> dict[str, MethodSettings | None]:

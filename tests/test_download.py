@@ -125,6 +125,10 @@ def test_terms_that_are_not_accepted_fetch_nothing(site, tmp_path):
     assert site.asked == [] and list(tmp_path.iterdir()) == []
 
 
+def test_terms_accepted_as_snakemake_does_not_read_it_are_a_line_that_says_how_to():
+    refused("accept_nuscenes_terms", "write True", call=lambda: load({"accept_nuscenes_terms": "true"}))
+
+
 def test_an_archive_that_is_kept_needs_no_network_the_next_time(site, world, tmp_path):
     job = site.job(tmp_path / "mini", keep_archive=True)
     download(job)

@@ -35,7 +35,7 @@ def refuse(job: DownloadJob) -> None:
     if not job.accept_nuscenes_terms:
         raise ConfigError(
             f"nuScenes comes under terms (non-commercial use, unless licensed): read {TERMS}, and where you accept "
-            "them set accept_nuscenes_terms: true in config.yaml, or --config accept_nuscenes_terms=true"
+            "them set accept_nuscenes_terms: true in config.yaml, or --config accept_nuscenes_terms=True"
         )
     if not is_there(job):
         _refuse_other_data(job)

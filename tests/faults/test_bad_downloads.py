@@ -24,6 +24,7 @@ from drivesplat.download.nuscenes_mini import download, work_folder
 from drivesplat.errors import DatasetError
 from drivesplat.settings.download import DownloadJob
 
+ACCEPTED = ("--config", "accept_nuscenes_terms=True")
 Usage = namedtuple("Usage", "total used free")
 
 
@@ -337,14 +338,14 @@ def test_through_the_workflow_it_is_refused_then_fetched_then_read(archive, tmp_
     assert not (copy.folder / "results").exists()
     with served(Site(archive)) as site:
         settings = site.settings()
-        copy.config |= {"accept_nuscenes_terms": True, "nuscenes_mini": settings.model_dump()}
+        copy.config |= {"nuscenes_mini": settings.model_dump()}
         copy.write_config()
-        done = copy.run("download_nuscenes_mini")
+        done = copy.run("download_nuscenes_mini", flags=ACCEPTED)
         assert done.returncode == 0 and "nuScenes v1.0-mini is in " in done.stdout, done.stdout
         assert len(site.asked) == 1
         done = copy.run("results/0001/scene.json")
         assert done.returncode == 0 and "download_nuscenes_mini" not in done.stdout, done.stdout
         shutil.rmtree(copy.folder / "data")
-        assert copy.run("download_nuscenes_mini").returncode == 0 and len(site.asked) == 2
+        assert copy.run("download_nuscenes_mini", flags=ACCEPTED).returncode == 0 and len(site.asked) == 2
     assert (copy.folder / "data/v1.0-mini/scene.json").is_file()
     assert "download_nuscenes_mini" not in copy.planned()
