@@ -7,6 +7,9 @@
 #   snakemake --cores 1 results/0061/ablation.csv     what each thing in the method `street` is worth, over three seeds
 #   snakemake --report report.zip                     all there is to look at, as a page that opens offline
 #
+# The data, once you have accepted nuScenes' terms (docs/data.md):
+#   snakemake --cores 1 --config accept_nuscenes_terms=True -- download_nuscenes_mini
+#
 # The demo world needs no dataset and no GPU:
 #   snakemake --cores 2 results/demo/metrics.json
 #   snakemake --cores 2 --configfile presets/demo.yaml -- all
@@ -24,6 +27,7 @@ report: "report/workflow.rst"
 
 
 include: "rules/common.smk"
+include: "rules/download.smk"
 include: "rules/demo.smk"
 include: "rules/scene.smk"
 include: "rules/train.smk"

@@ -16,6 +16,7 @@ from drivesplat.settings import Settings, validated
 from drivesplat.settings.ablation import AblationSettings
 from drivesplat.settings.actor_seed import ActorSeedSettings
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.download import NuscenesMiniSettings
 from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
 from drivesplat.settings.extract import ExtractSettings
@@ -128,6 +129,10 @@ def _default_methods() -> dict[str, MethodSettings]:
 class Config(Settings):
     datasets: dict[str, DatasetSettings] = Field(default_factory=_default_datasets, min_length=1)
     """Recorded drives, each under a name of your choice."""
+    accept_nuscenes_terms: bool = False
+    """Whether you accept nuScenes' terms, https://www.nuscenes.org/terms-of-use: non-commercial use, unless you have a
+    licence. Without it `snakemake download_nuscenes_mini` fetches nothing."""
+    nuscenes_mini: NuscenesMiniSettings = NuscenesMiniSettings()
     methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
     """Methods to train and compare, each under a name of your choice; a result folder each. null = no such method: a
     file laid over this one drops `street` by {street: null}."""
@@ -165,6 +170,13 @@ class Config(Settings):
     """Seeds every random choice."""
     results_dir: str = Field("results", min_length=1)
     """The folder of all output; keep experiments apart by giving each its own."""
+
+    @field_validator("accept_nuscenes_terms", mode="before")
+    @classmethod
+    def _text_on_the_command_line(cls, value: Any) -> Any:
+        if value in ("true", "false"):
+            raise ValueError(f"write {value.capitalize()}: Snakemake's --config takes {value} for text")
+        return value
 
     @field_validator("methods")
     @classmethod

@@ -14,6 +14,8 @@ from typing import Any
 
 from drivesplat.config import for_scene, load
 from drivesplat.demo.mark import refuse_foreign_data
+from drivesplat.download.destination import RULE as DOWNLOAD
+from drivesplat.download.destination import download_job, refuse
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.inputs import Inputs
 from drivesplat.report_plan import ReportPlan
@@ -68,6 +70,10 @@ class Plan(Inputs):
     def world_settings(self, dataset: str) -> str:
         """The settings of a dataset's synthetic world."""
         return stage_settings(self.config, "demo_world", self.worlds[dataset])
+
+    def download_settings(self, _: Any) -> str:
+        """The settings of the download of nuScenes mini. Raises ConfigError where no dataset takes it."""
+        return canonical_json(download_job(self.config).model_dump(mode="json"))
 
     def device(self, wildcards: Any) -> str:
         """Where a scene's jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
@@ -183,9 +189,15 @@ class Plan(Inputs):
         if film not in (path[-1], *self._films_of(scene, method)):
             raise ConfigError(no_such_film(for_scene(self.config, scene), scene, film))
 
+    def refuse_download(self, targets: list[str]) -> None:
+        """Raises ConfigError where nuScenes mini is asked for and may not be fetched."""
+        if DOWNLOAD in targets:
+            refuse(download_job(self.config))
+
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""
-        for scene in self._scenes_of(targets):
+        needing = [target for target in targets if target != DOWNLOAD]
+        for scene in self._scenes_of(needing) if needing or not targets else ():
             tables = self.tables(SimpleNamespace(scene=scene))
             if self.config.datasets[self.config.dataset_of(scene)].world:
                 refuse_foreign_data(Path(tables[0]).parents[1])

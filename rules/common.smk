@@ -21,6 +21,7 @@ try:
     edited = plan.edits(plan.config.batch_scenes)
     if workflow.is_main_process and not asked.lint:
         plan.refuse_unknown(asked.targets)
+        plan.refuse_download(asked.targets)
         plan.refuse_absent_data(asked.targets)
 except DriveSplatError as error:
     sys.exit(f"drivesplat: {error}")

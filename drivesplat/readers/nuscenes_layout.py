@@ -12,6 +12,14 @@ HOW_TO_GET_IT = (
     "download it from https://www.nuscenes.org/nuscenes (free registration), unpack it there, "
     "or set datasets.<name>.dataroot in config.yaml"
 )
+HOW_TO_GET_MINI = (
+    "`snakemake --cores 1 download_nuscenes_mini` fetches it, where you accept nuScenes' terms (docs/data.md); or "
+)
+
+
+def how_to_get_it(version: str) -> str:
+    """What to do where a version of nuScenes is not there."""
+    return (HOW_TO_GET_MINI if version == "v1.0-mini" else "") + HOW_TO_GET_IT
 
 
 def find_root(dataroot: str, version: str) -> Path:
@@ -28,12 +36,12 @@ def find_root(dataroot: str, version: str) -> Path:
         ):
             return root
     if not given.is_dir():
-        raise DatasetError(f"nuScenes {version} not found: there is no folder {given}; {HOW_TO_GET_IT}")
+        raise DatasetError(f"nuScenes {version} not found: there is no folder {given}; {how_to_get_it(version)}")
     others = sorted(p.parent.name for p in given.glob("v1.0-*/scene.json"))
     found = (
         f"it holds {', '.join(others)}: set datasets.<name>.version"
         if others
-        else f"it holds no nuScenes tables; {HOW_TO_GET_IT}"
+        else f"it holds no nuScenes tables; {how_to_get_it(version)}"
     )
     raise DatasetError(f"nuScenes {version} not found: looked for {version}/scene.json in {given}; {found}")
 
@@ -43,5 +51,7 @@ def table_files(root: Path, version: str) -> list[Path]:
     files = [root / version / f"{name}.json" for name in TABLES]
     absent = [file.name for file in files if not file.is_file()]
     if absent:
-        raise DatasetError(f"nuScenes {version} in {root} is incomplete: {', '.join(absent)} missing; {HOW_TO_GET_IT}")
+        raise DatasetError(
+            f"nuScenes {version} in {root} is incomplete: {', '.join(absent)} missing; {how_to_get_it(version)}"
+        )
     return files
