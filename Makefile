@@ -3,10 +3,11 @@
 # make doctor     what works on this machine, what does not, and what to do about it
 # make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
 # make test-gpu   what needs a GPU: the rasterizers agree, trainings resume
+# make test-slurm a scene through a real SLURM, started on this machine for it (root on Debian; docs/cluster.md)
 # make bench      what the benchmarks/ measure, against their bounds (two idle cores)
 # make quality    RECIPES=file: recipes trained with several seeds on one scene, and their table (docs/quality.md)
 # make config     config.yaml and config.schema.json from the settings' definitions
-.PHONY: demo setup doctor test lint test-gpu bench quality config
+.PHONY: demo setup doctor test lint test-gpu test-slurm bench quality config
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -23,7 +24,7 @@ doctor:
 	@bash scripts/doctor.sh $(CONFIG)
 
 test: setup lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu and not slurm"
 
 lint: setup
 	$(BIN)/ruff check .
@@ -34,6 +35,9 @@ lint: setup
 # Uses the Python at hand where there is no .venv: GPU machines often bring their own torch.
 test-gpu:
 	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -m gpu -rs -v
+
+test-slurm: setup
+	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/test_slurm.py
 
 bench: setup
 	$(BIN)/python -m pytest benchmarks -q

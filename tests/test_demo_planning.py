@@ -57,7 +57,7 @@ def test_the_demo_is_there_by_default_and_out_of_the_batch():
     config = load({})
     assert "demo" in config.scenes and "demo" not in config.batch_scenes
     assert config.batch_scenes == [s for s in config.scenes if s != "demo"]
-    assert plan().report_scenes([]) == config.batch_scenes
+    assert plan().report([]).scenes == config.batch_scenes
 
 
 def test_a_world_can_be_part_of_the_batch():
