@@ -1,0 +1,103 @@
+"""What a run is expected to take, in time and on disk, before it starts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivesplat.costs.disk import DiskNeed
+from drivesplat.costs.expected import KNOWN_MACHINE, Expectations, Work, wall_seconds
+from drivesplat.costs.measured import TRAIN, Job
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What jobs are spread over."""
+
+    cores: int
+    gpus: int
+
+
+@dataclass(frozen=True)
+class PlannedJob:
+    """A job that is to run, the threads it takes and whether it takes a GPU."""
+
+    job: Job
+    threads: int
+    on_gpu: bool
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The seconds that `jobs` take on a machine, by the time on the wall; how many of them are known from jobs that
+    were `measured`, and from how many; seconds of work by stage, the dearest first; and the disk they fill."""
+
+    jobs: int
+    seconds: float
+    measured: int
+    basis: int
+    by_stage: dict[str, tuple[int, float]]
+    machine: Machine
+    disk: DiskNeed
+
+
+def estimate(
+    planned: Sequence[PlannedJob], expectations: Expectations, basis: int, machine: Machine, disk: DiskNeed
+) -> Estimate:
+    """What is to be expected of `planned` jobs; `basis` is how many jobs have been measured."""
+    expected = [expectations.of(one.job) for one in planned]
+    work = [Work(one.job, found.seconds, one.threads, one.on_gpu) for one, found in zip(planned, expected, strict=True)]
+    stages: dict[str, tuple[int, float]] = {}
+    for one in work:
+        jobs, seconds = stages.get(one.job.stage, (0, 0.0))
+        stages[one.job.stage] = jobs + 1, seconds + one.seconds
+    return Estimate(
+        jobs=len(work),
+        seconds=wall_seconds(work, machine.cores, machine.gpus),
+        measured=sum(found.measured for found in expected),
+        basis=basis,
+        by_stage=dict(sorted(stages.items(), key=lambda item: -item[1][1])),
+        machine=machine,
+        disk=disk,
+    )
+
+
+def in_one_line(found: Estimate) -> str:
+    """'27 jobs, about 12 min on 4 cores and 1 GPU (…), about 0.4 GB of disk (70.0 GB free)'."""
+    if not found.jobs:
+        return "nothing is to be run"
+    cores, gpus = found.machine.cores, found.machine.gpus
+    where = f"{cores} core{'s' * (cores > 1)}" + (f" and {gpus} GPUs" if gpus > 1 else "")
+    disk = f"about {found.disk.needed / 1e9:.1f} GB of disk ({found.disk.free / 1e9:.1f} GB free)"
+    warning = "; THE DISK WILL NOT DO" if found.disk.needed > found.disk.free else ""
+    jobs = f"{found.jobs} job{'s' * (found.jobs > 1)}"
+    return f"{jobs}, about {spelled(found.seconds)} on {where} ({_basis(found)}), {disk}{warning}"
+
+
+def _basis(found: Estimate) -> str:
+    """How the time is known."""
+    if not found.measured:
+        return "none of the kind measured here yet: rough"
+    rest = found.jobs - found.measured
+    return f"from {found.basis} measured job{'s' * (found.basis > 1)}" + (f"; {rest} rough" if rest else "")
+
+
+def in_full(found: Estimate) -> str:
+    """The line, and a table of stages."""
+    lines = [f"drivesplat: {in_one_line(found)}"]
+    lines += [f"  {stage:<16}{jobs:>5} x {seconds / jobs:>8.1f} s" for stage, (jobs, seconds) in found.by_stage.items()]
+    if found.measured < found.jobs:
+        lines.append(
+            f"  rough: as on {KNOWN_MACHINE}, trainings by their iterations; it may be off by a factor of five"
+        )
+    if found.disk.rough:
+        lines.append("  disk: as is usual where no other scene of the dataset has been made yet")
+    if any(stage == TRAIN for stage in found.by_stage) and found.machine.gpus > 1:
+        lines.append(f"  {found.machine.gpus} GPUs share the jobs that take one")
+    return "\n".join(lines)
+
+
+def spelled(seconds: float) -> str:
+    """'45 s', '12 min', '3 h 5 min'."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
