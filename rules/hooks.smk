@@ -9,6 +9,8 @@ rule costs:
     """
     Nothing by itself: costs.csv and costs.json are written when any run ends, and this one's table is printed.
     """
+    input:
+        [],
 
 
 rule estimate:

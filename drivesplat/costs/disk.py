@@ -1,63 +1,68 @@
-"""How much disk a run will fill: as much as the folders of scenes and methods that are there already."""
+"""How much disk a run will fill: what the same jobs left on it for other scenes."""
 
 import shutil
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-SCENE_BYTES, METHOD_BYTES = 60e6, 120e6
-"""Of a scene's folder without its methods, and of a method's: where no other scene tells. A tenth to a half of it is
-what the scenes and methods of nuScenes mini and of the demo take; films and exports included."""
+MEGABYTES = {
+    "demo_world": 80.0, "extract": 2.0, "lidar_seed": 15.0, "parser": 5.0, "masks": 5.0, "actors": 2.0,
+    "lidar_depth": 10.0, "free_space": 5.0, "train": 110.0, "film": 5.0, "film_parts": 10.0, "edit": 10.0,
+    "ghost_panel": 2.0, "remove_actor": 8.0, "evaluate": 2.0, "export": 200.0, "export_usd": 60.0,
+    "export_viewer": 15.0, "gap_report": 10.0,
+}  # fmt: skip
+"""Of what stages leave at the defaults: 0.4 million Gaussians, 59 numbers each in checkpoint.pt and splat.ply."""
+OTHERS = 1.0
+BESIDE = {"masks.json": ".", "checkpoint.pt": "tensorboard", "parts.json": "."}
+"""Outputs beside which a job leaves a folder's files that no rule declares, and which folder."""
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """A job of a `stage` and `scene` (empty: of none), and the files that it makes."""
+
+    stage: str
+    scene: str
+    outputs: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class DiskNeed:
-    """Bytes that a run will add, how many folders' sizes were known from others, how many were not, and bytes free."""
+    """Bytes that a run will add, of how many jobs that is rough, and the bytes that are free."""
 
     needed: float
-    measured: int
     rough: int
     free: float
 
 
-def disk_need(results: Path, folders: Iterable[tuple[str, str]], dataset: Callable[[str], str]) -> DiskNeed:
-    """What is still to come into the `folders`, scenes with methods (empty: of the scene itself), of jobs that will
-    run: each gets as large as the median of those of other scenes of its dataset, else as is usual."""
-    there = sizes(results)
-    needed, measured, rough = 0.0, 0, 0
-    for scene, method in dict.fromkeys(folders):
-        peers = {
-            place: size for place, size in there.items() if place[0] != scene and dataset(place[0]) == dataset(scene)
-        }
-        same = [size for place, size in peers.items() if place[1] == method]
-        alike = same or [size for place, size in peers.items() if bool(place[1]) == bool(method)]
-        measured, rough = measured + bool(alike), rough + (not alike)
-        expected = statistics.median(alike) if alike else METHOD_BYTES if method else SCENE_BYTES
-        needed += max(0.0, expected - there.get((scene, method), 0.0))
+def disk_need(results: Path, jobs: Iterable[Leaves], peers: Callable[[str], Sequence[str]]) -> DiskNeed:
+    """What `jobs` will add in the folder of results: nothing where they replace what is there, else the median of what
+    they left for the `peers` of their scenes, the others of the dataset; else what is usual."""
+    needed, rough = 0.0, 0
+    for job in jobs:
+        if _left(job.outputs):
+            continue
+        elsewhere = (_elsewhere(results, job, scene) for scene in peers(job.scene))
+        known = [size for outputs in elsewhere if (size := _left(outputs))]
+        rough += not known
+        needed += statistics.median(known) if known else 1e6 * MEGABYTES.get(job.stage, OTHERS)
     existing = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
-    return DiskNeed(needed, measured, rough, shutil.disk_usage(existing).free)
+    return DiskNeed(needed, rough, shutil.disk_usage(existing).free)
 
 
-def sizes(results: Path) -> dict[tuple[str, str], float]:
-    """Bytes in the folders of all scenes, by scene and method; a folder counts as a scene's by its scene.json, one in
-    it as a method's by its checkpoint.pt."""
-    found: dict[tuple[str, str], float] = {}
-    for record in results.glob("*/scene.json"):
-        folder = record.parent
-        methods = [checkpoint.parent for checkpoint in folder.glob("*/checkpoint.pt")]
-        whole = _bytes_in(folder)
-        of_methods = {(folder.name, method.name): _bytes_in(method) for method in methods}
-        found |= of_methods
-        found[folder.name, ""] = whole - sum(of_methods.values())
-    return found
+def _elsewhere(results: Path, job: Leaves, scene: str) -> list[str]:
+    """The files of the same job of another scene."""
+    own = (results / job.scene, results / scene)
+    inside = [path for path in map(Path, job.outputs) if path.is_relative_to(own[0])]
+    return [str(own[1] / path.relative_to(own[0])) for path in inside]
 
 
-def _bytes_in(folder: Path) -> float:
-    total = 0
-    for file in folder.rglob("*"):
-        try:
-            total += file.lstat().st_size
-        except OSError:
-            continue  # a job at work has renamed it
-    return float(total)
+def _left(outputs: Sequence[str]) -> float:
+    """Bytes of these files and of what lies beside them; 0 where none is there."""
+    files: set[Path] = set()
+    for path in (Path(output) for output in outputs if Path(output).is_file()):
+        files.add(path)
+        if path.name in BESIDE:
+            files |= {file for file in (path.parent / BESIDE[path.name]).rglob("*") if file.is_file()}
+    return float(sum(file.stat().st_size for file in files))

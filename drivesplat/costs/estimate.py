@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from drivesplat.costs.disk import DiskNeed
+from drivesplat.costs.disk import DiskNeed, Leaves, disk_need
 from drivesplat.costs.expected import KNOWN_MACHINE, Expectations, Work, wall_seconds
-from drivesplat.costs.measured import TRAIN, Job
+from drivesplat.costs.measured import Job
 
 
 @dataclass(frozen=True)
@@ -18,31 +19,30 @@ class Machine:
 
 @dataclass(frozen=True)
 class PlannedJob:
-    """A job that is to run, the threads it takes and whether it takes a GPU."""
+    """A job that is to run, the threads it takes, whether it takes a GPU, and the files that it makes."""
 
     job: Job
     threads: int
     on_gpu: bool
+    outputs: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The seconds that `jobs` take on a machine, by the time on the wall; how many of them are known from jobs that
-    were `measured`, and from how many; seconds of work by stage, the dearest first; and the disk they fill."""
+    """The seconds that `jobs` take on a machine, by the clock on the wall; how many of them are `known`, and from how
+    many jobs that were `measured`; jobs and seconds of work by stage, the dearest first; and the disk they fill."""
 
     jobs: int
     seconds: float
+    known: int
     measured: int
-    basis: int
     by_stage: dict[str, tuple[int, float]]
     machine: Machine
     disk: DiskNeed
 
 
-def estimate(
-    planned: Sequence[PlannedJob], expectations: Expectations, basis: int, machine: Machine, disk: DiskNeed
-) -> Estimate:
-    """What is to be expected of `planned` jobs; `basis` is how many jobs have been measured."""
+def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine: Machine, results: Path) -> Estimate:
+    """What is to be expected of `planned` jobs in a folder of results."""
     expected = [expectations.of(one.job) for one in planned]
     work = [Work(one.job, found.seconds, one.threads, one.on_gpu) for one, found in zip(planned, expected, strict=True)]
     stages: dict[str, tuple[int, float]] = {}
@@ -52,11 +52,13 @@ def estimate(
     return Estimate(
         jobs=len(work),
         seconds=wall_seconds(work, machine.cores, machine.gpus),
-        measured=sum(found.measured for found in expected),
-        basis=basis,
+        known=sum(bool(found.measured) for found in expected),
+        measured=len(frozenset().union(*(found.measured for found in expected))),
         by_stage=dict(sorted(stages.items(), key=lambda item: -item[1][1])),
         machine=machine,
-        disk=disk,
+        disk=disk_need(
+            results, [Leaves(one.job.stage, one.job.scene, one.outputs) for one in planned], expectations.peers
+        ),
     )
 
 
@@ -74,24 +76,21 @@ def in_one_line(found: Estimate) -> str:
 
 def _basis(found: Estimate) -> str:
     """How the time is known."""
-    if not found.measured:
-        return "none of the kind measured here yet: rough"
-    rest = found.jobs - found.measured
-    return f"from {found.basis} measured job{'s' * (found.basis > 1)}" + (f"; {rest} rough" if rest else "")
+    if not found.known:
+        return "no such job measured here yet: rough"
+    rest = found.jobs - found.known
+    return f"from {found.measured} measured job{'s' * (found.measured > 1)}" + (f"; {rest} rough" if rest else "")
 
 
 def in_full(found: Estimate) -> str:
     """The line, and a table of stages."""
     lines = [f"drivesplat: {in_one_line(found)}"]
     lines += [f"  {stage:<16}{jobs:>5} x {seconds / jobs:>8.1f} s" for stage, (jobs, seconds) in found.by_stage.items()]
-    if found.measured < found.jobs:
-        lines.append(
-            f"  rough: as on {KNOWN_MACHINE}, trainings by their iterations; it may be off by a factor of five"
-        )
+    if found.known < found.jobs:
+        lines.append(f"  rough: as on {KNOWN_MACHINE},")
+        lines.append("         trainings by their iterations; on another machine it may be off by a factor of five")
     if found.disk.rough:
-        lines.append("  disk: as is usual where no other scene of the dataset has been made yet")
-    if any(stage == TRAIN for stage in found.by_stage) and found.machine.gpus > 1:
-        lines.append(f"  {found.machine.gpus} GPUs share the jobs that take one")
+        lines.append(f"  disk: for {found.disk.rough} of the jobs what is usual, for want of other scenes' files")
     return "\n".join(lines)
 
 

@@ -28,10 +28,10 @@ ITERATIONS_PER_SECOND = {
 
 @dataclass(frozen=True)
 class Expected:
-    """Seconds of a job, and whether jobs measured here say so."""
+    """Seconds of a job, and the jobs measured here that say so; none where it is rough."""
 
     seconds: float
-    measured: bool
+    measured: frozenset[Job]
 
 
 class Expectations:
@@ -54,10 +54,14 @@ class Expectations:
             lambda cost: job.stage != TRAIN or self._moves(cost.job.method) == self._moves(job.method),
         ]
         for like in alike:
-            found = [seconds for cost in peers if like(cost) and (seconds := self._scaled(cost, job)) is not None]
+            found = {c.job: seconds for c in peers if like(c) and (seconds := self._scaled(c, job)) is not None}
             if found:
-                return Expected(statistics.median(found), measured=True)
-        return Expected(self._rough(job), measured=False)
+                return Expected(statistics.median(found.values()), frozenset(found))
+        return Expected(self._rough(job), frozenset())
+
+    def peers(self, scene: str) -> list[str]:
+        """The other scenes of a scene's dataset."""
+        return [other for other in self._config.scenes if other != scene and self.dataset(other) == self.dataset(scene)]
 
     def dataset(self, scene: str) -> str:
         """The dataset of a scene, empty for jobs of no scene; a scene that is not configured any more has its own."""

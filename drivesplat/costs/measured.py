@@ -1,4 +1,4 @@
-"""What every job that has run cost: from the benchmark files that Snakemake leaves, and what trainings say themselves."""
+"""What every job that has run cost: from the benchmark files that Snakemake leaves, and what trainings say."""
 
 import csv
 import json

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from drivesplat.costs.disk import disk_need
 from drivesplat.costs.estimate import Estimate, Machine, PlannedJob, estimate, in_full, in_one_line
 from drivesplat.costs.expected import Expectations
 from drivesplat.costs.measured import BENCHMARKS, Job, read_costs
@@ -14,7 +13,6 @@ from drivesplat.costs.progress import Progress, Watch
 from drivesplat.costs.table import FILES, costs_in_words, finding, write_costs
 from drivesplat.errors import DriveSplatError
 from drivesplat.planning import Plan
-
 
 COSTS, ESTIMATE = "costs", "estimate"
 """Targets that make nothing: the first has costs.csv brought up to date, with the second only the estimate is told."""
@@ -49,11 +47,7 @@ class RunCosts:
 
     def estimate(self) -> Estimate:
         """What is to be expected of the run."""
-        costs, _ = read_costs(self._results)
-        expectations = Expectations(self._plan.config, costs)
-        folders = [(one.job.scene, one.job.method) for one in self._planned if one.job.scene]
-        disk = disk_need(self._results, folders, expectations.dataset)
-        return estimate(self._planned, expectations, len(costs), self._machine, disk)
+        return estimate(self._planned, self._expectations(), self._machine, self._results)
 
     def end(self) -> None:
         """Writes costs.csv and costs.json, and says which scenes of this run took 90 minutes or more. A failure is told
@@ -81,7 +75,10 @@ class RunCosts:
 
     @property
     def _planned(self) -> list[PlannedJob]:
-        return [PlannedJob(name, int(job.threads), "gpu" in job.rule.resources) for name, job in self._jobs.items()]
+        return [
+            PlannedJob(name, int(job.threads), "gpu" in job.rule.resources, tuple(map(str, job.output)))
+            for name, job in self._jobs.items()
+        ]
 
     @property
     def _machine(self) -> Machine:

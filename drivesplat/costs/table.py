@@ -26,7 +26,7 @@ def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[s
         if not counted:
             continue
         seconds = sum(c.seconds for c in counted)
-        by_part = {part: 0.0 for part in ("scene", *methods)}
+        by_part = dict.fromkeys(("scene", *methods), 0.0)
         for c in counted:
             by_part[c.job.method or "scene"] += c.seconds
         memory = {name: [v for c in counted if (v := getattr(c, name)) is not None] for name in _PEAKS}
