@@ -18,6 +18,9 @@ let_scripts_import(workflow.basedir)
 asked = get_argument_parser().parse_known_args()[0]
 wanted = [target for target in asked.targets if target != ESTIMATE]
 
+if ESTIMATE in asked.targets and asked.no_hooks:
+    sys.exit(f"drivesplat: --no-hooks leaves out what the target {ESTIMATE!r} is for, and would run everything")
+
 try:
     plan = Plan(config, workflow.basedir)
     run_costs = RunCosts(plan, workflow, asked.targets)

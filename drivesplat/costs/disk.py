@@ -48,7 +48,7 @@ def disk_need(results: Path, jobs: Iterable[Leaves], peers: Callable[[str], Sequ
         rough += not known
         needed += statistics.median(known) if known else 1e6 * MEGABYTES.get(job.stage, OTHERS)
     existing = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
-    return DiskNeed(needed, rough, shutil.disk_usage(existing).free)
+    return DiskNeed(needed, rough, float(shutil.disk_usage(existing).free))
 
 
 def _elsewhere(results: Path, job: Leaves, scene: str) -> list[str]:

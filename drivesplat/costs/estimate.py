@@ -68,8 +68,8 @@ def in_one_line(found: Estimate) -> str:
         return "nothing is to be run"
     cores, gpus = found.machine.cores, found.machine.gpus
     where = f"{cores} core{'s' * (cores > 1)}" + (f" and {gpus} GPUs" if gpus > 1 else "")
-    disk = f"about {found.disk.needed / 1e9:.1f} GB of disk ({found.disk.free / 1e9:.1f} GB free)"
-    warning = "; THE DISK WILL NOT DO" if found.disk.needed > found.disk.free else ""
+    disk = f"about {_spelled_bytes(found.disk.needed)} of disk ({found.disk.free / 1e9:.1f} GB free)"
+    warning = "; that is more than there is" if found.disk.needed > found.disk.free else ""
     jobs = f"{found.jobs} job{'s' * (found.jobs > 1)}"
     return f"{jobs}, about {spelled(found.seconds)} on {where} ({_basis(found)}), {disk}{warning}"
 
@@ -100,3 +100,7 @@ def spelled(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _spelled_bytes(size: float) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

@@ -1,5 +1,6 @@
 """What Snakemake's hooks say of costs: an estimate when a run starts, its progress, and costs.csv when it ends."""
 
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -35,11 +36,16 @@ class RunCosts:
         return ESTIMATE in self._targets
 
     def begin(self) -> None:
-        """Prints the estimate in a line, and from then on how far the run is."""
-        self._jobs = self._needed()
-        if not self._jobs:
-            return
-        _say(in_one_line(self.estimate()))
+        """Prints the estimate in a line, and from then on how far the run is; a failure is told and ends nothing."""
+        try:
+            self._jobs = self._needed()
+            if self._jobs:
+                _say(in_one_line(self.estimate()))
+                self._watch_jobs()
+        except Exception as error:  # a run must not end for what is told of it
+            _say(f"what the run will take cannot be told ({type(error).__name__}: {error})")
+
+    def _watch_jobs(self) -> None:
         logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
         args = self._planned, logs, self._expectations, self._finished, self._machine, time.time()
         self._watch = Watch(Progress(*args))
@@ -71,7 +77,7 @@ class RunCosts:
         """Snakemake's jobs that are to run, by what they are; those that only gather others are none."""
         jobs = (job for job in self._workflow.dag.needrun_jobs() if job.benchmark)
         folder = self._results / BENCHMARKS
-        return {Job.of(Path(str(job.benchmark)).relative_to(folder)): job for job in jobs}
+        return {Job.of(Path(os.path.relpath(job.benchmark, folder))): job for job in jobs}
 
     @property
     def _planned(self) -> list[PlannedJob]:

@@ -36,7 +36,7 @@ def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[s
                 "scene": scene,
                 "jobs": len(counted),
                 "seconds": seconds,
-                "training_seconds": sum(c.seconds for c in counted if c.job.stage == TRAIN),
+                "training_seconds": sum((c.seconds for c in counted if c.job.stage == TRAIN), 0.0),
                 "seconds_by_method": {part: value for part, value in by_part.items() if part != "scene"},
                 "scene_seconds": by_part["scene"],
                 **{name: max(values, default=None) for name, values in memory.items()},

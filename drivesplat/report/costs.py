@@ -18,8 +18,8 @@ def costs_table(totals: Sequence[dict[str, Any]]) -> str:
         '<h2>What it cost</h2><div class="card wide"><table><thead><tr><th class="name">scene</th>'
         + "".join(f"<th>{escape(head)}</th>" for head in heads)
         + f"</tr></thead><tbody>{lines}</tbody></table></div>"
-        '<p class="soft">Seconds of jobs one after another, films and exports that there were included, when this page '
-        "was made; side by side they take less. The variants of an ablation are left out. Every job stands in "
+        '<p class="soft">Of jobs one after another, films and exports included, when this page was made; '
+        "side by side they take less. The variants of an ablation are left out. Every job stands in "
         "costs.csv.</p>"
     )
 
