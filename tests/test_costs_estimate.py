@@ -112,6 +112,7 @@ def test_a_run_is_estimated_before_and_accounted_for_after_it(tmp_path):
     assert rows == [["0001", "", stage] for stage in ("extract", "lidar_seed", "own_car")]
     assert copy.planned(seed) == {}, "costs rerun nothing"
     costs.unlink()
+    (copy.folder / "data").rename(copy.folder / "elsewhere")
     again = copy.run("costs")
     assert again.returncode == 0 and costs.exists() and "0001: " in again.stdout and "under 90" in again.stdout
     refused = copy.run("estimate", flags=("--no-hooks",))
