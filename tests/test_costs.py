@@ -130,8 +130,11 @@ def test_what_is_missing_or_garbled_is_named_and_left_out(tmp_path):
     assert json.loads((tmp_path / "costs.json").read_text()) == record and record["unreadable"] == complaints
 
 
-def test_costs_that_cannot_be_written_end_no_run(tmp_path, capsys):
+def test_costs_that_cannot_be_told_or_written_end_no_run(tmp_path, capsys):
     (tmp_path / "costs.csv").mkdir()
     config = yaml.safe_load((REPOSITORY / "config.yaml").read_text()) | {"results_dir": str(tmp_path)}
-    RunCosts(Plan(config, str(REPOSITORY)), None, [COSTS]).end()
-    assert "costs are not written" in capsys.readouterr().err
+    of_run = RunCosts(Plan(config, str(REPOSITORY)), None, [COSTS])
+    of_run.begin()
+    of_run.end()
+    said = capsys.readouterr().err
+    assert "what the run will take cannot be told" in said and "costs are not written" in said

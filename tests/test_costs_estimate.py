@@ -57,6 +57,7 @@ def test_scenes_and_methods_share_cores_and_cards():
     work = [Work(Job("train", scene, m), 100.0, 8, True) for scene in "abcd" for m in ("vanilla", "street")]
     work += [Work(Job("masks", scene), 10.0, 1, False) for scene in "abcd"]
     assert wall_seconds(work, cores=1, gpus=1) == 840.0
+    assert wall_seconds(work, cores=4, gpus=8) == 810.0, "a training takes all four"
     assert wall_seconds(work, cores=64, gpus=1) == 800.0
     assert wall_seconds(work, cores=64, gpus=4) == 200.0
     assert wall_seconds(work, cores=64, gpus=8) == 110.0, "a training waits for its scene's masks"

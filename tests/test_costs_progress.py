@@ -62,15 +62,15 @@ def test_logs_of_earlier_runs_are_nobody_at_work(tmp_path):
 def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):
     clock = iter([0.0, 5.0, 12.0, 13.0, 24.0])
     monkeypatch.setattr(monitor.time, "monotonic", lambda: next(clock))
-    watched = monitor.Monitor(tmp_path / "tensorboard", iterations=1000, start=0, label="x")
+    watched = monitor.Monitor(tmp_path / "tensorboard", iterations=1000, start=40, label="x")
     with caplog.at_level(logging.INFO, logger="drivesplat.training.monitor"):
-        for step in (100, 240, 260, 480):
+        for step in (100, 280, 300, 520):
             watched.scalars(step, {"loss/total": 1.0, "gaussians": 5.0}, 100)
     monkeypatch.undo()
     watched.close()
-    assert [record.message for record in caplog.records] == ["24 %, 20.0 it/s, 38 s left", "48 %, 20.0 it/s, 26 s left"]
+    assert [record.message for record in caplog.records] == ["28 %, 20.0 it/s, 36 s left", "52 %, 20.0 it/s, 24 s left"]
     (tmp_path / "train.log").write_text(BEGINS + TOLD.format(caplog.records[-1].message))
-    assert "(48 %)" in progress(tmp_path, {MASKS}).line(0.0)
+    assert "(52 %)" in progress(tmp_path, {MASKS}).line(0.0)
 
 
 @pytest.mark.parametrize("fails", [False, True])
