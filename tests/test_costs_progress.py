@@ -41,9 +41,15 @@ def test_a_training_at_work_tells_how_far_it_is(tmp_path):
     assert line == "50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train (50 %)"
 
 
-def test_a_slower_training_takes_as_long_as_it_says(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("1 %, 1.0 it/s, 3500 s left"))
-    assert "about 60 min left" in progress(tmp_path, {MASKS}).line(0.0)
+def test_a_training_slower_than_expected_takes_as_long_as_it_says(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("50 %, 1.0 it/s, 4000 s left"))
+    assert progress(tmp_path, {MASKS}).line(0.0).startswith("50 % of the work, 1 of 3 jobs, about 68 min left")
+
+
+def test_a_training_faster_than_expected_is_no_further_than_it_says(tmp_path):
+    """4 % of 200 s, and the masks' 100, of 400."""
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("4 %, 99.0 it/s, 192 s left"))
+    assert progress(tmp_path, {MASKS}).line(0.0).startswith("27 % of the work, 1 of 3 jobs, about 5 min left")
 
 
 def test_a_job_that_says_nothing_is_taken_to_be_as_far_as_expected(tmp_path):
@@ -60,17 +66,17 @@ def test_logs_of_earlier_runs_are_nobody_at_work(tmp_path):
 
 
 def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):
-    clock = iter([0.0, 5.0, 12.0, 13.0, 24.0])
+    clock = iter([60.0, 65.0, 72.0, 73.0, 84.0])
     monkeypatch.setattr(monitor.time, "monotonic", lambda: next(clock))
     watched = monitor.Monitor(tmp_path / "tensorboard", iterations=1000, start=40, label="x")
     with caplog.at_level(logging.INFO, logger="drivesplat.training.monitor"):
-        for step in (100, 280, 300, 520):
+        for step in (100, 200, 340, 350, 460):
             watched.scalars(step, {"loss/total": 1.0, "gaussians": 5.0}, 100)
     monkeypatch.undo()
     watched.close()
-    assert [record.message for record in caplog.records] == ["28 %, 20.0 it/s, 36 s left", "52 %, 20.0 it/s, 24 s left"]
+    assert [record.message for record in caplog.records] == ["34 %, 20.0 it/s, 33 s left", "46 %, 10.0 it/s, 54 s left"]
     (tmp_path / "train.log").write_text(BEGINS + TOLD.format(caplog.records[-1].message))
-    assert "(52 %)" in progress(tmp_path, {MASKS}).line(0.0)
+    assert "(46 %)" in progress(tmp_path, {MASKS}).line(0.0)
 
 
 @pytest.mark.parametrize("fails", [False, True])

@@ -49,7 +49,7 @@ class Progress:
             if one.job not in finished and self._is_at_work(one.job):
                 part, remaining = self._of_running(one.job, seconds, now)
                 at_work.append(f"{one.job.name} ({part:.0f} %)" if part is not None else one.job.name)
-                seconds = max(seconds, remaining)
+                seconds = max(seconds, remaining) if part is None else remaining / (1.0 - min(part, 99.0) / 100.0)
             done += seconds - remaining
             left.append(Work(one.job, remaining, one.threads, one.on_gpu))
         whole = done + sum(work.seconds for work in left)

@@ -56,8 +56,8 @@ class Monitor:
     terminal looks."""
 
     def __init__(self, folder: Path, iterations: int, start: int, label: str):
-        self._iterations, self._start, self._began = iterations, start, time.monotonic()
-        self._told = self._began
+        self._iterations = iterations
+        self._told: tuple[int, float] | None = None
         self._writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
         self._bar = tqdm(
             total=iterations, initial=start, desc=label, unit="it", disable=not sys.stderr.isatty(), mininterval=1.0
@@ -71,11 +71,12 @@ class Monitor:
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
 
     def _tell(self, step: int, now: float) -> None:
-        """Logs '43 %, 12.3 it/s, 120 s left', at most every LOGGED_EVERY_S; `drivesplat.costs.progress` reads it."""
-        if now - self._told < LOGGED_EVERY_S or step == self._start:
+        """Logs '43 %, 12.3 it/s, 120 s left' at most every LOGGED_EVERY_S, by the speed since the last time, the first
+        iterations, in which kernels are compiled, left out; `drivesplat.costs.progress` reads it."""
+        before, began = self._told = self._told or (step, now)
+        if now - began < LOGGED_EVERY_S:
             return
-        self._told = now
-        speed = (step - self._start) / (now - self._began)
+        self._told, speed = (step, now), (step - before) / (now - began)
         left = (self._iterations - step) / speed
         log.info("%.0f %%, %.1f it/s, %.0f s left", 100 * step / self._iterations, speed, left)
 
