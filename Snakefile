@@ -5,6 +5,8 @@
 #   snakemake --cores 4 metrics                       the figures alone; `films`, `edits`, `looks`, `exports` likewise
 #   snakemake --cores 1 report                        results/gap_report.html of what has been measured
 #   snakemake --cores 1 results/0061/ablation.csv     what each thing in the method `street` is worth, over three seeds
+#   snakemake --cores 4 estimate                      what all of it would take in time and disk, and how that is known
+#   snakemake --cores 1 costs                         results/costs.csv of what has run
 #   snakemake --report report.zip                     all there is to look at, as a page that opens offline
 #
 # The data, once you have accepted nuScenes' terms (docs/data.md):
@@ -86,3 +88,6 @@ rule all:
         rules.looks.input,
         rules.exports.input,
         rules.gap_report.output,
+
+
+include: "rules/hooks.smk"

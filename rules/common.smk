@@ -10,19 +10,26 @@ from snakemake.utils import validate
 
 sys.path.insert(0, workflow.basedir)
 
+from drivesplat.costs.of_run import COSTS, ESTIMATE, RunCosts
 from drivesplat.errors import DriveSplatError
 from drivesplat.planning import Plan, let_scripts_import
 
 let_scripts_import(workflow.basedir)
 asked = get_argument_parser().parse_known_args()[0]
+wanted = [target for target in asked.targets if target != ESTIMATE]
+
+if ESTIMATE in asked.targets and asked.no_hooks:
+    sys.exit(f"drivesplat: --no-hooks leaves out what the target {ESTIMATE!r} is for, and would run everything")
 
 try:
     plan = Plan(config, workflow.basedir)
+    run_costs = RunCosts(plan, workflow, asked.targets)
     edited = plan.edits(plan.config.batch_scenes)
     if workflow.is_main_process and not asked.lint:
-        plan.refuse_unknown(asked.targets)
-        plan.refuse_download(asked.targets)
-        plan.refuse_absent_data(asked.targets)
+        plan.refuse_unknown(wanted)
+        plan.refuse_download(wanted)
+        if wanted != [COSTS]:
+            plan.refuse_absent_data(wanted)
 except DriveSplatError as error:
     sys.exit(f"drivesplat: {error}")
 
@@ -40,11 +47,3 @@ wildcard_constraints:
     method=plan.known(plan.config.all_methods),
     trajectory=plan.known(plan.all_trajectories),
     edit="[A-Za-z0-9_][A-Za-z0-9_.-]*",
-
-
-onstart:
-    if workflow.is_main_process:
-        try:
-            plan.hold_results()
-        except DriveSplatError as error:
-            sys.exit(f"drivesplat: {error}")

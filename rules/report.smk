@@ -11,10 +11,10 @@ rule gap_report:
     settings or code than the config's are left out and named.
     """
     input:
-        metrics=plan.report(asked.targets).metrics,
-        pictures=plan.report(asked.targets).pictures,
+        metrics=plan.report(wanted).metrics,
+        pictures=plan.report(wanted).pictures,
         # linked, not read: a film that is made anew is no other report
-        links=ancient(plan.report(asked.targets).links),
+        links=ancient(plan.report(wanted).links),
     output:
         page=report(
             "<results>/gap_report.html",
@@ -36,14 +36,7 @@ rule gap_report:
     conda:
         "../envs/drivesplat.yaml"
     params:
-        settings=plan.report(asked.targets).settings,
+        settings=plan.report(wanted).settings,
         code=plan.code("gap_report"),
     script:
         "../workflow_scripts/gap_report.py"
-
-
-onerror:
-    if workflow.is_main_process and plan.report(asked.targets).wanted:
-        from drivesplat.report.partial import write_partial_report
-
-        write_partial_report(plan)

@@ -3,7 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from drivesplat.costs.measured import read_costs
+from drivesplat.costs.table import scene_totals
 from drivesplat.report.console import console_table
 from drivesplat.report.gaps import gap_report, write_csv
 from drivesplat.report.html import report_page
@@ -32,5 +35,13 @@ def write_report(
     write_json(files.record, report)
     write_csv(files.table, report)
     with atomic_write(files.page) as page:
-        page.write(report_page(report, seen).encode())
+        page.write(report_page(report, seen, _costs(files.page.parent, job)).encode())
     print(console_table(report), flush=True)
+
+
+def _costs(results: Path, job: ReportJob) -> list[dict[str, Any]]:
+    """What the configured scenes have cost so far."""
+    stages = [name for stages in job.expected.values() for name in stages]
+    methods = dict.fromkeys(name.partition("/")[0] for name in stages if "/" in name)
+    totals = {total["scene"]: total for total in scene_totals(read_costs(results)[0], list(methods))}
+    return [totals[scene] for scene in job.expected if scene in totals]

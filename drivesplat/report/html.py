@@ -7,6 +7,7 @@ from typing import Any
 
 from drivesplat.comparison import WHERE
 from drivesplat.holdout import HELD_OUT_GROUPS
+from drivesplat.report.costs import costs_table
 from drivesplat.report.gaps import in_words
 from drivesplat.report.looks import Looks, data_address
 from drivesplat.report.page import filled_page
@@ -23,8 +24,9 @@ COSTS = {"gaussians": ("Gaussians", "{:,.0f}"), "train_seconds": ("training, s",
 NOTHING = "Nothing has been measured yet."
 
 
-def report_page(report: dict[str, Any], seen: Seen) -> str:
-    """The page of a report, with what is to be `seen` of scenes and methods; links count from the report's folder.
+def report_page(report: dict[str, Any], seen: Seen, costs: Sequence[dict[str, Any]] = ()) -> str:
+    """The page of a report, with what is to be `seen` of scenes and methods, and what scenes cost, their totals; links
+    count from the report's folder.
 
     Raises ResultError where a picture cannot be read.
     """
@@ -35,6 +37,7 @@ def report_page(report: dict[str, Any], seen: Seen) -> str:
         absent=_absent(report),
         scenes=_scenes(report, seen),
         protocol=_protocol(report),
+        costs=costs_table(costs),
         report=canonical_json(report).replace("<", "\\u003c"),
     )
 

@@ -1,6 +1,8 @@
 """What a training tells while it runs: TensorBoard, a progress bar, and a halt where numbers stop being numbers."""
 
+import logging
 import sys
+import time
 from pathlib import Path
 
 import torch
@@ -12,7 +14,10 @@ from drivesplat.errors import TrainingError
 from drivesplat.model.splat_model import Picture
 from drivesplat.training.views import TrainingView
 
+log = logging.getLogger(__name__)
+
 NEVER = 2**62
+LOGGED_EVERY_S = 10.0
 
 
 class FiniteGuard:
@@ -47,9 +52,12 @@ class FiniteGuard:
 
 
 class Monitor:
-    """Scalars and images into a TensorBoard folder, a progress bar where a terminal looks."""
+    """Scalars and images into a TensorBoard folder, how far it is into the log now and then, a progress bar where a
+    terminal looks."""
 
     def __init__(self, folder: Path, iterations: int, start: int, label: str):
+        self._iterations = iterations
+        self._told: tuple[int, float] | None = None
         self._writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
         self._bar = tqdm(
             total=iterations, initial=start, desc=label, unit="it", disable=not sys.stderr.isatty(), mininterval=1.0
@@ -58,8 +66,19 @@ class Monitor:
     def scalars(self, step: int, values: dict[str, float], advanced: int) -> None:
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
+        self._tell(step, time.monotonic())
         self._bar.update(advanced)
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
+
+    def _tell(self, step: int, now: float) -> None:
+        """Logs '43 %, 12.3 it/s, 120 s left' at most every LOGGED_EVERY_S, by the speed since the last time, the first
+        iterations, in which kernels are compiled, left out; `drivesplat.costs.progress` reads it."""
+        before, began = self._told = self._told or (step, now)
+        if now - began < LOGGED_EVERY_S:
+            return
+        self._told, speed = (step, now), (step - before) / (now - began)
+        left = (self._iterations - step) / speed
+        log.info("%.0f %%, %.1f it/s, %.0f s left", 100 * step / self._iterations, speed, left)
 
     def image(self, step: int, view: TrainingView, picture: Picture) -> None:
         """Recorded and rendered side by side."""

@@ -1,0 +1,127 @@
+"""What a job may be expected to cost, before it runs: as its like did here, else as on a machine that is known."""
+
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from drivesplat.config import Config, for_scene
+from drivesplat.costs.measured import TRAIN, Cost, Job
+from drivesplat.settings.train import MOVING_PARTS
+
+KNOWN_MACHINE = "two processor cores and the demo drive; trainings on one NVIDIA H200 at 640x360"
+SECONDS = {
+    "demo_world": 95.0, "lpips_backbone": 2.0, "extract": 3.0, "own_car": 5.0, "refine_poses": 60.0, "lidar_seed": 10.0,
+    "parser": 1.0, "masks": 6.0, "actors": 5.0, "lidar_depth": 5.0, "free_space": 10.0, "evaluate": 9.0, "tracks": 4.0,
+    "scene_metrics": 1.0, "film": 18.0, "film_parts": 16.0, "edit": 17.0, "ghost_panel": 5.0, "remove_actor": 6.0,
+    "export": 3.0, "export_usd": 4.0, "export_viewer": 3.0, "ablation": 1.0, "gap_report": 2.0,
+}  # fmt: skip
+"""Seconds of stages on KNOWN_MACHINE."""
+OTHERS = 10.0
+"""Seconds of a stage that is not among them."""
+START_SECONDS = 8.0
+"""Of every training: images are read, the model is made, files are written."""
+ITERATIONS_PER_SECOND = {
+    ("gpu", False): 131.0, ("gpu", True): 61.0, ("cpu", False): 11.8, ("cpu", True): 8.8
+}  # fmt: skip
+"""By device, and by whether a method has parts that move; on CPUs those of the demo."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Seconds of a job, and the jobs measured here that say so; none where it is rough."""
+
+    seconds: float
+    measured: frozenset[Job]
+
+
+class Expectations:
+    """What jobs of a `config` may cost where others have cost `costs`."""
+
+    def __init__(self, config: Config, costs: Sequence[Cost]):
+        self._config = config
+        self._costs: dict[tuple[str, str], list[Cost]] = {}
+        for cost in costs:
+            self._costs.setdefault((cost.job.stage, self.dataset(cost.job.scene)), []).append(cost)
+        self._iterations: dict[tuple[str, str], int] = {}
+
+    def of(self, job: Job) -> Expected:
+        """As the job itself cost when it ran before; else the median of this stage and method on other scenes of the
+        dataset; else of this stage; else as on the known machine. A training's seconds go with its iterations."""
+        peers = self._costs.get((job.stage, self.dataset(job.scene)), [])
+        alike: list[Callable[[Cost], bool]] = [
+            lambda cost: cost.job == job,
+            lambda cost: cost.job.method == job.method,
+            lambda cost: job.stage != TRAIN or self._moves(cost.job.method) == self._moves(job.method),
+        ]
+        for like in alike:
+            found = {c.job: seconds for c in peers if like(c) and (seconds := self._scaled(c, job)) is not None}
+            if found:
+                return Expected(statistics.median(found.values()), frozenset(found))
+        return Expected(self._rough(job), frozenset())
+
+    def peers(self, scene: str) -> list[str]:
+        """The other scenes of a scene's dataset."""
+        return [other for other in self._config.scenes if other != scene and self.dataset(other) == self.dataset(scene)]
+
+    def dataset(self, scene: str) -> str:
+        """The dataset of a scene, empty for jobs of no scene; a scene that is not configured any more has its own."""
+        return self._config.dataset_of(scene) if scene in self._config.scenes else f"?{scene}" if scene else ""
+
+    def _scaled(self, cost: Cost, job: Job) -> float | None:
+        if job.stage != TRAIN:
+            return cost.seconds
+        return cost.seconds * self._planned_iterations(job) / cost.iterations if cost.iterations else None
+
+    def _rough(self, job: Job) -> float:
+        if job.stage != TRAIN:
+            return SECONDS.get(job.stage, OTHERS)
+        kind = for_scene(self._config, job.scene).device.kind
+        synthetic = self._config.datasets[self._config.dataset_of(job.scene)].world is not None
+        where = "cpu" if kind == "cpu" or (kind == "auto" and synthetic) else "gpu"
+        return START_SECONDS + self._planned_iterations(job) / ITERATIONS_PER_SECOND[where, self._moves(job.method)]
+
+    def _planned_iterations(self, job: Job) -> int:
+        key = job.scene, job.method
+        if key not in self._iterations:
+            self._iterations[key] = for_scene(self._config, *key).train.iterations
+        return self._iterations[key]
+
+    def _moves(self, method: str) -> bool:
+        known = self._config.all_methods
+        return method in known and bool(set(known[method].parts) & MOVING_PARTS)
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is left of a job: seconds, on so many threads, with a GPU or without."""
+
+    job: Job
+    seconds: float
+    threads: int
+    on_gpu: bool
+
+
+def wall_seconds(work: Iterable[Work], cores: int, gpus: int) -> float:
+    """How long `work` takes at least on a machine: its cores are not idle, each GPU has one job, and of a scene the
+    training of a method waits for the scene's stages. Never far off where there is more work than machine."""
+    there = list(work)
+    busy = sum(one.seconds * min(one.threads, cores) for one in there) / max(1, cores)
+    on_gpus = sum(one.seconds for one in there if one.on_gpu) / max(1, gpus)
+    return max(busy, on_gpus, _longest_chain(there))
+
+
+def _longest_chain(work: Sequence[Work]) -> float:
+    """Of any scene its own stages, then the training and the longest further job of its longest method."""
+    scenes: dict[str, dict[str, list[Work]]] = {}
+    for one in work:
+        scenes.setdefault(one.job.scene, {}).setdefault(one.job.method, []).append(one)
+    chains = [0.0]
+    for methods in scenes.values():
+        own = sum(one.seconds for one in methods.pop("", []))
+        chains.append(own + max(map(_method_chain, methods.values()), default=0.0))
+    return max(chains)
+
+
+def _method_chain(work: Sequence[Work]) -> float:
+    others = (one.seconds for one in work if one.job.stage != TRAIN)
+    return sum(one.seconds for one in work if one.job.stage == TRAIN) + max(others, default=0.0)

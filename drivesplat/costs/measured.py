@@ -1,0 +1,150 @@
+"""What every job that has run cost: from the benchmark files that Snakemake leaves, and what trainings say."""
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+BENCHMARKS = "benchmarks"
+"""The folder of benchmark files in that of the results."""
+TRAIN, FILM, EDIT, FILM_PARTS, WORLD = "train", "film", "edit", "film_parts", "demo_world"
+RENAMED = {"metrics": "scene_metrics"}
+"""Stages whose benchmark file is called otherwise."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job of the workflow: a stage, of a scene, of a method, with the name of its film or edit; empty where it is of
+    none. The film of a synthetic world's stage is its dataset."""
+
+    stage: str
+    scene: str = ""
+    method: str = ""
+    film: str = ""
+
+    @classmethod
+    def of(cls, benchmark: PurePath) -> "Job":
+        """The job whose benchmark file this is, counted from the folder of benchmarks."""
+        *place, name = benchmark.with_suffix("").parts
+        if place == [WORLD]:
+            return cls(WORLD, film=name)
+        scene, method = [*place, "", ""][:2]
+        for stage in (FILM, EDIT):
+            if method and name.startswith(f"{stage}_") and name != FILM_PARTS:
+                return cls(stage, scene, method, name.removeprefix(f"{stage}_"))
+        return cls(RENAMED.get(name, name), scene, method)
+
+    @property
+    def name(self) -> str:
+        """The job for a person: '0103 street train'."""
+        return " ".join(word for word in (self.scene, self.method, self.stage, self.film) if word)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a job cost. `seconds` of wall time are those of the whole job, or, of a training that was resumed or has no
+    benchmark, those of the training loop (`seconds_from`); memory is the main memory's peak. None: not known."""
+
+    job: Job
+    seconds: float
+    seconds_from: str
+    max_rss_mb: float | None = None
+    cpu_seconds: float | None = None
+    mean_load: float | None = None
+    gpu_memory_gb: float | None = None
+    device: str | None = None
+    iterations: int | None = None
+
+
+def read_costs(results: Path) -> tuple[list[Cost], list[str]]:
+    """What is known of the jobs of a results folder, in the order of their names, and a sentence for each file that is
+    missing or cannot be read: what it would tell is left out, or told by another."""
+    costs, complaints = [], []
+    folder = results / BENCHMARKS
+    files = {Job.of(file.relative_to(folder)): file for file in sorted(folder.rglob("*.tsv"))}
+    trained = {Job(TRAIN, *file.parent.parts[-2:]): file for file in sorted(results.glob("*/*/train.json"))}
+    for job in sorted({*files, *trained}, key=lambda job: (job.scene, job.method, job.stage, job.film)):
+        benchmark = _reading(_benchmark, files.get(job), complaints)
+        summary = _reading(_summary, trained.get(job), complaints)
+        if job in trained and job not in files:
+            complaints.append(f"{trained[job]}: its job left no benchmark; only the training loop's seconds are known")
+        cost = _cost(job, benchmark, summary)
+        if cost is not None:
+            costs.append(cost)
+    return costs, complaints
+
+
+def _reading(reader: Any, path: Path | None, complaints: list[str]) -> dict[str, Any] | None:
+    if path is None:
+        return None
+    try:
+        return reader(path)
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        complaints.append(f"{path}: not readable, and left out ({type(error).__name__}: {error})")
+        return None
+
+
+def _benchmark(path: Path) -> dict[str, float | None]:
+    """The last line of a benchmark file; what Snakemake could not measure ('-', 'NA') is None."""
+    with open(path, encoding="utf-8", newline="") as file:
+        lines = list(csv.DictReader(file, delimiter="\t"))
+    if not lines:
+        raise ValueError("no line of figures")
+    last = lines[-1]
+    seconds = _figure(last["s"])
+    if seconds is None:
+        raise ValueError(f"{last['s']!r} are no seconds")
+    return {"s": seconds, **{key: _figure(last.get(key)) for key in ("max_rss", "cpu_time", "mean_load")}}
+
+
+def _figure(text: str | None) -> float | None:
+    try:
+        value = float(text or "")
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and value >= 0 else None
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    """What of train.json tells costs."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    memory = content["peak_gpu_memory_gb"]
+    return {
+        "seconds": float(content["seconds"]),
+        "iterations": int(content["iterations"]),
+        "resumed": bool(content["resumed_at"]),
+        "gpu_memory_gb": None if memory is None else float(memory),
+        "device": str(content["device"]),
+    }
+
+
+def _cost(job: Job, benchmark: dict[str, Any] | None, summary: dict[str, Any] | None) -> Cost | None:
+    """The benchmark of a training that was resumed has its last part alone, so that its own record counts."""
+    told = {key: summary[key] for key in ("gpu_memory_gb", "device", "iterations")} if summary else {}
+    if summary and (benchmark is None or summary["resumed"]):
+        used = {"seconds": summary["seconds"], "seconds_from": "train.json"}
+    elif benchmark:
+        used = {"seconds": benchmark["s"], "seconds_from": "benchmark"}
+    else:
+        return None
+    figures = {} if benchmark is None else benchmark
+    return Cost(
+        job,
+        **used,
+        max_rss_mb=figures.get("max_rss"),
+        cpu_seconds=figures.get("cpu_time"),
+        mean_load=figures.get("mean_load"),
+        **told,
+    )
+
+
+def by_scene(costs: Iterable[Cost]) -> Iterator[tuple[str, list[Cost]]]:
+    """The costs of each scene, in order; those of no scene are left out."""
+    scenes: dict[str, list[Cost]] = {}
+    for cost in costs:
+        if cost.job.scene:
+            scenes.setdefault(cost.job.scene, []).append(cost)
+    yield from scenes.items()

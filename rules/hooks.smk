@@ -1,0 +1,46 @@
+# What happens when a run starts and when it ends, however it ends.
+#
+# REQUIRED INPUTS: none.
+# OUTPUTS: <results>/costs.csv and costs.json, of all jobs that have run; where jobs failed, the partial report. No rule
+# declares the costs: they change with every job, and nothing is made of them.
+
+
+rule costs:
+    """
+    Nothing by itself: costs.csv and costs.json are written when any run ends, and this one's table is printed.
+    """
+    input:
+        [],
+
+
+rule estimate:
+    """
+    Nothing: what the targets beside it, else everything, would take in time and disk is printed, and the run ends there.
+    """
+    input:
+        [] if wanted else rules.all.input,
+
+
+onstart:
+    if workflow.is_main_process:
+        if run_costs.tell_estimate():
+            sys.exit(0)
+        try:
+            plan.hold_results()
+        except DriveSplatError as error:
+            sys.exit(f"drivesplat: {error}")
+        run_costs.begin()
+
+
+onsuccess:
+    if workflow.is_main_process:
+        run_costs.end()
+
+
+onerror:
+    if workflow.is_main_process:
+        if plan.report(wanted).wanted:
+            from drivesplat.report.partial import write_partial_report
+
+            write_partial_report(plan)
+        run_costs.end()

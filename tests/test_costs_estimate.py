@@ -1,0 +1,124 @@
+"""An estimate before a run: by what jobs like it cost here, else by a machine that is known; time, and disk."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from workflow_copy import WorkflowCopy
+
+from drivesplat.config import load, merged
+from drivesplat.costs.disk import MEGABYTES, Leaves, disk_need
+from drivesplat.costs.estimate import Machine, PlannedJob, estimate, in_full, in_one_line, spelled
+from drivesplat.costs.expected import SECONDS, Expectations, Work, wall_seconds
+from drivesplat.costs.measured import Cost, Job
+
+DEFAULTS = yaml.safe_load((Path(__file__).parent.parent / "config.yaml").read_text())
+
+
+def expectations(*costs: Cost, **config) -> Expectations:
+    return Expectations(load(merged(DEFAULTS, config)), costs)
+
+
+def training(scene: str, method: str, seconds: float, iterations: int = 15000) -> Cost:
+    return Cost(Job("train", scene, method), seconds, "benchmark", iterations=iterations)
+
+
+def test_the_nearest_that_was_measured_counts():
+    own, peers = (
+        Cost(Job("masks", "0061"), 7.0, ""),
+        [Cost(Job("masks", s), t, "") for s, t in (("0103", 3.0), ("0553", 5.0))],
+    )
+    demo = Cost(Job("masks", "demo"), 100.0, "")
+    assert expectations(own, *peers, demo).of(Job("masks", "0061")).seconds == 7.0
+    found = expectations(*peers, demo).of(Job("masks", "0061"))
+    assert (found.seconds, found.measured) == (4.0, {Job("masks", "0103"), Job("masks", "0553")})
+    found = expectations(demo).of(Job("masks", "0061"))
+    assert (found.seconds, found.measured) == (SECONDS["masks"], frozenset()), "another dataset tells nothing"
+
+
+def test_a_training_goes_with_its_iterations():
+    measured = [training("0061", "vanilla", 100.0, 10000), training("0061", "street", 300.0, 15000)]
+    known = expectations(*measured, train={"iterations": 30000})
+    assert known.of(Job("train", "0103", "vanilla")).seconds == 300.0
+    assert known.of(Job("train", "0103", "street")).seconds == 600.0
+    more = expectations(measured[0], train={"iterations": 30000}).of(Job("train", "0103", "street"))
+    assert not more.measured, "a method without parts that move tells nothing of one with them"
+    unknown = expectations(train={"iterations": 30000})
+    double = expectations(train={"iterations": 60000})
+    for method, seconds in (("vanilla", 2 * 114.0), ("street", 2 * 245.0)):
+        job = Job("train", "0103", method)
+        assert unknown.of(job).seconds == pytest.approx(seconds, rel=0.05), "as the README's table on that machine"
+        assert double.of(job).seconds - unknown.of(job).seconds == pytest.approx(seconds, rel=0.05)
+    slow = expectations(train={"iterations": 30000}, device="cpu").of(Job("train", "0103", "street"))
+    assert slow.seconds > 5 * unknown.of(Job("train", "0103", "street")).seconds
+
+
+def test_scenes_and_methods_share_cores_and_cards():
+    work = [Work(Job("train", scene, m), 100.0, 8, True) for scene in "abcd" for m in ("vanilla", "street")]
+    work += [Work(Job("masks", scene), 10.0, 1, False) for scene in "abcd"]
+    assert wall_seconds(work, cores=1, gpus=1) == 840.0
+    assert wall_seconds(work, cores=4, gpus=8) == 810.0, "a training takes all four"
+    assert wall_seconds(work, cores=64, gpus=1) == 800.0
+    assert wall_seconds(work, cores=64, gpus=4) == 200.0
+    assert wall_seconds(work, cores=64, gpus=8) == 110.0, "a training waits for its scene's masks"
+    assert wall_seconds([], cores=1, gpus=1) == 0.0
+
+
+def test_an_estimate_says_how_it_knows(tmp_path):
+    planned = [PlannedJob(Job("train", "0103", "vanilla"), 8, True), PlannedJob(Job("masks", "0103"), 1, False)]
+    rough = estimate(planned, expectations(), Machine(4, 2), tmp_path)
+    assert "no such job measured here yet: rough" in in_one_line(rough) and "H200" in in_full(rough)
+    half = estimate(planned, expectations(training("0061", "vanilla", 600.0)), Machine(1, 1), tmp_path)
+    assert half.seconds == 600.0 + SECONDS["masks"] and "from 1 measured job; 1 rough" in in_one_line(half)
+    measured = [training("0061", "vanilla", 600.0), Cost(Job("masks", "0061"), 60.0, "")]
+    line = in_one_line(estimate(planned, expectations(*measured), Machine(1, 1), tmp_path))
+    assert line.startswith("2 jobs, about 11 min on 1 core (from 2 measured jobs), ") and "GB free" in line
+    assert in_one_line(estimate([], expectations(), Machine(1, 1), tmp_path)) == "nothing is to be run"
+
+
+def test_disk_is_what_the_same_jobs_left_for_other_scenes(tmp_path):
+    for scene, size in (("0103", 1000), ("0553", 3000)):
+        folder = tmp_path / scene / "street"
+        (folder / "tensorboard").mkdir(parents=True)
+        (folder / "checkpoint.pt").write_bytes(bytes(size))
+        (folder / "tensorboard/events").write_bytes(bytes(50))
+    jobs = [
+        Leaves("train", "0061", (f"{tmp_path}/0061/street/checkpoint.pt", f"{tmp_path}/0061/street/train.json")),
+        Leaves("film", "0061", (f"{tmp_path}/0061/street/original.mp4",)),
+        Leaves("train", "0103", (f"{tmp_path}/0103/street/checkpoint.pt",)),
+    ]
+    found = disk_need(tmp_path, jobs, lambda scene: ["0103", "0553", "0655"])
+    assert found.needed == 2050 + 1e6 * MEGABYTES["film"], "what is there already is replaced"
+    assert found.rough == 1 and found.free > 0
+    assert disk_need(tmp_path / "not/there/yet", [], lambda scene: []).free > 0
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(45.2, "45 s"), (700.0, "12 min"), (11100.0, "3 h 5 min")])
+def test_time_is_spelled_for_people(seconds, text):
+    assert spelled(seconds) == text
+
+
+@pytest.mark.workflow
+def test_a_run_is_estimated_before_and_accounted_for_after_it(tmp_path):
+    copy = WorkflowCopy.make(tmp_path / "workflow", methods={"vanilla": {}})
+    seed, costs = "results/0001/seed.ply", copy.folder / "results/costs.csv"
+    asked = copy.run("estimate", seed)
+    assert asked.returncode == 0 and "drivesplat: 3 jobs, about " in asked.stdout, asked.stdout
+    assert "no such job measured here yet: rough" in asked.stdout and not (copy.folder / seed).exists()
+    everything = copy.run("estimate").stdout
+    assert " train " in everything and " film " in everything and not (copy.folder / "results/0001").exists()
+    done = copy.run(seed)
+    assert done.returncode == 0 and "drivesplat: 3 jobs, about " in done.stdout, done.stdout
+    rows = [line.split(",")[:3] for line in costs.read_text().splitlines()[1:]]
+    assert rows == [["0001", "", stage] for stage in ("extract", "lidar_seed", "own_car")]
+    assert copy.planned(seed) == {}, "costs rerun nothing"
+    costs.unlink()
+    (copy.folder / "data").rename(copy.folder / "elsewhere")
+    again = copy.run("costs")
+    assert again.returncode == 0 and costs.exists() and "0001: " in again.stdout and "under 90" in again.stdout
+    refused = copy.run("estimate", flags=("--no-hooks",))
+    assert (
+        refused.returncode != 0
+        and "--no-hooks" in refused.stdout
+        and not (copy.folder / "results/0001/vanilla").exists()
+    )
