@@ -4,12 +4,12 @@ Defaults, ranges and comments stand in `drivesplat.settings` alone; config.yaml 
 from them (`python -m drivesplat.config_document`). Importing this module is cheap: the Snakefile does.
 """
 
-import re
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
@@ -28,15 +28,14 @@ from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.looks import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings
+from drivesplat.settings.names import require_name, require_text
 from drivesplat.settings.overrides import merged
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
-from drivesplat.settings.scene_name import require_text
 from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.world import WorldSettings
 
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
-NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
     "lidar_depth", "free_space", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
@@ -222,7 +221,10 @@ class Config(Settings):
                 raise ValueError(f"method {name!r} is called like a variant of the ablation; rename it")
         return self
 
-    @property
+    _places: dict[tuple[str, str | None], "Config"] = PrivateAttr(default_factory=dict)
+    """What `for_scene` has found, by dataset and method: rules ask for it hundreds of times."""
+
+    @cached_property
     def ablated(self) -> dict[str, MethodSettings]:
         """The methods of the ablation, by name; none where the method that it takes apart is not configured."""
         whole = self.methods.get(self.ablation.of)
@@ -254,12 +256,6 @@ class Config(Settings):
         )
 
 
-def require_name(name: str, kind: str) -> None:
-    """Raises ValueError where `name`, of some `kind` of thing, cannot name a folder."""
-    if not re.match(NAME, name) or name in ("logs", "benchmarks"):
-        raise ValueError(f"{kind} {name!r} cannot name a folder: use letters, digits, '_', '-' and '.'")
-
-
 def load(values: Mapping[str, Any]) -> Config:
     """The validated config, overrides included. Raises ConfigError: one line, the key, its value, what is allowed."""
     config = validated(Config, dict(values), "")
@@ -277,9 +273,13 @@ def load(values: Mapping[str, Any]) -> Config:
 
 def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
     """The config as it holds for one scene, and one method where given. Raises ConfigError for an unknown scene."""
-    dataset = config.dataset_of(scene)
-    config = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
-    return _overridden(config, config.all_methods[method].overrides, f"the overrides of {method}") if method else config
+    dataset, known = config.dataset_of(scene), config._places
+    if (dataset, None) not in known:
+        known[dataset, None] = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
+    if (dataset, method) not in known:
+        there = known[dataset, None]
+        known[dataset, method] = _overridden(there, there.all_methods[method].overrides, f"the overrides of {method}")
+    return known[dataset, method]
 
 
 def _overridden(config: Config, overrides: Mapping[str, Any], where: str) -> Config:

@@ -9,9 +9,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from drivesplat.config import NAME
 from drivesplat.errors import ConfigError
 from drivesplat.settings.edit import Edit, Step
+from drivesplat.settings.names import NAME
 from drivesplat.yaml_file import read_yaml
 
 RESERVED = ("ego",)

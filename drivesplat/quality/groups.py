@@ -8,11 +8,12 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from drivesplat.config import DATASET_OVERRIDES, DatasetSettings, load, require_known, require_name
+from drivesplat.config import DATASET_OVERRIDES, DatasetSettings, load, require_known
 from drivesplat.errors import ConfigError
 from drivesplat.planning import Plan
 from drivesplat.settings import validated
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, with_seed, with_seeds
+from drivesplat.settings.names import require_name
 from drivesplat.settings.overrides import merged
 from drivesplat.settings.recipes import Recipe, RecipeFile
 from drivesplat.storage import canonical_json, sha256_text

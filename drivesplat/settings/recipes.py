@@ -7,7 +7,7 @@ from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.method import MethodSettings, Seeds
-from drivesplat.settings.scene_name import require_text
+from drivesplat.settings.names import require_text
 from drivesplat.settings.train import Parts
 
 
