@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
@@ -221,8 +221,10 @@ class Config(Settings):
                 raise ValueError(f"method {name!r} is called like a variant of the ablation; rename it")
         return self
 
-    _places: dict[tuple[str, str | None], "Config"] = PrivateAttr(default_factory=dict)
-    """What `for_scene` has found, by dataset and method: rules ask for it hundreds of times."""
+    @cached_property
+    def places(self) -> dict[tuple[str, str | None], "Config"]:
+        """What `for_scene` has found, by dataset and method: rules ask for it hundreds of times."""
+        return {}
 
     @cached_property
     def ablated(self) -> dict[str, MethodSettings]:
@@ -273,7 +275,7 @@ def load(values: Mapping[str, Any]) -> Config:
 
 def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
     """The config as it holds for one scene, and one method where given. Raises ConfigError for an unknown scene."""
-    dataset, known = config.dataset_of(scene), config._places
+    dataset, known = config.dataset_of(scene), config.places
     if (dataset, None) not in known:
         known[dataset, None] = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
     if (dataset, method) not in known:

@@ -25,7 +25,7 @@ class Job:
         self.input = snakemake.input
         self.output = snakemake.output
         self.wildcards = snakemake.wildcards
-        self.log = Path(snakemake.log[0])
+        self.log = snakemake.log
         self.threads: int = snakemake.threads
         self._rule: str = snakemake.rule
         self._params = snakemake.params

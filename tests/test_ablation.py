@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from workflow_copy import TINY_TRAINING, WorkflowCopy
+from workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
 
 from drivesplat.ablation import ablation, markdown, write_csv
 from drivesplat.config import Config, for_scene, load, merged
@@ -504,5 +504,5 @@ def test_it_runs_to_a_table_and_fails_in_one_line_where_protocols_differ(copy):
     path.write_text(json.dumps(foreign))
     done = copy.run("results/0001/ablation.csv")
     assert done.returncode != 0 and "Traceback" not in done.stdout
-    lines = {line for line in done.stdout.splitlines() if line.startswith("drivesplat: ")}
+    lines = complaints(done.stdout)
     assert len(lines) == 1 and methods[-1] in lines.pop()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from workflow_copy import WorkflowCopy
+from workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.settings.report import HELD_OUT_PAIR
 from drivesplat.video import read_footage
@@ -272,7 +272,7 @@ def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
     finally:
         path.write_text(EDITS)
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    (line,) = {line for line in done.stdout.splitlines() if line.startswith("drivesplat: ")}
+    (line,) = complaints(done.stdout)
     words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"there are: {CAR[:8]}")
     assert all(word in line for word in words), line
     assert not list((finished.folder / "results/0001/street/edits").glob("*typo*"))

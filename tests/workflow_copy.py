@@ -37,6 +37,15 @@ TINY_TRAINING = {
 }
 
 
+_COSTS = re.compile(r"drivesplat: (\d+ jobs?, about |\d+ % of the work, |what was finished, )")
+
+
+def complaints(output: str) -> set[str]:
+    """The workflow's own lines in a run's output, but for those that say what it costs, how far it is, and where the
+    report of what was finished lies."""
+    return {line for line in output.splitlines() if line.startswith("drivesplat: ") and not _COSTS.match(line)}
+
+
 @dataclass
 class WorkflowCopy:
     """The workflow at `folder`, with `config` in its mine.yaml."""

@@ -8,5 +8,5 @@ from drivesplat.settings.report import ReportJob
 
 with job(snakemake) as current:
     made = current.output
-    files = ReportFiles(Path(made.page), Path(made.report), Path(made.table), current.log.parent)
+    files = ReportFiles(Path(made.page), Path(made.report), Path(made.table), Path(current.log[0]).parent)
     write_report(files, current.settings(ReportJob), current.input.metrics, current.input.pictures, current.input.links)

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from archive_server import Site, packed, served
 from tiny_world import World, write_world
-from workflow_copy import WorkflowCopy
+from workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.download import fetch as fetching
 from drivesplat.download import unpack as unpacking
@@ -323,7 +323,7 @@ def test_a_wrong_archive_that_a_user_put_there_is_named_and_left_alone(archive, 
 def told(done: subprocess.CompletedProcess) -> str:
     """The one line that a failed run says, checked to be one line and no traceback."""
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    lines = {line for line in done.stdout.splitlines() if line.startswith("drivesplat: ")}
+    lines = complaints(done.stdout)
     assert len(lines) == 1, done.stdout
     return lines.pop()
 

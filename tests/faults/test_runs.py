@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from tiny_world import World
-from workflow_copy import TINY_TRAINING, WorkflowCopy
+from workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
 
@@ -19,7 +19,7 @@ def told(done: subprocess.CompletedProcess) -> str:
     """The one line that a failed run says, checked to be one line and no traceback."""
     assert done.returncode != 0, done.stdout
     assert "Traceback" not in done.stdout, done.stdout
-    lines = {line for line in done.stdout.splitlines() if line.startswith("drivesplat: ")}
+    lines = complaints(done.stdout)
     assert len(lines) == 1, done.stdout
     return lines.pop()
 
