@@ -1,10 +1,11 @@
 """How much disk a run will fill: what the same jobs left on it for other scenes."""
 
-import shutil
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from drivesplat.free_disk import free_bytes
 
 MEGABYTES = {
     "demo_world": 80.0, "extract": 2.0, "lidar_seed": 15.0, "parser": 5.0, "masks": 5.0, "actors": 2.0,
@@ -47,8 +48,7 @@ def disk_need(results: Path, jobs: Iterable[Leaves], peers: Callable[[str], Sequ
         known = [size for outputs in elsewhere if (size := _left(outputs))]
         rough += not known
         needed += statistics.median(known) if known else 1e6 * MEGABYTES.get(job.stage, OTHERS)
-    existing = next(folder for folder in (results.absolute(), *results.absolute().parents) if folder.is_dir())
-    return DiskNeed(needed, rough, float(shutil.disk_usage(existing).free))
+    return DiskNeed(needed, rough, float(free_bytes(results)))
 
 
 def _elsewhere(results: Path, job: Leaves, scene: str) -> list[str]:

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 
 from drivesplat.device import telling_out_of_memory
-from drivesplat.errors import DatasetError
 from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.drive import drive_record
+from drivesplat.evaluation.held_out import held_out_images, measured_images
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
 from drivesplat.evaluation.shown import Shown, held_out_pair
@@ -145,26 +145,6 @@ def held_out_depths(recording: Recording, camera: str, job: LidarDepthJob) -> di
     images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.parser, group, camera)]
     owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
     return {i: depths_in(scene, scene.frames[i], cloud, job, recording.own_car(i)) for i, cloud in owned.items()}
-
-
-def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int]:
-    """The images of `group` that are measured: key frames of the evaluated camera.
-
-    Raises DatasetError where the scene does not hold that camera.
-    """
-    if camera not in parser["camera_names"]:
-        raise DatasetError(
-            f"eval_camera {camera} is not among the cameras of this run ({', '.join(parser['camera_names'])})"
-        )
-    wanted = parser["camera_names"].index(camera)
-    return [
-        int(i) for i in parser["splits"][group] if parser["camera_indices"][i] == wanted and parser["is_key_frame"][i]
-    ]
-
-
-def measured_images(parser: dict[str, Any], camera: str) -> dict[str, list[int]]:
-    """The images that are measured, by held-out group. Raises what `held_out_images` raises."""
-    return {group: held_out_images(parser, group, camera) for group in HELD_OUT_GROUPS}
 
 
 def evaluate_groups(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from drivesplat.evaluation.held_out import held_out_images
 from drivesplat.evaluation.synthetic import rendered
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.model.splat_model import SplatModel
@@ -34,11 +35,8 @@ def held_out_pair(model: SplatModel, recording: Recording, camera: str, device: 
 
 
 def _candidates(recording: Recording, camera: str) -> tuple[str, list[int]]:
-    parser = recording.parser
-    number = parser["camera_names"].index(camera)
     for group in (*HELD_OUT_GROUPS, "train"):
-        images = [int(i) for i in parser["splits"].get(group, [])]
-        own = [i for i in images if parser["camera_indices"][i] == number and parser["is_key_frame"][i]]
-        if own:
-            return group, own
+        images = held_out_images(recording.parser, group, camera)
+        if images:
+            return group, images
     raise ValueError(f"no key frame of {camera} takes part")
