@@ -20,11 +20,11 @@ from drivesplat.seeding.actors import read_actors
 from drivesplat.seeding.free_space import read_free_space
 from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.train import TrainJob
+from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
 from drivesplat.training.first_exposure import first_gains
-from drivesplat.training.surfaces import surroundings_of
+from drivesplat.training.surfaces import Surroundings, surroundings_of
 from drivesplat.training.train import Workspace, train
 from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
 
@@ -120,6 +120,36 @@ class TrainingFiles:
         return self.checkpoint.parent / "resume"
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """What stands ready when a training's first iteration begins."""
+
+    model: SplatModel
+    views: list[TrainingView]
+    settings: TrainSettings
+    surroundings: Surroundings
+
+
+def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
+    """The training images on the device, an untrained model, and the settings with the cap that holds for them."""
+    with telling_out_of_memory(lambda: 0):
+        views = load_views(inputs.parser, inputs.guides(job), device)
+    settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
+    exposed = inputs.exposed(job)
+    beginnings = Beginnings(
+        inputs.parser,
+        inputs.actors,
+        mean_sky_color(views),
+        inputs.told_apart(job),
+        first_gains(inputs.parser, views, exposed, job.reference_camera) if exposed else {},
+        _times_by_camera(views) if job.train.camera_poses.corrected else {},
+    )
+    if not learns_from_sky_masks(job):
+        views = [dataclasses.replace(view, sky=None) for view in views]
+    model = build_model(beginnings, job.parts, job.sky, settings)
+    return Prepared(model, views, settings, surroundings_of(inputs.parser, inputs.free_space, settings))
+
+
 def run_training(
     inputs: TrainingInputs,
     job: TrainJob,
@@ -131,27 +161,13 @@ def run_training(
     """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure."""
     with checkpoint.sole_trainer(files.resume):
         device = choose_device(device_settings)
-        with telling_out_of_memory(lambda: 0):
-            views = load_views(inputs.parser, inputs.guides(job), device)
-        settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
-        exposed = inputs.exposed(job)
-        beginnings = Beginnings(
-            inputs.parser,
-            inputs.actors,
-            mean_sky_color(views),
-            inputs.told_apart(job),
-            first_gains(inputs.parser, views, exposed, job.reference_camera) if exposed else {},
-            _times_by_camera(views) if job.train.camera_poses.corrected else {},
-        )
-        if not learns_from_sky_masks(job):
-            views = [dataclasses.replace(view, sky=None) for view in views]
-        model = build_model(beginnings, job.parts, job.sky, settings)
+        begun = prepare(inputs, job, device)
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
         workspace = Workspace(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
-        surroundings = surroundings_of(inputs.parser, inputs.free_space, settings)
-        summary = train(model, views, settings, job.random_seed, device, workspace, surroundings)
+        model, seed = begun.model, job.random_seed
+        summary = train(model, begun.views, begun.settings, seed, device, workspace, begun.surroundings)
         content = {
             "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
             "job": job.model_dump_json(),

@@ -13,6 +13,7 @@ from drivesplat.errors import TrainingError
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
+from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.densify import Densifier
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.losses import loss_terms
@@ -54,6 +55,7 @@ class Trainer:
     densifiers: list[Densifier]
     guard: FiniteGuard
     surroundings: Surroundings
+    clock: Clock
     step: int = 0
 
     @classmethod
@@ -65,32 +67,39 @@ class Trainer:
         seed: int,
         device: torch.device,
         surroundings: Surroundings = NOTHING_KNOWN,
+        clock: Clock = UNTIMED,
     ) -> "Trainer":
         torch.manual_seed(seed)
         densifiers = [Densifier(part, settings) for part in model.parts]
         optimizers, known = make_optimizers(model), surroundings.to(device)
-        return cls(model, views, settings, seed, device, optimizers, densifiers, FiniteGuard(device), known)
+        return cls(model, views, settings, seed, device, optimizers, densifiers, FiniteGuard(device), known, clock)
 
     def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
         """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
-        view = self.views[order(len(self.views), self.step, self.seed)]
-        schedule(self.model, self.optimizers, self.step, self.settings)
-        by_gradient = self.settings.strategy == "default"
-        picture = self.model.render(
-            view.view,
-            self.sh_degree(),
-            absgrad=by_gradient and self.settings.default.absgrad,
-            with_depth=view.lidar is not None,
-        )
-        terms = loss_terms(picture, view, self.model, self.settings)
-        terms |= surface_terms(picture, self.model, self.surroundings, self.settings)
+        stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
+        with stage("data"):
+            view = self.views[order(len(self.views), self.step, self.seed)]
+        with stage("render"):
+            picture = self.model.render(
+                view.view,
+                self.sh_degree(),
+                absgrad=by_gradient and self.settings.default.absgrad,
+                with_depth=view.lidar is not None,
+            )
+        with stage("loss"):
+            terms = loss_terms(picture, view, self.model, self.settings)
+            terms |= surface_terms(picture, self.model, self.surroundings, self.settings)
+            loss = torch.stack(list(terms.values())).sum()
         if by_gradient:
             picture.info["means2d"].retain_grad()
-        torch.stack(list(terms.values())).sum().backward()
-        self.guard.watch(
-            self.step, {**{f"loss {name}": value for name, value in terms.items()}, **self._gradient_norms()}
-        )
-        self.optimizers.step()
+        with stage("backward"):
+            loss.backward()
+        with stage("checks"):
+            losses = {f"loss {name}": value for name, value in terms.items()}
+            self.guard.watch(self.step, {**losses, **self._gradient_norms()})
+        with stage("optimizer"):
+            schedule(self.model, self.optimizers, self.step, self.settings)
+            self.optimizers.step()
         return terms, picture, view
 
     def densifies(self) -> bool:
@@ -144,14 +153,15 @@ def train(
     device: torch.device,
     workspace: Workspace,
     surroundings: Surroundings = NOTHING_KNOWN,
+    clock: Clock = UNTIMED,
 ) -> TrainingSummary:
-    """Fits `model` in place, resuming where an earlier run of the same training was ended.
+    """Fits `model` in place, resuming where an earlier run of the same training was ended; `clock` times its stages.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
     with telling_out_of_memory(lambda: len(model)):
-        trainer = Trainer.begin(model.to(device), views, settings, seed, device, surroundings)
+        trainer = Trainer.begin(model.to(device), views, settings, seed, device, surroundings, clock)
         run = Run.begin(trainer, workspace)
         monitor = Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label)
         try:
@@ -234,25 +244,33 @@ def _iterate(run: Run, monitor: Monitor) -> None:
     path = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
     empty = EmptySpace(*path, settings.floaters.radius, trainer.surroundings.free)
     while trainer.step < settings.iterations:
-        terms, picture, view = trainer.fit_one()
-        if trainer.densifies():
-            run.check()  # a strategy fed with what is no number ends in an assertion on the GPU, beyond rescue
-            for part in trainer.model.parts:
-                part.confine()
-        trainer.densify(picture)
-        if len(trainer.model) == 0:
-            run.check()
-        if empty.known and trainer.step % settings.floaters.every == 0:
-            for part in (part for part in trainer.model.parts if not part.moves):
-                fade_floaters(part, empty)
-        if trainer.step % settings.log_every == 0:
-            run.check()
-            monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
-        if trainer.step % settings.image_every == 0:
-            monitor.image(trainer.step, view, picture)
-        if trainer.step % settings.checkpoint_every == 0 and trainer.step < settings.iterations:
-            run.save()
+        with trainer.clock.stage(ITERATION):
+            terms, picture, view = trainer.fit_one()
+            with trainer.clock.stage("densification"):
+                _densify(run, picture, empty)
+            if trainer.step % settings.log_every == 0:
+                run.check()
+                monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
+            if trainer.step % settings.image_every == 0:
+                monitor.image(trainer.step, view, picture)
+            if trainer.step % settings.checkpoint_every == 0 and trainer.step < settings.iterations:
+                run.save()
     run.check()
+
+
+def _densify(run: Run, picture: Picture, empty: EmptySpace) -> None:
+    """Ends an iteration: each part grows and moves its Gaussians, and those that must not be there fade."""
+    trainer, settings = run.trainer, run.trainer.settings
+    if trainer.densifies():
+        run.check()  # a strategy fed with what is no number ends in an assertion on the GPU, beyond rescue
+        for part in trainer.model.parts:
+            part.confine()
+    trainer.densify(picture)
+    if len(trainer.model) == 0:
+        run.check()
+    if empty.known and trainer.step % settings.floaters.every == 0:
+        for part in (part for part in trainer.model.parts if not part.moves):
+            fade_floaters(part, empty)
 
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
