@@ -6,8 +6,9 @@
 # make test-slurm a scene through a real SLURM, started on this machine for it (root on Debian; docs/cluster.md)
 # make bench      what the benchmarks/ measure, against their bounds (two idle cores)
 # make quality    RECIPES=file: recipes trained with several seeds on one scene, and their table (docs/quality.md)
+# make speed      FILE=file: how fast a method trains, held to gsplat's example trainer, and how well (docs/speed.md)
 # make config     config.yaml and config.schema.json from the settings' definitions
-.PHONY: demo setup doctor test lint test-gpu test-slurm bench quality config
+.PHONY: demo setup doctor test lint test-gpu test-slurm bench quality speed config
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -46,6 +47,10 @@ bench: setup
 quality: setup
 	@test -n "$(RECIPES)" || { echo "make quality RECIPES=benchmarks/recipes/demo.yaml" >&2; exit 2; }
 	$(BIN)/python -m benchmarks.quality $(RECIPES) -- --cores $(CORES) $(SNAKEMAKE)
+
+speed: setup
+	@test -n "$(FILE)" || { echo "make speed FILE=benchmarks/speed/demo.yaml" >&2; exit 2; }
+	$(BIN)/python -m benchmarks.speed $(FILE) -- --cores $(CORES) $(SNAKEMAKE)
 
 config: setup
 	$(BIN)/python -m drivesplat.config_document

@@ -94,7 +94,7 @@ def rebuild_model(
 
 def _background(beginnings: Beginnings, settings: TrainSettings) -> Part:
     parser = beginnings.parser
-    kept = _some(len(parser["points"]), settings.cap_max)
+    kept = some_of(len(parser["points"]), settings.cap_max)
     positions, colors = parser["points"][kept], parser["points_rgb"][kept] / 255.0
     return Background.from_points(positions, colors, settings.gaussians, parser["scene_scale"], beginnings.classes)
 
@@ -111,7 +111,7 @@ def _actors(beginnings: Beginnings, settings: TrainSettings) -> Part | None:
     limits = [actor_cap(actor, settings) for actor in actors]
     counts = [len(actor["points"]) for actor in actors]
     shares = shared_out(list(map(min, counts, limits)), settings.actors.cap_max)
-    kept = [_some(count, share) for count, share in zip(counts, shares, strict=True)]
+    kept = [some_of(count, share) for count, share in zip(counts, shares, strict=True)]
     points, colors = (
         [actor[key][chosen] for actor, chosen in zip(actors, kept, strict=True)] for key in ("points", "points_rgb")
     )
@@ -140,7 +140,7 @@ def shared_out(wanted: Sequence[int], cap: int) -> list[int]:
     return (least + np.diff(ends)).tolist()
 
 
-def _some(count: int, limit: int) -> np.ndarray:
+def some_of(count: int, limit: int) -> np.ndarray:
     """Indices of at most `limit` of `count`, in order."""
     if count <= limit:
         return np.arange(count)

@@ -1,7 +1,7 @@
 """A file of recipes as groups: recipes that share the settings of their scene share a results folder and one run of
 Snakemake, which sees a method for every recipe and seed."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
@@ -67,7 +67,7 @@ def read_recipes(path: str | Path) -> RecipeFile:
     content = read_yaml(path, "recipe file")
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a recipe file holds scene, seeds and recipes; {DOCUMENT} describes it")
-    with _told_of(str(path)):
+    with told_of(str(path)):
         recipes = validated(RecipeFile, content, "", DOCUMENT)
         require_known(recipes.config, SHARED, "config")
         for name, recipe in recipes.recipes.items():
@@ -101,22 +101,34 @@ class Layers:
         return layers.under({"datasets": {dataset: {"overrides": own}}}) if own else layers
 
 
+def layers_of(
+    base: Iterable[str], config: Mapping[str, Any], scene: str, workflow: Path, where: str = "base and config"
+) -> Layers:
+    """The settings of config.yaml in the folder `workflow` with the config files of `base` laid over them, and the tree
+    `config` over all, what the dataset of `scene` sets for itself included.
+
+    Raises ConfigError, which begins with `where`, where they are not valid.
+    """
+    laid = reduce(merged, (_config_file(Path(path).expanduser()) for path in base), {})
+    with told_of(where):
+        layers = Layers(_config_file(workflow / "config.yaml"), laid).everywhere_under(config, scene)
+        load(layers.values)
+    return layers
+
+
 def groups_of(recipes: RecipeFile, out: Path, workflow: Path) -> list[Group]:
     """The groups of recipes, in the order of their first ones, with results below `out`; `workflow` is the Snakefile's
     folder. Paths of config files count from the current folder, as Snakemake's do.
 
     Raises ConfigError where a recipe is not valid, comes to the same as another, or would make another's world anew.
     """
-    base = reduce(merged, (_config_file(Path(path).expanduser()) for path in recipes.base), {})
-    with _told_of("base and config of all recipes"):
-        shared = Layers(_config_file(workflow / "config.yaml"), base).everywhere_under(recipes.config, recipes.scene)
-        load(shared.values)
+    shared = layers_of(recipes.base, recipes.config, recipes.scene, workflow, "base and config of all recipes")
     together: dict[str, dict[str, Recipe]] = {}
     for name, recipe in recipes.recipes.items():
         together.setdefault(canonical_json(recipe.config), {})[name] = recipe
     groups = []
     for members in together.values():
-        with _told_of(f"recipe{'s' * (len(members) > 1)} {', '.join(members)}"):
+        with told_of(f"recipe{'s' * (len(members) > 1)} {', '.join(members)}"):
             groups.append(_group(recipes, members, shared, out, workflow))
     _refuse_twins(groups)
     _refuse_two_worlds(groups)
@@ -189,7 +201,7 @@ def _config_file(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _told_of(where: str) -> Iterator[None]:
+def told_of(where: str) -> Iterator[None]:
     """Puts `where` before the message of what is refused."""
     try:
         yield

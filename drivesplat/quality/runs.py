@@ -3,7 +3,7 @@
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,15 +54,15 @@ def passed_on(arguments: Sequence[str]) -> bool:
     return not known.dryrun
 
 
-def run(group: Group, arguments: Sequence[str], workflow: Path) -> Outcome:
-    """Runs Snakemake in the folder `workflow` until every result of a group is there or cannot be; what is measured
-    stays. Its output goes to the console and into the group's folder."""
+def run(group: Group, arguments: Sequence[str], workflow: Path, targets: Iterable[str | Path] | None = None) -> Outcome:
+    """Runs Snakemake in the folder `workflow` until every result of a group, or each of the files `targets`, is there
+    or cannot be; what is measured stays. Its output goes to the console and into the group's folder."""
     settings = group.folder / CONFIG_FILE
     with atomic_write(settings) as file:
         file.write(yaml.safe_dump(group.overlay, sort_keys=False).encode())
     command = [
         *(sys.executable, "-m", "snakemake", "--configfile", str(settings), "--keep-going", "--show-failed-logs"),
-        *(*arguments, "--", *map(str, group.targets)),
+        *(*arguments, "--", *map(str, group.targets if targets is None else targets)),
     ]
     with (
         open(group.folder / OUTPUT_FILE, "w", encoding="utf-8") as output,

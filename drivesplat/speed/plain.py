@@ -1,0 +1,129 @@
+"""The plain recipe: the settings of gsplat's example trainer in its configuration `mcmc` (gsplat 1.5, examples/
+simple_trainer.py), and what its training begins with.
+
+It is what this workflow's training is held to, so nothing here follows what is improved there.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gsplat import MCMCStrategy
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from drivesplat.model.background import Background
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.gaussians import GaussianSettings
+
+FULL_LENGTH = 30_000
+"""The length that the example's schedule is made for."""
+RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+"""Learning rates; that of means counts in units of the scene's scale."""
+DECAY = 0.01
+"""Means learn at the end at this fraction of their first rate."""
+SCALE_MARGIN = 1.1
+"""The scene's scale is that of its cameras times this."""
+SH_DEGREE = 3
+SH_C0 = 0.28209479177387814
+INIT_OPACITY, INIT_SCALE = 0.5, 0.1
+SSIM_WEIGHT = 0.2
+OPACITY_REG = SCALE_REG = 0.01
+WORKERS = 4
+"""Processes that decode images."""
+LOGGED_EVERY = 100
+SAVED_AT = (7_000, 30_000)
+LEAST_SPACING = 1e-7
+"""Seed points in one place are taken to be so far apart (metres): a scale has to have a logarithm."""
+
+Splats = nn.ParameterDict
+Optimizers = dict[str, torch.optim.Optimizer]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When what happens in a training of so many iterations: the spherical harmonics gain a degree, Gaussians are moved
+    and added after `refine_start` and before `refine_stop`, every hundredth iteration."""
+
+    iterations: int
+    sh_every: int
+    refine_start: int
+    refine_stop: int
+
+    @classmethod
+    def of(cls, iterations: int) -> "Schedule":
+        """The example's schedule, shortened as its `steps_scaler` does, but for the hundred iterations between two
+        refinements, which stay as they are in every training of this workflow, too."""
+        done = iterations / FULL_LENGTH
+        return cls(iterations, max(1, int(1_000 * done)), int(500 * done), int(25_000 * done))
+
+    @classmethod
+    def of_trained(cls, iterations: int) -> "Schedule":
+        """For what goes on from a trained model: all degrees from the beginning, refined to the end."""
+        return cls(iterations, 1, 0, iterations)
+
+    def sh_degree(self, step: int) -> int:
+        """The degree that a step renders with."""
+        return min(step // self.sh_every, SH_DEGREE)
+
+
+@dataclass(frozen=True)
+class PlainRecipe:
+    """A training by the plain recipe, of at most `cap_max` Gaussians."""
+
+    schedule: Schedule
+    cap_max: int
+    seed: int
+    workers: int = WORKERS
+
+    def strategy(self) -> MCMCStrategy:
+        """gsplat's own densification."""
+        return MCMCStrategy(
+            cap_max=self.cap_max,
+            refine_start_iter=self.schedule.refine_start,
+            refine_stop_iter=self.schedule.refine_stop,
+        )
+
+
+def scene_scale(parser: dict[str, Any]) -> float:
+    """What the rate of means counts in, in metres."""
+    return SCALE_MARGIN * parser["scene_scale"]
+
+
+def started(points: np.ndarray, colors: np.ndarray, seed: int) -> Splats:
+    """Gaussians at seed points (n, 3) metres with their colours (n, 3) uint8, on the CPU; turned at random."""
+    torch.manual_seed(seed)
+    count = len(points)
+    distances = cKDTree(points).query(points, k=4, workers=-1)[0][:, 1:]
+    spacing = np.maximum(np.sqrt((distances**2).mean(axis=1)), LEAST_SPACING)
+    coefficients = torch.zeros(count, (SH_DEGREE + 1) ** 2, 3)
+    coefficients[:, 0] = (torch.from_numpy(colors / 255.0).float() - 0.5) / SH_C0
+    values = {
+        "means": torch.from_numpy(np.asarray(points)).float(),
+        "scales": torch.from_numpy(np.log(spacing * INIT_SCALE)).float()[:, None].repeat(1, 3),
+        "quats": torch.rand(count, 4),
+        "opacities": torch.logit(torch.full((count,), INIT_OPACITY)),
+        "sh0": coefficients[:, :1].clone(),
+        "shN": coefficients[:, 1:].clone(),
+    }
+    return as_splats(values)
+
+
+def as_splats(values: dict[str, Tensor]) -> Splats:
+    """Tensors under gsplat's names as what is optimised."""
+    return nn.ParameterDict({name: nn.Parameter(value) for name, value in values.items()})
+
+
+def make_optimizers(splats: Splats, scale: float) -> Optimizers:
+    """An Adam for each parameter, as gsplat's strategies need it; fused, as later versions of the example have it."""
+    units = {"means": scale}
+    return {
+        name: torch.optim.Adam([splats[name]], lr=rate * units.get(name, 1.0), eps=1e-15, fused=True)
+        for name, rate in RATES.items()
+    }
+
+
+def as_model(splats: dict[str, Tensor], parser: dict[str, Any]) -> SplatModel:
+    """What was trained, as a model that this workflow measures: a background before black."""
+    return SplatModel([Background(dict(splats), GaussianSettings(), parser["scene_scale"])], sky=None)

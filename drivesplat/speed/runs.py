@@ -1,0 +1,165 @@
+"""One training, timed and measured: by the plain recipe, or as the rule `train` does it."""
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from drivesplat.cards import hold_card
+from drivesplat.device import choose_device, device_name
+from drivesplat.evaluation.evaluate import evaluate_groups, protocol
+from drivesplat.masks import read_masks_record
+from drivesplat.model.build import gaussian_cap, some_of
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.parser import read_parser
+from drivesplat.provenance import provenance
+from drivesplat.rasterize import rasterize
+from drivesplat.recording import read_recording
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.speed.bystanders import Moment, busy_elsewhere
+from drivesplat.speed.plain import PlainRecipe, Schedule, as_model, as_splats, scene_scale, started
+from drivesplat.speed.plain_images import ImageFiles, files_of_size
+from drivesplat.speed.plain_training import CHECKPOINT, fit
+from drivesplat.speed.plan import Task
+from drivesplat.storage import read_json
+from drivesplat.training.checkpoint import load
+from drivesplat.training.clock import StageClock
+from drivesplat.training.run import TrainingFiles, prepare, read_checkpoint, read_inputs, run_training, trained_model
+from drivesplat.training.train import Workspace, train
+
+Times = dict[str, Any]
+WARM_UP = 20
+"""So many iterations pass before stages are timed."""
+
+
+def run(task: Task) -> dict[str, Any]:
+    """Trains and measures. `loop` are the seconds of the training's loop, `whole` those from reading parser.pkl to the
+    files it leaves; `busy_elsewhere` says how many of the `processors` on average had other work meanwhile (None where
+    that is not known); `result` are the metrics per group of held-out frames, measured as `protocol` says.
+
+    What both recipes need once, the rasterizer's kernels and a copy of the images at their size, is there beforehand.
+    """
+    shutil.rmtree(task.folder, ignore_errors=True)
+    with held_device(task.device) as device:
+        parser = read_parser(task.files.parser)
+        paths = files_of_size(parser, task.images)
+        before = Moment.now()
+        times, model = plain(task, device, paths) if task.recipe == "plain" else ours(task, device)
+        elsewhere = busy_elsewhere(before, Moment.now())
+        recording, _ = read_recording(task.files.scene, task.files.parser, task.files.masks)
+        masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
+        groups = evaluate_groups(model.to(device).requires_grad_(False), recording, camera, None, device)
+        return {
+            "recipe": task.recipe,
+            "iterations": task.iterations,
+            "seed": task.seed,
+            "device": device_name(device),
+            "processors": os.cpu_count(),
+            "busy_elsewhere": elsewhere,
+            "cap_max": gaussian_cap(parser, task.train.train),
+            **times,
+            "dataset": parser["scene"]["dataset"],
+            "protocol": protocol(parser, masks, task.evaluate),
+            "result": groups,
+        }
+
+
+def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, SplatModel]:
+    """A training by the plain recipe, and its model."""
+    began = time.monotonic()
+    parser = read_parser(task.files.parser)
+    cap = gaussian_cap(parser, task.train.train)
+    kept = some_of(len(parser["points"]), cap)
+    splats = started(parser["points"][kept], parser["points_rgb"][kept], task.seed).to(device)
+    recipe = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers)
+    summary = fit(splats, ImageFiles(parser, paths), scene_scale(parser), recipe, task.folder)
+    times = {"loop": summary.seconds, "whole": time.monotonic() - began, **asdict(summary)}
+    del times["seconds"]
+    return times, as_model({name: value.detach() for name, value in splats.items()}, parser)
+
+
+def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
+    """A training by what the rule `train` calls, and its model."""
+    began = time.monotonic()
+    inputs, upstream = read_inputs(
+        task.files.parser, task.files.masks, task.files.actors, task.files.lidar_depth, task.files.free_space
+    )
+    settings = json.loads(task.train.model_dump_json())
+    made = provenance(task.stage, settings, task.code, upstream, {})
+    files = training_files(task)
+    run_training(inputs, task.train, task.device, files, made, task.label)
+    whole, summary = time.monotonic() - began, read_json(files.summary, rule="train")
+    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    costs = {key: summary[key] for key in ("gaussians", "peak_gpu_memory_gb")}
+    return {"loop": summary["seconds"], "whole": whole, **costs}, model
+
+
+def training_files(task: Task) -> TrainingFiles:
+    """What a training of ours writes."""
+    return TrainingFiles(task.folder / "checkpoint.pt", task.folder / "train.json")
+
+
+def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:
+    """Milliseconds an iteration by stage, over so many iterations that go on from where a task's training ended:
+    per stage `device_ms` and `host_ms` (`drivesplat.training.clock`). What is trained here is thrown away."""
+    profiled = _profile_plain if task.recipe == "plain" else _profile_ours
+    with held_device(task.device) as device:
+        clock = StageClock(device, WARM_UP)
+        profiled(task, device, WARM_UP + iterations, clock)
+        shutil.rmtree(_aside(task))
+        return {name: asdict(share) for name, share in clock.shares().items()}
+
+
+def _profile_plain(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
+    parser = read_parser(task.files.parser)
+    splats = as_splats(load(task.folder / CHECKPOINT, rule="train")["splats"]).to(device)
+    cap = gaussian_cap(parser, task.train.train)
+    recipe = PlainRecipe(Schedule.of_trained(iterations), cap, task.seed, task.workers)
+    images = ImageFiles(parser, files_of_size(parser, task.images))
+    fit(splats, images, scene_scale(parser), recipe, _aside(task), clock)
+
+
+def _profile_ours(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
+    inputs, _ = read_inputs(
+        task.files.parser, task.files.masks, task.files.actors, task.files.lidar_depth, task.files.free_space
+    )
+    begun = prepare(inputs, task.train, device)
+    model, _ = trained_model(read_checkpoint(training_files(task).checkpoint))
+    goes_on = {"iterations": iterations, "sh_every": 0.0, "refine_start": 0.0, "refine_stop": 1.0}
+    settings, aside = begun.settings.model_copy(update=goes_on), _aside(task)
+    workspace = Workspace(aside / "resume", aside / "tensorboard", "", task.label)
+    train(model, begun.views, settings, task.seed, device, workspace, begun.surroundings, clock)
+
+
+def _aside(task: Task) -> Path:
+    return task.folder / "profile"
+
+
+@contextmanager
+def held_device(settings: DeviceSettings) -> Iterator[torch.device]:
+    """The device that the settings choose, with no other job of this workflow on it, and awake."""
+    card = hold_card(1) if settings.kind != "cpu" else None
+    try:
+        device = choose_device(settings)
+        wake(device)
+        yield device
+    finally:
+        if card is not None:
+            card.close()
+
+
+def wake(device: torch.device) -> None:
+    """Loads the rasterizer's kernels and, on a GPU, what torch starts with: neither recipe pays for it."""
+    means = torch.tensor([[0.0, 0.0, 2.0]] * 8, device=device, requires_grad=True)
+    quats, scales = torch.ones(8, 4, device=device), torch.full((8, 3), 0.1, device=device)
+    cameras = torch.eye(4, device=device)[None], torch.eye(3, device=device)[None] * 16.0, 32, 32
+    opacities, coefficients = torch.full((8,), 0.5, device=device), torch.zeros(8, 16, 3, device=device)
+    rendering = rasterize(means, quats, scales, opacities, coefficients, *cameras, sh_degree=3)
+    rendering.image.sum().backward()

@@ -1,0 +1,238 @@
+"""The plain recipe: it is what gsplat's example trainer does in its configuration `mcmc`."""
+
+import math
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from skimage.metrics import structural_similarity
+
+from drivesplat.rasterize import rasterize
+from drivesplat.speed.plain import PlainRecipe, Schedule, as_model, make_optimizers, scene_scale, started
+from drivesplat.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
+from drivesplat.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
+from drivesplat.speed.plain_training import PlainTraining, fit
+from drivesplat.training.checkpoint import load
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CPU = torch.device("cpu")
+WIDTH, HEIGHT = 32, 24
+
+
+@pytest.fixture
+def parser(tmp_path) -> dict[str, Any]:
+    """Five images of a wall of dots by a camera that drives along it, the fourth held out, and 60 seed points."""
+    rng = np.random.default_rng(0)
+    paths, poses = [], np.tile(np.eye(4), (5, 1, 1))
+    for i in range(5):
+        poses[i, 0, 3] = 0.2 * i
+        paths.append(str(tmp_path / f"{i}.png"))
+        Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)).save(paths[-1])
+    return {
+        "Ks": np.tile([[20.0, 0.0, WIDTH / 2], [0.0, 20.0, HEIGHT / 2], [0.0, 0.0, 1.0]], (5, 1, 1)),
+        "camtoworlds": poses,
+        "image_paths": paths,
+        "image_sizes": np.tile([WIDTH, HEIGHT], (5, 1)),
+        "points": rng.uniform([-2.0, -1.5, 3.0], [3.0, 1.5, 5.0], (60, 3)),
+        "points_rgb": rng.integers(0, 256, (60, 3), dtype=np.uint8),
+        "scene_scale": 0.4,
+        "splits": {"train": np.array([0, 1, 2, 4]), "interpolation": np.array([3])},
+    }
+
+
+def begun(parser: dict[str, Any], recipe: PlainRecipe, ssim: Ssim | None = None) -> PlainTraining:
+    splats = started(parser["points"], parser["points_rgb"], recipe.seed)
+    optimizers = make_optimizers(splats, scene_scale(parser))
+    return PlainTraining(splats, optimizers, recipe, CPU, ssim or chosen_ssim(CPU))
+
+
+def images_of(parser: dict[str, Any]) -> ImageFiles:
+    return ImageFiles(parser, [parser["image_paths"][i] for i in parser["splits"]["train"]])
+
+
+# --- the recipe ---
+
+
+def test_the_schedule_at_full_length_is_the_examples():
+    schedule = Schedule.of(30_000)
+    assert schedule == Schedule(30_000, sh_every=1_000, refine_start=500, refine_stop=25_000)
+    assert [schedule.sh_degree(step) for step in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
+
+
+def test_a_shorter_schedule_is_shortened_in_proportion():
+    assert Schedule.of(7_000) == Schedule(7_000, sh_every=233, refine_start=116, refine_stop=5_833)
+    assert Schedule.of(3).sh_degree(2) == 2
+
+
+@pytest.mark.parametrize(("iterations", "start", "stop"), [(30_000, 500, 25_000), (15_000, 250, 12_500)])
+def test_what_is_densified_how_and_when(iterations, start, stop):
+    strategy = PlainRecipe(Schedule.of(iterations), cap_max=1234, seed=0).strategy()
+    told = (strategy.cap_max, strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every)
+    assert told == (1234, start, stop, 100)
+    assert (strategy.noise_lr, strategy.min_opacity) == (5e5, 0.005)
+
+
+def test_learning_rates_are_the_examples(parser):
+    training = begun(parser, PlainRecipe(Schedule.of(100), 100, 0))
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in training.optimizers.items()}
+    assert rates == pytest.approx(
+        {"means": 1.6e-4 * 1.1 * 0.4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+    )
+    for optimizer in training.optimizers.values():
+        assert isinstance(optimizer, torch.optim.Adam)
+        assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-15, (0.9, 0.999))
+
+
+def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(parser):
+    """Opacity 0.5; a tenth of the root mean square distance to three neighbours; the colour at degree 0."""
+    splats = started(parser["points"], parser["points_rgb"], seed=0)
+    distances = np.linalg.norm(parser["points"][:, None] - parser["points"][None], axis=2)
+    nearest = np.sort(distances, axis=1)[:, 1:4]
+    assert torch.allclose(splats["means"], torch.from_numpy(parser["points"]).float())
+    expected = 0.1 * np.sqrt((nearest**2).mean(axis=1))
+    assert np.allclose(torch.exp(splats["scales"]).detach().numpy(), expected[:, None], rtol=1e-5)
+    assert torch.allclose(torch.sigmoid(splats["opacities"]), torch.tensor(0.5))
+    shown = 0.5 + splats["sh0"][:, 0].detach().numpy() / (2.0 * math.sqrt(math.pi))
+    assert np.allclose(shown, parser["points_rgb"] / 255.0, atol=1e-6)
+    assert splats["shN"].shape == (60, 15, 3) and not splats["shN"].any()
+
+
+def test_seed_points_in_one_place_do_no_harm(parser):
+    splats = started(np.zeros((6, 3)), parser["points_rgb"][:6], seed=0)
+    assert torch.isfinite(splats["scales"]).all()
+
+
+# --- its images ---
+
+
+def test_images_come_decoded_each_once_an_epoch_in_random_order(parser):
+    images = images_of(parser)
+    recorded = [np.asarray(Image.open(parser["image_paths"][i]), dtype=np.float32) for i in (0, 1, 2, 4)]
+    torch.manual_seed(0)
+    data = endless(loader_of(images, 0, CPU))
+    seen = []
+    for _ in range(3 * len(images)):
+        batch = next(data)
+        (which,) = [i for i, pixels in enumerate(recorded) if np.array_equal(batch["image"][0].numpy(), pixels)]
+        assert batch["camtoworld"][0, 0, 3] == pytest.approx(0.2 * (0, 1, 2, 4)[which])
+        seen.append(which)
+    epochs = [seen[start : start + 4] for start in (0, 4, 8)]
+    assert all(sorted(epoch) == [0, 1, 2, 3] for epoch in epochs) and len({tuple(epoch) for epoch in epochs}) > 1
+
+
+def test_processes_decode_them_as_in_the_example(parser):
+    loader = loader_of(images_of(parser), 2, CPU)
+    assert (loader.num_workers, loader.persistent_workers, loader.batch_size) == (2, True, 1)
+    data = endless(loader)
+    assert [next(data)["image"].shape for _ in range(5)] == [(1, HEIGHT, WIDTH, 3)] * 5
+    assert PlainRecipe(Schedule.of(1), 1, 0).workers == 4
+
+
+def test_images_of_another_size_are_reduced_once_as_training_sees_them(parser, tmp_path):
+    assert files_of_size(parser, tmp_path / "reduced") == [parser["image_paths"][i] for i in (0, 1, 2, 4)]
+    parser["image_sizes"] = np.tile([WIDTH // 2, HEIGHT // 2], (5, 1))
+    paths = files_of_size(parser, tmp_path / "reduced")
+    whole, half = (np.asarray(Image.open(path), dtype=float) for path in (parser["image_paths"][4], paths[3]))
+    means = whole.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert np.abs(half - means).max() <= 0.5
+    times = [Path(path).stat().st_mtime_ns for path in paths]
+    assert files_of_size(parser, tmp_path / "reduced") == paths
+    assert [Path(path).stat().st_mtime_ns for path in paths] == times
+
+
+# --- its loss ---
+
+
+def test_ssim_is_that_of_windows_that_lie_in_the_image_whole():
+    rng = np.random.default_rng(1)
+    a = rng.random((40, 50, 3))
+    b = (a + rng.normal(scale=0.1, size=a.shape)).clip(0, 1)
+    _, full = structural_similarity(
+        a, b, data_range=1.0, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
+    )
+    batches = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (a, b)]
+    assert float(torch_ssim(*batches)) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
+
+
+def test_the_fused_ssim_is_taken_on_a_gpu_where_it_is_installed(monkeypatch):
+    calls = []
+    fused = SimpleNamespace(fused_ssim=lambda image, target, padding: calls.append(padding), __spec__=SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "fused_ssim", fused)
+    chosen = chosen_ssim(torch.device("cuda"))
+    chosen.of(torch.zeros(1), torch.zeros(1))
+    assert (chosen.name, calls) == ("fused_ssim", ["valid"])
+    assert chosen_ssim(CPU).name == "torch"
+    monkeypatch.delitem(sys.modules, "fused_ssim")
+    monkeypatch.setattr("drivesplat.speed.plain_ssim.find_spec", lambda name: None)
+    assert chosen_ssim(torch.device("cuda")).name == "torch"
+
+
+def test_the_loss_is_that_of_the_example_mcmc(parser):
+    """0.8 L1 + 0.2 (1 - SSIM) + 0.01 mean opacity + 0.01 mean scale, of an image before black at degree 0."""
+    training = begun(parser, PlainRecipe(Schedule.of(30_000), 60, 0))
+    batch = next(endless(loader_of(images_of(parser), 0, CPU)))
+    terms, _ = training.fit_one(iter([batch]))
+    s = {name: value.detach() for name, value in training.splats.items()}
+    scales, opacities = torch.exp(s["scales"]), torch.sigmoid(s["opacities"])
+    viewmat = torch.linalg.inv(batch["camtoworld"])
+    image = rasterize(
+        s["means"], s["quats"], scales, opacities, s["sh0"], viewmat, batch["K"], WIDTH, HEIGHT, sh_degree=0,
+        backend="reference",
+    ).image  # fmt: skip
+    pixels = batch["image"] / 255.0
+    similarity = torch_ssim(image.permute(0, 3, 1, 2), pixels.permute(0, 3, 1, 2))
+    expected = 0.8 * (image - pixels).abs().mean() + 0.2 * (1.0 - similarity) + 0.01 * (0.5 + scales.mean())
+    assert float(terms["loss"].detach()) == pytest.approx(float(expected), rel=1e-4)
+    assert all(value.grad is not None for name, value in training.splats.items() if name != "shN")
+
+
+# --- its loop ---
+
+
+def test_means_learn_ever_slower_and_the_noise_goes_with_them(parser, monkeypatch):
+    """A hundredth at the end; the noise of a step takes the rate of the next, as the example's order has it."""
+    told = []
+
+    def noted(self, params, optimizers, state, step, info, lr):
+        told.append((step, lr))
+
+    monkeypatch.setattr("drivesplat.speed.plain.MCMCStrategy.step_post_backward", noted)
+    training = begun(parser, PlainRecipe(Schedule.of(10), 60, 0))
+    data, first = endless(loader_of(images_of(parser), 0, CPU)), 1.6e-4 * 1.1 * 0.4
+    for step in range(10):
+        assert training.optimizers["means"].param_groups[0]["lr"] == pytest.approx(first * 0.01 ** (step / 10))
+        training.learn(training.fit_one(data)[1])
+    assert [step for step, _ in told] == list(range(10))
+    assert [lr for _, lr in told] == pytest.approx([first * 0.01 ** (step / 10) for step in range(1, 11)])
+    assert training.optimizers["scales"].param_groups[0]["lr"] == 5e-3
+
+
+def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(parser, tmp_path):
+    splats = started(parser["points"], parser["points_rgb"], seed=0)
+    schedule = Schedule(220, sh_every=1, refine_start=0, refine_stop=220)
+    before = as_model({name: value.detach().clone() for name, value in splats.items()}, parser)
+    recipe = PlainRecipe(schedule, 64, 0, workers=0)
+    summary = fit(splats, images_of(parser), scene_scale(parser), recipe, tmp_path / "out")
+    assert (summary.gaussians, summary.peak_gpu_memory_gb, summary.ssim) == (64, None, "torch")
+    assert len(splats["means"]) == 64, "60, 63 after 100 iterations, 64 after 200"
+    assert summary.seconds > 0
+    kept = load(tmp_path / "out/ckpt.pt", rule="train")
+    assert kept["step"] == 220 and torch.equal(kept["splats"]["means"], splats["means"])
+    after = as_model(kept["splats"], parser)
+    assert after.sky is None and off(after, parser) < 0.7 * off(before, parser)
+
+
+def off(model, parser: dict[str, Any]) -> float:
+    """How far a model's picture of the first image is off it, on average."""
+    from drivesplat.model.view import View
+
+    pose, intrinsics = (torch.from_numpy(parser[key][0]).float() for key in ("camtoworlds", "Ks"))
+    with torch.no_grad():
+        image = model.render(View(intrinsics, pose, WIDTH, HEIGHT, 0.0)).image
+    recorded = np.asarray(Image.open(parser["image_paths"][0])) / 255.0
+    return float(np.abs(image.numpy() - recorded).mean())
