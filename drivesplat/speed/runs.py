@@ -159,7 +159,8 @@ def wake(device: torch.device) -> None:
     """Loads the rasterizer's kernels and, on a GPU, what torch starts with: neither recipe pays for it."""
     means = torch.tensor([[0.0, 0.0, 2.0]] * 8, device=device, requires_grad=True)
     quats, scales = torch.ones(8, 4, device=device), torch.full((8, 3), 0.1, device=device)
-    cameras = torch.eye(4, device=device)[None], torch.eye(3, device=device)[None] * 16.0, 32, 32
     opacities, coefficients = torch.full((8,), 0.5, device=device), torch.zeros(8, 16, 3, device=device)
+    intrinsics = torch.tensor([[[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]]], device=device)
+    cameras = torch.eye(4, device=device)[None], intrinsics, 32, 32
     rendering = rasterize(means, quats, scales, opacities, coefficients, *cameras, sh_degree=3)
     rendering.image.sum().backward()
