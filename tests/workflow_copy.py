@@ -70,6 +70,7 @@ class WorkflowCopy:
         write_world(folder / "data", world)
         base = {
             "datasets": {"nuscenes": {"dataroot": "data", "scenes": list(world.scenes)}},
+            "refine_poses": {"enabled": False},
             "lidar_seed": {"max_points": 500, "far_points": 100},
             "train": TINY_TRAINING,
             "render": {"width": 64, "height": 36, "fps": 4},
