@@ -87,8 +87,10 @@ class WorkflowCopy:
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "snakemake", "--configfile", "mine.yaml", *arguments]
 
-    def run(self, *targets: str, cores: int = 2, flags: tuple[str, ...] = ()) -> subprocess.CompletedProcess:
-        """Runs Snakemake; the result holds its output (both streams) as `stdout`."""
+    def run(
+        self, *targets: str, cores: int = 2, flags: tuple[str, ...] = (), timeout: float = 600
+    ) -> subprocess.CompletedProcess:
+        """Runs Snakemake, for `timeout` seconds at most; the result holds its output (both streams) as `stdout`."""
         arguments = self.command("--cores", str(cores), *flags, "--", *targets)
         environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
         return subprocess.run(
@@ -98,7 +100,7 @@ class WorkflowCopy:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=600,
+            timeout=timeout,
         )
 
     def planned(self, *targets: str) -> dict[str, int]:
