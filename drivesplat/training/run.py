@@ -21,11 +21,11 @@ from drivesplat.seeding.free_space import read_free_space
 from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
-from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
+from drivesplat.storage import canonical_json, read_record, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
 from drivesplat.training.first_exposure import first_gains
 from drivesplat.training.surfaces import surroundings_of
-from drivesplat.training.train import Workspace, train
+from drivesplat.training.train import TrainingSummary, Workspace, train
 from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
 
 
@@ -169,6 +169,11 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not {"model", "job", "parts", "provenance"} <= content.keys():
         raise unreadable(path, "train", "not a checkpoint of a finished training")
     return content
+
+
+def read_summary(path: str | Path) -> dict[str, Any]:
+    """Reads `train.json`. Raises ResultError where it is not one."""
+    return read_record(path, "train", *(field.name for field in dataclasses.fields(TrainingSummary)), "provenance")
 
 
 def trained_model(content: dict[str, Any]) -> tuple[SplatModel, TrainJob]:
