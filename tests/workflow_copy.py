@@ -86,10 +86,13 @@ class WorkflowCopy:
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "snakemake", "--configfile", "mine.yaml", *arguments]
 
-    def run(self, *targets: str, cores: int = 2, flags: tuple[str, ...] = ()) -> subprocess.CompletedProcess:
-        """Runs Snakemake; the result holds its output (both streams) as `stdout`."""
-        arguments = self.command("--cores", str(cores), *flags, "--", *targets)
-        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
+    def run(
+        self, *targets: str, cores: int = 2, flags: tuple[str, ...] = (), cards: str = "", under: tuple[str, ...] = ()
+    ) -> subprocess.CompletedProcess:
+        """Runs Snakemake, on a machine that seems to have these `cards`, by the program `under` where one is given; the
+        result holds its output (both streams) as `stdout`."""
+        arguments = [*under, *self.command("--cores", str(cores), *flags, "--", *targets)]
+        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": cards}
         return subprocess.run(
             arguments,
             cwd=self.folder,
