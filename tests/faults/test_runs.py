@@ -76,6 +76,7 @@ def test_an_unquoted_scene_number_is_told_to_be_quoted(copy):
     copy.write_config("datasets: {nuscenes: {dataroot: data, scenes: [0061]}}\n")
     line = told(copy.run())
     assert "quotes" in line and '"0061"' in line
+    assert not (copy.folder / "results").exists()
 
 
 def test_an_unknown_method_lists_those_there_are(copy):
