@@ -134,7 +134,8 @@ def test_a_training_on_a_full_disk_names_what_it_could_not_write(tmp_path, quiet
 
 
 def test_what_ends_a_training_goes_before_what_the_disk_says_then(tmp_path, quiet_threads):
-    with pytest.raises(EndedError), Monitor(tmp_path, 10, 0, "x") as monitor, FullDisk(0):
+    monitor = Monitor(tmp_path, 10, 0, "x")
+    with FullDisk(0), pytest.raises(EndedError), monitor:
         monitor.scalars(1, {"loss/total": 1.0, "gaussians": 5.0}, 1)
         raise EndedError
 
