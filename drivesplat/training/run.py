@@ -1,6 +1,7 @@
 """A training from a parser record to its files: checkpoint.pt and train.json."""
 
 import dataclasses
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -128,7 +129,9 @@ def run_training(
     provenance: dict[str, Any],
     label: str,
 ) -> None:
-    """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure."""
+    """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure, and a training
+    whose parent has been killed meanwhile: Snakemake, which did not see it end, will have it made again."""
+    started_by = os.getppid()
     with checkpoint.sole_trainer(files.resume):
         device = choose_device(device_settings)
         with telling_out_of_memory(lambda: 0):
@@ -160,7 +163,8 @@ def run_training(
         }
         checkpoint.save(files.checkpoint, content)
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
-    shutil.rmtree(files.resume)
+    if os.getppid() == started_by:
+        shutil.rmtree(files.resume)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import threading
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,6 +36,7 @@ from drivesplat.training.run import run_training
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 CPU = DeviceSettings(kind="cpu")
+RESUMABLE = job_of(iterations=20, checkpoint_every=10)
 
 
 def write_until_killed(folder: str) -> None:
@@ -68,7 +70,7 @@ def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(t
 @pytest.mark.parametrize("other", ["settings_sha256", "code_sha256", "inputs_sha256", None])
 def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
     """The digests of a training's provenance are what tells its resume state from another's."""
-    settings, files, inputs = job_of(checkpoint_every=10, iterations=20), files_in(tmp_path / "it"), inputs_in(tmp_path)
+    files, inputs = files_in(tmp_path / "it"), inputs_in(tmp_path)
     checkpoint_save, ends = checkpoint.save, iter([False, True])
 
     def save(path: Path, content: dict[str, Any]) -> None:
@@ -78,14 +80,43 @@ def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
 
     with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
         patched.setattr(checkpoint, "save", save)
-        run_training(inputs, settings, CPU, files, PROVENANCE, "train")
+        run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
     assert checkpoint.load(files.resume / "state.pt", "train")["step"] == 10
     provenance = {**PROVENANCE, **({other: "other"} if other else {})}
     with caplog.at_level(logging.INFO):
-        run_training(inputs, settings, CPU, files, provenance, "train")
+        run_training(inputs, RESUMABLE, CPU, files, provenance, "train")
     ignored = f"{files.resume / 'state.pt'} belongs to other settings, code or inputs: training starts at 0"
     assert (ignored in caplog.text) == (other is not None)
     assert ("resuming at iteration 10 of 20" in caplog.text) == (other is None)
+
+
+def train_and_kill_the_parent(folder: str) -> None:
+    """For a subprocess: a training in a process of its own, which ends its parent, as by `kill -9`, once there is a
+    checkpoint, and itself comes to its end."""
+    torch.set_num_threads(1)
+    if os.fork():
+        signal.pause()
+    save, parent = checkpoint.save, os.getppid()
+
+    def save_and_kill(path: Path, content: dict[str, Any]) -> None:
+        save(path, content)
+        with suppress(ProcessLookupError):
+            os.kill(parent, signal.SIGKILL)
+
+    checkpoint.save = save_and_kill
+    run_training(inputs_in(Path(folder)), RESUMABLE, CPU, files_in(Path(folder) / "it"), PROVENANCE, "train")
+
+
+def test_a_training_that_nobody_saw_end_goes_on_from_its_last_checkpoint_when_it_is_made_again(tmp_path, caplog):
+    process, files = in_subprocess(train_and_kill_the_parent, str(tmp_path)), files_in(tmp_path / "it")
+    _, errors = process.communicate(timeout=60)  # as long as any of both is there
+    assert process.returncode == -signal.SIGKILL and files.summary.is_file(), errors
+    for output in (files.checkpoint, files.summary):
+        output.unlink()  # as Snakemake does, which takes them for half made
+    with caplog.at_level(logging.INFO):
+        run_training(inputs_in(tmp_path), RESUMABLE, CPU, files, PROVENANCE, "train")
+    assert "resuming at iteration 10 of 20" in caplog.text
+    assert files.summary.is_file() and not files.resume.exists()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
