@@ -2,11 +2,13 @@
 
 import ast
 import re
+import textwrap
 from pathlib import Path
 
 import pytest
+import yaml
 
-from drivesplat.config import Config
+from drivesplat.config import Config, load
 
 REPOSITORY = Path(__file__).parent.parent
 PAGE = (REPOSITORY / "docs/troubleshooting.md").read_text(encoding="utf-8")
@@ -57,6 +59,18 @@ def test_links_lead_to_pages_and_their_headings(link):
     page = REPOSITORY / "docs" / file if file else REPOSITORY / "docs/troubleshooting.md"
     headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.M)
     assert not place or place in {anchor(heading) for heading in headings}
+
+
+SETTINGS = re.findall(r"`(\w+: \{[^`]+)`|((?:^    \w+: \{.*\n)+)", PAGE, re.M)
+
+
+@pytest.mark.parametrize("text", [span or block for span, block in SETTINGS])
+def test_settings_to_copy_are_taken(text):
+    load(yaml.safe_load(textwrap.dedent(text)))
+
+
+def test_there_are_settings_to_copy():
+    assert len(SETTINGS) > 5
 
 
 def test_settings_that_it_names_exist():

@@ -440,7 +440,7 @@ def training_process(copy: WorkflowCopy) -> int | None:
 
 
 def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
-    training = TINY_TRAINING | {"iterations": 240, "checkpoint_every": 10}
+    training = TINY_TRAINING | {"iterations": 120, "checkpoint_every": 10}
     whole, killed = (
         WorkflowCopy.make(tmp_path / name, methods=VANILLA, train=training) for name in ("whole", "killed")
     )
@@ -462,7 +462,7 @@ def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
     done = killed.run("results/0001/metrics.json")
     assert done.returncode == 0, done.stdout
     summary = killed.read("results/0001/vanilla/train.json")
-    assert summary["iterations"] == 240 and len(summary["resumed_at"]) == 1 and summary["resumed_at"][0] >= 10
+    assert summary["iterations"] == 120 and len(summary["resumed_at"]) == 1 and summary["resumed_at"][0] >= 10
     a, b = (c.read("results/0001/metrics.json")["methods"]["vanilla"]["extrapolation"] for c in (whole, killed))
     for region in ("all", "static", "moving_vehicle"):
         assert abs(a[region]["psnr"] - b[region]["psnr"]) < 0.1
