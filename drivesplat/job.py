@@ -74,6 +74,7 @@ def job(snakemake: Any) -> Iterator[Job]:
     """
     log_path = Path(snakemake.log[0])
     _log_into(log_path)
+    threading_hook, threading.excepthook = threading.excepthook, _log_thread
     current = Job(snakemake)
     log = logging.getLogger(__name__)
     log.info("%s begins", current.name)
@@ -92,6 +93,7 @@ def job(snakemake: Any) -> Iterator[Job]:
             log.error(message, current.name, type(error).__name__, error, log_path)
         sys.exit(1)
     finally:
+        threading.excepthook = threading_hook
         logging.shutdown()
 
 
@@ -109,7 +111,6 @@ def _log_into(path: Path) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
     logging.captureWarnings(True)
     logging.raiseExceptions = False  # where the disk has no room for a log, what the job was to write says so, once
-    threading.excepthook = _log_thread
 
 
 def _log_thread(failed: threading.ExceptHookArgs) -> None:
