@@ -240,8 +240,14 @@ class Plan(Inputs):
         Raises DriveSplatError.
         """
         folder = Path(self.config.results_dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
+        except OSError as error:
+            raise DriveSplatError(
+                f"{folder}/: cannot be written ({error.strerror or error}); "
+                "fix its permissions, or give this run another folder (results_dir)"
+            ) from error
         try:
             fcntl.flock(self._held_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

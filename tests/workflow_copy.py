@@ -88,11 +88,18 @@ class WorkflowCopy:
         return [sys.executable, "-m", "snakemake", "--configfile", "mine.yaml", *arguments]
 
     def run(
-        self, *targets: str, cores: int = 2, flags: tuple[str, ...] = (), timeout: float = 600
+        self,
+        *targets: str,
+        cores: int = 2,
+        flags: tuple[str, ...] = (),
+        cards: str = "",
+        under: tuple[str, ...] = (),
+        timeout: float = 600,
     ) -> subprocess.CompletedProcess:
-        """Runs Snakemake, for `timeout` seconds at most; the result holds its output (both streams) as `stdout`."""
-        arguments = self.command("--cores", str(cores), *flags, "--", *targets)
-        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
+        """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `cards`, by the program
+        `under` where one is given; the result holds its output (both streams) as `stdout`."""
+        arguments = [*under, *self.command("--cores", str(cores), *flags, "--", *targets)]
+        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": cards}
         return subprocess.run(
             arguments,
             cwd=self.folder,
