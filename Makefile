@@ -4,11 +4,12 @@
 # make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
 # make test-gpu   what needs a GPU: the rasterizers agree, trainings resume
 # make test-slurm a scene through a real SLURM, started on this machine for it (root on Debian; docs/cluster.md)
+# make test-batch ten synthetic drives, one of them broken, as a batch (two cores: the better part of an hour)
 # make bench      what the benchmarks/ measure, against their bounds (two idle cores)
 # make quality    RECIPES=file: recipes trained with several seeds on one scene, and their table (docs/quality.md)
 # make speed      FILE=file: how fast a method trains, held to gsplat's example trainer, and how well (docs/speed.md)
 # make config     config.yaml and config.schema.json from the settings' definitions
-.PHONY: demo setup doctor test lint test-gpu test-slurm bench quality speed config
+.PHONY: demo setup doctor test lint test-gpu test-slurm test-batch bench quality speed config
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -25,7 +26,7 @@ doctor:
 	@bash scripts/doctor.sh $(CONFIG)
 
 test: setup lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu and not slurm"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu and not slurm and not batch"
 
 lint: setup
 	$(BIN)/ruff check .
@@ -39,6 +40,9 @@ test-gpu:
 
 test-slurm: setup
 	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/test_slurm.py
+
+test-batch: setup
+	DRIVESPLAT_BATCH=1 $(BIN)/python -m pytest -m batch -rs -v tests/test_batch.py
 
 bench: setup
 	$(BIN)/python -m pytest benchmarks -q

@@ -26,6 +26,11 @@ def visible_cards() -> int:
     return max(1, len(_visible()[1]))
 
 
+def any_card() -> bool:
+    """Whether this process may use a GPU, of any maker."""
+    return bool(_visible()[1])
+
+
 def hold_card(jobs_per_card: int) -> BinaryIO | None:
     """Takes a card that fewer than `jobs_per_card` jobs of this user hold on this machine, and hides all others from
     this process; to be called before anything looks for a GPU.

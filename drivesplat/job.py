@@ -1,9 +1,10 @@
 """The seam between Snakemake's scripts and the library: settings in, errors out in one line."""
 
+import errno
 import json
 import logging
 import sys
-import traceback
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,8 +15,12 @@ from drivesplat.errors import DriveSplatError
 from drivesplat.provenance import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.storage import unwritable
 
 S = TypeVar("S", bound=Settings)
+
+REFUSED_BY_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""What is wrong with the disk and not with the workflow."""
 
 
 class Job:
@@ -64,17 +69,12 @@ class Job:
 def job(snakemake: Any) -> Iterator[Job]:
     """A rule's script as a context: logs into the rule's log, and ends a failure in one line on the console.
 
-    A DriveSplatError is told as its sentence; anything else is a bug, told with the place of its traceback in the log.
+    A DriveSplatError is told as its sentence, a disk that takes no more as what it says; anything else is a bug, told
+    with the place of its traceback in the log.
     """
     log_path = Path(snakemake.log[0])
-    log_path.parent.mkdir(parents=True, exist_ok=True)
-    handler = logging.FileHandler(log_path, mode="w", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    console = logging.StreamHandler(sys.stderr)
-    console.setLevel(logging.WARNING)
-    console.setFormatter(logging.Formatter("drivesplat: %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
-    logging.captureWarnings(True)
+    _log_into(log_path)
+    threading_hook, threading.excepthook = threading.excepthook, _log_thread
     current = Job(snakemake)
     log = logging.getLogger(__name__)
     log.info("%s begins", current.name)
@@ -85,9 +85,34 @@ def job(snakemake: Any) -> Iterator[Job]:
         log.error("%s: %s", current.name, error)
         sys.exit(1)
     except Exception as error:
-        handler.stream.write(traceback.format_exc())
-        message = "%s: %s: %s (a bug; the traceback is in %s)"
-        log.error(message, current.name, type(error).__name__, error, log_path)
+        if isinstance(error, OSError) and error.errno in REFUSED_BY_DISK:
+            log.error("%s: %s", current.name, unwritable(error.filename or "a file", error))
+        else:
+            log.info("%s ends with this:", current.name, exc_info=True)
+            message = "%s: %s: %s (a bug; the traceback is in %s)"
+            log.error(message, current.name, type(error).__name__, error, log_path)
         sys.exit(1)
     finally:
+        threading.excepthook = threading_hook
         logging.shutdown()
+
+
+def _log_into(path: Path) -> None:
+    """Sends what is logged into the file at `path`, warnings and errors to the console as well."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    except OSError as error:
+        sys.exit(f"drivesplat: {unwritable(path, error)}")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    console = logging.StreamHandler(sys.stderr)
+    console.setLevel(logging.WARNING)
+    console.setFormatter(logging.Formatter("drivesplat: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
+    logging.captureWarnings(True)
+    logging.raiseExceptions = False  # where the disk has no room for a log, what the job was to write says so, once
+
+
+def _log_thread(failed: threading.ExceptHookArgs) -> None:
+    """What a thread fails with is the log's; who waits for the thread tells the user."""
+    logging.getLogger(__name__).info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)

@@ -24,7 +24,7 @@ from drivesplat.seeding.nearest_sweep import nearest_returns
 from drivesplat.seeding.sweeps import training_sweeps
 from drivesplat.settings.masks import MaskJob
 from drivesplat.sky_mask import sky_mask
-from drivesplat.storage import read_json, unreadable
+from drivesplat.storage import read_record, unreadable
 
 log = logging.getLogger(__name__)
 
@@ -81,10 +81,8 @@ def mask_name(kind: str, camera: str, timestamp: int) -> str:
 
 
 def read_masks_record(folder: Path) -> dict[str, Any]:
-    record = read_json(folder / "masks.json", rule="masks")
-    if not isinstance(record, dict) or "regions" not in record:
-        raise unreadable(folder / "masks.json", "masks", "not a record of masks")
-    return record
+    """Reads `masks.json`. Raises ResultError where it is not one."""
+    return read_record(folder / "masks.json", "masks", "regions", "sky_known", "semantic_classes", "own_car")
 
 
 def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:

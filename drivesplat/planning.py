@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from drivesplat.cards import any_card
 from drivesplat.config import for_scene, load
 from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.download.destination import RULE as DOWNLOAD
@@ -38,6 +39,9 @@ SCRIPTS = "workflow_scripts"
 PARTS_FILM = "parts"
 """The film of a method's parts."""
 ABLATION_FILES = ("ablation.json", "ablation.csv")
+
+THREADS_ON_CPU, THREADS_ON_GPU = 8, 2
+"""Threads of a training."""
 
 
 def let_scripts_import(folder: str) -> None:
@@ -80,6 +84,13 @@ class Plan(Inputs):
         device = for_scene(self.config, wildcards.scene).device.model_dump(mode="json")
         synthetic = self.config.datasets[self.config.dataset_of(wildcards.scene)].world is not None
         return canonical_json({**device, "kind": "any"} if synthetic and device["kind"] == "auto" else device)
+
+    def training_threads(self, wildcards: Any) -> int:
+        """The threads of a scene's trainings: on the CPU as many as its rasterizer can use; on a GPU few, so that a
+        machine of many cards and few processors still trains on all of them."""
+        kind = json.loads(self.device(wildcards))["kind"]
+        on_cpu = kind == "cpu" or (kind == "any" and not any_card())
+        return THREADS_ON_CPU if on_cpu else THREADS_ON_GPU
 
     def known(self, names: Any) -> str:
         """A wildcard constraint that admits these names only."""
@@ -229,8 +240,14 @@ class Plan(Inputs):
         Raises DriveSplatError.
         """
         folder = Path(self.config.results_dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
+        except OSError as error:
+            raise DriveSplatError(
+                f"{folder}/: cannot be written ({error.strerror or error}); "
+                "fix its permissions, or give this run another folder (results_dir)"
+            ) from error
         try:
             fcntl.flock(self._held_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

@@ -74,7 +74,8 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
 
 def refines_poses(config: Config, scene: str) -> bool:
     """Whether a scene's poses are refined before anything else is made of it."""
-    return for_scene(config, scene).refine_poses.enabled
+    enabled, world = for_scene(config, scene).refine_poses.enabled, config.datasets[config.dataset_of(scene)].world
+    return (world is None or world.pose_noise) if enabled == "auto" else enabled
 
 
 def scene_stages(config: Config, scene: str) -> tuple[str, ...]:

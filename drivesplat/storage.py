@@ -38,6 +38,11 @@ def unreadable(path: str | Path, rule: str, why: str) -> ResultError:
     return ResultError(f"{path}: {why}; delete it and rerun: the rule '{rule}' rebuilds it")
 
 
+def unwritable(path: str | Path, error: OSError) -> ResultError:
+    """The one sentence for a file or folder that cannot be written."""
+    return ResultError(f"{path}: cannot be written ({error.strerror or error}); free space or fix its permissions")
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A path beside `path`, of the same suffix, for what another program or library writes: it becomes `path` only once
@@ -55,9 +60,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         aside.replace(path)
         _fsync(path.parent)
     except OSError as error:
-        raise ResultError(
-            f"{path}: cannot be written ({error.strerror or error}); free space or fix its permissions"
-        ) from error
+        raise unwritable(path, error) from error
     finally:
         with suppress(OSError):
             aside.unlink(missing_ok=True)
@@ -126,6 +129,15 @@ def read_json(path: str | Path, rule: str) -> Any:
             return json.load(file)
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise unreadable(path, rule, f"not a readable JSON file ({error})") from error
+
+
+def read_record(path: str | Path, rule: str, *keys: str) -> dict[str, Any]:
+    """The content of a JSON result that has at least `keys`. Raises ResultError naming `path` and `rule`."""
+    record = read_json(path, rule)
+    absent = [key for key in keys if key not in record] if isinstance(record, dict) else list(keys)
+    if absent:
+        raise unreadable(path, rule, f"not what the rule writes (it lacks {', '.join(absent)})")
+    return record
 
 
 def write_plain_pickle(path: str | Path, value: Any) -> None:

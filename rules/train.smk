@@ -25,7 +25,7 @@ rule train:
         "<benchmarks>/{scene}/{method}/train.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: 8
+    threads: plan.training_threads
     resources:
         gpu=1,
         device=plan.device,

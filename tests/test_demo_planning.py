@@ -48,6 +48,20 @@ def test_the_demo_asks_for_little_gpu_memory_and_keeps_the_rest_of_the_device():
     assert told == {"kind": "cuda", "min_free_gb": 1.0, "max_gb": 10.0, "jobs_per_card": 2}
 
 
+@pytest.mark.parametrize(
+    ("device", "cards", "demo", "recorded"),
+    [
+        ("auto", "", 8, 2), ("auto", "0", 2, 2), ("any", "", 8, 8), ("any", "0,1", 2, 2), ("cuda", "", 2, 2),
+        ("cpu", "0", 8, 8),
+    ],
+)  # fmt: skip
+def test_trainings_ask_for_many_threads_where_they_run_on_the_cpu(monkeypatch, device, cards, demo, recorded):
+    """A recorded drive is trained on a GPU or not at all, unless told otherwise."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", cards)
+    made = plan(device=device)
+    assert [made.training_threads(scene(name)) for name in ("demo", "0103")] == [demo, recorded]
+
+
 def test_any_device_without_a_gpu_is_the_cpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert choose_device(DeviceSettings(kind="any")) == torch.device("cpu")

@@ -23,8 +23,8 @@ from drivesplat.training.losses import (
     masked_l1,
     sky_alpha_loss,
     sky_cross_entropy,
-    ssim,
 )
+from drivesplat.training.ssim import ssim, ssim_in_torch
 from drivesplat.training.views import LidarDepth, TrainingView
 
 WIDTH, HEIGHT = 20, 14
@@ -78,8 +78,9 @@ def zero_padded_ssim(image: np.ndarray, target: np.ndarray) -> float:
     return float(full[16:-16, 16:-16].mean())
 
 
+@pytest.mark.parametrize("measure", [ssim, ssim_in_torch])
 @pytest.mark.parametrize("kind", ["unlike", "alike", "flat", "one pixel wide"])
-def test_ssim_is_skimages(kind):
+def test_ssim_is_skimages(kind, measure):
     image = random_image(5, 30, 1 if kind == "one pixel wide" else 24)
     target = {
         "unlike": random_image(6, 30, 24),
@@ -87,7 +88,7 @@ def test_ssim_is_skimages(kind):
         "flat": torch.full_like(image, 0.4),
         "one pixel wide": random_image(6, 30, 1),
     }[kind]
-    assert float(ssim(image, target)) == pytest.approx(zero_padded_ssim(image.numpy(), target.numpy()), abs=1e-4)
+    assert float(measure(image, target)) == pytest.approx(zero_padded_ssim(image.numpy(), target.numpy()), abs=1e-4)
 
 
 def test_ssim_of_an_image_with_itself_is_one():
@@ -98,6 +99,20 @@ def test_ssim_of_an_image_with_itself_is_one():
 def test_ssim_has_the_gradient_of_finite_differences():
     image, target = random_image(9, 6, 5).double().requires_grad_(), random_image(10, 6, 5).double()
     assert torch.autograd.gradcheck(lambda x: ssim(x, target), image)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ssim_on_a_cpu_has_torchs_gradient(threads):
+    """Of an image that is not contiguous, and larger than a piece."""
+    image, target = random_image(11, 40, 70).transpose(0, 1), random_image(12, 70, 40)
+    gradients, before = [], torch.get_num_threads()
+    torch.set_num_threads(threads)
+    for measure in (ssim, ssim_in_torch):
+        asked = image.clone().requires_grad_()
+        (3.0 * measure(asked, target)).backward()
+        gradients.append(asked.grad)
+    torch.set_num_threads(before)
+    torch.testing.assert_close(*gradients, atol=1e-8, rtol=1e-4)
 
 
 def test_colour_terms_are_weighted_l1_and_ssim():

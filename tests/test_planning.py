@@ -10,7 +10,7 @@ import pytest
 from drivesplat.config import load
 from drivesplat.planning import Plan
 from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
-from drivesplat.stages import ALL_SCENE_STAGES, SCENE_STAGES, stage_settings
+from drivesplat.stages import ALL_SCENE_STAGES, SCENE_STAGES, refines_poses, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 ACTORS = ["background", "actors"]
@@ -20,7 +20,8 @@ KEPT_OUT = {"train": {"floaters": {"free_space": True}}}
 
 def plan(**values: Any) -> Plan:
     datasets = {"a": {"scenes": ["a1", "a2"]}, "b": {"scenes": ["b1"], "overrides": values.pop("b", {})}}
-    return Plan({"datasets": datasets, "results_dir": "elsewhere", **values}, str(REPOSITORY))
+    as_recorded = {"refine_poses": {"enabled": False}}
+    return Plan({"datasets": datasets, "results_dir": "elsewhere", **as_recorded, **values}, str(REPOSITORY))
 
 
 def taken(made: Plan, scene: str, method: str) -> list[str]:
@@ -88,6 +89,20 @@ def test_all_stages_take_the_refined_scene_where_poses_are_refined():
     made = plan(b=REFINED)
     scenes = {name: made.scene(SimpleNamespace(scene=name)) for name in ("a1", "b1")}
     assert scenes == {"a1": "elsewhere/a1/scene.json", "b1": "elsewhere/b1/scene_refined.json"}
+
+
+@pytest.mark.parametrize(
+    ("world", "enabled", "refined"),
+    [
+        (None, "auto", True), (None, True, True), (None, False, False),
+        ({}, "auto", False), ({}, True, True), ({"pose_noise": True}, "auto", True),
+    ],
+)  # fmt: skip
+def test_poses_are_refined_unless_they_are_known_to_be_exact(world, enabled, refined):
+    """Of recorded drives, and of worlds whose poses are as noisy; the default is 'auto'."""
+    dataset = {"dataroot": "resources/w", "scenes": ["w"], "world": world}
+    settings = {} if enabled == "auto" else {"refine_poses": {"enabled": enabled}}
+    assert refines_poses(load({"datasets": {"w": dataset}, **settings}), "w") is refined
 
 
 @pytest.mark.parametrize(

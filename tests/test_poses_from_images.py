@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
 from drivesplat.poses.from_images import aligned
-from drivesplat.poses.refine import Refinement, made_by_matches
+from drivesplat.poses.refine import made_by_matches
+from drivesplat.poses.refinement import Refinement
 from drivesplat.poses.rig import RigImages
 from drivesplat.rigid import apply, inverse, rigid
 from drivesplat.scene import Scene, Sweep

@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import sys
 
 import numpy as np
 import pytest
@@ -21,11 +22,12 @@ from hand_made_views import (
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.errors import DatasetError
+from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.poses import refine
 from drivesplat.poses.adjustment import adjust, priors_of, triangulated
 from drivesplat.poses.observations import Observations
-from drivesplat.poses.refine import Refinement, Trial, doubt, refine_poses, refined_by_matches
+from drivesplat.poses.refine import Trial, doubt, refine_poses, refined_by_matches
+from drivesplat.poses.refinement import Refinement, refined_or_kept
 from drivesplat.poses.rig import RigImages
 from drivesplat.rigid import rigid
 from drivesplat.settings.refine_poses import LimitSettings
@@ -252,6 +254,45 @@ def test_a_broken_image_is_named(tmp_path):
     (tmp_path / "1.png").write_bytes(b"no image")
     with pytest.raises(DatasetError, match=r"1\.png cannot be read"):
         refine_poses(drive.scene, job_of())
+
+
+def without_pycolmap(folder, monkeypatch) -> tuple[Drive, str]:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    monkeypatch.delitem(sys.modules, "drivesplat.poses.refine", raising=False)
+    return painted(folder, drive_of(3, size=SMALL), pattern), "pycolmap or pyceres cannot be imported"
+
+
+def camera_that_moves(folder, monkeypatch) -> tuple[Drive, str]:
+    drive = painted(folder, drive_of(3, size=SMALL), pattern)
+    first, *others = drive.scene.frames
+    first = dataclasses.replace(first, camera_to_world=first.camera_to_world @ shift(0.1))
+    return dataclasses.replace(drive, scene=dataclasses.replace(drive.scene, frames=(first, *others))), "moves on the"
+
+
+@pytest.mark.parametrize("obstacle", [without_pycolmap, camera_that_moves])
+class TestWhatCannotBeRefined:
+    def test_it_keeps_its_poses_where_nobody_insists(self, obstacle, tmp_path, monkeypatch, caplog):
+        drive, words = obstacle(tmp_path, monkeypatch)
+        with caplog.at_level(logging.WARNING):
+            kept = refined_or_kept(drive.scene, job_of(enabled="auto"))
+        assert kept.scene is drive.scene and words in kept.record["kept_because"] and not kept.record["refined"]
+        assert [words in record.message for record in caplog.records] == [True]
+        assert all(len(values) == 0 for values in kept.points.values())
+        tried = painted(tmp_path, drive_of(1, size=SMALL), black)
+        monkeypatch.undo()
+        assert kept.record.keys() == refine_poses(tried.scene, job_of()).record.keys()
+
+    @pytest.mark.parametrize("settings", [{"enabled": True}, {"enabled": "auto", "start": "images"}])
+    def test_it_fails_where_somebody_does(self, obstacle, tmp_path, monkeypatch, settings):
+        drive, words = obstacle(tmp_path, monkeypatch)
+        with pytest.raises(DriveSplatError, match=words) as failure:
+            refined_or_kept(drive.scene, job_of(**settings))
+        assert "\n" not in str(failure.value) and "made" in str(failure.value)
+
+
+def test_what_can_be_refined_is(tmp_path):
+    drive = painted(tmp_path, drive_of(3, size=SMALL), pattern)
+    assert refined_or_kept(drive.scene, job_of()).record == refine_poses(drive.scene, job_of()).record
 
 
 def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path, monkeypatch):

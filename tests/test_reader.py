@@ -384,7 +384,8 @@ def test_a_bad_lidar_file_is_counted_where_told_to_go_on(root, fault, caplog):
         points = seed_points(scene, seed_job("warn"))
     assert points.note["lidar_missing"] == 2
     assert points.note["lidar"] > 0
-    assert str(sweep_of(root, 0)) in caplog.text
+    assert str(sweep_of(root, 0)) in caplog.text and "left out" in caplog.text
+    assert "restore it" not in caplog.text, "what has been decided is not asked again"
 
 
 def refusal(root: Path, **changes) -> str:

@@ -32,7 +32,8 @@ def labels() -> np.ndarray:
 @pytest.fixture(scope="module")
 def masks(labels, tiny_scene, tmp_path_factory):
     folder = write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
-    write_json(folder / "masks.json", {"regions": "boxes", "own_car": {}, "provenance": {"made": "masks"}})
+    known = {"regions": "boxes", "own_car": {}, "sky_known": True, "semantic_classes": 0}
+    write_json(folder / "masks.json", {**known, "provenance": {"made": "masks"}})
     return folder
 
 

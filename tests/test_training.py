@@ -202,7 +202,8 @@ def hold_the_lock(folder: str) -> None:
 
 def in_subprocess(function: Callable[..., None], *arguments: str) -> subprocess.Popen:
     """A process that calls a function of a test module."""
-    paths = [str(REPOSITORY), str(REPOSITORY / "tests")]
+    module = Path(sys.modules[function.__module__].__file__)
+    paths = [str(REPOSITORY), str(REPOSITORY / "tests"), str(module.parent)]
     script = (
         f"import sys; sys.path[:0] = {paths}; import {function.__module__} as m; m.{function.__name__}(*{arguments})"
     )

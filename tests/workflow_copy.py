@@ -70,6 +70,7 @@ class WorkflowCopy:
         write_world(folder / "data", world)
         base = {
             "datasets": {"nuscenes": {"dataroot": "data", "scenes": list(world.scenes)}},
+            "refine_poses": {"enabled": False},
             "lidar_seed": {"max_points": 500, "far_points": 100},
             "train": TINY_TRAINING,
             "render": {"width": 64, "height": 36, "fps": 4},
@@ -86,10 +87,19 @@ class WorkflowCopy:
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "snakemake", "--configfile", "mine.yaml", *arguments]
 
-    def run(self, *targets: str, cores: int = 2, flags: tuple[str, ...] = ()) -> subprocess.CompletedProcess:
-        """Runs Snakemake; the result holds its output (both streams) as `stdout`."""
-        arguments = self.command("--cores", str(cores), *flags, "--", *targets)
-        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
+    def run(
+        self,
+        *targets: str,
+        cores: int = 2,
+        flags: tuple[str, ...] = (),
+        cards: str = "",
+        under: tuple[str, ...] = (),
+        timeout: float = 600,
+    ) -> subprocess.CompletedProcess:
+        """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `cards`, by the program
+        `under` where one is given; the result holds its output (both streams) as `stdout`."""
+        arguments = [*under, *self.command("--cores", str(cores), *flags, "--", *targets)]
+        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": cards}
         return subprocess.run(
             arguments,
             cwd=self.folder,
@@ -97,7 +107,7 @@ class WorkflowCopy:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=600,
+            timeout=timeout,
         )
 
     def planned(self, *targets: str) -> dict[str, int]:

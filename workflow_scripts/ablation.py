@@ -1,14 +1,13 @@
 """The eval.json of a method, whole and without each thing, into ablation.json, ablation.csv and a table."""
 
-from pathlib import Path
-
 from drivesplat.ablation import ablation, markdown, write_csv
+from drivesplat.evaluation.scene_metrics import read_evaluations
 from drivesplat.job import job
 from drivesplat.settings.ablation import AblationJob
-from drivesplat.storage import read_json, write_json
+from drivesplat.storage import write_json
 
 with job(snakemake) as current:
-    evals = {Path(path).parent.name: read_json(path, rule="evaluate") for path in current.input.evals}
+    evals = read_evaluations(current.input.evals)
     provenance = current.provenance(*(record["provenance"] for record in evals.values()))
     compared = ablation(evals, current.settings(AblationJob))
     write_csv(current.output.table, compared)

@@ -2,20 +2,21 @@
 
 from pathlib import Path
 
+from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.images import write_image
 from drivesplat.job import job
 from drivesplat.masks import read_masks_record
 from drivesplat.recording import read_recording
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.storage import read_json, sha256_file, write_json
-from drivesplat.training.run import read_checkpoint
+from drivesplat.storage import sha256_file, write_json
+from drivesplat.training.run import read_checkpoint, read_summary
 
 with job(snakemake) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)
     recording, upstream = read_recording(files.scene, files.parser, files.masks)
-    record, summary = read_masks_record(recording.masks), read_json(files.summary, rule="train")
-    lpips = read_json(files.lpips[0], rule="lpips_backbone") if files.lpips else None
+    record, summary = read_masks_record(recording.masks), read_summary(files.summary)
+    lpips = read_backbone(files.lpips[0]) if files.lpips else None
     truth = Path(files.truth[0]) if files.truth else None
     inputs = EvaluationInputs(checkpoint, summary, recording, record, lpips, truth)
     digests = {"truth": sha256_file(truth)} if truth else {}

@@ -4,14 +4,14 @@ import dataclasses
 
 from drivesplat.job import job
 from drivesplat.own_car import read_own_car
-from drivesplat.poses.refine import refine_poses
+from drivesplat.poses.refinement import refined_or_kept
 from drivesplat.scene import read_scene, write_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 from drivesplat.storage import write_json, write_plain_pickle
 
 with job(snakemake) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
-    refinement = refine_poses(scene, current.settings(RefinePosesJob), own_car, current.threads)
+    refinement = refined_or_kept(scene, current.settings(RefinePosesJob), own_car, current.threads)
     provenance = current.provenance(scene.provenance, upstream)
     write_json(current.output.poses, {**refinement.record, "provenance": provenance})
     write_plain_pickle(current.output.points, {**refinement.points, "provenance": provenance})

@@ -9,7 +9,7 @@ from typing import Any
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.settings.evaluate import LpipsSettings
-from drivesplat.storage import atomic_write, sha256_file
+from drivesplat.storage import atomic_write, read_record, sha256_file
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +31,11 @@ def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
     if reason:
         log.warning("LPIPS will be null: %s", reason)
     return {"file": str(path), "sha256": digest, "unavailable": reason}
+
+
+def read_backbone(path: str | Path) -> dict[str, Any]:
+    """Reads the record that `provide_backbone` made. Raises ResultError where it is not one."""
+    return read_record(path, "lpips_backbone", "file", "sha256", "unavailable")
 
 
 def _fetch(settings: LpipsSettings, path: Path) -> str | None:

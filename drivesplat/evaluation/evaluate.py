@@ -14,13 +14,14 @@ from drivesplat.evaluation.drive import drive_record
 from drivesplat.evaluation.held_out import held_out_images, measured_images
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
+from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.shown import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.parser import image_size
 from drivesplat.recording import Recording
-from drivesplat.regions import region_masks
+from drivesplat.regions import REGIONS, region_masks
 from drivesplat.seeding.depth_points import Depths, clouds_of, depths_in
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
@@ -155,14 +156,18 @@ def evaluate_groups(
     device: torch.device,
     depths: Mapping[int, Depths] = MappingProxyType({}),
 ) -> dict[str, dict[str, Any]]:
-    """The metrics of every held-out group, by region, and `depth` where LiDAR tells the `depths` of held-out images, by
-    their numbers."""
-    groups = {}
+    """The metrics of every held-out group, by region; `depth` where LiDAR tells the `depths` of held-out images, by
+    their numbers; with several cameras `overlap` and `no_overlap`, the static pixels where others look, too, and where
+    none does."""
+    groups, rig = {}, len(recording.parser["camera_names"]) > 1
     for group, images in measured_images(recording.parser, camera).items():
-        metrics, depth = RegionMetrics(lpips_map), DepthErrors()
+        metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if rig else ()))), DepthErrors()
         for index in images:
             image, metres = rendered_with_depth(model, view_of(recording.parser, index, device))
-            metrics.add(image, recording.image(index), region_masks(recording.labels(index)))
+            masks = region_masks(recording.labels(index))
+            if rig:
+                masks |= overlap_masks(recording.parser, index, masks["static"])
+            metrics.add(image, recording.image(index), masks)
             if index in depths:
                 depth.add(metres, depths[index])
         groups[group] = {**with_gap(metrics.summary()), **depth.summary()}

@@ -1,10 +1,20 @@
 """The stage `scene_metrics`: the methods of a scene side by side in metrics.json."""
 
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ResultError
+from drivesplat.storage import read_record
 
 SCHEMA = 1
+
+
+def read_evaluations(paths: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The content of every eval.json, by the name of the method, whose folder it lies in. Raises ResultError where one
+    is none."""
+    keys = ("scene", "dataset", "protocol", "drive", "result", "provenance")
+    return {Path(path).parent.name: read_record(path, "evaluate", *keys) for path in paths}
 
 
 def side_by_side(evals: dict[str, dict[str, Any]]) -> dict[str, Any]:

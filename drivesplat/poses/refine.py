@@ -29,6 +29,7 @@ from drivesplat.poses.corrections import Corrections, corrected
 from drivesplat.poses.features import find_features, match_features
 from drivesplat.poses.from_images import placed_by_images
 from drivesplat.poses.observations import Observations
+from drivesplat.poses.refinement import Refinement, verdict
 from drivesplat.poses.rig import RigImages, from_pycolmap
 from drivesplat.poses.triangulated import no_points, triangulated_record
 from drivesplat.rigid import inverse
@@ -36,17 +37,6 @@ from drivesplat.scene import Scene
 from drivesplat.settings.refine_poses import LimitSettings, RefinePosesJob
 
 log = logging.getLogger(__name__)
-
-SCHEMA = 1
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """`scene`: with refined poses, or as it was; `record`: the content of poses.json; `points`: of triangulated.pkl."""
-
-    scene: Scene
-    record: dict[str, Any]
-    points: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -90,7 +80,7 @@ def refined_by_matches(
     trial = _trial(untouched, priors, job, threads) if len(seen.positions) else None
     changes = corrections.at(images.timestamps)
     fault = doubt(images, seen, changes, trial, job.refine_poses.limits)
-    record = {**_verdict(images, job, fault), **_record(images, seen, changes, trial)}
+    record = {**verdict(scene, job, fault), **_record(images, seen, changes, trial)}
     if fault is not None:
         log.warning("scene %s: poses stay as they are: %s", scene.name, fault)
         return Refinement(scene, record, no_points())
@@ -113,7 +103,7 @@ def made_by_matches(
     if not placement.follows:
         described |= {"shift_m": None, "turn_deg": None}
         corrections = corrections.continued(images.scene.key_frame_interval)
-    record = {**_verdict(images, job, None), "placement": placement.record, **described}
+    record = {**verdict(scene, job, None), "placement": placement.record, **described}
     made = corrected(images.scene, corrections, poses="images")
     return Refinement(made, record, triangulated_record(images.indices, seen))
 
@@ -128,12 +118,6 @@ def _adjusted(
         untouched = pycolmap.Reconstruction(reconstruction)
         adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
     return untouched, reconstruction
-
-
-def _verdict(images: RigImages, job: RefinePosesJob, fault: str | None) -> dict[str, Any]:
-    """The head of poses.json."""
-    verdict = {"start": job.refine_poses.start, "refined": fault is None, "kept_because": fault}
-    return {"schema": SCHEMA, "scene": images.scene.name, **verdict}
 
 
 def _corrections(images: RigImages, seen: Observations, given: np.ndarray, refined: np.ndarray) -> Corrections:

@@ -26,7 +26,7 @@ from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.seeding.coloring import ColorView, color_by_visibility
 from drivesplat.seeding.far_points import far_points
-from drivesplat.seeding.sweeps import outside_boxes, read_sweep, thin, without_own_car
+from drivesplat.seeding.sweeps import outside_boxes, read_sweep, sweep_fault, thin, without_own_car
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.tracks import boxes_of, tracks_that_move
@@ -95,11 +95,11 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
         try:
             points = read_sweep(sweep)
-        except DatasetError as error:
+        except DatasetError:
             if settings.on_missing == "stop":
                 raise
             missing += 1
-            log.log(logging.WARNING if missing == 1 else logging.DEBUG, "%s", error)
+            log.log(logging.WARNING if missing == 1 else logging.DEBUG, "%s; left out", sweep_fault(sweep))
             continue
         if group != "train":
             continue

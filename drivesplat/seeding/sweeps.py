@@ -24,17 +24,24 @@ def read_sweep(sweep: Sweep) -> np.ndarray:
 
     Raises DatasetError naming the sample_data token and the path where the file is missing, truncated or empty.
     """
+    fault = sweep_fault(sweep)
+    if fault:
+        leave_out = "" if sweep.is_key_frame else "lidar_seed.sweeps: false to do without all between key frames, or "
+        raise DatasetError(f"{fault}; restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it")
+    points = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
+    return points[np.isfinite(points).all(axis=1)].astype(np.float64)
+
+
+def sweep_fault(sweep: Sweep) -> str | None:
+    """What is wrong with a sweep's file, beside its sample_data token and path, or None."""
     path = Path(sweep.path)
     where = f"{place_of(sweep)}: LiDAR file {path}"
-    leave_out = "" if sweep.is_key_frame else "lidar_seed.sweeps: false to do without all between key frames, or "
-    remedy = f"restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it"
     if not path.is_file():
-        raise DatasetError(f"{where} is missing; {remedy}")
+        return f"{where} is missing"
     size = path.stat().st_size
     if size == 0 or size % (4 * _RECORD):
-        raise DatasetError(f"{where} is corrupt ({size} bytes are no whole number of returns); {remedy}")
-    points = np.fromfile(path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
-    return points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        return f"{where} is corrupt ({size} bytes are no whole number of returns)"
+    return None
 
 
 def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:

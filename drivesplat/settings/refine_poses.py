@@ -62,8 +62,9 @@ class RefinePosesSettings(Settings):
     """Poses corrected by what the images show: features matched between neighbouring images and triangulated, then
     bundle adjustment with the given poses as priors, all cameras as one rig, intrinsics fixed."""
 
-    enabled: bool = False
-    """Whether every later stage takes the refined poses."""
+    enabled: Literal["auto", True, False] = "auto"
+    """Whether every later stage takes the refined poses. 'auto': those of recorded drives, and of synthetic worlds with
+    pose_noise; where they cannot be refined, the given ones are kept, with a warning. true insists on pycolmap."""
     start: Literal["recorded", "images"] = "recorded"
     """Where poses start from: 'recorded' corrects those of the dataset; 'images' makes poses from images alone, for
     drives that have none, and stops where the drive does not allow it. docs/poses.md"""

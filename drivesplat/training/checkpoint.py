@@ -12,7 +12,7 @@ import torch
 
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.storage import atomic_write, unreadable
+from drivesplat.storage import atomic_write, unreadable, unwritable
 from drivesplat.training.densify import Densifier
 from drivesplat.training.optimizers import ModelOptimizers
 
@@ -48,25 +48,27 @@ def load(path: Path, rule: str) -> dict[str, Any]:
 def sole_trainer(folder: Path) -> Iterator[None]:
     """Keeps a second trainer out of `folder`; the kernel frees the lock when this process ends, however it ends.
 
-    Raises TrainingError naming the process that holds it.
+    Raises TrainingError naming the process that holds it, ResultError where the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = open(folder / "lock", "a+", encoding="utf-8")  # noqa: SIM115 (closed by the with below)
+        file = open(folder / "lock", "ab+", buffering=0)  # noqa: SIM115 (closed by the with below)
     except OSError as error:
-        raise ResultError(f"{folder}: cannot be written ({error.strerror}); fix its permissions") from error
+        raise unwritable(folder, error) from error
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             file.seek(0)
-            holder = file.read().strip() or "unknown"
+            holder = file.read().decode(errors="replace").strip() or "unknown"
             raise TrainingError(
                 f"process {holder} is still training in {folder}; wait for it or end it (kill {holder}), then run again"
             ) from None
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
+        try:
+            file.truncate(0)
+            file.write(str(os.getpid()).encode())
+        except OSError as error:
+            raise unwritable(folder, error) from error
         yield
 
 

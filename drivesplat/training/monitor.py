@@ -3,6 +3,8 @@
 import logging
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import torch
@@ -10,8 +12,9 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from drivesplat.errors import TrainingError
+from drivesplat.errors import ResultError, TrainingError
 from drivesplat.model.splat_model import Picture
+from drivesplat.storage import unwritable
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
@@ -53,19 +56,22 @@ class FiniteGuard:
 
 class Monitor:
     """Scalars and images into a TensorBoard folder, how far it is into the log now and then, a progress bar where a
-    terminal looks."""
+    terminal looks. Raises ResultError, naming the folder, where it cannot be written."""
 
     def __init__(self, folder: Path, iterations: int, start: int, label: str):
+        self._folder = folder
         self._iterations = iterations
         self._told: tuple[int, float] | None = None
-        self._writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
+        with self._writing():
+            self._writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
         self._bar = tqdm(
             total=iterations, initial=start, desc=label, unit="it", disable=not sys.stderr.isatty(), mininterval=1.0
         )
 
     def scalars(self, step: int, values: dict[str, float], advanced: int) -> None:
-        for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
+        with self._writing():
+            for name, value in values.items():
+                self._writer.add_scalar(name, value, step)
         self._tell(step, time.monotonic())
         self._bar.update(advanced)
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
@@ -83,8 +89,25 @@ class Monitor:
     def image(self, step: int, view: TrainingView, picture: Picture) -> None:
         """Recorded and rendered side by side."""
         pair = torch.cat([view.target(), picture.image.detach().clamp(0.0, 1.0)], dim=1)
-        self._writer.add_image("recorded_and_rendered", pair.cpu(), step, dataformats="HWC")
+        with self._writing():
+            self._writer.add_image("recorded_and_rendered", pair.cpu(), step, dataformats="HWC")
 
     def close(self) -> None:
         self._bar.close()
-        self._writer.close()
+        with self._writing():
+            self._writer.close()
+
+    def __enter__(self) -> "Monitor":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Closes it; what has ended the training goes before what the disk says then."""
+        with suppress(ResultError) if kind else nullcontext():
+            self.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise unwritable(self._folder, error) from error

@@ -1,6 +1,7 @@
 """A training from a parser record to its files: checkpoint.pt and train.json."""
 
 import dataclasses
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,11 +22,11 @@ from drivesplat.seeding.free_space import read_free_space
 from drivesplat.seeding.lidar_depth import read_lidar_depth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
-from drivesplat.storage import canonical_json, sha256_text, unreadable, write_json
+from drivesplat.storage import canonical_json, read_record, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
 from drivesplat.training.first_exposure import first_gains
 from drivesplat.training.surfaces import Surroundings, surroundings_of
-from drivesplat.training.train import Workspace, train
+from drivesplat.training.train import TrainingSummary, Workspace, train
 from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
 
 
@@ -158,7 +159,9 @@ def run_training(
     provenance: dict[str, Any],
     label: str,
 ) -> None:
-    """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure."""
+    """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure, and a training
+    whose parent has been killed meanwhile: Snakemake, which did not see it end, will have it made again."""
+    started_by = os.getppid()
     with checkpoint.sole_trainer(files.resume):
         device = choose_device(device_settings)
         begun = prepare(inputs, job, device)
@@ -176,7 +179,8 @@ def run_training(
         }
         checkpoint.save(files.checkpoint, content)
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
-    shutil.rmtree(files.resume)
+    if os.getppid() == started_by:
+        shutil.rmtree(files.resume)
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -185,6 +189,11 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not {"model", "job", "parts", "provenance"} <= content.keys():
         raise unreadable(path, "train", "not a checkpoint of a finished training")
     return content
+
+
+def read_summary(path: str | Path) -> dict[str, Any]:
+    """Reads `train.json`. Raises ResultError where it is not one."""
+    return read_record(path, "train", *(field.name for field in dataclasses.fields(TrainingSummary)), "provenance")
 
 
 def trained_model(content: dict[str, Any]) -> tuple[SplatModel, TrainJob]:

@@ -7,12 +7,12 @@ from unittest.mock import patch
 
 import torch
 from gsplat import DefaultStrategy, MCMCStrategy
-from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from gsplat.strategy import ops
 from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.settings.train import TrainSettings
+from drivesplat.training.exploration import explore
 from drivesplat.training.optimizers import Optimizers
 
 
@@ -43,11 +43,24 @@ class CappedDefaultStrategy(DefaultStrategy):
         return super()._grow_gs(params, optimizers, state, step)
 
 
+class ExploringStrategy(MCMCStrategy):
+    """gsplat's MCMCStrategy that keeps the memory which it will need again, and explores in one pass on a CPU."""
+
+    def step_post_backward(
+        self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any], lr: float
+    ) -> None:
+        if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
+            state["binoms"] = state["binoms"].to(params["means"].device)
+            self._relocate_gs(params, optimizers, state["binoms"])
+            self._add_new_gs(params, optimizers, state["binoms"])
+        explore(params, lr * self.noise_lr)
+
+
 def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MCMCStrategy:
     """The strategy that the settings name, for at most `cap_max` Gaussians."""
     start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
     if settings.strategy == "mcmc":
-        return MCMCStrategy(
+        return ExploringStrategy(
             cap_max=cap_max,
             noise_lr=settings.mcmc.noise_lr,
             min_opacity=settings.mcmc.min_opacity,
@@ -69,12 +82,9 @@ def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MC
 
 
 @contextmanager
-def torch_twins() -> Iterator[None]:
-    """For its duration gsplat's strategies use torch twins of the two CUDA kernels they call."""
-    with (
-        patch.object(ops, "compute_relocation", relocation),
-        patch.object(ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
-    ):
+def torch_twin() -> Iterator[None]:
+    """For its duration gsplat's strategies use the torch twin of a CUDA kernel that they call."""
+    with patch.object(ops, "compute_relocation", relocation):
         yield
 
 

@@ -163,11 +163,8 @@ def train(
     with telling_out_of_memory(lambda: len(model)):
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, surroundings, clock)
         run = Run.begin(trainer, workspace)
-        monitor = Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label)
-        try:
+        with Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label) as monitor:
             _iterate(run, monitor)
-        finally:
-            monitor.close()
         return run.summary()
 
 

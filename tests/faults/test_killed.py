@@ -69,6 +69,7 @@ def test_a_training_that_outlives_a_killed_run_is_named_and_never_doubled(copy):
 
 def test_an_interrupted_run_takes_its_training_along_and_the_next_one_goes_on(copy):
     running = at_work(copy)
+    assert "another run is working in results/" in told(copy.run("report")), "meanwhile there is no second one"
     os.killpg(running.pid, signal.SIGINT)
     assert running.wait(PATIENCE) != 0
     until(lambda: training_process(copy) is None)

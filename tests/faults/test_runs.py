@@ -1,16 +1,22 @@
 """What goes wrong, and what the user may count on: each fault through Snakemake itself, in one line."""
 
 import fcntl
+import itertools
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tiny_world import World
-from workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
+from workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
 
@@ -70,6 +76,7 @@ def test_an_unquoted_scene_number_is_told_to_be_quoted(copy):
     copy.write_config("datasets: {nuscenes: {dataroot: data, scenes: [0061]}}\n")
     line = told(copy.run())
     assert "quotes" in line and '"0061"' in line
+    assert not (copy.folder / "results").exists()
 
 
 def test_an_unknown_method_lists_those_there_are(copy):
@@ -252,31 +259,58 @@ def test_an_ffmpeg_that_is_absent_or_dies_is_named_and_leaves_no_half_film(train
     assert not list(trained.folder.glob("results/0001/vanilla/*original*"))
 
 
-@pytest.mark.parametrize(
-    ("script", "name"),
-    [
-        ("film", "vanilla/original.mp4"),
-        ("film_parts", "street/parts.mp4"),
-        ("edit", "street/edits/gone.mp4"),
-        ("ghost_panel", "vanilla/ghost_panel.png"),
-        ("remove_actor", "vanilla/with_car.png"),
-        ("export", "vanilla/splat.ply"),
-        ("export_usd", "vanilla/scene.usdz"),
-        ("export_viewer", "vanilla/viewer.html"),
-    ],
-)
-def test_a_full_disk_stops_a_look_and_names_the_file(trained, script, name):
-    """A limit on the size of the job's files stands in for a disk without room: the same write fails the same way."""
-    path = trained.folder / f"workflow_scripts/{script}.py"
-    whole, folder = path.read_text(), trained.folder / "results/0001"
-    before = {file for file in folder.rglob("*") if file.is_file()}
-    limit = f"import resource\n\nresource.setrlimit(resource.RLIMIT_FSIZE, ({LARGEST_FILE}, {LARGEST_FILE}))\n"
-    path.write_text(limit + whole)
+@contextmanager
+def altered(copy: WorkflowCopy, script: str, change: Callable[[str], str]) -> Iterator[None]:
+    """One of the workflow's scripts, changed for a while."""
+    path = copy.folder / f"workflow_scripts/{script}.py"
+    whole = path.read_text()
+    path.write_text(change(whole))
     try:
-        line = told(trained.run(f"results/0001/{name}"))
+        yield
     finally:
         path.write_text(whole)
-    assert f"results/0001/{name}: " in line
+
+
+@contextmanager
+def set_to(copy: WorkflowCopy, **config: Any) -> Iterator[None]:
+    """Another config for a while."""
+    before, copy.config = copy.config, {**copy.config, **config}
+    copy.write_config()
+    try:
+        yield
+    finally:
+        copy.config = before
+        copy.write_config()
+
+
+LOOK_SCRIPTS = {
+    "film": "vanilla/original.mp4",
+    "film_parts": "street/parts.mp4",
+    "edit": "street/edits/gone.mp4",
+    "ghost_panel": "vanilla/ghost_panel.png",
+    "remove_actor": "vanilla/with_car.png",
+    "export": "vanilla/splat.ply",
+    "export_usd": "vanilla/scene.usdz",
+    "export_viewer": "vanilla/viewer.html",
+}
+"""Scripts, and a file of each that it cannot write."""
+
+
+def test_a_full_disk_stops_looks_and_each_names_its_file(trained):
+    """A limit on the size of the job's files stands in for a disk without room: the same write fails the same way."""
+    folder = trained.folder / "results/0001"
+    before = {file for file in folder.rglob("*") if file.is_file()}
+    limit = f"import resource\n\nresource.setrlimit(resource.RLIMIT_FSIZE, ({LARGEST_FILE}, {LARGEST_FILE}))\n"
+    with ExitStack() as changed:
+        for script in LOOK_SCRIPTS:
+            changed.enter_context(altered(trained, script, lambda whole: limit + whole))
+        done = trained.run(*(f"results/0001/{name}" for name in LOOK_SCRIPTS.values()), flags=("--keep-going",))
+    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
+    lines = complaints(done.stdout)
+    for name in LOOK_SCRIPTS.values():
+        (line,) = (line for line in lines if f"results/0001/{name}: " in line)
+        assert "a bug" not in line
+    assert len(lines) == len(LOOK_SCRIPTS), lines
     assert {file for file in folder.rglob("*") if file.is_file()} == before
 
 
@@ -284,11 +318,97 @@ LARGEST_FILE = 2500
 """Bytes: less than any of these files has, more than a log takes."""
 
 
-def test_a_results_folder_that_cannot_be_written_is_named(trained, tmp_path):
-    other = WorkflowCopy(trained.folder, trained.config)
+def test_a_results_folder_that_cannot_be_made_is_named(trained, tmp_path):
     (tmp_path / "results").write_text("a file")
-    done = other.run("results/0001/vanilla/splat.ply", flags=("--config", f"results_dir={tmp_path}/results/in"))
-    assert done.returncode != 0 and f"{tmp_path}/results" in done.stdout and "Traceback" not in done.stdout, done.stdout
+    folder = f"{tmp_path}/results/in"
+    line = told(trained.run(f"{folder}/0001/scene.json", flags=("--config", f"results_dir={folder}")))
+    assert line.startswith(f"drivesplat: {folder}/: cannot be written (") and "results_dir" in line
+
+
+READ_ONLY = 'mount --bind results results && mount -o remount,bind,ro results && exec "$@"'
+
+
+def test_a_results_folder_on_a_read_only_disk_is_named(trained):
+    under = ("unshare", "--map-root-user", "--mount", "sh", "-c", READ_ONLY, "sh")
+    if shutil.which("unshare") is None or subprocess.run([*under, "true"], cwd=trained.folder).returncode:
+        pytest.skip("only where users may mount what others do not see")
+    line = told(trained.run("results/0001/vanilla/scene.usdz", under=under))
+    assert line.startswith("drivesplat: results/: cannot be written (Read-only file system); fix its permissions")
+
+
+OUT_OF_MEMORY = """\
+import torch
+from drivesplat.training.train import Trainer
+
+
+def fit_one(self):
+    raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+
+Trainer.fit_one = fit_one
+"""
+
+
+def test_a_training_out_of_gpu_memory_says_what_lowers_the_need_and_is_not_tried_again(trained):
+    """The peak is the card's own in tests/test_gpu.py."""
+    changed = set_to(trained, methods={"large": {}})
+    with changed, altered(trained, "train", lambda whole: OUT_OF_MEMORY + whole):
+        done = trained.run("results/0001/large/train.json")
+    line = told(done)
+    assert re.search(r"out of GPU memory with \d[\d,]* Gaussians \(peak 0\.0 GB\): lower train\.cap_max", line), line
+    assert len(re.findall(r"^(?:local)?rule train:$", done.stdout, re.M)) == done.stdout.count(f"{line}\n") == 1
+    assert not list((trained.folder / "results/0001/large").glob("*.*"))
+
+
+@pytest.mark.parametrize("profile", ["default", "slurm"])
+def test_no_profile_tries_failed_jobs_again(profile):
+    text = (REPOSITORY / f"profiles/{profile}/config.yaml").read_text()
+    rules = "".join(path.read_text() for path in (REPOSITORY / "rules").glob("*.smk"))
+    assert not re.search(r"restart-times|retries", text + rules)
+
+
+def test_without_network_lpips_is_null_with_the_reason_and_nothing_else_is(trained):
+    url = "http://127.0.0.1:9/alexnet.pth"
+    with set_to(trained, lpips={"enabled": True, "url": url}):
+        done = trained.run("results/0001/vanilla/eval.json")
+    assert done.returncode == 0, done.stdout
+    assert f"LPIPS will be null: the AlexNet backbone could not be fetched from {url}" in done.stdout
+    result = trained.read("results/0001/vanilla/eval.json")["result"]
+    assert url in result["lpips_unavailable"] and "put the file at" in result["lpips_unavailable"]
+    figures = result["extrapolation"]["all"]
+    assert figures["lpips"] is None and figures["psnr"] > 0 and figures["ssim"] > 0
+
+
+TRAINING_THAT_SLEEPS = """\
+import json, os, time
+from pathlib import Path
+from drivesplat.job import job
+
+with job(snakemake) as current:
+    current.device()
+    began = time.time()
+    time.sleep(0.7)
+    seen = {"card": os.environ["CUDA_VISIBLE_DEVICES"], "began": began, "ended": time.time()}
+    Path(current.output.checkpoint).write_text("")
+    Path(current.output.summary).write_text(json.dumps(seen))
+"""
+
+
+@pytest.mark.parametrize("cards", [1, 4])
+def test_there_are_never_more_gpu_jobs_than_cards_and_each_sees_its_own(trained, cards):
+    """However many cores there are. None waits for a card, since none is started before one is free."""
+    names = [f"GPU-{os.getpid()}-{number}" for number in range(cards)]
+    methods = [f"on{cards}cards{number}" for number in range(cards + 2)]
+    targets = [f"results/0001/{method}/train.json" for method in methods]
+    changed = set_to(trained, methods={method: {} for method in methods}, device="any")
+    with changed, altered(trained, "train", lambda _: TRAINING_THAT_SLEEPS):
+        done = trained.run(*targets, cores=100, cards=",".join(names))
+    assert done.returncode == 0 and "waits for a GPU" not in done.stdout, done.stdout
+    jobs = [trained.read(target) for target in targets]
+    assert {job["card"] for job in jobs} == set(names)
+    for name in names:
+        spans = sorted((job["began"], job["ended"]) for job in jobs if job["card"] == name)
+        assert all(ended <= began for (_, ended), (began, _) in itertools.pairwise(spans))
 
 
 def test_a_second_run_in_one_folder_is_refused(copy):
@@ -320,7 +440,7 @@ def training_process(copy: WorkflowCopy) -> int | None:
 
 
 def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
-    training = TINY_TRAINING | {"iterations": 240, "checkpoint_every": 10}
+    training = TINY_TRAINING | {"iterations": 120, "checkpoint_every": 10}
     whole, killed = (
         WorkflowCopy.make(tmp_path / name, methods=VANILLA, train=training) for name in ("whole", "killed")
     )
@@ -342,7 +462,7 @@ def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
     done = killed.run("results/0001/metrics.json")
     assert done.returncode == 0, done.stdout
     summary = killed.read("results/0001/vanilla/train.json")
-    assert summary["iterations"] == 240 and len(summary["resumed_at"]) == 1 and summary["resumed_at"][0] >= 10
+    assert summary["iterations"] == 120 and len(summary["resumed_at"]) == 1 and summary["resumed_at"][0] >= 10
     a, b = (c.read("results/0001/metrics.json")["methods"]["vanilla"]["extrapolation"] for c in (whole, killed))
     for region in ("all", "static", "moving_vehicle"):
         assert abs(a[region]["psnr"] - b[region]["psnr"]) < 0.1

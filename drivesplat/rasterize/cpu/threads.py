@@ -19,15 +19,18 @@ def parallel_for(piece: Callable[..., None], count: int, grain: int, *args: Any)
     number of threads, so neither need the results.
     """
     starts = range(0, count, grain)
-    threads = min(torch.get_num_threads(), len(starts))
+    others = min(torch.get_num_threads(), len(starts)) - 1
+    left = iter(starts)  # one for all threads: each takes the next piece when it is done with its own
 
-    def work(start: int) -> None:
-        piece(start, min(start + grain, count), *args)
+    def work() -> None:
+        for start in left:
+            piece(start, min(start + grain, count), *args)
 
-    if threads <= 1:
-        for start in starts:
-            work(start)
+    if others <= 0:
+        work()
         return
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(work, starts):  # what a piece raises is raised here
-            pass
+    with ThreadPoolExecutor(others) as pool:
+        helpers = [pool.submit(work) for _ in range(others)]
+        work()
+    for helper in helpers:
+        helper.result()  # what a piece raises is raised here

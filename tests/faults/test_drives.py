@@ -1,0 +1,48 @@
+"""Drives that lack what others have, from their tables to the metrics of all methods: null, or counted, never NaN."""
+
+import json
+import re
+import shutil
+
+import pytest
+import yaml
+from small_runs import BASE, run
+from tiny_world import Thing, World, write_world
+from workflow_copy import REPOSITORY
+
+from drivesplat.config import load
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+GROUPS = ("interpolation", "extrapolation")
+
+
+def test_a_track_with_one_box_stands_where_it_was_seen_and_is_there_at_that_time_alone(tmp_path):
+    """A van ahead, annotated in key frame 2 alone, which is held out for interpolation."""
+    van = Thing("vehicle.truck", (4.0, 4.0, 3.0), (9.0, 0.0, 1.5), seen=range(2, 3))
+    made = run(write_world(tmp_path / "data", World(things=[van], key_frames=8, speed=1.0)), tmp_path)
+    json.dumps(made.metrics, allow_nan=False)
+    for method in made.metrics["methods"].values():
+        seen, gone = (method[group] for group in GROUPS)
+        assert seen["vehicle"]["psnr"] > 0 and seen["parked_vehicle"] == seen["vehicle"]
+        assert seen["moving_vehicle"] is gone["moving_vehicle"] is gone["vehicle"] is gone["gap_db"] is None
+        assert seen["gap_db"] == pytest.approx(seen["static"]["psnr"] - seen["vehicle"]["psnr"])
+
+
+def test_a_drive_whose_lidar_is_gone_is_measured_with_the_count_beside_it(tmp_path):
+    """Where `lidar_seed.on_missing` says to go on; where not, tests/test_reader.py holds that it stops."""
+    root = write_world(tmp_path / "data", World(key_frames=8))
+    shutil.rmtree(root / "samples/LIDAR_TOP")
+    made = run(root, tmp_path, lidar_seed={**BASE["lidar_seed"], "on_missing": "warn"})
+    json.dumps(made.metrics, allow_nan=False)
+    assert made.metrics["protocol"]["lidar_missing"] == 8
+    for method in made.metrics["methods"].values():
+        assert all(method[group]["static"]["psnr"] > 0 and not method[group].get("depth") for group in GROUPS)
+
+
+def test_a_small_card_is_asked_for_what_its_preset_was_measured_to_take_and_something_more():
+    """The peak is README's, of the preset for 8 GB; the CUDA context alone adds half a gigabyte to it."""
+    preset = yaml.safe_load((REPOSITORY / "presets/8gb.yaml").read_text())
+    (peak,) = re.findall(r"^\| `8gb` \|.*\| ([0-9.]+) GB \|", (REPOSITORY / "README.md").read_text(), re.M)
+    asked = load(preset).device.min_free_gb
+    assert float(peak) + 0.5 <= asked < load({}).device.min_free_gb == 8

@@ -1,0 +1,200 @@
+"""Files that are truncated, foreign or malicious, by every reader of the workflow; files that can only be whole."""
+
+import ast
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from drivesplat.errors import ResultError
+from drivesplat.evaluation.backbone import read_backbone
+from drivesplat.evaluation.lpips_map import load_alexnet
+from drivesplat.evaluation.scene_metrics import read_evaluations
+from drivesplat.export.splat_ply import read_splat_ply
+from drivesplat.masks import read_masks_record
+from drivesplat.own_car import read_own_car
+from drivesplat.parser import read_parser
+from drivesplat.point_cloud import read_ply
+from drivesplat.poses.triangulated import read_triangulated
+from drivesplat.scene import read_scene
+from drivesplat.seeding.actors import read_actors
+from drivesplat.seeding.free_space import read_free_space
+from drivesplat.seeding.lidar_depth import read_lidar_depth
+from drivesplat.storage import read_json
+from drivesplat.training.checkpoint import resumable
+from drivesplat.training.run import read_checkpoint, read_summary
+from drivesplat.truth import read_truth
+
+REPOSITORY = Path(__file__).parents[2]
+SOURCES = [
+    path for folder in ("drivesplat", "workflow_scripts", "benchmarks") for path in (REPOSITORY / folder).rglob("*.py")
+]
+
+
+def alexnet(path: Path) -> None:
+    load_alexnet(torch.nn.Linear(1, 1), path)
+
+
+READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "scene.json": (read_scene, "extract"),
+    "scene_refined.json": (read_scene, "refine_poses"),
+    "own_car.json": (read_own_car, "own_car"),
+    "masks.json": (lambda path: read_masks_record(path.parent), "masks"),
+    "seed.ply": (lambda path: read_ply(path, "lidar_seed"), "lidar_seed"),
+    "parser.pkl": (read_parser, "parser"),
+    "actors.pkl": (read_actors, "actors"),
+    "lidar_depth.pkl": (read_lidar_depth, "lidar_depth"),
+    "free_space.pkl": (read_free_space, "free_space"),
+    "triangulated.pkl": (read_triangulated, "refine_poses"),
+    "checkpoint.pt": (read_checkpoint, "train"),
+    "train.json": (read_summary, "train"),
+    "eval.json": (lambda path: read_evaluations([str(path)]), "evaluate"),
+    "truth.json": (read_truth, "demo_world"),
+    "backbone.json": (read_backbone, "lpips_backbone"),
+    "alexnet.pth": (alexnet, "lpips_backbone"),
+    "metrics.json": (lambda path: read_json(path, rule="scene_metrics"), "scene_metrics"),
+    "splat.ply": (read_splat_ply, "export"),
+}
+"""By the name of a file, who reads it, and the rule that makes it."""
+
+
+class Malicious:
+    """A pickle of it makes a file when it is loaded."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def write(path: Path, kind: str) -> None:
+    """Puts a file at `path` that no rule wrote there whole."""
+    attack = {"provenance": {}, "regions": {}, "extra": Malicious(path.parent / "executed")}
+    content = {
+        "empty": b"",
+        "truncated": b'{"schema": 1, "frames": [{"camera": "CAM_FR',
+        "a web page": b"<html>404</html>",
+        "a malicious pickle": pickle.dumps(attack, protocol=2),
+        "a pickle of another record": pickle.dumps({"note": "of someone else"}),
+        "a list": b"[1, 2, 3]",
+        "another record": b'{"note": "of someone else"}',
+        "bytes": bytes(range(256)),
+    }
+    if kind == "a malicious checkpoint":
+        torch.save(attack, path)
+    else:
+        path.write_bytes(content[kind])
+
+
+BROKEN = ["empty", "truncated", "a web page", "bytes", "a malicious pickle", "a malicious checkpoint"]
+FOREIGN = ["a pickle of another record", "a list", "another record"]
+LEFT_OUT = ("metrics.json", True)
+"""The report leaves a foreign one out and names it: tests/test_report.py."""
+
+
+CASES = [(name, kind) for name in READERS for kind in (*BROKEN, *FOREIGN) if (name, kind in FOREIGN) != LEFT_OUT]
+
+
+@pytest.mark.parametrize(("name", "kind"), CASES)
+def test_every_reader_stops_names_file_and_rule_and_executes_nothing(tmp_path, name, kind):
+    (read, rule), path = READERS[name], tmp_path / name
+    write(path, kind)
+    with pytest.raises(ResultError) as error:
+        read(path)
+    message = str(error.value)
+    assert message.startswith(f"{path}: ") and f"delete it and rerun: the rule '{rule}' rebuilds it" in message
+    assert "\n" not in message
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_resume_state_of_any_kind_executes_nothing(tmp_path, kind):
+    write(tmp_path / "state.pt", kind)
+    assert resumable(tmp_path / "state.pt", "a training") is None
+    assert not (tmp_path / "executed").exists()
+
+
+def test_no_script_reads_results_but_by_a_reader_that_is_tested():
+    """`read_recording` and `read_inputs` are made of others."""
+    tested = {
+        "read_json",
+        "read_recording",
+        "read_inputs",
+        "read_scene",
+        "read_own_car",
+        "read_masks_record",
+        "read_ply",
+    }
+    tested |= {"read_parser", "read_actors", "read_lidar_depth", "read_free_space", "read_triangulated", "read_summary"}
+    tested |= {"read_checkpoint", "read_evaluations", "read_backbone"}
+    used = {
+        name.name
+        for path in (REPOSITORY / "workflow_scripts").glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+        if name.name.startswith(("read_", "load_"))
+    }
+    assert used <= tested
+
+
+def calls(path: Path) -> list[tuple[str, ast.Call]]:
+    """The calls in a module, by what is called: 'torch.load', 'open'."""
+    return [
+        (ast.unparse(node.func), node) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
+    ]
+
+
+EXECUTES = {
+    "eval", "exec", "pickle.load", "pickle.loads", "np.load", "numpy.load", "yaml.unsafe_load", "yaml.full_load",
+    "marshal.load", "marshal.loads", "joblib.load", "shelve.open", "torch.jit.load", "torch.package.PackageImporter",
+}  # fmt: skip
+"""What would run what a file tells it to, or would where it is called with other arguments."""
+
+
+def test_nothing_loads_a_file_in_a_way_that_could_execute_it():
+    """torch's loader takes tensors alone, YAML's is a safe one, and pickles have one reader, of plain data."""
+    found = set()
+    for path in SOURCES:
+        for name, call in calls(path):
+            arguments = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
+            if name in EXECUTES or (name == "torch.load" and arguments.get("weights_only") != "True"):
+                found.add((path.name, name))
+            if name == "yaml.load" and arguments.get("Loader") != "_EveryKeyOnce":
+                found.add((path.name, name))
+        if "pickle.Unpickler" in path.read_text() and path.name != "storage.py":
+            found.add((path.name, "pickle.Unpickler"))
+    assert not found
+
+
+WRITES = ("write_text", "write_bytes", "tofile", "np.save", "np.savez", "np.savetxt", "imwrite", "to_csv", "json.dump")
+NO_RESULTS = {
+    "config_document.py": "config.yaml, by hand",
+    "features.py": "pairs of images in a temporary folder",
+    "compile.py": "gsplat's build, with its own log",
+    "runs.py": "what Snakemake says, as it says it",
+    "nuscenes_mini.py": "a lock",
+    "planning.py": "a lock",
+    "checkpoint.py": "a lock",
+    "cards.py": "a lock",
+    "fetch.py": "a download, which is checked before it counts",
+    "storage.py": "the way all others go",
+}
+"""The modules that open files for writing by themselves, and what."""
+
+
+def test_results_are_written_whole_or_not_at_all():
+    """Every file that is written goes through `drivesplat.storage`, beside its place and into it once it is on disk."""
+    found = set()
+    for path in (path for path in SOURCES if path.name not in NO_RESULTS):
+        for name, call in calls(path):
+            place = {"open": 1}.get(name, 0 if name.endswith(".open") and name != "Image.open" else None)
+            named = [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
+            modes = [] if place is None else [*call.args[place : place + 1], *named]
+            if any(set(ast.unparse(mode)) & set("wax+") for mode in modes) or name.endswith(WRITES):
+                found.add((path.name, name))
+    assert not found

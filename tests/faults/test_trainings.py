@@ -1,0 +1,209 @@
+"""What befalls trainings: killed while they write, resumed by another, without room on the disk, without numbers."""
+
+import errno
+import logging
+import math
+import os
+import resource
+import signal
+import threading
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from test_training import (
+    PROVENANCE,
+    EndedError,
+    files_in,
+    in_subprocess,
+    inputs_in,
+    job_of,
+    settings_of,
+    trained,
+    untrained,
+)
+
+from drivesplat.errors import ResultError, TrainingError
+from drivesplat.job import job
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.training import checkpoint
+from drivesplat.training.monitor import Monitor
+from drivesplat.training.run import run_training
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+CPU = DeviceSettings(kind="cpu")
+RESUMABLE = job_of(iterations=20, checkpoint_every=10)
+
+
+def write_until_killed(folder: str) -> None:
+    """For a subprocess: a training that dies, as by `kill -9`, halfway through its second checkpoint."""
+    torch.set_num_threads(1)
+    whole, saves = torch.save, []
+
+    def save(content: Any, file: Any) -> None:
+        saves.append(file)
+        whole(content, file)
+        if len(saves) == 2:
+            file.flush()
+            os.truncate(file.fileno(), file.tell() // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    torch.save = save
+    trained(Path(folder), settings_of(checkpoint_every=20))
+
+
+def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(tmp_path):
+    process = in_subprocess(write_until_killed, str(tmp_path))
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL, errors
+    (half,) = (tmp_path / "resume").glob(".state.*.partial.pt")
+    assert half.stat().st_size > 0
+    assert checkpoint.load(tmp_path / "resume/state.pt", "train")["step"] == 20
+    _, summary = trained(tmp_path, settings_of(checkpoint_every=20))
+    assert summary.resumed_at == [20] and summary.iterations == 60
+
+
+@pytest.mark.parametrize("other", ["settings_sha256", "code_sha256", "inputs_sha256", None])
+def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
+    """The digests of a training's provenance are what tells its resume state from another's."""
+    files, inputs = files_in(tmp_path / "it"), inputs_in(tmp_path)
+    checkpoint_save, ends = checkpoint.save, iter([False, True])
+
+    def save(path: Path, content: dict[str, Any]) -> None:
+        if next(ends, False):
+            raise EndedError
+        checkpoint_save(path, content)
+
+    with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
+        patched.setattr(checkpoint, "save", save)
+        run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
+    assert checkpoint.load(files.resume / "state.pt", "train")["step"] == 10
+    provenance = {**PROVENANCE, **({other: "other"} if other else {})}
+    with caplog.at_level(logging.INFO):
+        run_training(inputs, RESUMABLE, CPU, files, provenance, "train")
+    ignored = f"{files.resume / 'state.pt'} belongs to other settings, code or inputs: training starts at 0"
+    assert (ignored in caplog.text) == (other is not None)
+    assert ("resuming at iteration 10 of 20" in caplog.text) == (other is None)
+
+
+def train_and_kill_the_parent(folder: str) -> None:
+    """For a subprocess: a training in a process of its own, which ends its parent, as by `kill -9`, once there is a
+    checkpoint, and itself comes to its end."""
+    torch.set_num_threads(1)
+    if os.fork():
+        signal.pause()
+    save, parent = checkpoint.save, os.getppid()
+
+    def save_and_kill(path: Path, content: dict[str, Any]) -> None:
+        save(path, content)
+        with suppress(ProcessLookupError):
+            os.kill(parent, signal.SIGKILL)
+
+    checkpoint.save = save_and_kill
+    run_training(inputs_in(Path(folder)), RESUMABLE, CPU, files_in(Path(folder) / "it"), PROVENANCE, "train")
+
+
+def test_a_training_that_nobody_saw_end_goes_on_from_its_last_checkpoint_when_it_is_made_again(tmp_path, caplog):
+    process, files = in_subprocess(train_and_kill_the_parent, str(tmp_path)), files_in(tmp_path / "it")
+    _, errors = process.communicate(timeout=60)  # as long as any of both is there
+    assert process.returncode == -signal.SIGKILL and files.summary.is_file(), errors
+    for output in (files.checkpoint, files.summary):
+        output.unlink()  # as Snakemake does, which takes them for half made
+    with caplog.at_level(logging.INFO):
+        run_training(inputs_in(tmp_path), RESUMABLE, CPU, files, PROVENANCE, "train")
+    assert "resuming at iteration 10 of 20" in caplog.text
+    assert files.summary.is_file() and not files.resume.exists()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_gradient_that_is_no_number_stops_a_training_whose_losses_are_numbers(tmp_path, value):
+    settings = settings_of(checkpoint_every=2, log_every=1, refine_start=1.0)
+    model = untrained(settings)
+    calls = iter(range(1, 1000))
+    model.parts[0].params["quats"].register_hook(lambda g: g * value if next(calls) == 4 else g)
+    with pytest.raises(TrainingError) as error:
+        trained(tmp_path, settings, model=model)
+    message = str(error.value)
+    assert message.startswith("iteration 4: gradient of background quats is not finite;") and "loss" not in message
+    kept = checkpoint.load(tmp_path / "resume/state.pt", "train")
+    assert kept["step"] == 2
+    assert all(torch.isfinite(value).all() for value in kept["state"]["model"].values())
+
+
+class FullDisk:
+    """So many bytes a file, no more, as on a disk without room: the same write fails in the same place."""
+
+    def __init__(self, size: int):
+        self.size = size
+
+    def __enter__(self) -> None:
+        self.before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, self.before[1]))
+
+    def __exit__(self, *_: object) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, self.before)
+
+
+@pytest.fixture
+def quiet_threads(monkeypatch):
+    """TensorBoard writes in a thread, which fails as well: what it says is no part of this."""
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+
+
+@pytest.mark.parametrize(("size", "named"), [(0, "resume"), (16, "tensorboard"), (8192, "state.pt")])
+def test_a_training_on_a_full_disk_names_what_it_could_not_write(tmp_path, quiet_threads, size, named):
+    """And leaves no file that could pass for a result."""
+    files, inputs = files_in(tmp_path / "vanilla"), inputs_in(tmp_path)
+    with FullDisk(size), pytest.raises(ResultError, match=rf"{named}: cannot be written .*; free space or fix its"):
+        run_training(inputs, job_of(checkpoint_every=5), CPU, files, PROVENANCE, "train")
+    left = {path.name for path in files.checkpoint.parent.rglob("*") if path.is_file()}
+    assert all(name == "lock" or name.startswith("events.") for name in left)
+
+
+def test_what_ends_a_training_goes_before_what_the_disk_says_then(tmp_path, quiet_threads):
+    monitor = Monitor(tmp_path, 10, 0, "x")
+    with FullDisk(0), pytest.raises(EndedError), monitor:
+        monitor.scalars(1, {"loss/total": 1.0, "gaussians": 5.0}, 1)
+        raise EndedError
+
+
+def ended_by(tmp_path: Path, error: Exception | None, capsys: pytest.CaptureFixture) -> tuple[str, str]:
+    """What a rule's script that raises `error` says on the console, and what its log holds."""
+    root = logging.getLogger()
+    before = root.handlers[:], root.level, logging.raiseExceptions, threading.excepthook
+    nothing = dict.fromkeys(("input", "output", "threads", "params", "resources"))
+    place = {"rule": "film", "wildcards": SimpleNamespace(scene="0001"), "log": [str(tmp_path / "logs/x.log")]}
+    try:
+        with pytest.raises(SystemExit) as ended, job(SimpleNamespace(**nothing, **place)):
+            raise error
+        assert ended.value.code == 1
+    finally:
+        root.handlers[:], root.level, logging.raiseExceptions, threading.excepthook = before
+        logging.captureWarnings(False)
+    return capsys.readouterr().err, (tmp_path / "logs/x.log").read_text()
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
+def test_a_disk_that_takes_no_more_is_no_bug(tmp_path, capsys, number):
+    said, logged = ended_by(tmp_path, OSError(number, os.strerror(number), "frames/000001.png"), capsys)
+    expected = (
+        f"film 0001: frames/000001.png: cannot be written ({os.strerror(number)}); free space or fix its permissions"
+    )
+    assert said == f"drivesplat: {expected}\n"
+    assert logged.splitlines()[-1].endswith(f"ERROR drivesplat.job: {expected}") and "Traceback" not in logged
+
+
+def test_any_other_error_is_one_with_its_traceback_in_the_log(tmp_path, capsys):
+    said, logged = ended_by(tmp_path, FileNotFoundError(errno.ENOENT, "No such file", "x"), capsys)
+    assert said.count("\n") == 1 and "(a bug; the traceback is in" in said and "x.log)" in said
+    assert "Traceback" in logged and logged.splitlines()[-1].endswith(said.strip().removeprefix("drivesplat: "))
+
+
+def test_a_disk_without_room_for_the_log_is_said_once(tmp_path, capsys):
+    with FullDisk(0):
+        said, logged = ended_by(tmp_path, ResultError("x.mp4: cannot be written (No space left on device)"), capsys)
+    assert said == "drivesplat: film 0001: x.mp4: cannot be written (No space left on device)\n" and logged == ""
