@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -119,4 +120,10 @@ def _lidar_depth(
 def order(count: int, step: int, seed: int) -> int:
     """Which of `count` views step `step` sees: a new seeded permutation every epoch, known without the steps before."""
     epoch, position = divmod(step, count)
-    return int(np.random.default_rng((seed, epoch)).permutation(count)[position])
+    return _epoch(count, epoch, seed)[position]
+
+
+@lru_cache(maxsize=2)
+def _epoch(count: int, epoch: int, seed: int) -> list[int]:
+    """The order of an epoch's views, worked out once for all of its steps."""
+    return np.random.default_rng((seed, epoch)).permutation(count).tolist()
