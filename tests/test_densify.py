@@ -15,11 +15,11 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
+from drivesplat.on_cpu.exploration import explore
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
 from drivesplat.training.densify import Densifier, Optimizers
-from drivesplat.training.exploration import explore
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.strategies import relocation, torch_twin
 from drivesplat.training.train import Trainer

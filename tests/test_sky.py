@@ -68,6 +68,15 @@ def test_the_length_of_a_ray_does_not_matter():
     torch.testing.assert_close(face_coordinates(rays * 37.0), face_coordinates(rays))
 
 
+def test_directions_that_are_learned_meet_the_cube_where_others_do():
+    """A compiled pass serves those that are not; ties between axes fall alike."""
+    rays = torch.cat([random_rays(4, 300), torch.tensor(AXES, dtype=torch.float32).reshape(1, 6, 3).repeat(1, 50, 1)])
+    rays[0, :3] = torch.tensor([[1.0, -1.0, 1.0], [0.5, 0.5, 0.1], [0.1, -0.7, 0.7]])
+    learned = rays.clone().requires_grad_()
+    torch.testing.assert_close(face_coordinates(learned).detach(), face_coordinates(rays), atol=1e-6, rtol=0)
+    assert face_coordinates(learned).requires_grad
+
+
 @pytest.mark.parametrize("resolution", [2, 7])
 def test_colours_lie_where_the_layout_says(resolution):
     """Bilinear interpolation is exact for a function that is linear on the cube's surface."""

@@ -4,20 +4,12 @@ The cube map's texels are the vertices of a grid on the cube: texels on an edge 
 meet there, so that the colour is continuous over seams by construction.
 """
 
-from typing import no_type_check
-
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat.kernels import kernel
 from drivesplat.model.part import Sky
-from drivesplat.rasterize.cpu.threads import parallel_for
-
-ROWS = 16
-"""Rows of an image a piece."""
 
 
 class ConstantSky(Sky):
@@ -69,33 +61,15 @@ def face_coordinates(rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     Faces 0 to 5 are +x, -x, +y, -y, +z, -z. On a face with axis i, x and y are the coordinates of axes i + 1 and i + 2.
     """
     if rays.device.type == "cpu" and not rays.requires_grad:
-        directions = rays.contiguous().numpy()
-        coordinates = np.empty_like(directions)
-        parallel_for(_face_coordinates, len(directions), ROWS, directions, coordinates)
-        return torch.from_numpy(coordinates)
+        from drivesplat.on_cpu.cube import face_coordinates_of
+
+        return torch.from_numpy(face_coordinates_of(rays.contiguous().numpy()))
     axis = rays.abs().argmax(dim=-1, keepdim=True)
     along = rays.gather(-1, axis)
     u = rays.gather(-1, (axis + 1) % 3) / along.abs()
     v = rays.gather(-1, (axis + 2) % 3) / along.abs()
     face = 2 * axis + (along < 0)
     return torch.cat([u, v, face * (2.0 / 5.0) - 1.0], dim=-1)
-
-
-@kernel
-@no_type_check
-def _face_coordinates(start, stop, rays, coordinates):
-    """Rows `start` to `stop` of the same, in one pass."""
-    for row in range(start, stop):
-        for column in range(rays.shape[1]):
-            ray = rays[row, column]
-            axis = 0
-            for other in (1, 2):
-                if abs(ray[other]) > abs(ray[axis]):
-                    axis = other
-            along = abs(ray[axis])
-            coordinates[row, column, 0] = ray[(axis + 1) % 3] / along
-            coordinates[row, column, 1] = ray[(axis + 2) % 3] / along
-            coordinates[row, column, 2] = (2 * axis + (ray[axis] < 0)) * (2.0 / 5.0) - 1.0
 
 
 def shared_vertices(resolution: int) -> tuple[Int[Tensor, "6 r r"], int]:

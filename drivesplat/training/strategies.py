@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.exploration import explore
 from drivesplat.training.optimizers import Optimizers
 
 
@@ -53,6 +52,11 @@ class ExploringStrategy(MCMCStrategy):
             state["binoms"] = state["binoms"].to(params["means"].device)
             self._relocate_gs(params, optimizers, state["binoms"])
             self._add_new_gs(params, optimizers, state["binoms"])
+        if params["means"].is_cuda:
+            ops.inject_noise_to_position(params=params, optimizers=optimizers, state={}, scaler=lr * self.noise_lr)
+            return
+        from drivesplat.on_cpu.exploration import explore
+
         explore(params, lr * self.noise_lr)
 
 

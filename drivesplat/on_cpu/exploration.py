@@ -5,7 +5,6 @@ import math
 from typing import no_type_check
 
 import torch
-from gsplat.strategy import ops
 from torch import nn
 
 from drivesplat.kernels import kernel
@@ -20,13 +19,9 @@ GRAIN = 4096
 
 @torch.no_grad()
 def explore(params: nn.ParameterDict, strength: float) -> None:
-    """Moves `means` (n, 3) at random, drawing from torch's global generator; `quats` (n, 4), log `scales` (n, 3) and
-    `opacities` (n,), logits, say how far. On a CPU what gsplat's `inject_noise_to_position` does, in one pass."""
-    means = params["means"]
-    if means.is_cuda:
-        ops.inject_noise_to_position(params=params, optimizers={}, state={}, scaler=strength)
-        return
-    noise = torch.randn_like(means)
+    """What gsplat's `inject_noise_to_position` does, in one pass: moves `means` (n, 3) at random, drawing from torch's
+    global generator; `quats` (n, 4), log `scales` (n, 3) and `opacities` (n,), logits, say how far."""
+    means, noise = params["means"], torch.randn_like(params["means"])
     shapes = arrays(params["quats"], params["scales"], params["opacities"])
     parallel_for(_move, len(means), GRAIN, means.numpy(), noise.numpy(), *shapes, strength)
 
