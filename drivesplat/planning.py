@@ -40,9 +40,6 @@ PARTS_FILM = "parts"
 """The film of a method's parts."""
 ABLATION_FILES = ("ablation.json", "ablation.csv")
 
-THREADS_ON_CPU, THREADS_ON_GPU = 8, 2
-"""Threads of a training."""
-
 
 def let_scripts_import(folder: str) -> None:
     """Makes the package at `folder` importable for the scripts of all rules, in whatever environment they run."""
@@ -85,12 +82,17 @@ class Plan(Inputs):
         synthetic = self.config.datasets[self.config.dataset_of(wildcards.scene)].world is not None
         return canonical_json({**device, "kind": "any"} if synthetic and device["kind"] == "auto" else device)
 
-    def training_threads(self, wildcards: Any) -> int:
-        """The threads of a scene's trainings: on the CPU as many as its rasterizer can use; on a GPU few, so that a
-        machine of many cards and few processors still trains on all of them."""
+    def cards(self, wildcards: Any) -> int:
+        """How many GPUs a scene's trainings and renderings take each: one, or none where they run on the CPU; by what
+        can be told on this machine, whose GPUs are those of the jobs."""
         kind = json.loads(self.device(wildcards))["kind"]
-        on_cpu = kind == "cpu" or (kind == "any" and not any_card())
-        return THREADS_ON_CPU if on_cpu else THREADS_ON_GPU
+        return int(kind != "cpu" and (kind != "any" or any_card()))
+
+    def threads(self, on_gpu: int) -> Callable[[Any], int]:
+        """The threads of such a job, `on_gpu` where it has one. On the CPU half of the processors: two jobs beside one
+        another are done sooner than one after the other on all of them."""
+        on_cpu = max(1, len(os.sched_getaffinity(0)) // 2)
+        return lambda wildcards: on_gpu if self.cards(wildcards) else on_cpu
 
     def known(self, names: Any) -> str:
         """A wildcard constraint that admits these names only."""

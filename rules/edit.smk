@@ -37,9 +37,9 @@ rule edit:
         method=plan.known(plan.methods_with_actors),
     conda:
         "../envs/drivesplat.yaml"
-    threads: 8
+    threads: plan.threads(on_gpu=8)
     resources:
-        gpu=1,
+        gpu=plan.cards,
         device=plan.device,
         mem_mb=8000,
         runtime=60,

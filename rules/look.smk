@@ -63,9 +63,9 @@ rule film:
         "<benchmarks>/{scene}/{method}/film_{trajectory}.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: 8
+    threads: plan.threads(on_gpu=8)
     resources:
-        gpu=1,
+        gpu=plan.cards,
         device=plan.device,
         mem_mb=8000,
         runtime=60,
@@ -100,9 +100,9 @@ rule film_parts:
         method=plan.known(plan.methods_with_actors),
     conda:
         "../envs/drivesplat.yaml"
-    threads: 8
+    threads: plan.threads(on_gpu=8)
     resources:
-        gpu=1,
+        gpu=plan.cards,
         device=plan.device,
         mem_mb=8000,
         runtime=60,
@@ -138,9 +138,9 @@ rule ghost_panel:
         "<benchmarks>/{scene}/{method}/ghost_panel.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: 4
+    threads: plan.threads(on_gpu=4)
     resources:
-        gpu=1,
+        gpu=plan.cards,
         device=plan.device,
         mem_mb=8000,
         runtime=15,
@@ -178,9 +178,9 @@ rule remove_actor:
         "<benchmarks>/{scene}/{method}/remove_actor.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: 4
+    threads: plan.threads(on_gpu=4)
     resources:
-        gpu=1,
+        gpu=plan.cards,
         device=plan.device,
         mem_mb=8000,
         runtime=15,

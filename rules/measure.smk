@@ -51,9 +51,9 @@ rule evaluate:
         "<benchmarks>/{scene}/{method}/evaluate.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: 4
+    threads: plan.threads(on_gpu=4)
     resources:
-        gpu=1,
+        gpu=plan.cards,
         device=plan.device,
         mem_mb=8000,
         runtime=30,

@@ -25,9 +25,9 @@ rule train:
         "<benchmarks>/{scene}/{method}/train.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: plan.training_threads
+    threads: plan.threads(on_gpu=2)
     resources:
-        gpu=1,
+        gpu=plan.cards,
         device=plan.device,
         mem_mb=16000,
         runtime=240,

@@ -1,6 +1,7 @@
 """What the workflow knows of a synthetic world: its tables are made, it stays out of the batch, a CPU will do."""
 
 import json
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -49,17 +50,28 @@ def test_the_demo_asks_for_little_gpu_memory_and_keeps_the_rest_of_the_device():
 
 
 @pytest.mark.parametrize(
-    ("device", "cards", "demo", "recorded"),
+    ("device", "visible", "demo", "recorded"),
     [
-        ("auto", "", 8, 2), ("auto", "0", 2, 2), ("any", "", 8, 8), ("any", "0,1", 2, 2), ("cuda", "", 2, 2),
-        ("cpu", "0", 8, 8),
+        ("auto", "", 0, 1),
+        ("auto", "0", 1, 1),
+        ("any", "", 0, 0),
+        ("any", "0,1", 1, 1),
+        ("cuda", "", 1, 1),
+        ("cpu", "0", 0, 0),
     ],
-)  # fmt: skip
-def test_trainings_ask_for_many_threads_where_they_run_on_the_cpu(monkeypatch, device, cards, demo, recorded):
+)
+def test_trainings_take_a_card_where_they_run_on_one_and_half_the_processors_elsewhere(
+    monkeypatch, device, visible, demo, recorded
+):
     """A recorded drive is trained on a GPU or not at all, unless told otherwise."""
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", cards)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(12)))
     made = plan(device=device)
-    assert [made.training_threads(scene(name)) for name in ("demo", "0103")] == [demo, recorded]
+    assert [made.cards(scene(name)) for name in ("demo", "0103")] == [demo, recorded]
+    threads = made.threads(on_gpu=3)
+    assert [threads(scene(name)) for name in ("demo", "0103")] == [3 if demo else 6, 3 if recorded else 6]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {5})
+    assert plan(device="cpu").threads(on_gpu=3)(scene("demo")) == 1
 
 
 def test_any_device_without_a_gpu_is_the_cpu(monkeypatch):

@@ -31,8 +31,11 @@ def test_a_scene_through_slurm_comes_out_as_one_that_runs_here(tmp_path):
     copies = {name: WorkflowCopy.make(tmp_path / name, methods={"vanilla": {}}) for name in ("here", "there")}
     assert copies["here"].run(TARGET).returncode == 0
     there = copies["there"]
+    there.config["device"] = "any"  # of the GPUs that SLURM is told there are none exists
+    there.write_config()
+    environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"}
     done = subprocess.run(
-        there.command(*ON_SLURM, "--", TARGET), cwd=there.folder, env={**os.environ, "PYTHONPATH": ""},
+        there.command(*ON_SLURM, "--", TARGET), cwd=there.folder, env=environment,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=500,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
@@ -41,7 +44,7 @@ def test_a_scene_through_slurm_comes_out_as_one_that_runs_here(tmp_path):
     asked = {rule: show(number) for number, rule in jobs}
     for rule, gpu in (("train", True), ("evaluate", True), ("extract", False), ("masks", False)):
         assert ("gres:gpu:1" in asked[rule]) == gpu, f"{rule} asks for a GPU: {gpu}"
-    assert "cpu=8,mem=16000M" in asked["train"] and "TimeLimit=04:00:00" in asked["train"]
+    assert "cpu=2,mem=16000M" in asked["train"] and "TimeLimit=04:00:00" in asked["train"]
     results = [copy.read(TARGET)["methods"]["vanilla"] for copy in copies.values()]
     for group in ("interpolation", "extrapolation"):
         here, elsewhere = (result[group]["all"]["psnr"] for result in results)
@@ -58,6 +61,6 @@ def planned(copy: WorkflowCopy) -> str:
     """The rules that a further call through the profile would run, by its table."""
     done = subprocess.run(
         copy.command("-n", "--workflow-profile", "profiles/slurm", "--", TARGET), cwd=copy.folder,
-        capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": ""},
+        capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"},
     )  # fmt: skip
     return done.stdout.rpartition("Job stats:")[2] if "Job stats:" in done.stdout else ""
