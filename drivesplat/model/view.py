@@ -29,9 +29,8 @@ class View:
 
     def rays(self) -> Float[Tensor, "h w 3"]:
         """The unit viewing direction of every pixel's centre in world coordinates."""
-        rotation, (focal_x, focal_y) = self.camera_to_world[:3, :3], self.K.diagonal()[:2]
-        across, down = rotation[:, 0] / focal_x, rotation[:, 1] / focal_y
-        corner = rotation[:, 2] - self.K[0, 2] * across - self.K[1, 2] * down
-        x = torch.arange(self.width, device=self.K.device)[None, :, None] + 0.5
-        y = torch.arange(self.height, device=self.K.device)[:, None, None] + 0.5
-        return torch.nn.functional.normalize(x * across + (y * down + corner), dim=-1)
+        x = torch.arange(self.width, device=self.K.device) + 0.5
+        y = torch.arange(self.height, device=self.K.device) + 0.5
+        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+        directions = torch.cat([(grid - self.K[:2, 2]) / self.K.diagonal()[:2], torch.ones_like(grid[..., :1])], dim=-1)
+        return torch.nn.functional.normalize(directions @ self.camera_to_world[:3, :3].T, dim=-1)

@@ -43,20 +43,19 @@ class CappedDefaultStrategy(DefaultStrategy):
 
 
 class ExploringStrategy(MCMCStrategy):
-    """gsplat's MCMCStrategy that keeps the memory which it will need again, and explores in one pass on a CPU."""
+    """gsplat's MCMCStrategy, which explores in one compiled pass on a CPU."""
 
     def step_post_backward(
         self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any], lr: float
     ) -> None:
-        if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
-            state["binoms"] = state["binoms"].to(params["means"].device)
-            self._relocate_gs(params, optimizers, state["binoms"])
-            self._add_new_gs(params, optimizers, state["binoms"])
         if params["means"].is_cuda:
-            ops.inject_noise_to_position(params=params, optimizers=optimizers, state={}, scaler=lr * self.noise_lr)
+            super().step_post_backward(params, optimizers, state, step, info, lr)
             return
         from drivesplat.on_cpu.exploration import explore
 
+        if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
+            self._relocate_gs(params, optimizers, state["binoms"])
+            self._add_new_gs(params, optimizers, state["binoms"])
         explore(params, lr * self.noise_lr)
 
 
