@@ -128,6 +128,7 @@ def test_images_come_decoded_each_once_an_epoch_in_random_order(parser):
 def test_processes_decode_them_as_in_the_example(parser):
     loader = loader_of(images_of(parser), 2, CPU)
     assert (loader.num_workers, loader.persistent_workers, loader.batch_size) == (2, True, 1)
+    assert loader.multiprocessing_context.get_start_method() == "fork", "in a spawned process, too: no import of torch"
     data = endless(loader)
     assert [next(data)["image"].shape for _ in range(5)] == [(1, HEIGHT, WIDTH, 3)] * 5
     assert PlainRecipe(Schedule.of(1), 1, 0).workers == 4

@@ -69,6 +69,7 @@ def loader_of(images: Dataset, workers: int, device: torch.device) -> DataLoader
             batch_size=1,
             shuffle=True,
             num_workers=workers,
+            multiprocessing_context="fork" if workers else None,  # as users have it, whose program nothing spawned
             persistent_workers=workers > 0,
             pin_memory=device.type == "cuda",
         )

@@ -40,10 +40,12 @@ CHECKPOINT = "ckpt.pt"
 
 @dataclass(frozen=True)
 class PlainSummary:
-    """What there is to say of a training that ended: the seconds of its loop, the Gaussians, what torch allocated at
-    its peak (GB; None on the CPU), and which SSIM it trained with."""
+    """What there is to say of a training that ended: the seconds of its loop, when its files were there (by
+    `time.monotonic`), the Gaussians, what torch allocated at its peak (GB; None on the CPU), and which SSIM it trained
+    with."""
 
     seconds: float
+    ended: float
     gaussians: int
     peak_gpu_memory_gb: float | None
     ssim: str
@@ -68,8 +70,9 @@ def fit(
             torch.cuda.synchronize(device)
         seconds = time.monotonic() - began
     save(folder / CHECKPOINT, training.state())
+    ended = time.monotonic()  # the processes that decode images take up to seconds to leave: no part of a training
     peak = torch.cuda.max_memory_allocated(device) / 1e9 if on_gpu else None
-    return PlainSummary(seconds, len(splats["means"]), peak, training.ssim.name)
+    return PlainSummary(seconds, ended, len(splats["means"]), peak, training.ssim.name)
 
 
 class PlainTraining:

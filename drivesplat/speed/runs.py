@@ -80,8 +80,8 @@ def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, Sp
     splats = started(parser["points"][kept], parser["points_rgb"][kept], task.seed).to(device)
     recipe = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers)
     summary = fit(splats, ImageFiles(parser, paths), scene_scale(parser), recipe, task.folder)
-    times = {"loop": summary.seconds, "whole": time.monotonic() - began, **asdict(summary)}
-    del times["seconds"]
+    costs = {key: getattr(summary, key) for key in ("gaussians", "peak_gpu_memory_gb", "ssim")}
+    times = {"loop": summary.seconds, "whole": summary.ended - began, **costs}
     return times, as_model({name: value.detach() for name, value in splats.items()}, parser)
 
 
