@@ -20,7 +20,7 @@ class Densifier:
         self._part = part
         self._by_gradient = settings.strategy == "default"
         self._strategy = strategies.make_strategy(settings, part.cap_max or settings.cap_max)
-        self._on_cpu = strategies.torch_twin
+        self._on_cpu = strategies.torch_twins
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
         scale = {"scene_scale": part.extent} if self._by_gradient else {}

@@ -7,6 +7,7 @@ from unittest.mock import patch
 
 import torch
 from gsplat import DefaultStrategy, MCMCStrategy
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from gsplat.strategy import ops
 from jaxtyping import Float
 from torch import Tensor
@@ -85,9 +86,12 @@ def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MC
 
 
 @contextmanager
-def torch_twin() -> Iterator[None]:
-    """For its duration gsplat's strategies use the torch twin of a CUDA kernel that they call."""
-    with patch.object(ops, "compute_relocation", relocation):
+def torch_twins() -> Iterator[None]:
+    """For its duration gsplat's strategies use torch twins of the two CUDA kernels they call."""
+    with (
+        patch.object(ops, "compute_relocation", relocation),
+        patch.object(ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
+    ):
         yield
 
 
