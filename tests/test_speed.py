@@ -61,7 +61,7 @@ def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path)
         group.plan.actors(at), group.plan.lidar_depth(at), group.plan.free_space(at)
     ]  # fmt: skip
     assert {Path(path).name for path in targets_of(group)} == {
-        "scene.json", "parser.pkl", "masks.json", "actors.pkl", "lidar_depth.pkl"
+        "scene_refined.json", "parser.pkl", "masks.json", "actors.pkl", "lidar_depth.pkl"
     }  # fmt: skip
 
 
