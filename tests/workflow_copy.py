@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from forked_snakemake import run_snakemake
 from tiny_world import World, write_world
 
 REPOSITORY = Path(__file__).parent.parent
@@ -98,10 +99,12 @@ class WorkflowCopy:
     ) -> subprocess.CompletedProcess:
         """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `cards`, by the program
         `under` where one is given; the result holds its output (both streams) as `stdout`."""
-        arguments = [*under, *self.command("--cores", str(cores), *flags, "--", *targets)]
+        arguments = ["--configfile", "mine.yaml", "--cores", str(cores), *flags, "--", *targets]
         environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": cards}
+        if not under:
+            return run_snakemake(arguments, self.folder, environment, timeout)
         return subprocess.run(
-            arguments,
+            [*under, sys.executable, "-m", "snakemake", *arguments],
             cwd=self.folder,
             env=environment,
             stdout=subprocess.PIPE,

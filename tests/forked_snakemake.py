@@ -1,0 +1,51 @@
+"""Snakemake called as a process of its own that need not import it again: forked from one that has, and nothing else.
+
+Most of what a call for a tiny world takes is that import, and the suite makes hundreds of them.
+"""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["snakemake.cli"])
+
+
+def run_snakemake(
+    arguments: Sequence[str], folder: Path, environment: Mapping[str, str], timeout: float
+) -> subprocess.CompletedProcess:
+    """`python -m snakemake {arguments}` in a folder; the result holds its output (both streams) as `stdout`.
+
+    Raises subprocess.TimeoutExpired after `timeout` seconds, the process being ended.
+    """
+    with tempfile.NamedTemporaryFile() as output:
+        process = _CONTEXT.Process(target=_call, args=(list(arguments), str(folder), dict(environment), output.name))
+        process.start()
+        process.join(timeout)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+            raise subprocess.TimeoutExpired(list(arguments), timeout, Path(output.name).read_text())
+        return subprocess.CompletedProcess(list(arguments), process.exitcode, Path(output.name).read_text())
+
+
+def _call(arguments: list[str], folder: str, environment: dict[str, str], output: str) -> None:
+    """In the forked process: as if Python had been started there for Snakemake."""
+    stream = os.open(output, os.O_WRONLY)
+    for descriptor in (1, 2):
+        os.dup2(stream, descriptor)
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    outside = [path for path in sys.path if path and Path(path).resolve() not in (REPOSITORY, REPOSITORY / "tests")]
+    sys.path[:] = [folder, *outside]
+    sys.argv = ["snakemake", *arguments]
+
+    from snakemake.cli import main
+
+    main(arguments)
