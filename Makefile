@@ -4,7 +4,7 @@
 # make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
 # make test-gpu   what needs a GPU: the rasterizers agree, trainings resume
 # make test-slurm a scene through a real SLURM, started on this machine for it (root on Debian; docs/cluster.md)
-# make test-batch ten synthetic drives, one of them broken, as a batch (two cores: the better part of an hour)
+# make test-batch ten synthetic drives, one of them broken, as a batch (two cores: a quarter of an hour)
 # make bench      what the benchmarks/ measure, against their bounds (two idle cores)
 # make quality    RECIPES=file: recipes trained with several seeds on one scene, and their table (docs/quality.md)
 # make speed      FILE=file: how fast a method trains, held to gsplat's example trainer, and how well (docs/speed.md)

@@ -1,4 +1,4 @@
-"""Ten synthetic drives as a batch, one of them with a broken image (`make test-batch`; the better part of an hour on
+"""Ten synthetic drives as a batch, one of them with a broken image (`make test-batch`; a quarter of an hour on
 two cores)."""
 
 import os
@@ -10,7 +10,7 @@ from workflow_copy import REPOSITORY, WorkflowCopy
 
 pytestmark = [
     pytest.mark.batch,
-    pytest.mark.skipif("DRIVESPLAT_BATCH" not in os.environ, reason="most of an hour: make test-batch"),
+    pytest.mark.skipif("DRIVESPLAT_BATCH" not in os.environ, reason="a quarter of an hour: make test-batch"),
 ]
 
 BROKEN = "third_street"
