@@ -7,8 +7,9 @@ import multiprocessing
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -23,22 +24,25 @@ def run_snakemake(
 
     Raises subprocess.TimeoutExpired after `timeout` seconds, the process being ended.
     """
-    with tempfile.NamedTemporaryFile() as output:
-        process = _CONTEXT.Process(target=_call, args=(list(arguments), str(folder), dict(environment), output.name))
-        process.start()
+    reader, writer = _CONTEXT.Pipe(duplex=False)
+    process = _CONTEXT.Process(target=_call, args=(list(arguments), str(folder), dict(environment), writer))
+    process.start()
+    writer.close()
+    with ThreadPoolExecutor(1) as threads, open(os.dup(reader.fileno()), encoding="utf-8", errors="replace") as stream:
+        output = threads.submit(stream.read)
         process.join(timeout)
         if process.exitcode is None:
             process.kill()
             process.join()
-            raise subprocess.TimeoutExpired(list(arguments), timeout, Path(output.name).read_text())
-        return subprocess.CompletedProcess(list(arguments), process.exitcode, Path(output.name).read_text())
+            raise subprocess.TimeoutExpired(list(arguments), timeout, output.result())
+        return subprocess.CompletedProcess(list(arguments), process.exitcode, output.result())
 
 
-def _call(arguments: list[str], folder: str, environment: dict[str, str], output: str) -> None:
+def _call(arguments: list[str], folder: str, environment: dict[str, str], output: Connection) -> None:
     """In the forked process: as if Python had been started there for Snakemake."""
-    stream = os.open(output, os.O_WRONLY)
     for descriptor in (1, 2):
-        os.dup2(stream, descriptor)
+        os.dup2(output.fileno(), descriptor)
+    output.close()
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
