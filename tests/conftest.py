@@ -8,7 +8,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch comes: its threads
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drivesplat/rasterize/cpu/__pycache__"))
 
 import pytest
+import torch
 from jaxtyping import install_import_hook
+
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # asked for before Triton comes: its own library is kernels, too
 
 install_import_hook("drivesplat", "beartype.beartype")
 
@@ -18,8 +22,6 @@ REPOSITORY = Path(__file__).parent.parent
 @pytest.fixture(scope="module")
 def one_thread():
     """Tests run side by side: with a thread per core each, they would mostly wait for each other."""
-    import torch
-
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

@@ -16,6 +16,7 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
 from drivesplat.on_cpu.exploration import explore
 from drivesplat.settings.actors import ActorSettings
+from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
 from drivesplat.training.densify import Densifier, Optimizers
@@ -166,6 +167,13 @@ def densified(strategy: str, steps: int, count: int = 100, size: float = 0.05, *
 def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
     counts = densified("mcmc", 12, cap_max=118)
     assert counts == [100, 100, 105, 105, 110, 110, 115, 115, 118, 118, 118, 118]
+
+
+def test_mcmc_grows_evenly_in_ratio_where_it_is_told_when_to_be_grown():
+    """From 100 to 120 over the first ten iterations, a fifth of the way at each second one; then it stays."""
+    evenly = CoarseToFineSettings(grown_at=0.010)
+    counts = densified("mcmc", 14, cap_max=120, coarse_to_fine=evenly)
+    assert counts[::2] == [100, *(int(100 * 1.2 ** (step / 10)) for step in (2, 4, 6, 8)), 120, 120]
 
 
 def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():

@@ -15,12 +15,12 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
+from drivesplat.training.colours import masked_l1
 from drivesplat.training.losses import (
     class_cross_entropy,
     depth_loss,
     entropy,
     loss_terms,
-    masked_l1,
     sky_alpha_loss,
     sky_cross_entropy,
 )

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.view import View
 from drivesplat.motion import Motion
 
 FADED = 1e-4
@@ -115,6 +116,17 @@ class Sky(nn.Module, ABC):
     @abstractmethod
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """RGB in [0, 1] seen along unit world directions."""
+
+    def behind(
+        self,
+        splats: Float[Tensor, "h w 3"],
+        alpha: Float[Tensor, "h w 1"],
+        view: View,
+        rays: Float[Tensor, "h w 3"] | None = None,
+    ) -> Float[Tensor, "h w 3"]:
+        """What a view shows: `splats`, premultiplied by `alpha`, before this sky. `rays` are `view.rays()` where they
+        are known."""
+        return splats + (1.0 - alpha) * self.colors(view.rays() if rays is None else rays)
 
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:

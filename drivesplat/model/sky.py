@@ -9,7 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from drivesplat import on_gpu
 from drivesplat.model.part import Sky
+from drivesplat.model.view import View
 
 
 class ConstantSky(Sky):
@@ -50,6 +52,19 @@ class CubemapSky(Sky):
             padding_mode="border",
         )
         return torch.sigmoid(sampled[0, :, 0].permute(1, 2, 0))
+
+    def behind(
+        self,
+        splats: Float[Tensor, "h w 3"],
+        alpha: Float[Tensor, "h w 1"],
+        view: View,
+        rays: Float[Tensor, "h w 3"] | None = None,
+    ) -> Float[Tensor, "h w 3"]:
+        if view.camera_to_world.requires_grad or not on_gpu.for_tensor(splats):
+            return super().behind(splats, alpha, view, rays)
+        from drivesplat.on_gpu.cube import Cube, before_cube
+
+        return before_cube(splats, alpha, Cube(self.params["texels"], self.index), view.K, view.camera_to_world)
 
     def learning_rates(self) -> dict[str, float]:
         return {"texels": self._learning_rate}

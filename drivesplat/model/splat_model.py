@@ -125,8 +125,7 @@ class SplatModel(nn.Module):
         splats, alpha = rendering.image[0], rendering.alpha[0]
         image = splats
         if self.sky is not None:
-            directions = seen_from.rays() if rays is None or seen_from is not view else rays
-            image = splats + (1.0 - alpha) * self.sky.colors(directions)
+            image = self.sky.behind(splats, alpha, seen_from, rays if seen_from is view else None)
         if self.exposure is not None:
             image = self.exposure.shown(image, view.camera)
         depth = rendering.depth[0, ..., 0] if rendering.depth is not None else None

@@ -1,11 +1,19 @@
-"""gsplat behind the door."""
+"""gsplat behind the door: the calls that its `rasterization` makes of one process, without its questions.
 
+Camera positions are told by the poses' transposes, where `rasterization` inverts them and waits for the device.
+"""
+
+import math
 from typing import Any
 
-from gsplat import rasterization
+import torch
+from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
 from drivesplat.rasterize.rendering import Rendering, assembled
+
+TILE = 16
+"""Edge of a tile in pixels."""
 
 
 def rasterize_gsplat(
@@ -13,19 +21,38 @@ def rasterize_gsplat(
     width: int, height: int, *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
 ) -> Rendering:  # fmt: skip
     """See `drivesplat.rasterize.rasterize`. Needs a GPU."""
+    cameras = len(viewmats)
     if len(means) == 0:  # gsplat's kernels do not start on nothing
-        shape = (len(viewmats), height, width)
+        shape = (cameras, height, width)
         values = colors.shape[-1] + with_depth
         return assembled(means.new_zeros(*shape, values), means.new_zeros(*shape, 1), with_depth)
-    image, alpha, info = rasterization(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-        sh_degree=sh_degree,
-        packed=False,  # faster than packed at one image a step, and what gsplat's strategies read without a gather
-        absgrad=absgrad,
-        rasterize_mode="antialiased" if antialiased else "classic",
-        render_mode="RGB+ED" if with_depth else "RGB",
+    radii, means2d, depths, conics, compensations = fully_fused_projection(
+        means, None, quats, scales, viewmats, Ks, width, height,
+        calc_compensations=antialiased, opacities=opacities,
     )  # fmt: skip
-    strategy_info: dict[str, Any] = {**info, "gaussian_ids": None}
-    if not with_depth:
-        return Rendering(image, alpha, None, strategy_info)
-    return Rendering(image[..., :-1], alpha, image[..., -1:], strategy_info)
+    shown = opacities.expand(cameras, -1)
+    if compensations is not None:
+        shown = shown * compensations
+    values = colors.expand(cameras, *colors.shape)
+    if sh_degree is not None:
+        values = _seen_colors(means, values, viewmats, radii, sh_degree)
+    if with_depth:
+        values = torch.cat([values, depths[..., None]], dim=-1)
+    across, down = math.ceil(width / TILE), math.ceil(height / TILE)
+    _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, across, down, n_images=cameras)
+    offsets = isect_offset_encode(isect_ids, cameras, across, down).reshape(cameras, down, across)
+    composited, alpha = rasterize_to_pixels(
+        means2d, conics, values, shown, width, height, TILE, offsets, flatten_ids, absgrad=absgrad
+    )
+    projected: dict[str, Any] = {"means2d": means2d, "radii": radii, "depths": depths, "conics": conics}
+    return assembled(composited, alpha, with_depth, **projected, opacities=shown, isect_ids=isect_ids)
+
+
+def _seen_colors(means: Tensor, coefficients: Tensor, viewmats: Tensor, radii: Tensor, degree: int) -> Tensor:
+    """The colours (c, n, 3) in which c cameras see Gaussians, of their harmonics (c, n, k, 3); of those that no camera
+    sees there are none."""
+    rotations, translations = viewmats[:, :3, :3], viewmats[:, :3, 3:]
+    positions = -(rotations.mT @ translations)[..., 0]
+    seen = (radii > 0).all(dim=-1)
+    colors = spherical_harmonics(degree, means - positions[:, None], coefficients, masks=seen)
+    return torch.clamp_min(colors + 0.5, 0.0)

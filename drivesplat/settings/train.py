@@ -7,6 +7,7 @@ from pydantic import AfterValidator, Field
 from drivesplat.settings import Settings
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.camera_poses import CameraPoseSettings
+from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.road import RoadSettings
 
@@ -107,6 +108,7 @@ class TrainSettings(Settings):
     floaters: FloaterSettings = FloaterSettings()
     exposure: ExposureSettings = ExposureSettings()
     camera_poses: CameraPoseSettings = CameraPoseSettings()
+    coarse_to_fine: CoarseToFineSettings = CoarseToFineSettings()
     refine_start: float = Field(0.0167, ge=0, le=1)
     """Densification starts after this fraction of the iterations."""
     refine_stop: float = Field(0.833, ge=0, le=1)

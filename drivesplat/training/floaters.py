@@ -11,6 +11,8 @@ from drivesplat.training.cells import Cells
 
 LARGEST_STEP = 15.0
 """Camera positions farther apart than this (metres) are not joined into a path."""
+PAIRS = 2**21
+"""Points by segments that are looked at together: 25 MB an array."""
 
 
 def camera_path(centers: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
@@ -27,12 +29,15 @@ def near_path(
     points: Float[Tensor, "n 3"], starts: Float[Tensor, "m 3"], ends: Float[Tensor, "m 3"], radius: float
 ) -> Bool[Tensor, " n"]:
     """Which points are nearer than `radius` metres to any of the segments."""
-    near = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for start, end in zip(starts, ends, strict=True):
-        along = end - start
-        fraction = ((points - start) @ along / along.dot(along).clamp(min=1e-12)).clamp(0.0, 1.0)
-        near |= (points - start - fraction[:, None] * along).square().sum(dim=1) < radius**2
-    return near
+    along = ends - starts
+    squared = along.square().sum(dim=1).clamp(min=1e-12)
+    near = []
+    for some in points.split(max(1, PAIRS // max(1, len(starts)))):
+        offsets = some[:, None] - starts
+        fractions = ((offsets * along).sum(dim=2) / squared).clamp(0.0, 1.0)
+        distances = (offsets - fractions[..., None] * along).square().sum(dim=2)
+        near.append((distances < radius**2).any(dim=1))
+    return torch.cat(near)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
 """gsplat's densification strategies as this workflow runs them: capped, resetting, and on the CPU."""
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
@@ -12,6 +14,7 @@ from gsplat.strategy import ops
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat import on_gpu
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.optimizers import Optimizers
 
@@ -43,21 +46,47 @@ class CappedDefaultStrategy(DefaultStrategy):
         return super()._grow_gs(params, optimizers, state, step)
 
 
+@dataclass
 class ExploringStrategy(MCMCStrategy):
-    """gsplat's MCMCStrategy, which explores in one compiled pass on a CPU."""
+    """gsplat's MCMCStrategy, which explores in one compiled pass, and which keeps the memory that torch holds: what it
+    would hand back after every densification has to be asked for again.
 
+    Where `grown_at` is not 0 it adds no more than evenly, in ratio, leads to `cap_max` at that iteration.
+    """
+
+    grown_at: int = 0
+
+    @torch.no_grad()
     def step_post_backward(
         self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any], lr: float
     ) -> None:
-        if params["means"].is_cuda:
-            super().step_post_backward(params, optimizers, state, step, info, lr)
-            return
+        if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
+            state["binoms"] = state["binoms"].to(params["means"].device)
+            self._relocate_gs(params, optimizers, state["binoms"])
+            room = self._room(step, state.setdefault("began", len(params["means"])))
+            dataclasses.replace(self, cap_max=room)._add_new_gs(params, optimizers, state["binoms"])
+        _explore(params, optimizers, lr * self.noise_lr)
+
+    def _room(self, step: int, began: int) -> int:
+        """How many Gaussians there may be after `step`, of as many as there were before the first were added."""
+        if step >= self.grown_at or began >= self.cap_max:
+            return self.cap_max
+        done = (step - self.refine_start_iter) / (self.grown_at - self.refine_start_iter)
+        return int(began * (self.cap_max / began) ** done)
+
+
+def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
+    """Moves positions at random, the farther the fainter and larger a Gaussian is."""
+    if not params["means"].is_cuda:
         from drivesplat.on_cpu.exploration import explore
 
-        if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
-            self._relocate_gs(params, optimizers, state["binoms"])
-            self._add_new_gs(params, optimizers, state["binoms"])
-        explore(params, lr * self.noise_lr)
+        explore(params, strength)
+    elif on_gpu.compiles():
+        from drivesplat.on_gpu.exploration import explore
+
+        explore(params, strength)
+    else:
+        ops.inject_noise_to_position(params, optimizers, {}, strength)
 
 
 def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MCMCStrategy:
@@ -71,6 +100,7 @@ def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MC
             refine_start_iter=start,
             refine_stop_iter=stop,
             refine_every=settings.mcmc.refine_every,
+            grown_at=int(settings.coarse_to_fine.grown_at * settings.iterations),
         )
     strategy = CappedDefaultStrategy(
         grow_grad2d=settings.default.grow_grad2d,

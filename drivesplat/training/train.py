@@ -14,13 +14,14 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
+from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.densify import Densifier
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard, Monitor
 from drivesplat.training.optimizers import ModelOptimizers, make_optimizers, schedule
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
-from drivesplat.training.views import TrainingView, order
+from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +48,7 @@ class Trainer:
     """A training between two iterations."""
 
     model: SplatModel
-    views: list[TrainingView]
+    images: TrainingImages
     settings: TrainSettings
     seed: int
     device: torch.device
@@ -72,13 +73,14 @@ class Trainer:
         torch.manual_seed(seed)
         densifiers = [Densifier(part, settings) for part in model.parts]
         optimizers, known = make_optimizers(model), surroundings.to(device)
-        return cls(model, views, settings, seed, device, optimizers, densifiers, FiniteGuard(device), known, clock)
+        images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
+        return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock)
 
     def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
         """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         with stage("data"):
-            view = self.views[order(len(self.views), self.step, self.seed)]
+            view = self.images.at(self.step)
         with stage("render"):
             picture = self.model.render(
                 view.view,
@@ -238,7 +240,7 @@ class Run:
 
 def _iterate(run: Run, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
-    path = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.views]))
+    path = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.images.views]))
     empty = EmptySpace(*path, settings.floaters.radius, trainer.surroundings.free)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):

@@ -1,0 +1,146 @@
+"""The sky's cube map behind an image, in one pass, and its gradient in another: rays, faces, texels and blending."""
+
+from typing import Any, NamedTuple, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+BLOCK = 256
+"""Pixels a program."""
+
+
+class Cube(NamedTuple):
+    """A cube map: `texels` (n, 3), logits of colours, and for every texel of a face (face, v, u) which one it is."""
+
+    texels: Float[Tensor, "n 3"]
+    index: Int[Tensor, "6 r r"]
+
+
+def before_cube(
+    splats: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w 1"],
+    cube: Cube,
+    K: Float[Tensor, "3 3"],
+    camera_to_world: Float[Tensor, "4 4"],
+) -> Float[Tensor, "h w 3"]:
+    """`splats` (premultiplied by `alpha`) before the sky that a pinhole camera sees; there is no gradient for it."""
+    return _BeforeCube.apply(splats, alpha, cube.texels, cube.index, K, camera_to_world)
+
+
+class _BeforeCube(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, splats: Tensor, alpha: Tensor, texels: Tensor, index: Tensor, K: Tensor, camera_to_world: Tensor
+    ) -> Tensor:
+        camera = K.contiguous(), camera_to_world.contiguous()
+        splats, alpha = splats.contiguous(), alpha.contiguous()
+        image = torch.empty_like(splats)
+        pixels = alpha.numel()
+        _blend[(triton.cdiv(pixels, BLOCK),)](
+            splats, alpha, texels, index, *camera, image, pixels, splats.shape[1], index.shape[1], BLOCK
+        )
+        ctx.save_for_backward(alpha, texels, index, *camera)
+        return image
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor) -> tuple[Tensor | None, ...]:
+        alpha, texels, index, *camera = ctx.saved_tensors
+        v_image = v_image.contiguous()
+        v_alpha, v_texels = torch.empty_like(alpha), torch.zeros_like(texels)
+        pixels = alpha.numel()
+        _gradients[(triton.cdiv(pixels, BLOCK),)](
+            v_image, alpha, texels, index, *camera, v_alpha, v_texels, pixels, v_image.shape[1], index.shape[1], BLOCK
+        )
+        return v_image, v_alpha, v_texels, None, None, None
+
+
+@triton.jit
+@no_type_check
+def _ray(K, camera_to_world, pixel, width):
+    """The directions of pixels' centres in the world, of any length."""
+    x = ((pixel % width).to(tl.float32) + 0.5 - tl.load(K + 2)) / tl.load(K)
+    y = ((pixel // width).to(tl.float32) + 0.5 - tl.load(K + 5)) / tl.load(K + 4)
+    pose = camera_to_world
+    ray_x = tl.load(pose) * x + tl.load(pose + 1) * y + tl.load(pose + 2)
+    ray_y = tl.load(pose + 4) * x + tl.load(pose + 5) * y + tl.load(pose + 6)
+    ray_z = tl.load(pose + 8) * x + tl.load(pose + 9) * y + tl.load(pose + 10)
+    return ray_x, ray_y, ray_z
+
+
+@triton.jit
+@no_type_check
+def _corners(index, K, camera_to_world, pixel, width, resolution, inside):
+    """The four texels around where pixels look, and how far it is from the first one along each edge of the face."""
+    ray_x, ray_y, ray_z = _ray(K, camera_to_world, pixel, width)
+    far_x, far_y, far_z = tl.abs(ray_x), tl.abs(ray_y), tl.abs(ray_z)
+    on_x = (far_x >= far_y) & (far_x >= far_z)
+    on_y = (far_y > far_x) & (far_y >= far_z)
+    along = tl.where(on_x, ray_x, tl.where(on_y, ray_y, ray_z))
+    u = tl.where(on_x, ray_y, tl.where(on_y, ray_z, ray_x)) / tl.abs(along)
+    v = tl.where(on_x, ray_z, tl.where(on_y, ray_x, ray_y)) / tl.abs(along)
+    face = tl.where(on_x, 0, tl.where(on_y, 2, 4)) + tl.where(along < 0, 1, 0)
+    last = resolution - 1
+    at_u = tl.minimum(tl.maximum((u + 1.0) * 0.5 * last, 0.0), last)
+    at_v = tl.minimum(tl.maximum((v + 1.0) * 0.5 * last, 0.0), last)
+    low_u, low_v = at_u.to(tl.int32), at_v.to(tl.int32)
+    high_u, high_v = tl.minimum(low_u + 1, last), tl.minimum(low_v + 1, last)
+    low, high = (face * resolution + low_v) * resolution, (face * resolution + high_v) * resolution
+    texel_00 = tl.load(index + low + low_u, mask=inside, other=0)
+    texel_01 = tl.load(index + low + high_u, mask=inside, other=0)
+    texel_10 = tl.load(index + high + low_u, mask=inside, other=0)
+    texel_11 = tl.load(index + high + high_u, mask=inside, other=0)
+    return texel_00, texel_01, texel_10, texel_11, at_u - low_u, at_v - low_v
+
+
+@triton.jit
+@no_type_check
+def _color(texels, channel, texel_00, texel_01, texel_10, texel_11, part_u, part_v, inside):
+    """One channel of the sky."""
+    above = (1.0 - part_u) * tl.load(texels + 3 * texel_00 + channel, mask=inside, other=0.0)
+    above += part_u * tl.load(texels + 3 * texel_01 + channel, mask=inside, other=0.0)
+    below = (1.0 - part_u) * tl.load(texels + 3 * texel_10 + channel, mask=inside, other=0.0)
+    below += part_u * tl.load(texels + 3 * texel_11 + channel, mask=inside, other=0.0)
+    return tl.sigmoid((1.0 - part_v) * above + part_v * below)
+
+
+@triton.jit(do_not_specialize=["pixels", "width"])
+@no_type_check
+def _blend(splats, alpha, texels, index, K, camera_to_world, image, pixels, width, resolution, BLOCK: tl.constexpr):
+    """The image."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < pixels
+    a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, pixel, width, resolution, inside)
+    left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
+    for channel in tl.static_range(3):
+        sky = _color(texels, channel, a, b, c, d, part_u, part_v, inside)
+        before = tl.load(splats + 3 * pixel + channel, mask=inside, other=0.0)
+        tl.store(image + 3 * pixel + channel, before + left * sky, mask=inside)
+
+
+@triton.jit(do_not_specialize=["pixels", "width"])
+@no_type_check
+def _gradients(
+    v_image, alpha, texels, index, K, camera_to_world, v_alpha, v_texels, pixels, width, resolution, BLOCK: tl.constexpr
+):
+    """Those of alpha, and those of texels, added up."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < pixels
+    a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, pixel, width, resolution, inside)
+    left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
+    hidden = tl.zeros((BLOCK,), tl.float32)
+    seen = inside & (left != 0.0)
+    for channel in tl.static_range(3):
+        sky = _color(texels, channel, a, b, c, d, part_u, part_v, inside)
+        by_pixel = tl.load(v_image + 3 * pixel + channel, mask=inside, other=0.0)
+        hidden += by_pixel * sky
+        by_logit = by_pixel * left * sky * (1.0 - sky)
+        tl.atomic_add(v_texels + 3 * a + channel, by_logit * (1.0 - part_u) * (1.0 - part_v), mask=seen)
+        tl.atomic_add(v_texels + 3 * b + channel, by_logit * part_u * (1.0 - part_v), mask=seen)
+        tl.atomic_add(v_texels + 3 * c + channel, by_logit * (1.0 - part_u) * part_v, mask=seen)
+        tl.atomic_add(v_texels + 3 * d + channel, by_logit * part_u * part_v, mask=seen)
+    tl.store(v_alpha + pixel, -hidden, mask=inside)

@@ -1,0 +1,201 @@
+"""Triton's kernels: each is what torch does, within rounding, and compiles for the GPUs there are.
+
+Where there is no GPU they run in Triton's interpreter, see conftest.py.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+from scipy.spatial.transform import Rotation
+from torch import nn
+
+from drivesplat import on_gpu
+from drivesplat.model.sky import CubemapSky
+from drivesplat.model.view import View
+from drivesplat.training.colours import masked_l1
+from drivesplat.training.ssim import C1, C2, ssim_in_torch, weights
+
+pytest.importorskip("triton", reason="Triton is not there for this system")
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+REPOSITORY = Path(__file__).parent.parent
+
+
+def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(size=(height, width)) < share).to(DEVICE)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "hidden", "moving"),
+    [
+        pytest.param(10, 45, True, True, id="wider than a block, rows that fill none"),
+        pytest.param(10, 45, False, False, id="no masks"),
+        pytest.param(3, 4, False, True, id="less than a window"),
+    ],
+)
+def test_colours_differ_by_what_torch_says_and_pull_as_it_does(height, width, hidden, moving):
+    from drivesplat.on_gpu.colours import Window, colour_difference
+
+    rng = np.random.default_rng(0)
+    image, recorded = (torch.from_numpy(rng.uniform(0, 1, (height, width, 3))).float().to(DEVICE) for _ in range(2))
+    pixels = (255 * recorded).to(torch.uint8)
+    body = a_mask(height, width, 1) if hidden else None
+    moves = a_mask(height, width, 2) if moving else None
+    window = Window(torch.from_numpy(weights()).float().to(DEVICE), C1, C2)
+    target, asked = pixels.float() / 255.0, image.clone().requires_grad_()
+    seen = asked if body is None else torch.where(body[..., None], target, asked)
+    expected = [F.l1_loss(seen, target), ssim_in_torch(seen, target)]
+    expected.append(asked.new_zeros(()) if moves is None else masked_l1(seen, target, moves))
+    found_for = image.clone().requires_grad_()
+    found = colour_difference(found_for, pixels, body, moves, window)
+    for name, mine, theirs in zip(("l1", "similarity", "moving"), found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5, msg=lambda said, name=name: f"{name}: {said}")
+    torch.stack([weight * value for weight, value in zip((0.8, -0.2, 0.3), expected, strict=True)]).sum().backward()
+    torch.stack([weight * value for weight, value in zip((0.8, -0.2, 0.3), found, strict=True)]).sum().backward()
+    assert float(asked.grad.abs().max()) > 0.0
+    torch.testing.assert_close(found_for.grad, asked.grad, atol=1e-8, rtol=1e-3)
+
+
+def test_nothing_that_moves_is_no_difference():
+    from drivesplat.on_gpu.colours import Window, colour_difference
+
+    image = torch.rand(4, 5, 3, device=DEVICE, requires_grad=True)
+    window = Window(torch.from_numpy(weights()).float().to(DEVICE), C1, C2)
+    nowhere = torch.zeros(4, 5, dtype=torch.bool, device=DEVICE)
+    pixels = torch.zeros(4, 5, 3, dtype=torch.uint8, device=DEVICE)
+    moving = colour_difference(image, pixels, None, nowhere, window)[2]
+    moving.backward()
+    assert float(moving.detach()) == 0.0 and not image.grad.any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_sky_behind_is_that_of_torch_and_learns_as_much(seed):
+    """Cameras that look every way: over edges and corners of the cube, too."""
+    from drivesplat.on_gpu.cube import Cube, before_cube
+
+    torch.manual_seed(seed)
+    sky = CubemapSky(9, torch.tensor([0.3, 0.5, 0.7]), 1e-2).to(DEVICE)
+    texels = sky.params["texels"]
+    texels.data += torch.randn_like(texels)
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+    K = torch.tensor([[10.0, 0.0, 14.0], [0.0, 11.0, 6.0], [0.0, 0.0, 1.0]])
+    view = View(K.to(DEVICE), pose.to(DEVICE), 29, 13, 0.0)
+    splats, alpha = torch.rand(13, 29, 3, device=DEVICE), torch.rand(13, 29, 1, device=DEVICE)
+    alpha[3:5] = 1.0
+    given = [splats.requires_grad_(), alpha.requires_grad_(), texels]
+    weighed = torch.randn(13, 29, 3, device=DEVICE)
+    expected = splats + (1.0 - alpha) * sky.colors(view.rays())
+    found = before_cube(splats, alpha, Cube(texels, sky.index), view.K, view.camera_to_world)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
+    pulls = [torch.autograd.grad((image * weighed).sum(), given) for image in (expected, found)]
+    for theirs, mine in zip(*pulls, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-4)
+
+
+def test_exploration_spreads_as_far_as_a_gaussian_reaches_and_less_where_it_is_seen():
+    """By the covariance of many draws: strength² times that of the Gaussian, squared, of a faint one; an opaque one
+    stays."""
+    from drivesplat.on_gpu.exploration import explore
+
+    torch.manual_seed(0)
+    count, strength, logit = 20_000, 2.0, -6.0
+    rows = {"means": [5.0, -3.0, 1.0], "quats": [1.0, 0.3, -0.2, 0.5], "scales": [0.0, -1.0, -0.5]}
+    params = nn.ParameterDict({name: nn.Parameter(torch.tensor(row).repeat(count, 1)) for name, row in rows.items()})
+    params["opacities"] = nn.Parameter(torch.full((count,), logit))
+    params["opacities"].data[count // 2 :] = 3.0
+    params = params.to(DEVICE)
+    explore(params, strength)
+    moved = params["means"].detach().cpu().double() - torch.tensor(rows["means"])
+    faint, opaque = moved[: count // 2], moved[count // 2 :]
+    assert float(opaque.abs().max()) < 1e-5
+    covariance = _quat_scale_to_covar_preci(params["quats"][:1], params["scales"][:1].exp(), True, False)[0][0]
+    covariance = covariance.detach().cpu().double()
+    fades = 1.0 / (1.0 + np.exp(100.0 * (1.0 / (1.0 + np.exp(-logit)) - 0.005)))
+    expected = (strength * fades) ** 2 * covariance @ covariance.T
+    torch.testing.assert_close(torch.cov(faint.T), expected, rtol=0.06, atol=0.01)
+    assert float(faint.mean(dim=0).abs().max()) < 5.0 * float(expected.diagonal().max().sqrt()) / np.sqrt(count // 2)
+
+
+def test_exploration_is_seeded():
+    from drivesplat.on_gpu.exploration import explore
+
+    ends = []
+    for seed in (1, 1, 2):
+        params = nn.ParameterDict(
+            {"means": torch.zeros(50, 3), "quats": torch.ones(50, 4), "scales": torch.zeros(50, 3)}
+        ).to(DEVICE)
+        params["opacities"] = torch.full((50,), -6.0, device=DEVICE)
+        torch.manual_seed(seed)
+        explore(params, 1.0)
+        explore(params, 1.0)
+        ends.append(params["means"].detach().clone())
+    assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
+
+
+COMPILED = """
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from drivesplat.on_gpu import colours, cube, exploration, trial
+
+FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64"}
+NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
+NUMBERS |= dict.fromkeys(("c1", "c2", "strength"), "fp32")
+SIZES = {"TAPS": 11, "ROWS": colours.ROWS, "COLUMNS": colours.COLUMNS}
+
+def compiled(kernel, **constants):
+    kinds = {name: "constexpr" if name in constants else {**IN, **NUMBERS}.get(name, FLOATS)
+             for name in kernel.arg_names}
+    if kernel in (cube._blend, cube._gradients):
+        kinds["pixels"] = "i32"
+    places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
+    source = ASTSource(fn=kernel, signature=kinds, constexprs=places)
+    assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
+
+compiled(trial._count)
+compiled(exploration._move, BLOCK=exploration.BLOCK)
+compiled(cube._blend, BLOCK=cube.BLOCK)
+compiled(cube._gradients, BLOCK=cube.BLOCK)
+compiled(colours._window_along_rows, TAPS=11, BLOCK=colours.BLOCK)
+compiled(colours._means_along_rows, HIDDEN=True, TAPS=11, BLOCK=colours.BLOCK)
+compiled(colours._means_along_rows, HIDDEN=False, hidden=None, TAPS=11, BLOCK=colours.BLOCK)
+for kernel in (colours._similarity, colours._gradient):
+    compiled(kernel, HIDDEN=True, MOVING=True, **SIZES)
+    compiled(kernel, HIDDEN=False, MOVING=False, hidden=None, moving=None, **SIZES)
+"""
+
+
+def test_every_kernel_compiles():
+    """Which needs no card: it is what the interpreter does not try."""
+    environment = {**os.environ, "TRITON_INTERPRET": "0"}
+    done = subprocess.run([sys.executable, "-c", COMPILED], cwd=REPOSITORY, env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+@pytest.mark.parametrize("switch", ["0", "1"])
+def test_what_triton_cannot_do_torch_does(switch, monkeypatch, caplog):
+    """The user has switched it off, which needs no word; or it fails, which is told once."""
+    from drivesplat.on_gpu import trial
+
+    def fail() -> None:
+        raise RuntimeError("Failed to find C compiler.\nmore")
+
+    monkeypatch.setenv(on_gpu.SWITCH, switch)
+    monkeypatch.setattr(trial, "run", fail)
+    on_gpu.compiles.cache_clear()
+    try:
+        assert not on_gpu.compiles() and not on_gpu.compiles()
+        assert [record.message.count("Failed to find C compiler.") for record in caplog.records] == [1] * int(switch)
+    finally:
+        on_gpu.compiles.cache_clear()
+
+
+def test_tensors_on_a_cpu_are_not_theirs():
+    assert not on_gpu.for_tensor(torch.zeros(1))
