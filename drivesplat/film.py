@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from drivesplat.ahead import in_advance
 from drivesplat.device import telling_out_of_memory
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
@@ -113,7 +114,14 @@ def write_film(
     the film cannot be written.
     """
     began, count = time.perf_counter(), len(shot.cameras)
-    shown = tqdm(pictures, total=count, desc=path.stem, unit="frame", disable=not sys.stderr.isatty(), mininterval=1.0)
+    shown = tqdm(
+        in_advance(pictures),
+        total=count,
+        desc=path.stem,
+        unit="frame",
+        disable=not sys.stderr.isatty(),
+        mininterval=1.0,
+    )
     size = (columns * shot.size[0], shot.size[1])
     with telling_out_of_memory(lambda: len(model)):
         write_video(path, iter(shown), size, shot.format.fps, shot.format.crf, threads=torch.get_num_threads())
@@ -143,7 +151,9 @@ def _apart(model: SplatModel, view: View) -> np.ndarray:
 
 def _bytes(image: torch.Tensor) -> np.ndarray:
     finite = torch.isfinite(image).all()
-    pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
-    if not finite:  # asked after the copy, which has waited for the device anyway
+    pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    if pixels.is_cuda:  # into memory that the card writes by itself, several times as fast
+        pixels = torch.empty(pixels.shape, dtype=torch.uint8, pin_memory=True).copy_(pixels, non_blocking=True)
+    if not finite:  # which waits for the device, and so for the copy
         raise ResultError("a frame of a film was rendered as no numbers; delete its checkpoint.pt and rerun")
-    return pixels
+    return pixels.numpy()

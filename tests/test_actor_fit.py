@@ -19,7 +19,7 @@ from drivesplat.rasterize import rasterize
 from drivesplat.settings.actors import ActorSettings, TrackSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.train import Trainer
+from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -1,11 +1,11 @@
-"""Files read ahead."""
+"""Work done ahead."""
 
 import threading
 import time
 
 import pytest
 
-from drivesplat.ahead import ahead
+from drivesplat.ahead import ahead, in_advance
 
 
 def test_results_come_in_order_however_long_each_takes():
@@ -38,3 +38,39 @@ def test_what_one_raises_is_raised_in_its_place():
     assert [next(results), next(results)] == [-1, -1]
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+def test_items_in_advance_are_made_by_one_thread_while_others_are_used():
+    made, meeting = [], threading.Barrier(2, timeout=5.0)
+
+    def items():
+        for item in range(20):
+            made.append(threading.get_ident())
+            if item == 3:
+                meeting.wait()  # until the first is used
+            yield item
+
+    given = in_advance(items(), at_most=4)
+    assert next(given) == 0
+    meeting.wait()
+    assert list(given) == list(range(1, 20))
+    assert len(set(made)) == 1 and made[0] != threading.get_ident()
+    assert list(in_advance([])) == []
+
+
+def test_no_more_than_asked_for_are_in_advance():
+    made = []
+    given = in_advance((made.append(item) or item for item in range(100)), at_most=3)
+    for taken in range(1, 6):
+        next(given)
+        time.sleep(0.01)
+        assert len(made) <= taken + 3
+    given.close()
+    assert len(made) < 10
+
+
+def test_what_making_an_item_raises_is_raised_in_its_place():
+    given = in_advance((1 // (item - 2) for item in range(5)), at_most=4)
+    assert [next(given), next(given)] == [-1, -1]
+    with pytest.raises(ZeroDivisionError):
+        next(given)

@@ -21,7 +21,7 @@ from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, schedule
 from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
-from drivesplat.training.train import Trainer
+from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
 pytestmark = pytest.mark.usefixtures("one_thread")

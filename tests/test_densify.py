@@ -22,7 +22,7 @@ from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettin
 from drivesplat.training.densify import Densifier, Optimizers
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.strategies import relocation, torch_twins
-from drivesplat.training.train import Trainer
+from drivesplat.training.trainer import Trainer
 
 BINOMS = MCMCStrategy().initialize_state()["binoms"]
 N_MAX = len(BINOMS)

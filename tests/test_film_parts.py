@@ -1,6 +1,7 @@
 """The film of a model's parts: everything, what stands still, and what moves."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from hand_made_street import Reels, a_format, checkpoint_of, street_actors, street_model, street_scene, views_of
 
+from drivesplat.ahead import THREADS
 from drivesplat.film import BACKDROP, film_frame, render_film, render_parts
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene import Scene
@@ -89,13 +91,16 @@ def test_where_nothing_moves_the_third_picture_is_plain_grey(scene, tmp_path, re
     assert record["frames"] == len(reels["parts"])
 
 
-def test_frames_are_rendered_as_the_encoder_takes_them(scene, tmp_path, monkeypatch):
+def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, tmp_path, monkeypatch):
     rendered = []
     monkeypatch.setattr("drivesplat.film.film_frame", lambda *_: rendered.append(1) or np.zeros((10, 20, 3), np.uint8))
 
     def encoder(path, frames, size, fps, crf, threads):
-        next(iter(frames))
-        assert len(rendered) == 2
+        frames = iter(frames)
+        next(frames)
+        time.sleep(0.05)
+        assert 2 <= len(rendered) <= 2 * (1 + THREADS + 1)
+        assert len([*frames]) > 2 * THREADS
         path.write_bytes(b"")
 
     monkeypatch.setattr("drivesplat.film.write_video", encoder)

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,8 @@ from drivesplat.training.run import (
     trained_model,
 )
 from drivesplat.training.surfaces import Surroundings
-from drivesplat.training.train import Trainer, TrainingSummary, Workspace, train
+from drivesplat.training.train import TrainingSummary, Workspace, train
+from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import Guides, LidarDepth, TrainingView, load_views, order, view_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -133,7 +135,7 @@ def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:
     """A training of 60 iterations in which everything happens that happens in one of 30,000."""
     common = {
         "iterations": ITERATIONS, "strategy": strategy, "cap_max": 200, "checkpoint_every": CHECKPOINT_AT,
-        "log_every": 10, "image_every": 30,
+        "checkpoint_apart_s": 0.0, "log_every": 10, "image_every": 30,
         "gaussians": GaussianSettings(sh_degree=1, lr_means=2e-3, lr_sh0=2e-2, lr_scales=1e-2),
         "mcmc": McmcSettings(refine_every=5, noise_lr=1e3),
         "default": DefaultSettings(refine_every=5, grow_grad2d=5e-3),
@@ -506,6 +508,26 @@ def test_a_training_ended_twice_resumes_twice_and_counts_all_its_time(uninterrup
     assert summary.resumed_at == [20, 40]
     assert summary.seconds > before > 0.0
     assert same_parameters(resumed, uninterrupted["mcmc"][0])
+
+
+class TickingViews(EndingViews):
+    """Training images of which a look takes a second, by the clock that the training sees."""
+
+    seconds = 0.0
+
+    def __getitem__(self, index: int) -> TrainingView:
+        self.seconds += 1.0
+        return super().__getitem__(index)
+
+
+@pytest.mark.parametrize(("apart", "kept"), [(0.0, 40), (20.5, 30), (39.5, 40), (100.0, None)])
+def test_resume_states_come_no_sooner_than_their_time(apart, kept, tmp_path, monkeypatch):
+    views = TickingViews(recorded_views(), 45)
+    monkeypatch.setattr("drivesplat.training.train.time", SimpleNamespace(monotonic=lambda: views.seconds))
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(checkpoint_every=10, checkpoint_apart_s=apart), views)
+    state = tmp_path / "resume/state.pt"
+    assert (checkpoint.load(state, "train")["step"] if state.exists() else None) == kept
 
 
 def test_a_training_ended_before_its_first_checkpoint_starts_at_0(uninterrupted, tmp_path):

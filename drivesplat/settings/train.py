@@ -149,8 +149,10 @@ class TrainSettings(Settings):
     """Learning rate of the sky's colours (logits)."""
     antialiased: bool = False
     """Mip-Splatting's 2D filter instead of 3DGS's dilation."""
-    checkpoint_every: int = Field(5_000, ge=1)
+    checkpoint_every: int = Field(500, ge=1)
     """Iterations between resume checkpoints."""
+    checkpoint_apart_s: float = Field(60.0, ge=0)
+    """Seconds between them at least: they hold a short training up for longer than they can save."""
     log_every: int = Field(100, ge=1)
     """Iterations between TensorBoard scalars, and between checks that all losses and gradients are finite."""
     image_every: int = Field(5_000, ge=1)

@@ -14,13 +14,10 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
-from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.densify import Densifier
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
-from drivesplat.training.losses import loss_terms
-from drivesplat.training.monitor import FiniteGuard, Monitor
-from drivesplat.training.optimizers import ModelOptimizers, make_optimizers, schedule
-from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
+from drivesplat.training.monitor import Monitor
+from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings
+from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
@@ -41,92 +38,6 @@ class Workspace:
     @property
     def state(self) -> Path:
         return self.resume / "state.pt"
-
-
-@dataclass
-class Trainer:
-    """A training between two iterations."""
-
-    model: SplatModel
-    images: TrainingImages
-    settings: TrainSettings
-    seed: int
-    device: torch.device
-    optimizers: ModelOptimizers
-    densifiers: list[Densifier]
-    guard: FiniteGuard
-    surroundings: Surroundings
-    clock: Clock
-    step: int = 0
-
-    @classmethod
-    def begin(
-        cls,
-        model: SplatModel,
-        views: list[TrainingView],
-        settings: TrainSettings,
-        seed: int,
-        device: torch.device,
-        surroundings: Surroundings = NOTHING_KNOWN,
-        clock: Clock = UNTIMED,
-    ) -> "Trainer":
-        torch.manual_seed(seed)
-        densifiers = [Densifier(part, settings) for part in model.parts]
-        optimizers, known = make_optimizers(model), surroundings.to(device)
-        images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock)
-
-    def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
-        """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
-        stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
-        with stage("data"):
-            view = self.images.at(self.step)
-        with stage("render"):
-            picture = self.model.render(
-                view.view,
-                self.sh_degree(),
-                absgrad=by_gradient and self.settings.default.absgrad,
-                with_depth=view.lidar is not None,
-            )
-        with stage("loss"):
-            terms = loss_terms(picture, view, self.model, self.settings)
-            terms |= surface_terms(picture, self.model, self.surroundings, self.settings)
-            loss = torch.stack(list(terms.values())).sum()
-        if by_gradient:
-            picture.info["means2d"].retain_grad()
-        with stage("backward"):
-            loss.backward()
-        with stage("checks"):
-            losses = {f"loss {name}": value for name, value in terms.items()}
-            self.guard.watch(self.step, {**losses, **self._gradient_norms()})
-        with stage("optimizer"):
-            schedule(self.model, self.optimizers, self.step, self.settings)
-            self.optimizers.step()
-        return terms, picture, view
-
-    def densifies(self) -> bool:
-        """Whether this iteration may add, move or remove Gaussians."""
-        return any(densifier.due(self.step) for densifier in self.densifiers)
-
-    def densify(self, picture: Picture) -> None:
-        """The second half: each part grows, prunes and moves its Gaussians."""
-        for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
-            densifier.after_step(self.step, optimizers, picture.info, rows)
-        self.step += 1
-
-    def sh_degree(self) -> int:
-        every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        return self.step // every
-
-    def _gradient_norms(self) -> dict[str, torch.Tensor]:
-        named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
-        norms = torch._foreach_norm([gradient for _, gradient in named])
-        return {f"gradient of {self._spoken(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}
-
-    def _spoken(self, parameter: str) -> str:
-        """What a parameter of the model is called in a message: 'background means', 'sky texels'."""
-        owner, *place, name = parameter.split(".")
-        return f"{self.model.parts[int(place[0])].name if owner == 'parts' else owner} {name}"
 
 
 @dataclass(frozen=True)
@@ -179,6 +90,8 @@ class Run:
     seconds_before: float
     resumed_at: list[int]
     began: float
+    saved: float
+    """When its state was last known on disk, or began (by `time.monotonic`, as `began`)."""
 
     @classmethod
     def begin(cls, trainer: Trainer, workspace: Workspace) -> "Run":
@@ -188,11 +101,12 @@ class Run:
         saved = checkpoint.resumable(workspace.state, workspace.fingerprint)
         if saved is None:
             shutil.rmtree(workspace.tensorboard, ignore_errors=True)
-            return cls(trainer, workspace, 0.0, [], time.monotonic())
+            return cls(trainer, workspace, 0.0, [], now := time.monotonic(), now)
         checkpoint.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
         log.info("resuming at iteration %d of %d", trainer.step, trainer.settings.iterations)
-        return cls(trainer, workspace, saved["seconds"], [*saved["resumed_at"], trainer.step], time.monotonic())
+        now = time.monotonic()
+        return cls(trainer, workspace, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now)
 
     @property
     def seconds(self) -> float:
@@ -220,6 +134,14 @@ class Run:
             "state": checkpoint.state_of(t.model, t.optimizers, t.densifiers, t.device),
         }
         checkpoint.save(self.workspace.state, content)
+        self.saved = time.monotonic()
+
+    @property
+    def save_due(self) -> bool:
+        """Whether the state is to be kept now: of the last iteration the training's own files are."""
+        step, settings = self.trainer.step, self.trainer.settings
+        apart = time.monotonic() - self.saved >= settings.checkpoint_apart_s
+        return step % settings.checkpoint_every == 0 and step < settings.iterations and apart
 
     def summary(self) -> TrainingSummary:
         t, on_gpu = self.trainer, self.trainer.device.type == "cuda"
@@ -252,7 +174,7 @@ def _iterate(run: Run, monitor: Monitor) -> None:
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
             if trainer.step % settings.image_every == 0:
                 monitor.image(trainer.step, view, picture)
-            if trainer.step % settings.checkpoint_every == 0 and trainer.step < settings.iterations:
+            if run.save_due:
                 run.save()
     run.check()
 

@@ -1,0 +1,102 @@
+"""A training between two iterations: one image seen, compared, learned from."""
+
+from dataclasses import dataclass
+
+import torch
+
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.clock import UNTIMED, Clock
+from drivesplat.training.coarse_to_fine import TrainingImages
+from drivesplat.training.densify import Densifier
+from drivesplat.training.losses import loss_terms
+from drivesplat.training.monitor import FiniteGuard
+from drivesplat.training.optimizers import ModelOptimizers, make_optimizers, schedule
+from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
+from drivesplat.training.views import TrainingView
+
+
+@dataclass
+class Trainer:
+    """A training between two iterations."""
+
+    model: SplatModel
+    images: TrainingImages
+    settings: TrainSettings
+    seed: int
+    device: torch.device
+    optimizers: ModelOptimizers
+    densifiers: list[Densifier]
+    guard: FiniteGuard
+    surroundings: Surroundings
+    clock: Clock
+    step: int = 0
+
+    @classmethod
+    def begin(
+        cls,
+        model: SplatModel,
+        views: list[TrainingView],
+        settings: TrainSettings,
+        seed: int,
+        device: torch.device,
+        surroundings: Surroundings = NOTHING_KNOWN,
+        clock: Clock = UNTIMED,
+    ) -> "Trainer":
+        torch.manual_seed(seed)
+        densifiers = [Densifier(part, settings) for part in model.parts]
+        optimizers, known = make_optimizers(model), surroundings.to(device)
+        images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
+        return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock)
+
+    def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
+        """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
+        stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
+        with stage("data"):
+            view = self.images.at(self.step)
+        with stage("render"):
+            picture = self.model.render(
+                view.view,
+                self.sh_degree(),
+                absgrad=by_gradient and self.settings.default.absgrad,
+                with_depth=view.lidar is not None,
+            )
+        with stage("loss"):
+            terms = loss_terms(picture, view, self.model, self.settings)
+            terms |= surface_terms(picture, self.model, self.surroundings, self.settings)
+            loss = torch.stack(list(terms.values())).sum()
+        if by_gradient:
+            picture.info["means2d"].retain_grad()
+        with stage("backward"):
+            loss.backward()
+        with stage("checks"):
+            losses = {f"loss {name}": value for name, value in terms.items()}
+            self.guard.watch(self.step, {**losses, **self._gradient_norms()})
+        with stage("optimizer"):
+            schedule(self.model, self.optimizers, self.step, self.settings)
+            self.optimizers.step()
+        return terms, picture, view
+
+    def densifies(self) -> bool:
+        """Whether this iteration may add, move or remove Gaussians."""
+        return any(densifier.due(self.step) for densifier in self.densifiers)
+
+    def densify(self, picture: Picture) -> None:
+        """The second half: each part grows, prunes and moves its Gaussians."""
+        for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
+            densifier.after_step(self.step, optimizers, picture.info, rows)
+        self.step += 1
+
+    def sh_degree(self) -> int:
+        every = max(1, int(self.settings.sh_every * self.settings.iterations))
+        return self.step // every
+
+    def _gradient_norms(self) -> dict[str, torch.Tensor]:
+        named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
+        norms = torch._foreach_norm([gradient for _, gradient in named])
+        return {f"gradient of {self._spoken(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}
+
+    def _spoken(self, parameter: str) -> str:
+        """What a parameter of the model is called in a message: 'background means', 'sky texels'."""
+        owner, *place, name = parameter.split(".")
+        return f"{self.model.parts[int(place[0])].name if owner == 'parts' else owner} {name}"
