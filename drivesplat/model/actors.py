@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
+from drivesplat import on_gpu
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import learning_rates, optimised, started_at
@@ -80,6 +81,7 @@ class Actors(Part):
         self.cap_max = settings.cap_max
         self._settings = settings
         self._gaussians = gaussians
+        self._known_owners: tuple[Tensor | None, int, Tensor | None] = (None, 0, None)
         sizes = torch.from_numpy(np.stack([track.size for track in tracks])).float()
         self.register_buffer("_reach", 0.5 * sizes + settings.box_margin, persistent=False)
         self.register_buffer("_annotated", self.timeline.of_actors, persistent=False)
@@ -135,8 +137,9 @@ class Actors(Part):
 
     def placed(self, time: float, placements: Placements) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time."""
-        p = self.params
-        rotations = rotation_matrix(placements.quats)
+        p, rotations = self.params, rotation_matrix(placements.quats)
+        if on_gpu.for_tensor(p["means"]):
+            return self._placed_on_gpu(time, placements, rotations)
         scales = self._of_owners(placements.scales)[:, None]
         sh = self.harmonics(time)
         if sh.shape[1] > 1:  # colours turn by degrees at most: no gradient of theirs is worth its noise to the track
@@ -150,11 +153,33 @@ class Actors(Part):
             sh,
         )
 
+    def _placed_on_gpu(self, time: float, placements: Placements, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
+        """The same by two kernels."""
+        from drivesplat.on_gpu.colours_in_time import turned_colours
+        from drivesplat.on_gpu.placing import Objects, Shapes, placed
+
+        p, owner, coefficients = self.params, self.params["owner"], self.params["shN"].shape[2] + 1
+        shapes = Shapes(p["means"], p["quats"], p["scales"], p["opacities"])
+        presence = placements.present.to(rotations.dtype)
+        objects = Objects(placements.quats, placements.translations, placements.scales, presence)
+        turns = rotation_of_harmonics(rotations.detach(), coefficients)
+        series = self.timeline.at(time, owner.device).series
+        sh = turned_colours(p["sh0"], p["shN"], series, turns, owner)
+        return Gaussians(*placed(shapes, objects, owner, self._owns), sh)
+
     def _of_owners(self, values: Float[Tensor, "a *v"]) -> Float[Tensor, "n *v"]:
         """For every Gaussian its actor's value: a product with the matrix of who owns what, exact, and with a gradient
         that is a product as well, where that of indexing adds up row by row."""
-        owns = one_hot(self.params["owner"], len(values)).to(values.dtype)
-        return (owns @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
+        return (self._owns.to(values.dtype) @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
+
+    @property
+    def _owns(self) -> Float[Tensor, "n a"]:
+        """1 where a Gaussian is an actor's, else 0; made anew where densification has changed whose they are."""
+        owner, (known, version, matrix) = self.params["owner"], self._known_owners
+        if matrix is None or known is not owner or version != owner._version or matrix.device != owner.device:
+            matrix = one_hot(owner, len(self.timeline.tracks)).float()
+            self._known_owners = owner, owner._version, matrix
+        return matrix
 
     def harmonics(self, time: float) -> Float[Tensor, "n k 3"]:
         """The coefficients of the colours at a time, in the object's frame: the sum over i of f_i cos(i pi t / T), t

@@ -18,9 +18,27 @@ def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) 
     Exact for every degree, from as many directions as determine it: with Y(d) the basis along directions d (rows),
     Y(d) sh_world = Y(R^T d) sh_object for all d. Between degrees it is exactly 0: Adam makes whole steps of rounding.
     """
+    if coefficients <= 4:
+        return _of_vectors(rotations, coefficients)
     directions, inverse, same_degree = _directions(coefficients, rotations.dtype, rotations.device)
     turned = directions @ rotations  # rows are R^T d
     return inverse @ _basis(coefficients, turned) * same_degree
+
+
+def _of_vectors(rotations: Float[Tensor, "a 3 3"], coefficients: int) -> Float[Tensor, "a k k"]:
+    """The maps of k = 1 or 4 coefficients: those of degree 1 are the components of a vector along -y, z and -x."""
+    maps = rotations.new_zeros(len(rotations), coefficients, coefficients)
+    maps[:, 0, 0] = 1.0
+    if coefficients == 4:
+        axes = _axes(rotations.dtype, rotations.device)
+        maps[:, 1:, 1:] = axes @ rotations @ axes.T
+    return maps
+
+
+@cache
+def _axes(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 3"]:
+    """The directions along which the functions of degree 1 grow, as rows."""
+    return torch.tensor([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=dtype, device=device)
 
 
 def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:

@@ -141,7 +141,7 @@ class SplatModel(nn.Module):
         if not moving:
             return None
         alone = concatenate(moving)
-        return self._composited(alone, torch.ones_like(alone.means), view).alpha[0, ..., 0]
+        return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha[0, ..., 0]
 
     def class_logits(self, picture: Picture, view: View) -> Float[Tensor, "h w c"] | None:
         """The logits of classes in a picture of this model; None for a model that tells no classes apart."""

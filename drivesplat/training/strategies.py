@@ -77,16 +77,16 @@ class ExploringStrategy(MCMCStrategy):
 
 def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
     """Moves positions at random, the farther the fainter and larger a Gaussian is."""
-    if not params["means"].is_cuda:
-        from drivesplat.on_cpu.exploration import explore
-
-        explore(params, strength)
-    elif on_gpu.compiles():
+    if on_gpu.for_tensor(params["means"]):
         from drivesplat.on_gpu.exploration import explore
 
         explore(params, strength)
-    else:
+    elif params["means"].is_cuda:
         ops.inject_noise_to_position(params, optimizers, {}, strength)
+    else:
+        from drivesplat.on_cpu.exploration import explore
+
+        explore(params, strength)
 
 
 def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MCMCStrategy:
