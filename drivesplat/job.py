@@ -1,6 +1,7 @@
 """The seam between Snakemake's scripts and the library: settings in, errors out in one line."""
 
 import errno
+import gc
 import json
 import logging
 import sys
@@ -21,6 +22,9 @@ S = TypeVar("S", bound=Settings)
 
 REFUSED_BY_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 """What is wrong with the disk and not with the workflow."""
+
+if hasattr(sys.modules["__main__"], "snakemake"):  # in a rule's script, which imports this before all else
+    gc.disable()  # until the job begins: what is imported stays, and looking for waste in it takes half a second
 
 
 class Job:
@@ -72,6 +76,8 @@ def job(snakemake: Any) -> Iterator[Job]:
     A DriveSplatError is told as its sentence, a disk that takes no more as what it says; anything else is a bug, told
     with the place of its traceback in the log.
     """
+    gc.freeze()  # nor is it looked through again; when the script ends, that is what most of the time goes to
+    gc.enable()
     log_path = Path(snakemake.log[0])
     _log_into(log_path)
     threading_hook, threading.excepthook = threading.excepthook, _log_thread
@@ -95,6 +101,7 @@ def job(snakemake: Any) -> Iterator[Job]:
     finally:
         threading.excepthook = threading_hook
         logging.shutdown()
+        gc.freeze()
 
 
 def _log_into(path: Path) -> None:

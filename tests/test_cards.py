@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivesplat.cards import visible_cards
 from drivesplat.job import Job
+from drivesplat.cards import visible_cards
 from drivesplat.settings.device import DeviceSettings
 
 REPOSITORY = Path(__file__).parent.parent

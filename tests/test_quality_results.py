@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 from hand_made_recipes import evaluation, recipe_file, write_evaluation
 
-from drivesplat.errors import ConfigError
 from drivesplat.job import job
+from drivesplat.errors import ConfigError
 from drivesplat.quality.results import Result, occupation, results_of
 from drivesplat.quality.runs import Outcome, outcome, passed_on
 from drivesplat.settings.device import DeviceSettings

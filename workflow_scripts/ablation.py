@@ -1,8 +1,8 @@
 """The eval.json of a method, whole and without each thing, into ablation.json, ablation.csv and a table."""
 
+from drivesplat.job import job
 from drivesplat.ablation import ablation, markdown, write_csv
 from drivesplat.evaluation.scene_metrics import read_evaluations
-from drivesplat.job import job
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.storage import write_json
 

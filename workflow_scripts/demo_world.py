@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from drivesplat.demo.world import make_world
 from drivesplat.job import job
+from drivesplat.demo.world import make_world
 from drivesplat.settings.world import WorldJob
 
 with job(snakemake) as current:

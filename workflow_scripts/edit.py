@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from drivesplat.editing.film import EditFiles, render_edit
 from drivesplat.job import job
+from drivesplat.editing.film import EditFiles, render_edit
 from drivesplat.scene import read_scene
 from drivesplat.settings.render import EditJob
 from drivesplat.storage import write_json

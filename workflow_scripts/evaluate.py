@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from drivesplat.job import job
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.images import write_image
-from drivesplat.job import job
 from drivesplat.masks import read_masks_record
 from drivesplat.recording import read_recording
 from drivesplat.settings.evaluate import EvaluateJob

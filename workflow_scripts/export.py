@@ -1,7 +1,7 @@
 """checkpoint.pt as splat.ply, in the convention of splat viewers, its parts likewise, cameras.json and parts.json."""
 
-from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.job import job
+from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.parser import read_parser
 from drivesplat.scene import read_scene
 from drivesplat.training.run import read_checkpoint

@@ -3,8 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from drivesplat.extract import extract_scene
 from drivesplat.job import job
+from drivesplat.extract import extract_scene
 from drivesplat.provenance import digests_of
 from drivesplat.scene import write_scene
 from drivesplat.settings.extract import SceneSource

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from drivesplat.film import render_parts
 from drivesplat.job import job
+from drivesplat.film import render_parts
 from drivesplat.scene import read_scene
 from drivesplat.settings.render import FilmFormat
 from drivesplat.storage import write_json

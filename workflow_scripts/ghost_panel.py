@@ -1,10 +1,10 @@
 """checkpoint.pt before a moving vehicle, into ghost_panel.png and ghost_panel.json."""
 
+from drivesplat.job import job
 from drivesplat.actors.drawing import draw_panel
 from drivesplat.actors.panel import ghost_panel
 from drivesplat.actors.sheet import save_figure
 from drivesplat.actors.sight import open_drive
-from drivesplat.job import job
 from drivesplat.recording import read_recording
 from drivesplat.settings.looks import PanelJob
 from drivesplat.storage import write_json

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from drivesplat.evaluation.backbone import provide_backbone
 from drivesplat.job import job
+from drivesplat.evaluation.backbone import provide_backbone
 from drivesplat.settings.evaluate import BACKBONE, LpipsSettings
 from drivesplat.storage import write_json
 

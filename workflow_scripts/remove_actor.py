@@ -1,11 +1,11 @@
 """checkpoint.pt with and without a vehicle, into with_car.png, without_car.png, removal.png and removal.json."""
 
+from drivesplat.job import job
 from drivesplat.actors.drawing import draw_removal
 from drivesplat.actors.remove import remove_actor
 from drivesplat.actors.sheet import save_figure
 from drivesplat.actors.sight import open_drive
 from drivesplat.images import write_image
-from drivesplat.job import job
 from drivesplat.recording import read_recording
 from drivesplat.settings.looks import RemovalJob
 from drivesplat.storage import write_json

@@ -1,7 +1,7 @@
 """The eval.json of every method into metrics.json."""
 
-from drivesplat.evaluation.scene_metrics import read_evaluations, side_by_side
 from drivesplat.job import job
+from drivesplat.evaluation.scene_metrics import read_evaluations, side_by_side
 from drivesplat.storage import write_json
 
 with job(snakemake) as current:

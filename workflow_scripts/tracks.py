@@ -1,8 +1,8 @@
 """scene.json as tracks.csv and tracks.png: what moves, and by which id."""
 
+from drivesplat.job import job
 from drivesplat.actors.listing import draw_tracks, sightings_of, track_rows, write_tracks
 from drivesplat.actors.sheet import save_figure
-from drivesplat.job import job
 from drivesplat.recording import read_recording
 from drivesplat.settings.looks import TracksJob
 

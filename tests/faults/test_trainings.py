@@ -26,8 +26,8 @@ from test_training import (
     untrained,
 )
 
-from drivesplat.errors import ResultError, TrainingError
 from drivesplat.job import job
+from drivesplat.errors import ResultError, TrainingError
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.monitor import Monitor
