@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -102,6 +103,8 @@ def train_and_kill_the_parent(folder: str) -> None:
         save(path, content)
         with suppress(ProcessLookupError):
             os.kill(parent, signal.SIGKILL)
+        while os.getppid() == parent:  # a killed process has children until all its memory is given back
+            time.sleep(0.01)
 
     checkpoint.save = save_and_kill
     run_training(inputs_in(Path(folder)), RESUMABLE, CPU, files_in(Path(folder) / "it"), PROVENANCE, "train")
