@@ -143,6 +143,12 @@ def test_gsplat_that_cannot_be_imported_is_to_be_fixed(facts):
     assert level == "fix" and "make setup" in text and (facts.gsplat_problem or facts.gsplat.problem) in text
 
 
+def test_a_gpu_that_triton_does_not_compile_for_is_a_note_with_what_it_needs():
+    assert only(WORKSTATION, "Triton")[0] == "ok" and not of(LAPTOP, "Triton")
+    level, text = only(replace(WORKSTATION, triton_problem="Failed to find C compiler."), "Triton")
+    assert level == "note" and "Failed to find C compiler." in text and "gcc" in text and "python3-dev" in text
+
+
 def test_torch_that_cannot_be_imported_is_to_be_fixed():
     facts = replace(WORKSTATION, torch=None, torch_problem="ImportError: libcudart.so.13")
     assert only(facts, "torch")[0] == "fix" and "libcudart.so.13" in only(facts, "torch")[1]

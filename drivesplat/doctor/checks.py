@@ -24,7 +24,7 @@ class Finding:
 
 def examine(facts: Facts) -> list[Finding]:
     """All findings, in the order in which things depend on each other."""
-    checks = (python, torch_build, gpu, gsplat, compiler, config, datasets, disk, backbone, ffmpeg)
+    checks = (python, torch_build, gpu, gsplat, compiler, triton, config, datasets, disk, backbone, ffmpeg)
     return [finding for check in checks for finding in check(facts)]
 
 
@@ -155,6 +155,19 @@ def _compiled(facts: Facts, torch: Torch) -> Iterator[Finding]:
         )  # fmt: skip
     else:
         yield Finding("ok", "gsplat", text + (f" for compute capability {', '.join(archs)}" if archs else ""))
+
+
+def triton(facts: Facts) -> Iterator[Finding]:
+    """Whether the kernels that train faster can be compiled; of interest where there is a GPU alone."""
+    if facts.torch is None or facts.torch.card is None:
+        return
+    if facts.triton_problem is None:
+        yield Finding("ok", "Triton", "compiles for this GPU")
+    else:
+        yield Finding(
+            "note", "Triton", f"cannot be used ({facts.triton_problem}): trainings take longer; it needs a C compiler "
+            "and Python's headers (Ubuntu: sudo apt install gcc python3-dev)",
+        )  # fmt: skip
 
 
 def compiler(facts: Facts) -> Iterator[Finding]:

@@ -11,6 +11,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from drivesplat import on_gpu
 from drivesplat.config import Config, load, merged
 from drivesplat.doctor.torch_builds import Capability, Card, read_cards
 from drivesplat.errors import DriveSplatError
@@ -96,10 +97,12 @@ class Facts:
     """Free space by folder."""
     backbone: Backbone = Backbone()
     ffmpeg: str | None = None
+    triton_problem: str | None = None
+    """Why kernels that train faster cannot be compiled for the GPU that torch sees."""
 
 
 def gather(root: Path, config_files: Sequence[Path]) -> Facts:
-    """Looks at everything. Changes nothing, fetches nothing, compiles nothing."""
+    """Looks at everything. Changes nothing, fetches nothing, compiles nothing but Triton's trial."""
     cards, cards_problem = read_cards()
     torch, torch_problem = _torch()
     gsplat, gsplat_problem = _gsplat(cuda=bool(torch and torch.cuda))
@@ -123,6 +126,7 @@ def gather(root: Path, config_files: Sequence[Path]) -> Facts:
         disk_gb={name: free_disk_gb(root / name) for name in (results, "resources")},
         backbone=_backbone(root),
         ffmpeg=_ffmpeg(),
+        triton_problem=on_gpu.problem() if torch and torch.card else None,
     )
 
 

@@ -3,8 +3,7 @@
 import logging
 import os
 from functools import cache
-
-import torch
+from typing import Any
 
 log = logging.getLogger(__name__)
 
@@ -12,7 +11,7 @@ SWITCH = "DRIVESPLAT_TRITON"
 """An environment variable: with 0 torch does all of it."""
 
 
-def for_tensor(tensor: torch.Tensor) -> bool:
+def for_tensor(tensor: Any) -> bool:
     """Whether these kernels are there for a tensor, or torch has to do."""
     return tensor.is_cuda and compiles()
 
@@ -22,12 +21,18 @@ def compiles() -> bool:
     """Whether Triton compiles for the GPU of this process; where it does not, says so once: torch is slower."""
     if os.environ.get(SWITCH) == "0":
         return False
+    reason = problem()
+    if reason is not None:
+        log.warning("Triton cannot be used (%s): trainings take longer; see docs/troubleshooting.md", reason)
+    return reason is None
+
+
+def problem() -> str | None:
+    """What keeps Triton from compiling for the GPU of this process; None where it does."""
     try:
         from drivesplat.on_gpu import trial
 
         trial.run()
     except Exception as error:  # no Triton for this system, no C compiler, no headers of Python, a GPU it does not know
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        log.warning("Triton cannot be used (%s): trainings take longer; see docs/troubleshooting.md", reason[0])
-        return False
-    return True
+        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return None
