@@ -87,7 +87,11 @@ class WorkflowCopy:
         (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))
 
     def command(self, *arguments: str) -> list[str]:
-        return [sys.executable, "-m", "snakemake", "--configfile", "mine.yaml", *arguments]
+        return [sys.executable, "-m", "snakemake", *self._told(*arguments)]
+
+    def _told(self, *arguments: str) -> list[str]:
+        """What Snakemake is told."""
+        return ["--configfile", "mine.yaml", *arguments]
 
     def run(
         self,
@@ -100,12 +104,12 @@ class WorkflowCopy:
     ) -> subprocess.CompletedProcess:
         """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `cards`, by the program
         `under` where one is given; the result holds its output (both streams) as `stdout`."""
-        arguments = ["--configfile", "mine.yaml", "--cores", str(cores), *flags, "--", *targets]
+        arguments = ("--cores", str(cores), *flags, "--", *targets)
         environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": cards}
         if not under:
-            return run_snakemake(arguments, self.folder, environment, timeout)
+            return run_snakemake(self._told(*arguments), self.folder, environment, timeout)
         return subprocess.run(
-            [*under, sys.executable, "-m", "snakemake", *arguments],
+            [*under, *self.command(*arguments)],
             cwd=self.folder,
             env=environment,
             stdout=subprocess.PIPE,

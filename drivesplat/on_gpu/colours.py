@@ -92,6 +92,16 @@ def _seen(image, pixels, hidden, at, there, HIDDEN: tl.constexpr):
     return x, y
 
 
+@triton.jit
+@no_type_check
+def _block(height, values, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """A program's rows and columns, the places of its values, and which of them are in the image."""
+    row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
+    column = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)
+    inside = (row < height)[:, None] & (column < values)[None, :]
+    return row, column, row[:, None] * values + column[None, :], inside
+
+
 @triton.jit(do_not_specialize=["height"])
 @no_type_check
 def _means_along_rows(
@@ -157,8 +167,7 @@ def _similarity(
     HIDDEN: tl.constexpr, MOVING: tl.constexpr, TAPS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """The similarity of a block and its absolute difference, summed, and the similarity's slopes."""
-    row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
-    column = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)
+    row, column, at, inside = _block(height, values, ROWS, COLUMNS)
     size = height * values
     x = _window_along_columns(means, taps, row, column, height, values, TAPS, ROWS, COLUMNS)
     y = _window_along_columns(means + size, taps, row, column, height, values, TAPS, ROWS, COLUMNS)
@@ -170,9 +179,6 @@ def _similarity(
     scale = 1.0 / (denominator_1 * denominator_2)
     value = numerator_1 * numerator_2 * scale
     by_x = 2 * y * (numerator_2 - numerator_1) * scale + 2 * x * value * (1.0 / denominator_2 - 1.0 / denominator_1)
-
-    inside = (row < height)[:, None] & (column < values)[None, :]
-    at = row[:, None] * values + column[None, :]
     tl.store(slopes + at, by_x, mask=inside)
     tl.store(slopes + size + at, -value / denominator_2, mask=inside)
     tl.store(slopes + 2 * size + at, 2 * numerator_1 * scale, mask=inside)
@@ -199,17 +205,13 @@ def _gradient(
     HIDDEN: tl.constexpr, MOVING: tl.constexpr, TAPS: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """The image's gradient in a block."""
-    row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
-    column = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)
+    row, column, at, inside = _block(height, values, ROWS, COLUMNS)
     size = height * values
     by_x = _window_along_columns(windowed, taps, row, column, height, values, TAPS, ROWS, COLUMNS)
     by_xx = _window_along_columns(windowed + size, taps, row, column, height, values, TAPS, ROWS, COLUMNS)
     by_xy = _window_along_columns(windowed + 2 * size, taps, row, column, height, values, TAPS, ROWS, COLUMNS)
 
-    inside = (row < height)[:, None] & (column < values)[None, :]
-    at = row[:, None] * values + column[None, :]
-    y = tl.load(pixels + at, mask=inside, other=0).to(tl.float32) / 255.0
-    x = tl.load(image + at, mask=inside, other=0.0)
+    x, y = _seen(image, pixels, hidden, at, inside, False)
     share = tl.full((ROWS, COLUMNS), 1.0, tl.float32) * (tl.load(v_l1) / size)
     if MOVING:
         moves = tl.load(moving + at // 3, mask=inside, other=0) != 0

@@ -30,11 +30,7 @@ class _TurnedColours(torch.autograd.Function):
     def forward(ctx: Any, sh0: Tensor, shN: Tensor, series: Tensor, turns: Tensor, owner: Tensor) -> Tensor:
         count, terms, coefficients = len(sh0), sh0.shape[1], shN.shape[2] + 1
         colours = sh0.new_empty(count, coefficients, 3)
-        padded = triton.next_power_of_2(coefficients)
-        block = VALUES // padded
-        _colours[(triton.cdiv(count, block),)](
-            sh0, shN, series, turns, owner, colours, count, terms, coefficients, padded, block
-        )
+        _launch(_colours, sh0, shN, series, turns, owner, colours, count, terms, coefficients)
         ctx.save_for_backward(series, turns, owner)
         return colours
 
@@ -46,12 +42,17 @@ class _TurnedColours(torch.autograd.Function):
         (count, coefficients, _), terms = v_colours.shape, series.shape[1]
         v_sh0 = v_colours.new_empty(count, terms, 1, 3)
         v_shN = v_colours.new_empty(count, terms, coefficients - 1, 3)
-        padded = triton.next_power_of_2(coefficients)
-        block = VALUES // padded
-        _colours_back[(triton.cdiv(count, block),)](
-            v_colours, series, turns, owner, v_sh0, v_shN, count, terms, coefficients, padded, block
-        )
+        _launch(_colours_back, v_colours, series, turns, owner, v_sh0, v_shN, count, terms, coefficients)
         return v_sh0, v_shN, None, None, None
+
+
+def _launch(kernel: Any, *told: Any) -> None:
+    """A kernel over all Gaussians; the last three that it is told are how many there are, their Fourier terms, and
+    their coefficients."""
+    *_, count, _, coefficients = told
+    padded = triton.next_power_of_2(coefficients)
+    block = VALUES // padded
+    kernel[(triton.cdiv(count, block),)](*told, padded, block)
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -60,13 +61,7 @@ def _colours(
     sh0, shN, series, turns, owner, colours, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    k = tl.arange(0, PADDED)
-    there = i < count
-    whose = tl.load(owner + i, mask=there, other=0)
-    first = there[:, None] & (k == 0)[None, :]
-    others = there[:, None] & ((k > 0) & (k < K))[None, :]
-    turn = _turn(turns, whose, k, there, K)
+    i, k, there, whose, first, others, turn = _harmonics(turns, owner, count, K, PADDED, BLOCK)
     for channel in tl.static_range(3):
         own = tl.zeros((BLOCK, PADDED), tl.float32)
         for term in tl.static_range(TERMS):
@@ -85,13 +80,7 @@ def _colours_back(
     v_colours, series, turns, owner, v_sh0, v_shN, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    k = tl.arange(0, PADDED)
-    there = i < count
-    whose = tl.load(owner + i, mask=there, other=0)
-    first = there[:, None] & (k == 0)[None, :]
-    others = there[:, None] & ((k > 0) & (k < K))[None, :]
-    turn = _turn(turns, whose, k, there, K)
+    i, k, there, whose, first, others, turn = _harmonics(turns, owner, count, K, PADDED, BLOCK)
     for channel in tl.static_range(3):
         given = tl.load(v_colours + (i[:, None] * K + k[None, :]) * 3 + channel, mask=first | others, other=0.0)
         own = tl.sum(turn * given[:, :, None], axis=1)
@@ -104,8 +93,15 @@ def _colours_back(
 
 @triton.jit
 @no_type_check
-def _turn(turns, whose, k, there, K: tl.constexpr):
-    """The maps of Gaussians' objects."""
+def _harmonics(turns, owner, count, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr):
+    """The Gaussians i and coefficients k of a program; which i there are and whose they are; where of i and k the first
+    and the other coefficients are; and the maps of the Gaussians' objects."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    k = tl.arange(0, PADDED)
+    there = i < count
+    whose = tl.load(owner + i, mask=there, other=0)
+    first = there[:, None] & (k == 0)[None, :]
+    others = there[:, None] & ((k > 0) & (k < K))[None, :]
     at = (whose[:, None, None] * K + k[None, :, None]) * K + k[None, None, :]
     known = there[:, None, None] & (k < K)[None, :, None] & (k < K)[None, None, :]
-    return tl.load(turns + at, mask=known, other=0.0)
+    return i, k, there, whose, first, others, tl.load(turns + at, mask=known, other=0.0)

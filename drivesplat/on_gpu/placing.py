@@ -103,6 +103,15 @@ def _quaternion(values, i, there):
 
 @triton.jit
 @no_type_check
+def _store_quaternion(values, i, w, x, y, z, there):
+    tl.store(values + 4 * i, w, mask=there)
+    tl.store(values + 4 * i + 1, x, mask=there)
+    tl.store(values + 4 * i + 2, y, mask=there)
+    tl.store(values + 4 * i + 3, z, mask=there)
+
+
+@triton.jit
+@no_type_check
 def _unit(values, i, there):
     """Row i of an array of quaternions, and its length before it was made 1."""
     w, x, y, z = _quaternion(values, i, there)
@@ -150,10 +159,7 @@ def _place(
 
     bw, bx, by, bz, _ = _unit(quats, i, there)
     w, x, y, z = _product(w, ux, uy, uz, bw, bx, by, bz)
-    tl.store(world_quats + 4 * i, w, mask=there)
-    tl.store(world_quats + 4 * i + 1, x, mask=there)
-    tl.store(world_quats + 4 * i + 2, y, mask=there)
-    tl.store(world_quats + 4 * i + 3, z, mask=there)
+    _store_quaternion(world_quats, i, w, x, y, z, there)
 
     x, y, z = _three(log_scales, i, there)
     _store_three(world_scales, i, size * tl.exp(x), size * tl.exp(y), size * tl.exp(z), there)
@@ -198,10 +204,8 @@ def _place_back(
     tl.store(v_owners + 7 * i + 6, gz, mask=there)
     pw, px, py, pz = _product(w, -ux, -uy, -uz, pw, px, py, pz)
     radial = pw * bw + px * bx + py * by + pz * bz
-    tl.store(v_quats + 4 * i, (pw - radial * bw) / length, mask=there)
-    tl.store(v_quats + 4 * i + 1, (px - radial * bx) / length, mask=there)
-    tl.store(v_quats + 4 * i + 2, (py - radial * by) / length, mask=there)
-    tl.store(v_quats + 4 * i + 3, (pz - radial * bz) / length, mask=there)
+    pw, px, py, pz = pw - radial * bw, px - radial * bx, py - radial * by, pz - radial * bz
+    _store_quaternion(v_quats, i, pw / length, px / length, py / length, pz / length, there)
 
     x, y, z = _three(world_scales, i, there)
     gx, gy, gz = _three(v_world_scales, i, there)

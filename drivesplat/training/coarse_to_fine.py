@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -38,12 +39,12 @@ class TrainingImages:
         """By how much width and height are reduced at an iteration."""
         done, coarse = step / self._settings.iterations, self._settings.coarse_to_fine
         wanted = 4 if done < coarse.quarter_until else 2 if done < coarse.half_until else 1
-        if wanted == 1:
-            return 1
-        rows = min(view.view.height for view in self.views)
-        return next(
-            factor for factor in (4, 2, 1) if factor <= wanted and (factor == 1 or rows // factor >= LEAST_HEIGHT)
-        )
+        return next((factor for factor in (4, 2) if factor <= wanted and self._rows >= factor * LEAST_HEIGHT), 1)
+
+    @cached_property
+    def _rows(self) -> int:
+        """Those of the lowest image."""
+        return min(view.view.height for view in self.views)
 
 
 def reduced(view: TrainingView, factor: int) -> TrainingView:
