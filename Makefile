@@ -37,7 +37,7 @@ lint: setup
 # Uses the Python at hand where there is no .venv: GPU machines often bring their own torch.
 test-gpu:
 	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -m gpu -rs -v
-	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -rs -v tests/test_on_gpu.py
+	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -rs -v tests/test_on_gpu.py tests/test_on_gpu_tiles.py
 
 test-slurm: setup
 	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/test_slurm.py

@@ -198,6 +198,14 @@ def test_colours_in_time_are_summed_and_turned_and_learn_alike(degree, terms):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
 
 
+def stretch(model):
+    """Makes Gaussians of what start as spheres, whose rotations would learn from rounding alone."""
+    generator = torch.Generator().manual_seed(0)
+    for part in model.parts:
+        scales = part.params["scales"].data
+        scales += 0.5 * torch.randn(scales.shape, generator=generator)
+
+
 @pytest.mark.parametrize("body", [False, True])
 def test_a_training_by_kernels_is_that_by_torch(body, monkeypatch):
     """Four iterations of background, cars and a cube map, with every term of the loss, and the own car's body."""
@@ -207,6 +215,7 @@ def test_a_training_by_kernels_is_that_by_torch(body, monkeypatch):
         settings = settings_of(**ALL_TERMS, mcmc=McmcSettings(noise_lr=0.0), refine_start=1.0)
         model = untrained_street(settings)
         model.sky = CubemapSky(6, torch.full((3,), 0.5), 1e-2)
+        stretch(model)
         views = guided_views(DEVICE)
         if body:
             own_car = torch.zeros_like(views[0].sky)
@@ -234,10 +243,13 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.on_gpu import colours, colours_in_time, cube, exploration, placing, trial
+from drivesplat.on_gpu import chunks, colours, colours_in_time, cube, exploration, placing, tiles, trial
 
-FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64"}
+FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
+              "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "there": "*i1",
+              "radii": "*i32", "counts": "*i32", "nearest": "*i64", "ends": "*i32", "keys": "*i16"}
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
+NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "room", "each"), "i32")
 NUMBERS |= dict.fromkeys(("c1", "c2", "strength"), "fp32")
 SIZES = {"TAPS": 11, "ROWS": colours.ROWS, "COLUMNS": colours.COLUMNS}
 
@@ -246,11 +258,20 @@ def compiled(kernel, **constants):
              for name in kernel.arg_names}
     if kernel in (cube._blend, cube._gradients):
         kinds["pixels"] = "i32"
+    if kernel in (chunks._take_apart, chunks._composite, chunks._pull_apart):
+        kinds["values"] = FLOATS
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
     source = ASTSource(fn=kernel, signature=kinds, constexprs=places)
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
 
 compiled(trial._count)
+compiled(tiles._count, BLOCK=tiles.BLOCK)
+compiled(tiles._list, BLOCK=tiles.BLOCK)
+compiled(chunks._count, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
+for kernel in (chunks._take_apart, chunks._add_up):
+    compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
+for kernel in (chunks._composite, chunks._pull_apart):
+    compiled(kernel, CHANNELS=3, WIDTH=4)
 compiled(exploration._move, BLOCK=exploration.BLOCK)
 compiled(cube._blend, BLOCK=cube.BLOCK)
 compiled(cube._gradients, BLOCK=cube.BLOCK)

@@ -1,6 +1,7 @@
 """gsplat behind the door: the calls that its `rasterization` makes of one process, without its questions.
 
-Camera positions are told by the poses' transposes, where `rasterization` inverts them and waits for the device.
+Camera positions are told by the poses' transposes, where `rasterization` inverts them and waits for the device. Where
+Triton compiles, long lists of Gaussians are cut, so that no tile waits for the fullest one.
 """
 
 import math
@@ -10,6 +11,7 @@ import torch
 from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
 
+from drivesplat import on_gpu
 from drivesplat.rasterize.rendering import Rendering, assembled
 
 TILE = 16
@@ -38,14 +40,27 @@ def rasterize_gsplat(
         values = _seen_colors(means, values, viewmats, radii, sh_degree)
     if with_depth:
         values = torch.cat([values, depths[..., None]], dim=-1)
-    across, down = math.ceil(width / TILE), math.ceil(height / TILE)
-    _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, across, down, n_images=cameras)
-    offsets = isect_offset_encode(isect_ids, cameras, across, down).reshape(cameras, down, across)
-    composited, alpha = rasterize_to_pixels(
-        means2d, conics, values, shown, width, height, TILE, offsets, flatten_ids, absgrad=absgrad
-    )
+    seen = means2d, conics, values, shown
+    if absgrad or not on_gpu.for_tensor(means):
+        composited, alpha = _by_whole_lists(seen, radii, depths, width, height, absgrad)
+    else:
+        from drivesplat.on_gpu import chunks, tiles
+
+        gaussians = tiles.Projected(*seen)
+        lists = tiles.lists_of(gaussians, radii, depths, width, height)
+        composited, alpha = chunks.composited(gaussians, lists, width, height, rasterize_to_pixels)
     projected: dict[str, Any] = {"means2d": means2d, "radii": radii, "depths": depths, "conics": conics}
-    return assembled(composited, alpha, with_depth, **projected, opacities=shown, isect_ids=isect_ids)
+    return assembled(composited, alpha, with_depth, **projected, opacities=shown)
+
+
+def _by_whole_lists(
+    seen: tuple[Tensor, Tensor, Tensor, Tensor], radii: Tensor, depths: Tensor, width: int, height: int, absgrad: bool
+) -> tuple[Tensor, Tensor]:
+    """Gaussians `seen` by c cameras, (means2d, conics, values, opacities), composited as gsplat does."""
+    cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)
+    _, isect_ids, flatten_ids = isect_tiles(seen[0], radii, depths, TILE, across, down, n_images=cameras)
+    offsets = isect_offset_encode(isect_ids, cameras, across, down).reshape(cameras, down, across)
+    return rasterize_to_pixels(*seen, width, height, TILE, offsets, flatten_ids, absgrad=absgrad)
 
 
 def _seen_colors(means: Tensor, coefficients: Tensor, viewmats: Tensor, radii: Tensor, degree: int) -> Tensor:

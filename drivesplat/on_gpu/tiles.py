@@ -1,0 +1,177 @@
+"""Which Gaussians the tiles of images show, front to back.
+
+A Gaussian is listed where its ellipse, out to where it covers a pixel by less than 1/255, reaches the centres of a
+tile's pixels: on a drive half of the tiles that hold its bounding box do not show it. No step waits for the device.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+
+BLOCK = 128
+"""Gaussians a program."""
+TILE = tl.constexpr(16)
+"""Edge of a tile in pixels."""
+FAINTEST = tl.constexpr(1.0 / 255.0)
+"""What covers a pixel by less is not rasterized, as in 3D Gaussian Splatting."""
+SLACK = tl.constexpr(0.01)
+"""Pixels by which an ellipse is taken to be wider and taller, against rounding."""
+
+
+class Projected(NamedTuple):
+    """Gaussians as c cameras see them, n each. `conics` are the upper triangles of inverse covariances."""
+
+    means: Float[Tensor, "c n 2"]
+    conics: Float[Tensor, "c n 3"]
+    values: Float[Tensor, "c n v"]
+    opacities: Float[Tensor, "c n"]
+
+
+class Lists(NamedTuple):
+    """What tiles show, by camera, row and column: of those, front to back, `ids[order[offsets[t] : offsets[t + 1]]]`
+    are the Gaussians of tile t, counted through all cameras. What `order` holds beyond the last offset means nothing.
+    `tiles` is the number of cameras, and of rows and columns of tiles."""
+
+    ids: Int[Tensor, " p"]
+    order: Int[Tensor, " p"]
+    offsets: Int[Tensor, " t"]
+    tiles: tuple[int, int, int]
+
+
+@torch.no_grad()
+def lists_of(
+    gaussians: Projected,
+    radii: Int[Tensor, "c n 2"],
+    depths: Float[Tensor, "c n"],
+    width: int,
+    height: int,
+    room: int | None = None,
+) -> Lists:
+    """The lists of all tiles of c images. `radii` are 0 where a camera does not see a Gaussian, `depths` metres.
+
+    With `room` there are at most so many entries, the farthest left out, and nothing waits for the device; without it
+    there are as many as needed, which the device has to be asked for.
+    """
+    means, conics, opacities = (
+        tensor.contiguous() for tensor in (gaussians.means, gaussians.conics, gaussians.opacities)
+    )
+    cameras, each = opacities.shape
+    down, across = triton.cdiv(height, TILE.value), triton.cdiv(width, TILE.value)
+    tiles, count = cameras * down * across, cameras * each
+    counts, nearness = radii.new_empty(count), means.new_empty(count)
+    seen, size = (means, conics, opacities, radii.contiguous()), (width, height, across, down * across)
+    blocks = (triton.cdiv(count, BLOCK),)
+    if count:
+        _count[blocks](*seen, depths.contiguous(), counts, nearness, count, each, *size[:2], BLOCK)
+    nearest = torch.argsort(nearness)
+    ends = torch.cumsum(counts[nearest], dim=0, dtype=torch.int32)
+    if room is None:
+        room = int(ends[-1]) if count else 0
+    kind = torch.int16 if tiles < torch.iinfo(torch.int16).max else torch.int32
+    keys, ids = torch.full((room,), tiles, dtype=kind, device=means.device), radii.new_empty(room)
+    if count:
+        _list[blocks](*seen, counts, nearest, ends, keys, ids, room, count, each, *size, BLOCK)
+    keys, order = torch.sort(keys, stable=True)
+    each_tile = torch.arange(tiles + 1, dtype=kind, device=means.device)
+    offsets = torch.searchsorted(keys, each_tile, out_int32=True)
+    return Lists(ids, order, offsets, (cameras, down, across))
+
+
+@triton.jit
+@no_type_check
+def _ellipse(means, conics, opacities, radii, i, there):
+    """Centres and conics of Gaussians, how far out they reach, in the conic's measure, and which can be seen."""
+    there &= (tl.load(radii + 2 * i, mask=there, other=0) > 0) & (tl.load(radii + 2 * i + 1, mask=there, other=0) > 0)
+    x, y = tl.load(means + 2 * i, mask=there, other=0.0), tl.load(means + 2 * i + 1, mask=there, other=0.0)
+    a = tl.load(conics + 3 * i, mask=there, other=1.0)
+    b = tl.load(conics + 3 * i + 1, mask=there, other=0.0)
+    c = tl.load(conics + 3 * i + 2, mask=there, other=1.0)
+    opacity = tl.load(opacities + i, mask=there, other=0.0)
+    there &= opacity > FAINTEST
+    reach = 2.0 * tl.log(tl.where(there, opacity, 1.0) / FAINTEST)
+    return x, y, a, b, c, reach, there
+
+
+@triton.jit
+@no_type_check
+def _first(edge):
+    """The first pixel whose centre is not before a coordinate."""
+    return tl.ceil(edge - 0.5).to(tl.int32)
+
+
+@triton.jit
+@no_type_check
+def _last(edge):
+    """The last pixel whose centre is not behind a coordinate."""
+    return tl.floor(edge - 0.5).to(tl.int32)
+
+
+@triton.jit
+@no_type_check
+def _rows(y, a, b, c, reach, there, height):
+    """The first row of tiles that shows Gaussians, and how many do."""
+    tall = tl.sqrt(reach * a / (a * c - b * b)) + SLACK
+    top, bottom = tl.maximum(_first(y - tall), 0), tl.minimum(_last(y + tall), height - 1)
+    return top // TILE, tl.where(there & (top <= bottom), bottom // TILE - top // TILE + 1, 0)
+
+
+@triton.jit
+@no_type_check
+def _columns(row, x, y, a, b, c, reach, there, width):
+    """The first tile of a row that shows Gaussians, and how many do: between the outermost points of the ellipse among
+    the rows of pixels of these tiles."""
+    det = a * c - b * b
+    tall = tl.sqrt(reach * a / det)
+    top = tl.maximum((row * TILE).to(tl.float32) + 0.5 - y - SLACK, -tall)
+    bottom = tl.minimum((row * TILE + TILE - 1).to(tl.float32) + 0.5 - y + SLACK, tall)
+    tilt = b * tl.sqrt(reach / (c * det))  # of its outermost points, by height
+    at_right, at_left = tl.maximum(tl.minimum(-tilt, bottom), top), tl.maximum(tl.minimum(tilt, bottom), top)
+    right = (tl.sqrt(tl.maximum(a * reach - det * at_right * at_right, 0.0)) - b * at_right) / a + SLACK
+    left = (-tl.sqrt(tl.maximum(a * reach - det * at_left * at_left, 0.0)) - b * at_left) / a - SLACK
+    start, end = tl.maximum(_first(x + left), 0), tl.minimum(_last(x + right), width - 1)
+    shown = there & (top <= bottom) & (start <= end)
+    return start // TILE, tl.where(shown, end // TILE - start // TILE + 1, 0)
+
+
+@triton.jit(do_not_specialize=["count", "each", "width", "height"])
+@no_type_check
+def _count(means, conics, opacities, radii, depths, counts, nearness, count, each, width, height, BLOCK: tl.constexpr):
+    """How many tiles show each Gaussian, and by what it is sorted: its depth, if any does."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    x, y, a, b, c, reach, there = _ellipse(means, conics, opacities, radii, i, i < count)
+    first, rows = _rows(y, a, b, c, reach, there, height)
+    found = tl.zeros((BLOCK,), tl.int32)
+    for step in range(tl.max(rows, 0)):
+        found += _columns(first + step, x, y, a, b, c, reach, step < rows, width)[1]
+    tl.store(counts + i, found, mask=i < count)
+    depth = tl.load(depths + i, mask=found > 0, other=float("inf"))
+    tl.store(nearness + i, depth, mask=i < count)
+
+
+@triton.jit(do_not_specialize=["room", "count", "each", "width", "height", "across", "per_camera"])
+@no_type_check
+def _list(
+    means, conics, opacities, radii, counts, nearest, ends, keys, ids, room, count, each, width, height, across,
+    per_camera, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes each Gaussian, from the nearest to the farthest, down for every tile that shows it."""
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    i = tl.load(nearest + place, mask=place < count, other=0)
+    there = place < count
+    there &= tl.load(counts + i, mask=there, other=0) > 0
+    free = tl.load(ends + place, mask=there, other=0) - tl.load(counts + i, mask=there, other=0)
+    x, y, a, b, c, reach, there = _ellipse(means, conics, opacities, radii, i, there)
+    first, rows = _rows(y, a, b, c, reach, there, height)
+    camera = (i // each).to(tl.int32) * per_camera
+    for step in range(tl.max(rows, 0)):
+        start, columns = _columns(first + step, x, y, a, b, c, reach, step < rows, width)
+        tile = camera + (first + step) * across + start
+        for column in range(tl.max(columns, 0)):
+            fits = (column < columns) & (free + column < room)
+            tl.store(keys + free + column, tile + column, mask=fits)
+            tl.store(ids + free + column, i.to(tl.int32), mask=fits)
+        free += columns

@@ -1,0 +1,176 @@
+"""Which Gaussians tiles show, and long lists of them cut into chunks, held to what torch says of every pixel.
+
+Where there is no GPU Triton's kernels run in its interpreter, see conftest.py.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("triton", reason="Triton is not there for this system")
+from drivesplat.on_gpu import chunks
+from drivesplat.on_gpu.tiles import Lists, Projected, lists_of
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+TILE = 16
+
+
+def ellipses(cameras: int, count: int, width: int, height: int, seed: int = 0) -> tuple[Projected, torch.Tensor]:
+    """Gaussians of all sizes and shapes in and around images, and their depths."""
+    rng = np.random.default_rng(seed)
+    axes = np.exp(rng.uniform(-1.0, 2.5, (cameras, count, 2)))
+    turns = Rotation.from_euler("z", rng.uniform(0, np.pi, (cameras * count, 1))).as_matrix()[:, :2, :2]
+    turns = turns.reshape(cameras, count, 2, 2)
+    conics = turns @ ((1 / axes**2)[..., None] * turns.swapaxes(-1, -2))
+    shown = Projected(
+        rng.uniform(-20, [width + 20, height + 20], (cameras, count, 2)),
+        conics[..., [0, 0, 1], [0, 1, 1]],
+        rng.uniform(0, 1, (cameras, count, 3)),
+        rng.uniform(0.0, 1.0, (cameras, count)) ** 3,
+    )
+    on_device = Projected(*(torch.from_numpy(values).float().to(DEVICE) for values in shown))
+    return on_device, torch.from_numpy(rng.uniform(1, 9, (cameras, count))).float().to(DEVICE)
+
+
+def covered(gaussians: Projected, width: int, height: int) -> np.ndarray:
+    """Which tiles (c, n, rows, columns) have a pixel that a Gaussian covers by 1/255 or more."""
+    x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+    means, conics, _, opacities = (values.cpu().double().numpy() for values in gaussians)
+    over_x, over_y = x - means[..., :1], y - means[..., 1:]
+    a, b, c = (conics[..., k, None, None] for k in range(3))
+    falls = 0.5 * (a * over_x[..., None, :] ** 2 + c * over_y[..., None] ** 2)
+    falls = falls + b * over_y[..., None] * over_x[..., None, :]
+    seen = opacities[..., None, None] * np.exp(-falls) >= 1 / 255
+    full = np.zeros((*seen.shape[:2], -(-height // TILE) * TILE, -(-width // TILE) * TILE), dtype=bool)
+    full[..., :height, :width] = seen
+    return full.reshape(*seen.shape[:2], full.shape[2] // TILE, TILE, full.shape[3] // TILE, TILE).any(axis=(3, 5))
+
+
+def by_tile(lists: Lists) -> list[list[int]]:
+    ends = lists.offsets.tolist()
+    return [lists.ids[lists.order[start:end]].tolist() for start, end in pairwise(ends)]
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_tiles_list_what_they_show_from_near_to_far_and_little_else(cameras):
+    width, height, count = 75, 40, 300
+    gaussians, depths = ellipses(cameras, count, width, height)
+    radii = torch.full((cameras, count, 2), 9, dtype=torch.int32, device=DEVICE)
+    radii[0, ::7, 0], radii[0, 1::7, 1] = 0, 0
+    lists = lists_of(gaussians, radii, depths, width, height)
+    shown = covered(gaussians, width, height) & (radii > 0).all(dim=-1).cpu().numpy()[..., None, None]
+    assert lists.tiles == (cameras, *shown.shape[2:])
+    wanted = [
+        {camera * count + int(i) for i in np.flatnonzero(shown[camera, :, row, column])}
+        for camera, row, column in np.ndindex(*lists.tiles)
+    ]
+    for listed, missed in zip(by_tile(lists), wanted, strict=True):
+        assert missed <= set(listed) and len(set(listed)) == len(listed)
+        near = depths.flatten()[listed].tolist()
+        assert near == sorted(near)
+        assert all((radii.reshape(-1, 2)[i] > 0).all() for i in listed)
+    assert 100 * cameras < shown.sum() <= len(lists.ids) <= 1.05 * shown.sum()
+
+
+def test_without_room_for_all_the_farthest_are_left_out():
+    gaussians, depths = ellipses(1, 200, 75, 40)
+    radii = torch.full((1, 200, 2), 9, dtype=torch.int32, device=DEVICE)
+    every = lists_of(gaussians, radii, depths, 75, 40)
+    some, ample = (lists_of(gaussians, radii, depths, 75, 40, room) for room in (150, 10_000))
+    assert by_tile(ample) == by_tile(every)
+    kept = [i for listed in by_tile(some) for i in listed]
+    assert len(kept) == 150
+    assert all(listed == whole[: len(listed)] for listed, whole in zip(by_tile(some), by_tile(every), strict=True))
+    left_out = {i for listed in by_tile(every) for i in listed} - set(kept)
+    assert left_out and depths[0, list(left_out)].min() >= depths[0, kept].max()
+
+
+def test_nothing_is_listed_of_what_is_not_there():
+    gaussians, depths = ellipses(1, 9, 20, 10)
+    unseen = lists_of(gaussians, torch.zeros(1, 9, 2, dtype=torch.int32, device=DEVICE), depths, 20, 10)
+    empty = Projected(*(values[:, :0] for values in gaussians))
+    none = lists_of(empty, torch.zeros(1, 0, 2, dtype=torch.int32, device=DEVICE), depths[:, :0], 20, 10)
+    for lists in (unseen, none):
+        assert len(lists.ids) == 0 and lists.offsets.tolist() == [0, 0, 0]
+
+
+def rasterized(means, conics, values, opacities, width, height, tile, offsets, ids, masks=None, packed=False):
+    """What gsplat's `rasterize_to_pixels` does, in torch, list by list; nothing ends early."""
+    cameras, down, across = offsets.shape
+    ends = [*offsets.flatten().tolist()[1:], len(ids)]
+    means, conics, opacities = means.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()
+    values = values.flatten(0, 1) if values.dim() == 3 else values
+    image = values.new_zeros(cameras, down * tile, across * tile, values.shape[1] + 1)
+    for at, (start, end) in enumerate(zip(offsets.flatten().tolist(), ends, strict=True)):
+        if masks is not None and not masks.flatten()[at]:
+            image[at // (down * across)] = torch.nan  # what is not rasterized is not written
+            continue
+        camera, row, column = at // (down * across), at % (down * across) // across, at % across
+        x, y = (torch.arange(tile, device=means.device) + 0.5 + tile * first for first in (column, row))
+        passes, rows = torch.ones(tile, tile, device=means.device), slice(row * tile, (row + 1) * tile)
+        total = torch.zeros(tile, tile, values.shape[1] + 1, device=means.device)
+        for i in ids[start:end].tolist():
+            over_x, over_y = x[None, :] - means[i, 0], y[:, None] - means[i, 1]
+            a, b, c = conics[i]
+            falls = 0.5 * (a * over_x**2 + c * over_y**2) + b * over_x * over_y
+            alpha = opacities[i] * torch.exp(-falls)
+            total = total + (passes * alpha)[..., None] * torch.cat([values[i], values.new_ones(1)])
+            passes = passes * (1.0 - alpha)
+        image[camera, rows, column * tile : (column + 1) * tile] += total
+    image = image[:, :height, :width]
+    return image[..., :-1], image[..., -1:]
+
+
+def shuffled(ids: torch.Tensor, offsets: torch.Tensor) -> Lists:
+    """Lists whose entries were not written down in their order, and with entries that are nobody's."""
+    order = torch.cat([torch.randperm(len(ids)), torch.full((9,), 10**6)])
+    written = torch.empty_like(ids)
+    written[order[: len(ids)]] = ids
+    room = torch.cat([written, torch.full((9,), 10**6)])
+    ends = torch.cat([offsets.flatten(), torch.tensor([len(ids)])])
+    made = (room.to(torch.int32), order, ends.to(torch.int32))
+    return Lists(*(values.to(DEVICE) for values in made), tuple(offsets.shape))
+
+
+@pytest.mark.parametrize(("cameras", "channels"), [(1, 3), (2, 4), (1, 1)])
+def test_chunks_show_what_whole_lists_do(cameras, channels, monkeypatch):
+    """Tiles with nothing in them, with less than a chunk, with a chunk to the brim, and with several; images that fill
+    no tile to its edges."""
+    monkeypatch.setattr(chunks, "LENGTH", 4)
+    torch.manual_seed(0)
+    width, height, down, across, n = 39, 20, 2, 3, 30
+    lengths = [0, 3, 4, 9, 1, 0] if cameras == 1 else [0, 3, 4, 9, 1, 0, 0, 8, 2, 0, 5, 13]
+    offsets = torch.tensor([sum(lengths[:i]) for i in range(len(lengths))], dtype=torch.int32).reshape(-1, down, across)
+    ids = torch.cat([torch.randperm(n)[:length] + n * (i // (down * across)) for i, length in enumerate(lengths)])
+    size = torch.tensor([width, height])
+    given = [
+        torch.rand(cameras, n, 2) * size,
+        torch.tensor([0.02, 0.005, 0.03]) * (0.5 + torch.rand(cameras, n, 1)),
+        torch.rand(cameras, n, channels),
+        0.1 + 0.6 * torch.rand(cameras, n),
+    ]
+    given = [values.to(DEVICE).requires_grad_() for values in given]
+    expected = rasterized(*given, width, height, TILE, offsets, ids)
+    found = chunks.composited(Projected(*given), shuffled(ids, offsets), width, height, rasterized)
+    for mine, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+    assert float(found[1].detach().max()) > 0.5 and float(found[1].detach()[:, :16, :16].max()) == 0.0
+    weights = [torch.randn_like(image) for image in expected]
+    pulls = [
+        torch.autograd.grad(sum((w * image).sum() for w, image in zip(weights, images, strict=True)), given)
+        for images in (expected, found)
+    ]
+    for theirs, mine in zip(*pulls, strict=True):
+        assert theirs.any()
+        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_where_nothing_is_chunks_show_nothing():
+    nothing = torch.zeros(0, dtype=torch.int32, device=DEVICE)
+    lists = Lists(nothing, nothing.long(), torch.zeros(3, dtype=torch.int32, device=DEVICE), (1, 1, 2))
+    seen = Projected(*(torch.zeros(1, 5, *tail, device=DEVICE) for tail in ((2,), (3,), (3,), ())))
+    image, alpha = chunks.composited(seen, lists, 20, 10, rasterized)
+    assert image.shape == (1, 10, 20, 3) and alpha.shape == (1, 10, 20, 1) and not image.any() and not alpha.any()
