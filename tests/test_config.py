@@ -360,7 +360,7 @@ def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stag
         (at("sky", "none"), "train"),
         (at("train.iterations", 9), "train"),
         (at("train.mcmc.noise_lr", 9), "train"),
-        (at("train.gaussians.sh_degree", 1), "train"),
+        (at("train.gaussians.sh_degree", 2), "train"),
         (at("train.exposure.kind", "affine"), "train"),
         (at("methods.vanilla.overrides", {"train": {"iterations": 9}}), "train"),
         (at("methods.another.overrides", {"train": {"iterations": 9}}), ""),

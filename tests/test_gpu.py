@@ -35,11 +35,15 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
+from drivesplat.on_gpu import rooms
 from drivesplat.rasterize import gpu, rasterize
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
+from drivesplat.training import replays
+from drivesplat.training import trainer as trainer_module
 from drivesplat.training.strategies import relocation
+from drivesplat.training.trainer import Trainer
 
 pytestmark = [
     pytest.mark.gpu,
@@ -338,3 +342,81 @@ def test_too_little_free_memory_is_refused_naming_both_numbers():
 
 def test_a_card_that_suffices_is_taken():
     assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU
+
+
+def replayed(record: bool, monkeypatch, iterations: int = 30, **settings) -> tuple[Trainer, list[float]]:
+    """A training of background and cars by every term, recorded as soon as an image comes again, or not at all."""
+    monkeypatch.setattr(replays, "SETTLED", 0)
+    chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
+    model = untrained_street(chosen)
+    for part in model.parts:  # no spheres, whose rotations learn from rounding
+        part.params["scales"].data += 0.5 * torch.randn(
+            part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
+        )
+    chosen = chosen.model_copy(update={"cuda_graphs": record, "iterations": iterations})
+    trainer, losses = Trainer.begin(model.to(GPU), guided_views(GPU), chosen, 0, GPU), []
+    for _ in range(iterations):
+        terms, picture, _ = trainer.fit_one(shown=False)
+        trainer.densify(picture)
+        losses.append(float(torch.stack(list(terms.values())).sum()))
+    trainer.guard.check("nowhere")
+    return trainer, losses
+
+
+def test_a_training_that_is_replayed_learns_what_it_does_otherwise(monkeypatch, caplog):
+    recorded, mine = replayed(True, monkeypatch)
+    plain, theirs = replayed(False, monkeypatch)
+    assert not caplog.records, "nothing was refused"
+    assert len(recorded.replays._recorded) == len(recorded.images.views) and not plain.replays._recorded
+    np.testing.assert_allclose(mine, theirs, rtol=0.02)
+    assert mine[-1] < 0.8 * mine[0]
+    before = untrained_street(recorded.settings).state_dict()
+    for name, value in plain.model.state_dict().items():
+        moved = (value.cpu() - before[name]).abs().float()
+        if moved.any() and not name.endswith(("scales", "quats")):
+            apart = (recorded.model.state_dict()[name] - value).abs().cpu()
+            assert float(apart.quantile(0.5)) <= 0.1 * float(moved.max()), name
+    steps = [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in recorded.optimizers.all()]
+    assert steps == [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in plain.optimizers.all()]
+
+
+def test_recordings_outlive_relocation_and_not_growth(monkeypatch):
+    """Gaussians that MCMC moves stay where they lie; more of them do not."""
+    grows = {"mcmc": McmcSettings(noise_lr=0.0, refine_every=12), "refine_start": 0.0, "refine_stop": 1.0}
+    settings = {"iterations": 60, **grows}
+    trainer, losses = replayed(True, monkeypatch, cap_max=100, **settings)
+    assert len(trainer.model.parts[0]) <= 100 and trainer.replays._recorded
+    assert losses[-1] < losses[0]
+    known = set(map(id, trainer.replays._recorded.values()))
+    trainer.densifiers[0]._strategy.cap_max = 10_000
+    for _ in range(13):
+        terms, picture, _ = trainer.fit_one(shown=False)
+        trainer.densify(picture)
+    assert not known & set(map(id, trainer.replays._recorded.values()))
+    assert all(bool(torch.isfinite(value)) for value in terms.values())
+
+
+def test_lists_that_outgrow_their_room_are_noticed(monkeypatch):
+    monkeypatch.setattr(rooms, "LEAST", 0)
+    monkeypatch.setattr(rooms, "MARGIN", 1.0)
+    trainer, _ = replayed(True, monkeypatch, iterations=8)
+    trainer.model.parts[0].params["scales"].data += 1.0
+    for _ in range(4):
+        trainer.densify(trainer.fit_one(shown=False)[1])
+    assert int(trainer.replays.missing) > 0
+    trainer.replays.check()
+    assert not trainer.replays._recorded and int(trainer.replays.missing) == 0
+
+
+def test_what_cannot_be_recorded_is_done_all_the_same(monkeypatch, caplog):
+    """As where a term of the loss asks the device something."""
+
+    def asks(*told, terms=trainer_module.loss_terms):
+        found = terms(*told)
+        assert float(found["l1"]) >= 0.0
+        return found
+
+    monkeypatch.setattr(trainer_module, "loss_terms", asks)
+    trainer, losses = replayed(True, monkeypatch, iterations=12)
+    assert [record.message.startswith("iterations cannot be recorded") for record in caplog.records] == [True]
+    assert not trainer.replays.wanted and losses[-1] < losses[0] and all(map(math.isfinite, losses))

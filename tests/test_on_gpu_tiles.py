@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
-from drivesplat.on_gpu import chunks
+from drivesplat.on_gpu import chunks, rooms
 from drivesplat.on_gpu.tiles import Lists, Projected, lists_of
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -75,11 +75,17 @@ def test_tiles_list_what_they_show_from_near_to_far_and_little_else(cameras):
     assert 100 * cameras < shown.sum() <= len(lists.ids) <= 1.05 * shown.sum()
 
 
-def test_without_room_for_all_the_farthest_are_left_out():
+def test_without_room_for_all_the_farthest_are_left_out(monkeypatch):
     gaussians, depths = ellipses(1, 200, 75, 40)
     radii = torch.full((1, 200, 2), 9, dtype=torch.int32, device=DEVICE)
-    every = lists_of(gaussians, radii, depths, 75, 40)
-    some, ample = (lists_of(gaussians, radii, depths, 75, 40, room) for room in (150, 10_000))
+    with rooms.counted() as needs:
+        every = lists_of(gaussians, radii, depths, 75, 40)
+    assert needs == [len(every.ids)]
+    monkeypatch.setattr(rooms, "LEAST", 0)
+    monkeypatch.setattr(rooms, "MARGIN", 1.0)
+    with rooms.given([150, 10_000]) as told:
+        some, ample = (lists_of(gaussians, radii, depths, 75, 40) for _ in range(2))
+    assert [(int(needed), room) for needed, room in told] == [(len(every.ids), 150), (len(every.ids), 10_000)]
     assert by_tile(ample) == by_tile(every)
     kept = [i for listed in by_tile(some) for i in listed]
     assert len(kept) == 150

@@ -174,8 +174,11 @@ class Actors(Part):
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
-        """1 where a Gaussian is an actor's, else 0; made anew where densification has changed whose they are."""
+        """1 where a Gaussian is an actor's, else 0; made anew where densification has changed whose they are, and
+        wherever an iteration is recorded, to be replayed when it has."""
         owner, (known, version, matrix) = self.params["owner"], self._known_owners
+        if owner.is_cuda and torch.cuda.is_current_stream_capturing():
+            return one_hot(owner, len(self.timeline.tracks)).float()
         if matrix is None or known is not owner or version != owner._version or matrix.device != owner.device:
             matrix = one_hot(owner, len(self.timeline.tracks)).float()
             self._known_owners = owner, owner._version, matrix

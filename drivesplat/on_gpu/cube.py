@@ -11,6 +11,8 @@ from torch.autograd.function import once_differentiable
 
 BLOCK = 256
 """Pixels a program."""
+RUN = tl.constexpr(8)
+"""Neighbouring pixels that most often look at the same texels."""
 
 
 class Cube(NamedTuple):
@@ -122,6 +124,27 @@ def _blend(splats, alpha, texels, index, K, camera_to_world, image, pixels, widt
         tl.store(image + 3 * pixel + channel, before + left * sky, mask=inside)
 
 
+@triton.jit
+@no_type_check
+def _alike(texel, BLOCK: tl.constexpr):
+    """Of which runs of pixels all look at the same texel."""
+    runs = tl.reshape(texel, (BLOCK // RUN, RUN))
+    return tl.max(runs, 1) == tl.min(runs, 1)
+
+
+@triton.jit
+@no_type_check
+def _add(place, value, seen, alike, BLOCK: tl.constexpr):
+    """Adds values up where their texels' gradients are, those of a run that is alike together: hardly any place has to
+    take more than a few."""
+    value = tl.where(seen, value, 0.0)
+    together = tl.sum(tl.reshape(value, (BLOCK // RUN, RUN)), 1)
+    first = tl.min(tl.reshape(place.to(tl.int64), (BLOCK // RUN, RUN)), 1).to(place.dtype)
+    tl.atomic_add(first, together, mask=alike & (together != 0.0), sem="relaxed")
+    alone = tl.reshape(tl.broadcast_to(alike[:, None], (BLOCK // RUN, RUN)), (BLOCK,)) == 0
+    tl.atomic_add(place, value, mask=alone & (value != 0.0), sem="relaxed")
+
+
 @triton.jit(do_not_specialize=["pixels", "width"])
 @no_type_check
 def _gradients(
@@ -134,13 +157,14 @@ def _gradients(
     left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
     hidden = tl.zeros((BLOCK,), tl.float32)
     seen = inside & (left != 0.0)
+    alike = _alike(a, BLOCK) & _alike(b, BLOCK) & _alike(c, BLOCK) & _alike(d, BLOCK)
     for channel in tl.static_range(3):
         sky = _color(texels, channel, a, b, c, d, part_u, part_v, inside)
         by_pixel = tl.load(v_image + 3 * pixel + channel, mask=inside, other=0.0)
         hidden += by_pixel * sky
         by_logit = by_pixel * left * sky * (1.0 - sky)
-        tl.atomic_add(v_texels + 3 * a + channel, by_logit * (1.0 - part_u) * (1.0 - part_v), mask=seen)
-        tl.atomic_add(v_texels + 3 * b + channel, by_logit * part_u * (1.0 - part_v), mask=seen)
-        tl.atomic_add(v_texels + 3 * c + channel, by_logit * (1.0 - part_u) * part_v, mask=seen)
-        tl.atomic_add(v_texels + 3 * d + channel, by_logit * part_u * part_v, mask=seen)
+        _add(v_texels + 3 * a + channel, by_logit * (1.0 - part_u) * (1.0 - part_v), seen, alike, BLOCK)
+        _add(v_texels + 3 * b + channel, by_logit * part_u * (1.0 - part_v), seen, alike, BLOCK)
+        _add(v_texels + 3 * c + channel, by_logit * (1.0 - part_u) * part_v, seen, alike, BLOCK)
+        _add(v_texels + 3 * d + channel, by_logit * part_u * part_v, seen, alike, BLOCK)
     tl.store(v_alpha + pixel, -hidden, mask=inside)

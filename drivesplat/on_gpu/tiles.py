@@ -1,7 +1,7 @@
 """Which Gaussians the tiles of images show, front to back.
 
 A Gaussian is listed where its ellipse, out to where it covers a pixel by less than 1/255, reaches the centres of a
-tile's pixels: on a drive half of the tiles that hold its bounding box do not show it. No step waits for the device.
+tile's pixels, which is not wherever its bounding box does.
 """
 
 from typing import NamedTuple, no_type_check
@@ -11,6 +11,8 @@ import triton
 import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from drivesplat.on_gpu import rooms
 
 BLOCK = 128
 """Gaussians a program."""
@@ -49,13 +51,9 @@ def lists_of(
     depths: Float[Tensor, "c n"],
     width: int,
     height: int,
-    room: int | None = None,
 ) -> Lists:
-    """The lists of all tiles of c images. `radii` are 0 where a camera does not see a Gaussian, `depths` metres.
-
-    With `room` there are at most so many entries, the farthest left out, and nothing waits for the device; without it
-    there are as many as needed, which the device has to be asked for.
-    """
+    """The lists of all tiles of c images. `radii` are 0 where a camera does not see a Gaussian, `depths` metres. Where
+    `rooms` gives too little room, what is farthest is left out."""
     means, conics, opacities = (
         tensor.contiguous() for tensor in (gaussians.means, gaussians.conics, gaussians.opacities)
     )
@@ -69,8 +67,7 @@ def lists_of(
         _count[blocks](*seen, depths.contiguous(), counts, nearness, count, each, *size[:2], BLOCK)
     nearest = torch.argsort(nearness)
     ends = torch.cumsum(counts[nearest], dim=0, dtype=torch.int32)
-    if room is None:
-        room = int(ends[-1]) if count else 0
+    room = rooms.room_for(ends[-1]) if count else 0
     kind = torch.int16 if tiles < torch.iinfo(torch.int16).max else torch.int32
     keys, ids = torch.full((room,), tiles, dtype=kind, device=means.device), radii.new_empty(room)
     if count:

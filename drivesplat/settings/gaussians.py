@@ -8,8 +8,9 @@ from drivesplat.settings import Settings
 class GaussianSettings(Settings):
     """How Gaussians start and how fast they learn; learning rates are gsplat's example's."""
 
-    sh_degree: int = Field(3, ge=0, le=3)
-    """Highest degree of the spherical harmonics that hold the colours."""
+    sh_degree: int = Field(1, ge=0, le=3)
+    """Highest degree of the spherical harmonics that hold the colours. A drive sees things from few directions: on
+    scene 0061 degree 3 measures the same, held out, with twice the memory."""
     init_opacity: float = Field(0.1, gt=0, lt=1)
     """Opacity of seed Gaussians."""
     init_scale: float = Field(0.4, gt=0, le=10)

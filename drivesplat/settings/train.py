@@ -99,8 +99,8 @@ class TrainSettings(Settings):
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
     """Most Gaussians. Memory grows with it: about 1 GB per million, and as much again while rendering."""
     pixels_per_gaussian: float = Field(20.0, ge=0)
-    """At most one Gaussian per so many training pixels (0 = no such limit): one of SH degree 3 has 59 parameters, 20
-    pixels have 60 values. More Gaussians than that fit what no other view shows."""
+    """At most one Gaussian per so many training pixels (0 = no such limit). More Gaussians than that fit what no other
+    view shows."""
     gaussians: GaussianSettings = GaussianSettings()
     actors: ActorSettings = ActorSettings()
     mcmc: McmcSettings = McmcSettings()
@@ -153,6 +153,9 @@ class TrainSettings(Settings):
     """Iterations between resume checkpoints."""
     checkpoint_apart_s: float = Field(60.0, ge=0)
     """Seconds between them at least: they hold a short training up for longer than they can save."""
+    cuda_graphs: bool = True
+    """Whether iterations are recorded as CUDA graphs and replayed, on a GPU, with strategy: mcmc: otherwise Python asks
+    for each of their hundreds of kernels by itself. What is learned is the same within rounding."""
     log_every: int = Field(100, ge=1)
     """Iterations between TensorBoard scalars, and between checks that all losses and gradients are finite."""
     image_every: int = Field(5_000, ge=1)

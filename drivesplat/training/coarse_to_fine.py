@@ -33,7 +33,11 @@ class TrainingImages:
         if factor != self._factor:
             self._reduced = self.views if factor == 1 else [reduced(view, factor) for view in self.views]
             self._factor = factor
-        return self._reduced[order(len(self.views), step, self._seed)]
+        return self._reduced[self.number(step)]
+
+    def number(self, step: int) -> int:
+        """Which image it is, of all `views`."""
+        return order(len(self.views), step, self._seed)
 
     def factor(self, step: int) -> int:
         """By how much width and height are reduced at an iteration."""

@@ -5,7 +5,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from drivesplat import on_gpu
 from drivesplat.masks import UNLABELLED
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.colours import colour_difference
@@ -29,11 +31,9 @@ def loss_terms(
     }
     if colours.moving_l1 is not None:
         terms["dynamic"] = settings.dynamic_weight * colours.moving_l1
-    if settings.opacity_reg:
-        terms["opacity_reg"] = settings.opacity_reg * shown.opacities.mean()
-    if settings.scale_reg:
-        there = shown.opacities.detach() > 0.0
-        terms["scale_reg"] = settings.scale_reg * (shown.scales * there[:, None]).mean()
+    if settings.opacity_reg or settings.scale_reg:
+        opacity, scale = mean_opacity_and_scale(shown)
+        terms["opacity_reg"], terms["scale_reg"] = settings.opacity_reg * opacity, settings.scale_reg * scale
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
@@ -60,6 +60,16 @@ def _moving_terms(
         seen = alpha if view.own_car is None else alpha.masked_fill(view.own_car, 1.0)
         terms["entropy"] = settings.entropy_weight * entropy(seen)
     return terms
+
+
+def mean_opacity_and_scale(shown: Gaussians) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """The mean opacity, and the mean of all scales in metres, 0 for those of what is not there, of opacity 0."""
+    if on_gpu.for_tensor(shown.scales) and len(shown):
+        from drivesplat.on_gpu import regularisers
+
+        return regularisers.mean_opacity_and_scale(shown.opacities, shown.scales)
+    there = shown.opacities.detach() > 0.0
+    return shown.opacities.mean(), (shown.scales * there[:, None]).mean()
 
 
 def sky_cross_entropy(alpha: Float[Tensor, "h w"], sky: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:

@@ -8,6 +8,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -21,6 +22,8 @@ log = logging.getLogger(__name__)
 
 NEVER = 2**62
 LOGGED_EVERY_S = 10.0
+PICTURE_HEIGHT = 360
+"""Pixels that TensorBoard's images are about as high as, or lower."""
 
 
 class FiniteGuard:
@@ -30,13 +33,14 @@ class FiniteGuard:
         self._device = device
         self._first: dict[tuple[str, ...], Tensor] = {}
 
-    def watch(self, step: int, values: dict[str, Tensor]) -> None:
-        """Looks at the scalars `values`, by name, of an iteration."""
+    def watch(self, step: int | Tensor, values: dict[str, Tensor]) -> None:
+        """Looks at the scalars `values`, by name, of an iteration, which the device may know (a scalar, int64)."""
         names = tuple(values)
         if names not in self._first:
             self._first[names] = torch.full((len(names),), NEVER, device=self._device)
         finite = torch.isfinite(torch.stack([value.detach() for value in values.values()]))
-        self._first[names] = torch.minimum(self._first[names], torch.where(finite, NEVER, step))
+        first = self._first[names]
+        torch.minimum(first, torch.where(finite, NEVER, step), out=first)
 
     def check(self, checkpoint: str) -> None:
         """Raises TrainingError naming the earliest iteration and its terms where one was not finite."""
@@ -87,10 +91,11 @@ class Monitor:
         log.info("%.0f %%, %.1f it/s, %.0f s left", 100 * step / self._iterations, speed, left)
 
     def image(self, step: int, view: TrainingView, picture: Picture) -> None:
-        """Recorded and rendered side by side."""
-        pair = torch.cat([view.target(), picture.image.detach().clamp(0.0, 1.0)], dim=1)
+        """Recorded and rendered side by side, reduced to what is quickly encoded."""
+        pair = torch.cat([view.target(), picture.image.detach().clamp(0.0, 1.0)], dim=1).permute(2, 0, 1)
+        pair = F.avg_pool2d(pair, max(1, round(pair.shape[1] / PICTURE_HEIGHT)))
         with self._writing():
-            self._writer.add_image("recorded_and_rendered", pair.cpu(), step, dataformats="HWC")
+            self._writer.add_image("recorded_and_rendered", pair.cpu(), step)
 
     def close(self) -> None:
         self._bar.close()

@@ -1,10 +1,12 @@
 """Adam for every parameter of a model, one optimizer each, as gsplat's strategies need it."""
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
@@ -32,14 +34,15 @@ class ModelOptimizers:
         ]
 
     @torch.no_grad()
-    def step(self) -> None:
-        """A step of every optimizer with a gradient, which is dropped.
+    def step(self, rates: Mapping[str, Tensor] | None = None) -> None:
+        """A step of every optimizer with a gradient, which is dropped; at the `rates` that the device knows, by name,
+        where they are told.
 
         What torch.optim.Adam does with `fused`, whose kernel and state these are; but all steps are counted at once,
         and what learns at one rate goes together. A step of each by itself takes Python longer than the GPU.
         """
         alike, steps = defaultdict(list), []
-        for _, optimizer in self.all():
+        for name, optimizer in self.all():
             (group,) = optimizer.param_groups
             (parameter,) = group["params"]
             if parameter.grad is None:
@@ -49,7 +52,7 @@ class ModelOptimizers:
                 optimizer.step()  # which makes the state
             else:
                 steps.append(state["step"])
-                hyper = (group["lr"], *group["betas"], group["eps"])
+                hyper = (group["lr"] if rates is None else rates[name], *group["betas"], group["eps"])
                 alike[hyper].append((parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], state["step"]))
             parameter.grad = None
         if steps:
@@ -60,6 +63,28 @@ class ModelOptimizers:
                 parameters, gradients, means, squares, [], counts,
                 lr=lr, beta1=beta1, beta2=beta2, eps=eps, weight_decay=0.0, amsgrad=False, maximize=False,
             )  # fmt: skip
+
+
+class ToldDevice:
+    """What changes from one iteration to the next, where the device reads it: the step, and the learning rates."""
+
+    def __init__(self, device: torch.device):
+        self._device = device
+        self._step = torch.zeros((), dtype=torch.int64, device=device)
+        self._rates: dict[str, Tensor] = {}
+        self._told: dict[str, float] = {}
+
+    def told(self, step: int, optimizers: ModelOptimizers) -> tuple[Int[Tensor, ""], Mapping[str, Float[Tensor, ""]]]:
+        """The step, and the rates of `optimizers` by name, as the device knows them from now on; always in the same
+        places."""
+        self._step.fill_(step)
+        for name, optimizer in optimizers.all():
+            rate = optimizer.param_groups[0]["lr"]
+            if self._told.get(name) != rate:
+                place = self._rates.setdefault(name, torch.zeros((), device=self._device))
+                place.fill_(rate)
+                self._told[name] = rate
+        return self._step, self._rates
 
 
 def make_optimizers(model: SplatModel) -> ModelOptimizers:

@@ -166,20 +166,22 @@ def _iterate(run: Run, monitor: Monitor) -> None:
     empty = EmptySpace(*path, settings.floaters.radius, trainer.surroundings.free)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):
-            terms, picture, view = trainer.fit_one()
+            shown = (trainer.step + 1) % settings.image_every == 0
+            terms, picture, view = trainer.fit_one(shown)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
             if trainer.step % settings.log_every == 0:
                 run.check()
+                trainer.replays.check()
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
-            if trainer.step % settings.image_every == 0:
+            if shown and picture is not None:
                 monitor.image(trainer.step, view, picture)
             if run.save_due:
                 run.save()
     run.check()
 
 
-def _densify(run: Run, picture: Picture, empty: EmptySpace) -> None:
+def _densify(run: Run, picture: Picture | None, empty: EmptySpace) -> None:
     """Ends an iteration: each part grows and moves its Gaussians, and those that must not be there fade."""
     trainer, settings = run.trainer, run.trainer.settings
     if trainer.densifies():

@@ -1,8 +1,10 @@
 """A training between two iterations: one image seen, compared, learned from."""
 
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
@@ -11,9 +13,13 @@ from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.densify import Densifier
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
-from drivesplat.training.optimizers import ModelOptimizers, make_optimizers, schedule
+from drivesplat.training.optimizers import ModelOptimizers, ToldDevice, make_optimizers, schedule
+from drivesplat.training.replays import Replays, Terms, can_be_replayed
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
 from drivesplat.training.views import TrainingView
+
+HIGHEST_DEGREE = 3
+"""Of the spherical harmonics that there are kernels for."""
 
 
 @dataclass
@@ -30,6 +36,8 @@ class Trainer:
     guard: FiniteGuard
     surroundings: Surroundings
     clock: Clock
+    replays: Replays
+    on_device: ToldDevice
     step: int = 0
 
     @classmethod
@@ -47,13 +55,35 @@ class Trainer:
         densifiers = [Densifier(part, settings) for part in model.parts]
         optimizers, known = make_optimizers(model), surroundings.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock)
+        replays = Replays(can_be_replayed(settings, device) and clock is UNTIMED, device)
+        told = ToldDevice(device)
+        return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, told)
 
-    def fit_one(self) -> tuple[dict[str, torch.Tensor], Picture, TrainingView]:
-        """The first half of an iteration: render a view, compare, step. Returns its loss terms, picture and view."""
+    def fit_one(self, shown: bool = True) -> tuple[Terms, Picture | None, TrainingView]:
+        """The first half of an iteration: render a view, compare, step. Returns its loss terms, the picture and the
+        view; where the picture need not be `shown` the iteration may be replayed, and there is none."""
+        with self.clock.stage("data"):
+            number, view = self.images.number(self.step), self.images.at(self.step)
+        schedule(self.model, self.optimizers, self.step, self.settings)
+        if not self.replays.wanted:
+            terms, picture = self._learn(view, self.step)
+            return terms, picture, view
+        step, rates = self.on_device.told(self.step, self.optimizers)
+        if shown:
+            terms, picture = self._learn(view, step, rates)
+            return terms, picture, view
+
+        def once() -> Terms:
+            return self._learn(view, step, rates)[0]
+
+        return self.replays.iterate(self.step, number, self._shape(), once), None, view
+
+    def _learn(
+        self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None = None
+    ) -> tuple[Terms, Picture]:
+        """What an iteration does with a view; `step` and `rates` may be known to the device alone."""
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
-        with stage("data"):
-            view = self.images.at(self.step)
+        self.model.zero_grad()  # of an iteration that broke off
         with stage("render"):
             picture = self.model.render(
                 view.view,
@@ -71,27 +101,32 @@ class Trainer:
             loss.backward()
         with stage("checks"):
             losses = {f"loss {name}": value for name, value in terms.items()}
-            self.guard.watch(self.step, {**losses, **self._gradient_norms()})
+            self.guard.watch(step, {**losses, **self._gradient_norms()})
         with stage("optimizer"):
-            schedule(self.model, self.optimizers, self.step, self.settings)
-            self.optimizers.step()
-        return terms, picture, view
+            self.optimizers.step(rates)
+        return terms, picture
+
+    def _shape(self) -> Hashable:
+        """All that a recorded iteration holds on to beside its view: how much is rendered, and where it lies."""
+        places = [(parameter.data_ptr(), parameter.numel()) for parameter in self.model.parameters()]
+        return self.images.factor(self.step), self.sh_degree(), *places
 
     def densifies(self) -> bool:
         """Whether this iteration may add, move or remove Gaussians."""
         return any(densifier.due(self.step) for densifier in self.densifiers)
 
-    def densify(self, picture: Picture) -> None:
+    def densify(self, picture: Picture | None) -> None:
         """The second half: each part grows, prunes and moves its Gaussians."""
+        info = {} if picture is None else picture.info
         for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
-            densifier.after_step(self.step, optimizers, picture.info, rows)
+            densifier.after_step(self.step, optimizers, info, rows)
         self.step += 1
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        return self.step // every
+        return min(self.step // every, HIGHEST_DEGREE)
 
-    def _gradient_norms(self) -> dict[str, torch.Tensor]:
+    def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
         norms = torch._foreach_norm([gradient for _, gradient in named])
         return {f"gradient of {self._spoken(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}

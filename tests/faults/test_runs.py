@@ -341,7 +341,7 @@ import torch
 from drivesplat.training.trainer import Trainer
 
 
-def fit_one(self):
+def fit_one(self, shown=True):
     raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
 
