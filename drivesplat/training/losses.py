@@ -31,9 +31,10 @@ def loss_terms(
     }
     if colours.moving_l1 is not None:
         terms["dynamic"] = settings.dynamic_weight * colours.moving_l1
-    if settings.opacity_reg or settings.scale_reg:
-        opacity, scale = mean_opacity_and_scale(shown)
-        terms["opacity_reg"], terms["scale_reg"] = settings.opacity_reg * opacity, settings.scale_reg * scale
+    regularisers = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
+    if any(regularisers.values()):
+        means = mean_opacity_and_scale(shown)
+        terms |= {name: w * mean for (name, w), mean in zip(regularisers.items(), means, strict=True) if w}
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
