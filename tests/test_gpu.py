@@ -354,13 +354,19 @@ def replayed(record: bool, monkeypatch, iterations: int = 30, **settings) -> tup
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
         )
     chosen = chosen.model_copy(update={"cuda_graphs": record, "iterations": iterations})
-    trainer, losses = Trainer.begin(model.to(GPU), guided_views(GPU), chosen, 0, GPU), []
+    with replays.own_stream(GPU):
+        trainer = Trainer.begin(model.to(GPU), guided_views(GPU), chosen, 0, GPU)
+        losses = [float(torch.stack(list(goes_on(trainer).values())).sum()) for _ in range(iterations)]
+    trainer.guard.check("nowhere")
+    return trainer, losses
+
+
+def goes_on(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
+    """The loss terms of the last of so many iterations."""
     for _ in range(iterations):
         terms, picture, _ = trainer.fit_one(shown=False)
         trainer.densify(picture)
-        losses.append(float(torch.stack(list(terms.values())).sum()))
-    trainer.guard.check("nowhere")
-    return trainer, losses
+    return terms
 
 
 def test_a_training_that_is_replayed_learns_what_it_does_otherwise(monkeypatch, caplog):
@@ -389,9 +395,8 @@ def test_recordings_outlive_relocation_and_not_growth(monkeypatch):
     assert losses[-1] < losses[0]
     known = set(map(id, trainer.replays._recorded.values()))
     trainer.densifiers[0]._strategy.cap_max = 10_000
-    for _ in range(13):
-        terms, picture, _ = trainer.fit_one(shown=False)
-        trainer.densify(picture)
+    with replays.own_stream(GPU):
+        terms = goes_on(trainer, 13)
     assert not known & set(map(id, trainer.replays._recorded.values()))
     assert all(bool(torch.isfinite(value)) for value in terms.values())
 
@@ -401,8 +406,8 @@ def test_lists_that_outgrow_their_room_are_noticed(monkeypatch):
     monkeypatch.setattr(rooms, "MARGIN", 1.0)
     trainer, _ = replayed(True, monkeypatch, iterations=8)
     trainer.model.parts[0].params["scales"].data += 1.0
-    for _ in range(4):
-        trainer.densify(trainer.fit_one(shown=False)[1])
+    with replays.own_stream(GPU):
+        goes_on(trainer, 4)
     assert int(trainer.replays.missing) > 0
     trainer.replays.check()
     assert not trainer.replays._recorded and int(trainer.replays.missing) == 0
@@ -418,5 +423,6 @@ def test_what_cannot_be_recorded_is_done_all_the_same(monkeypatch, caplog):
 
     monkeypatch.setattr(trainer_module, "loss_terms", asks)
     trainer, losses = replayed(True, monkeypatch, iterations=12)
+    assert torch.rand(3, device=GPU).any(), "random numbers can still be drawn"
     assert [record.message.startswith("iterations cannot be recorded") for record in caplog.records] == [True]
     assert not trainer.replays.wanted and losses[-1] < losses[0] and all(map(math.isfinite, losses))

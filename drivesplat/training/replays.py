@@ -7,7 +7,8 @@ made when an image comes again after their number has stayed for a while, and dr
 """
 
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import torch
@@ -33,6 +34,27 @@ class Recording:
     terms: Terms
 
 
+@contextmanager
+def own_stream(device: torch.device) -> Iterator[None]:
+    """Work for the device goes into a queue of its own: what the usual one is asked for cannot be recorded, nor what
+    autograd once did there."""
+    if device.type != "cuda":
+        yield
+        return
+    usual, own = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+    own.wait_stream(usual)
+    with torch.cuda.stream(own):
+        yield
+    usual.wait_stream(own)
+
+
+def _draw_again(device: torch.device) -> None:
+    """Has torch's generator of a GPU draw again, which waits for the end of a recording that broke off."""
+    generator = torch.cuda.default_generators[torch.cuda.current_device() if device.index is None else device.index]
+    fresh = torch.Generator(device=device).manual_seed(generator.initial_seed())
+    generator.graphsafe_set_state(fresh.graphsafe_get_state())
+
+
 def can_be_replayed(settings: TrainSettings, device: torch.device) -> bool:
     """Whether iterations can be recorded, and shall be: densification by gradient reads what they leave behind."""
     wanted = settings.cuda_graphs and settings.strategy == "mcmc"
@@ -51,7 +73,6 @@ class Replays:
     _since: int = 0
     _needs: dict[int, list[int]] = field(default_factory=dict)
     _recorded: dict[int, Recording] = field(default_factory=dict)
-    _stream: torch.cuda.Stream | None = None
     _pool: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -90,15 +111,13 @@ class Replays:
     def _record(self, image: int, once: Callable[[], Terms]) -> Recording | None:
         """The recording of an iteration, which recording does not do; None, and none from now on, where the GPU or its
         driver refuses."""
-        self._stream = self._stream or torch.cuda.Stream(self.device)
         self._pool = self._pool or torch.cuda.graph_pool_handle()
-        graph, usual = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self.device)
-        self._stream.wait_stream(usual)
+        graph = torch.cuda.CUDAGraph()
         try:
-            with torch.cuda.stream(self._stream), rooms.given(self._needs[image]) as lists:
+            with rooms.given(self._needs[image]) as lists:
                 graph.capture_begin(pool=self._pool)
                 try:
-                    terms = {name: value.detach() for name, value in once().items()}
+                    terms = once()
                     for needed, room in lists:
                         torch.maximum(self.missing, needed - room, out=self.missing)
                 finally:
@@ -108,7 +127,7 @@ class Replays:
             log.warning("iterations cannot be recorded, which takes longer: %s", str(first).splitlines()[0])
             self.wanted = False
             self._forget()
+            _draw_again(self.device)
             return None
-        usual.wait_stream(self._stream)
         self._recorded[image] = recording = Recording(graph.replay, terms)
         return recording

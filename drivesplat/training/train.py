@@ -16,6 +16,7 @@ from drivesplat.training import checkpoint
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.monitor import Monitor
+from drivesplat.training.replays import own_stream
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
@@ -73,7 +74,7 @@ def train(
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
-    with telling_out_of_memory(lambda: len(model)):
+    with telling_out_of_memory(lambda: len(model)), own_stream(device):
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, surroundings, clock)
         run = Run.begin(trainer, workspace)
         with Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label) as monitor:
@@ -197,7 +198,7 @@ def _densify(run: Run, picture: Picture | None, empty: EmptySpace) -> None:
 
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
-    losses = {f"loss/{name}": float(value.detach()) for name, value in terms.items()}
+    losses = {f"loss/{name}": float(value) for name, value in terms.items()}
     of_cameras = learned_of_cameras(trainer.model)
     return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model)), **of_cameras}
 

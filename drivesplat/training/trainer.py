@@ -104,7 +104,7 @@ class Trainer:
             self.guard.watch(step, {**losses, **self._gradient_norms()})
         with stage("optimizer"):
             self.optimizers.step(rates)
-        return terms, picture
+        return {name: value.detach() for name, value in terms.items()}, picture
 
     def _shape(self) -> Hashable:
         """All that a recorded iteration holds on to beside its view: how much is rendered, and where it lies."""
