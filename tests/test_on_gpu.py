@@ -81,6 +81,24 @@ def test_nothing_that_moves_is_no_difference():
     assert float(moving.detach()) == 0.0 and not image.grad.any()
 
 
+def test_adams_steps_are_torchs():
+    from drivesplat.on_gpu.adam import adam_step
+
+    torch.manual_seed(0)
+    theirs = torch.randn(700, 3, device=DEVICE)
+    mine, rate = theirs.clone(), torch.tensor(0.02, device=DEVICE)
+    states = {"exp_avg": torch.zeros_like(mine), "exp_avg_sq": torch.zeros_like(mine), "step": rate.new_zeros(())}
+    adam = torch.optim.Adam([theirs], lr=0.02, eps=1e-15, fused=True)
+    for step in range(25):
+        theirs.grad = torch.randn_like(theirs) * 10.0 ** -(step % 7)
+        rate.fill_(0.02 * 0.9**step)
+        adam.param_groups[0]["lr"] = 0.02 * 0.9**step
+        states["step"] += 1
+        adam_step(mine, theirs.grad, states, rate, (0.9, 0.999), 1e-15)
+        adam.step()
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+
+
 def test_regularisers_hold_down_what_torch_says_and_as_much():
     from drivesplat.on_gpu.regularisers import mean_opacity_and_scale
 
@@ -110,7 +128,7 @@ def test_the_sky_behind_is_that_of_torch_and_learns_as_much(seed):
     K = torch.tensor([[10.0, 0.0, 14.0], [0.0, 11.0, 6.0], [0.0, 0.0, 1.0]])
     K[:2, :2] *= (seed % 2) * 9.0 + 1.0
     view = View(K.to(DEVICE), pose.to(DEVICE), 29, 13, 0.0)
-    splats, alpha = torch.rand(13, 29, 3, device=DEVICE), torch.rand(13, 29, 1, device=DEVICE)
+    splats, alpha = torch.rand(13, 29, 3, device=DEVICE), 0.99 * torch.rand(13, 29, 1, device=DEVICE)
     alpha[3:5] = 1.0
     given = [splats.requires_grad_(), alpha.requires_grad_(), texels]
     weighed = torch.randn(13, 29, 3, device=DEVICE)
@@ -259,14 +277,16 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.on_gpu import chunks, colours, colours_in_time, cube, exploration, placing, regularisers, tiles, trial
+from drivesplat.on_gpu import adam, chunks, colours, colours_in_time, cube, exploration, placing, regularisers
+from drivesplat.on_gpu import tiles, trial
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "there": "*i1",
               "radii": "*i32", "counts": "*i32", "nearest": "*i64", "ends": "*i32", "keys": "*i16"}
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "room", "each"), "i32")
-NUMBERS |= dict.fromkeys(("c1", "c2", "strength"), "fp32")
+NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps"), "fp32")
+NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
 SIZES = {"TAPS": 11, "ROWS": colours.ROWS, "COLUMNS": colours.COLUMNS}
 
 def compiled(kernel, **constants):
@@ -274,13 +294,14 @@ def compiled(kernel, **constants):
              for name in kernel.arg_names}
     if kernel in (cube._blend, cube._gradients):
         kinds["pixels"] = "i32"
-    if kernel in (chunks._take_apart, chunks._composite, chunks._pull_apart):
+    if kernel in (adam._step, chunks._take_apart, chunks._composite, chunks._pull_apart):
         kinds["values"] = FLOATS
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
     source = ASTSource(fn=kernel, signature=kinds, constexprs=places)
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
 
 compiled(trial._count)
+compiled(adam._step, BLOCK=adam.BLOCK)
 compiled(regularisers._sums, BLOCK=regularisers.BLOCK)
 compiled(regularisers._spread, BLOCK=regularisers.BLOCK)
 compiled(tiles._count, BLOCK=tiles.BLOCK)

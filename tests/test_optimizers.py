@@ -5,12 +5,13 @@ import pytest
 import torch
 from hand_made import actors_of, motion_through, track_of
 
+from drivesplat import on_gpu
 from drivesplat.model.background import Background
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.optimizers import ToldDevice, make_optimizers, schedule
 
 DEVICES = [
     "cpu",
@@ -61,3 +62,29 @@ def test_a_step_together_is_every_optimizers_own(device):
         for key, values in state.items():
             assert all(torch.equal(values[part], my_states[name][key][part]) for part in values)
     assert not torch.equal(mine["parts.0.params.means"], a_model(device).state_dict()["parts.0.params.means"])
+
+
+def test_a_cpu_need_not_be_told_rates():
+    optimizers = make_optimizers(a_model("cpu"))
+    assert ToldDevice(torch.device("cpu")).told(3, optimizers) == (3, None)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("kernels", [True, False])
+def test_steps_at_rates_that_the_device_knows_are_those_of_adam(kernels, monkeypatch):
+    monkeypatch.setattr(on_gpu, "for_tensor", lambda _: kernels)
+    settings, ends, places = TrainSettings(iterations=10), [], {}
+    for device in ("cuda", "cpu"):
+        model = a_model(device)
+        optimizers, told = make_optimizers(model), ToldDevice(torch.device(device))
+        for step in range(7):
+            give_gradients(model, step)
+            schedule(model, optimizers, step, settings)
+            counted, rates = told.told(step, optimizers)
+            optimizers.step(rates)
+            assert int(counted) == step
+            assert all(places.setdefault(name, place) is place for name, place in (rates or {}).items()), "for replays"
+        ends.append({name: value.cpu() for name, value in model.state_dict().items()})
+    for name, value in ends[1].items():
+        torch.testing.assert_close(ends[0][name], value, atol=1e-5, rtol=1e-4, msg=lambda said, name=name: name + said)

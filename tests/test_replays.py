@@ -99,6 +99,6 @@ def test_lists_have_the_room_they_need_or_what_they_needed_and_a_margin():
         assert [rooms.room_for(torch.tensor(need)) for need in (5000, 0)] == [5000, 0]
     assert needs == [5000, 0]
     with rooms.given(needs) as lists:
-        assert [rooms.room_for(torch.tensor(need)) for need in (9, 8)] == [rooms.LEAST + 6500, rooms.LEAST]
-    assert [(int(needed), room) for needed, room in lists] == [(9, rooms.LEAST + 6500), (8, rooms.LEAST)]
+        assert [rooms.room_for(torch.tensor(need)) for need in (9, 8)] == [rooms.LEAST + 7500, rooms.LEAST]
+    assert [(int(needed), room) for needed, room in lists] == [(9, rooms.LEAST + 7500), (8, rooms.LEAST)]
     assert rooms.room_for(torch.tensor(3)) == 3

@@ -11,6 +11,8 @@ from torch.autograd.function import once_differentiable
 
 BLOCK = 256
 """Pixels a program."""
+HARDLY_SEEN = tl.constexpr(1e-3)
+"""Where less than this comes through to the sky, it learns nothing: all that is opaque lets a trace of it through."""
 RUN = tl.constexpr(8)
 """Neighbouring pixels that most often look at the same texels."""
 
@@ -156,7 +158,7 @@ def _gradients(
     a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, pixel, width, resolution, inside)
     left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
     hidden = tl.zeros((BLOCK,), tl.float32)
-    seen = inside & (left != 0.0)
+    seen = inside & (left > HARDLY_SEEN)
     alike = _alike(a, BLOCK) & _alike(b, BLOCK) & _alike(c, BLOCK) & _alike(d, BLOCK)
     for channel in tl.static_range(3):
         sky = _color(texels, channel, a, b, c, d, part_u, part_v, inside)

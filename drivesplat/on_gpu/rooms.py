@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Int
 from torch import Tensor
 
-MARGIN, LEAST = 1.3, 4096
+MARGIN, LEAST = 1.5, 4096
 """Room beyond what was needed: a factor, and a number of entries."""
 
 

@@ -32,10 +32,10 @@ def rasterize_gsplat(
         means, None, quats, scales, viewmats, Ks, width, height,
         calc_compensations=antialiased, opacities=opacities,
     )  # fmt: skip
-    shown = opacities.expand(cameras, -1)
+    shown = opacities[None] if cameras == 1 else opacities.expand(cameras, -1)  # no sum over one in its gradient
     if compensations is not None:
         shown = shown * compensations
-    values = colors.expand(cameras, *colors.shape)
+    values = colors[None] if cameras == 1 else colors.expand(cameras, *colors.shape)
     if sh_degree is not None:
         values = _seen_colors(means, values, viewmats, radii, sh_degree)
     if with_depth:

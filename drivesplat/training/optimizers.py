@@ -1,13 +1,14 @@
 """Adam for every parameter of a model, one optimizer each, as gsplat's strategies need it."""
 
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from drivesplat import on_gpu
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
@@ -38,31 +39,41 @@ class ModelOptimizers:
         """A step of every optimizer with a gradient, which is dropped; at the `rates` that the device knows, by name,
         where they are told.
 
-        What torch.optim.Adam does with `fused`, whose kernel and state these are; but all steps are counted at once,
-        and what learns at one rate goes together. A step of each by itself takes Python longer than the GPU.
+        What torch.optim.Adam does with `fused`, whose state this is; but all steps are counted at once. A step of each
+        by itself takes Python longer than the GPU.
         """
-        alike, steps = defaultdict(list), []
+        ready: list[tuple[nn.Parameter, dict[str, Tensor], float | Tensor, dict[str, Any]]] = []
         for name, optimizer in self.all():
             (group,) = optimizer.param_groups
             (parameter,) = group["params"]
             if parameter.grad is None:
                 continue
-            state = optimizer.state.get(parameter)
-            if not state:
-                optimizer.step()  # which makes the state
+            if optimizer.state.get(parameter):
+                rate = group["lr"] if rates is None else rates[name]
+                ready.append((parameter, optimizer.state[parameter], rate, group))
             else:
-                steps.append(state["step"])
-                hyper = (group["lr"] if rates is None else rates[name], *group["betas"], group["eps"])
-                alike[hyper].append((parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], state["step"]))
+                optimizer.step()  # which makes the state
+                parameter.grad = None
+        if ready:
+            torch._foreach_add_([state["step"] for _, state, _, _ in ready], 1)
+        for parameter, state, rate, group in ready:
+            _adam(parameter, state, rate, group["betas"], group["eps"])
             parameter.grad = None
-        if steps:
-            torch._foreach_add_(steps, 1)
-        for (lr, beta1, beta2, eps), rows in alike.items():
-            parameters, gradients, means, squares, counts = map(list, zip(*rows, strict=True))
-            torch._fused_adam_(
-                parameters, gradients, means, squares, [], counts,
-                lr=lr, beta1=beta1, beta2=beta2, eps=eps, weight_decay=0.0, amsgrad=False, maximize=False,
-            )  # fmt: skip
+
+
+def _adam(
+    parameter: nn.Parameter, state: dict[str, Tensor], rate: float | Tensor, betas: tuple[float, float], eps: float
+) -> None:
+    """A step that has been counted."""
+    if isinstance(rate, Tensor) and on_gpu.for_tensor(parameter):
+        from drivesplat.on_gpu.adam import adam_step
+
+        adam_step(parameter, parameter.grad, state, rate, betas, eps)
+        return
+    torch._fused_adam_(
+        [parameter], [parameter.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
+        lr=rate, beta1=betas[0], beta2=betas[1], eps=eps, weight_decay=0.0, amsgrad=False, maximize=False,
+    )  # fmt: skip
 
 
 class ToldDevice:
@@ -74,9 +85,13 @@ class ToldDevice:
         self._rates: dict[str, Tensor] = {}
         self._told: dict[str, float] = {}
 
-    def told(self, step: int, optimizers: ModelOptimizers) -> tuple[Int[Tensor, ""], Mapping[str, Float[Tensor, ""]]]:
-        """The step, and the rates of `optimizers` by name, as the device knows them from now on; always in the same
-        places."""
+    def told(
+        self, step: int, optimizers: ModelOptimizers
+    ) -> tuple[int | Int[Tensor, ""], Mapping[str, Float[Tensor, ""]] | None]:
+        """The step, and the rates of `optimizers` by name, as the device knows them from now on, always in the same
+        places; a CPU, which Python is part of, need not be told."""
+        if self._device.type == "cpu":
+            return step, None
         self._step.fill_(step)
         for name, optimizer in optimizers.all():
             rate = optimizer.param_groups[0]["lr"]

@@ -61,6 +61,18 @@ def can_be_replayed(settings: TrainSettings, device: torch.device) -> bool:
     return wanted and device.type == "cuda" and on_gpu.compiles()
 
 
+class Memory:
+    """What all recordings of a training work in, one after the other. It lasts while a recording does, so a small one
+    is kept."""
+
+    def __init__(self, device: torch.device):
+        self.pool = torch.cuda.graph_pool_handle()
+        self._kept = torch.cuda.CUDAGraph()
+        self._kept.capture_begin(pool=self.pool)
+        self._place = torch.zeros(1, device=device)
+        self._kept.capture_end()
+
+
 @dataclass
 class Replays:
     """The recordings of a training's iterations, by its images; of a training that has none on a CPU, or by choice."""
@@ -73,7 +85,7 @@ class Replays:
     _since: int = 0
     _needs: dict[int, list[int]] = field(default_factory=dict)
     _recorded: dict[int, Recording] = field(default_factory=dict)
-    _pool: tuple[int, int] | None = None
+    _memory: Memory | None = None
 
     def __post_init__(self) -> None:
         self.missing = torch.zeros((), dtype=torch.int32, device=self.device)
@@ -111,11 +123,11 @@ class Replays:
     def _record(self, image: int, once: Callable[[], Terms]) -> Recording | None:
         """The recording of an iteration, which recording does not do; None, and none from now on, where the GPU or its
         driver refuses."""
-        self._pool = self._pool or torch.cuda.graph_pool_handle()
         graph = torch.cuda.CUDAGraph()
         try:
+            self._memory = self._memory or Memory(self.device)
             with rooms.given(self._needs[image]) as lists:
-                graph.capture_begin(pool=self._pool)
+                graph.capture_begin(pool=self._memory.pool)
                 try:
                     terms = once()
                     for needed, room in lists:

@@ -18,9 +18,6 @@ from drivesplat.training.replays import Replays, Terms, can_be_replayed
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
 from drivesplat.training.views import TrainingView
 
-HIGHEST_DEGREE = 3
-"""Of the spherical harmonics that there are kernels for."""
-
 
 @dataclass
 class Trainer:
@@ -65,11 +62,8 @@ class Trainer:
         with self.clock.stage("data"):
             number, view = self.images.number(self.step), self.images.at(self.step)
         schedule(self.model, self.optimizers, self.step, self.settings)
-        if not self.replays.wanted:
-            terms, picture = self._learn(view, self.step)
-            return terms, picture, view
         step, rates = self.on_device.told(self.step, self.optimizers)
-        if shown:
+        if shown or not self.replays.wanted:
             terms, picture = self._learn(view, step, rates)
             return terms, picture, view
 
@@ -79,9 +73,10 @@ class Trainer:
         return self.replays.iterate(self.step, number, self._shape(), once), None, view
 
     def _learn(
-        self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None = None
+        self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
     ) -> tuple[Terms, Picture]:
-        """What an iteration does with a view; `step` and `rates` may be known to the device alone."""
+        """What an iteration does with a view; `step` and `rates` as `ToldDevice` says, whose others they may be when
+        this is replayed."""
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # of an iteration that broke off
         with stage("render"):
@@ -124,7 +119,7 @@ class Trainer:
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        return min(self.step // every, HIGHEST_DEGREE)
+        return min(self.step // every, self.settings.gaussians.sh_degree)
 
     def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
