@@ -16,7 +16,6 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
 from drivesplat.on_cpu.exploration import explore
 from drivesplat.settings.actors import ActorSettings
-from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
 from drivesplat.training.densify import Densifier, Optimizers
@@ -169,11 +168,9 @@ def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
     assert counts == [100, 100, 105, 105, 110, 110, 115, 115, 118, 118, 118, 118]
 
 
-def test_mcmc_grows_evenly_in_ratio_where_it_is_told_when_to_be_grown():
-    """From 100 to 120 over the first ten iterations, a fifth of the way at each second one; then it stays."""
-    evenly = CoarseToFineSettings(grown_at=0.010)
-    counts = densified("mcmc", 14, cap_max=120, coarse_to_fine=evenly)
-    assert counts[::2] == [100, *(int(100 * 1.2 ** (step / 10)) for step in (2, 4, 6, 8)), 120, 120]
+def test_mcmc_grows_by_the_share_it_is_told():
+    counts = densified("mcmc", 8, cap_max=170, mcmc=McmcSettings(refine_every=2, growth=0.25))
+    assert counts == [100, 100, 125, 125, 156, 156, 170, 170]
 
 
 def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():

@@ -28,12 +28,12 @@ class Played:
         self.replays._recorded[image] = Recording(replay, {"l1": torch.tensor(float(image))})
         return self.replays._recorded[image]
 
-    def iterate(self, step, image, shape=0):
+    def iterate(self, step, image, shape=0, settled=False):
         def once():
             self.done.append(("done", image))
             return {"l1": torch.tensor(float(image))}
 
-        terms = self.replays.iterate(step, image, shape, once)
+        terms = self.replays.iterate(step, image, shape, once, settled)
         assert float(terms["l1"]) == image
         said = [word for word, of in self.done if of == image]
         self.done.clear()
@@ -48,6 +48,12 @@ def test_an_image_is_recorded_when_it_comes_again_and_the_number_of_gaussians_ha
     assert played.iterate(11 + replays.SETTLED, 0) == ["recorded", "replayed"]
     assert played.iterate(12 + replays.SETTLED, 0) == ["replayed"]
     assert played.iterate(13 + replays.SETTLED, 1) == ["recorded", "replayed"]
+
+
+def test_where_their_number_will_stay_nobody_waits(monkeypatch):
+    played = Played(monkeypatch)
+    assert played.iterate(10, 0, settled=True) == ["done"]
+    assert played.iterate(11, 0, settled=True) == ["recorded", "replayed"]
 
 
 def test_nothing_recorded_outlives_another_number_of_gaussians(monkeypatch):

@@ -6,13 +6,10 @@ from drivesplat.settings import Settings
 
 
 class CoarseToFineSettings(Settings):
-    """Reduced images and few Gaussians at first: an iteration costs less, and what is large is found before what is
-    small (after DashGaussian, Chen et al. 2025, arXiv 2503.18402)."""
+    """Reduced images at first: an iteration costs less, and what is large is found before what is small (after
+    DashGaussian, Chen et al. 2025, arXiv 2503.18402)."""
 
     quarter_until: float = Field(0.0, ge=0, le=1)
     """Until this fraction of the iterations images are reduced to a quarter of their width and height."""
     half_until: float = Field(0.0, ge=0, le=1)
     """From then on, until this fraction, to a half."""
-    grown_at: float = Field(0.0, ge=0, le=1)
-    """With strategy: mcmc the number of Gaussians grows evenly, in ratio, until it reaches its cap at this fraction of
-    the iterations; 0 = by a twentieth at every densification."""

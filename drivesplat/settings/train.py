@@ -44,6 +44,8 @@ class McmcSettings(Settings):
     """Gaussians below it are dead and are relocated."""
     refine_every: int = Field(100, ge=1)
     """Iterations between relocations."""
+    growth: float = Field(0.05, ge=0)
+    """By so large a share their number grows at each of these, up to the cap."""
 
 
 class DefaultSettings(Settings):

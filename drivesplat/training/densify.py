@@ -30,6 +30,11 @@ class Densifier:
         """Whether Gaussians may be added, moved or removed after `step`."""
         return step % self._every == 0
 
+    def full(self, step: int) -> bool:
+        """Whether after `step` their number stays as it is: as many as there may be, or no longer looked at."""
+        ended = step >= self._strategy.refine_stop_iter
+        return ended or (not self._by_gradient and len(self._part) >= self._strategy.cap_max)
+
     def any_alive(self) -> bool:
         """Whether a Gaussian is left; one that MCMC would relocate for its opacity is not."""
         opacities = self._part.params["opacities"]

@@ -90,16 +90,18 @@ class Replays:
     def __post_init__(self) -> None:
         self.missing = torch.zeros((), dtype=torch.int32, device=self.device)
 
-    def iterate(self, step: int, image: int, shape: Hashable, once: Callable[[], Terms]) -> Terms:
+    def iterate(
+        self, step: int, image: int, shape: Hashable, once: Callable[[], Terms], settled: bool = False
+    ) -> Terms:
         """An iteration with an image, known by a number: what is done `once`, or its recording replayed. `shape` is all
-        that a recording holds on to, beside the image."""
+        that a recording holds on to, beside the image; `settled` where the number of Gaussians will stay."""
         if not self.wanted:
             return once()
         if shape != self._shape:
             self._forget()
             self._shape, self._since = shape, step
         recording = self._recorded.get(image)
-        if recording is None and image in self._needs and step >= self._since + SETTLED:
+        if recording is None and image in self._needs and (settled or step >= self._since + SETTLED):
             recording = self._record(image, once)
         if recording is None:
             with rooms.counted() as needs:

@@ -1,6 +1,5 @@
 """gsplat's densification strategies as this workflow runs them: capped, resetting, and on the CPU."""
 
-import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -48,13 +47,10 @@ class CappedDefaultStrategy(DefaultStrategy):
 
 @dataclass
 class ExploringStrategy(MCMCStrategy):
-    """gsplat's MCMCStrategy, which explores in one compiled pass, and which keeps the memory that torch holds: what it
-    would hand back after every densification has to be asked for again.
+    """gsplat's MCMCStrategy, which explores in one compiled pass, grows by `growth` at a time, and keeps the memory
+    that torch holds: what it would hand back after every densification has to be asked for again."""
 
-    Where `grown_at` is not 0 it adds no more than evenly, in ratio, leads to `cap_max` at that iteration.
-    """
-
-    grown_at: int = 0
+    growth: float = 0.05
 
     @torch.no_grad()
     def step_post_backward(
@@ -63,16 +59,16 @@ class ExploringStrategy(MCMCStrategy):
         if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
             state["binoms"] = state["binoms"].to(params["means"].device)
             self._relocate_gs(params, optimizers, state["binoms"])
-            room = self._room(step, state.setdefault("began", len(params["means"])))
-            dataclasses.replace(self, cap_max=room)._add_new_gs(params, optimizers, state["binoms"])
+            self._add_new_gs(params, optimizers, state["binoms"])
         _explore(params, optimizers, lr * self.noise_lr)
 
-    def _room(self, step: int, began: int) -> int:
-        """How many Gaussians there may be after `step`, of as many as there were before the first were added."""
-        if step >= self.grown_at or began >= self.cap_max:
-            return self.cap_max
-        done = (step - self.refine_start_iter) / (self.grown_at - self.refine_start_iter)
-        return int(began * (self.cap_max / began) ** done)
+    @torch.no_grad()
+    def _add_new_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
+        count = len(params["means"])
+        more = max(0, min(self.cap_max, int((1.0 + self.growth) * count)) - count)
+        if more:
+            ops.sample_add(params, optimizers, {}, more, binoms, self.min_opacity)
+        return more
 
 
 def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
@@ -100,7 +96,7 @@ def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MC
             refine_start_iter=start,
             refine_stop_iter=stop,
             refine_every=settings.mcmc.refine_every,
-            grown_at=int(settings.coarse_to_fine.grown_at * settings.iterations),
+            growth=settings.mcmc.growth,
         )
     strategy = CappedDefaultStrategy(
         grow_grad2d=settings.default.grow_grad2d,

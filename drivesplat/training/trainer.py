@@ -70,7 +70,8 @@ class Trainer:
         def once() -> Terms:
             return self._learn(view, step, rates)[0]
 
-        return self.replays.iterate(self.step, number, self._shape(), once), None, view
+        settled = all(densifier.full(self.step) for densifier in self.densifiers)
+        return self.replays.iterate(self.step, number, self._shape(), once, settled), None, view
 
     def _learn(
         self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
