@@ -65,15 +65,13 @@ def some_gaussians(count: int, sh_degree: int, seed: int) -> Gaussians:
     random = torch.rand(count, 8, generator=generator)
     quats = torch.randn(count, 4, generator=generator)
     sh = 0.3 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator)
-    return Gaussians(4.0 * random[:, :3] - 2.0, quats, 0.01 + random[:, 3:6], 0.01 + 0.98 * random[:, 6], sh)
+    return Gaussians.of(4.0 * random[:, :3] - 2.0, quats, 0.01 + random[:, 3:6], 0.01 + 0.98 * random[:, 6], sh)
 
 
 def own_gaussians(track_id: str, time: float) -> Gaussians:
     """A vehicle's in its own frame, in the colours of a time."""
     own = some_gaussians(12, 1, seed=list(COURSES).index(track_id))
-    fading = torch.zeros_like(own.sh)
-    fading[:, 0] = FADING * time
-    return replace(own, sh=own.sh + fading)
+    return replace(own, sh0=own.sh0 + FADING * time)
 
 
 def placed(own: Gaussians, pose: np.ndarray) -> Gaussians:
@@ -81,11 +79,13 @@ def placed(own: Gaussians, pose: np.ndarray) -> Gaussians:
     means = own.means.double().numpy() @ pose[:3, :3].T + pose[:3, 3]
     turned = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_quat(own.quats.double().numpy(), scalar_first=True)
     quats, rotation = turned.as_quat(scalar_first=True), torch.from_numpy(pose[:3, :3].copy())
+    sh = rotated(own.sh.double(), rotation).float()
     return replace(
         own,
         means=torch.from_numpy(means).float(),
         quats=torch.from_numpy(quats).float(),
-        sh=rotated(own.sh.double(), rotation).float(),
+        sh0=sh[:, :1],
+        shN=sh[:, 1:],
     )
 
 

@@ -152,7 +152,7 @@ def test_the_drive_can_be_put_together_again_at_any_image(folder, parts, scene):
                 continue
             pose = np.array(motion["object_to_world"][motion["timestamps"].index(frame.timestamp)])
             found = placed(read_splat_ply(folder / "parts" / parts[track_id]["file"]), pose)
-            expected.sh[:, 0] += FADING * (MIDDLE - seconds)
+            expected.sh0[:, 0] += FADING * (MIDDLE - seconds)
             assert_same(found, expected, atol=2e-5)
 
 

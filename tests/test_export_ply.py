@@ -34,7 +34,7 @@ def some_gaussians(count: int = 30, sh_degree: int = 3, seed: int = 0) -> Gaussi
     """Gaussians two to six metres before a camera at the origin, with quaternions of any length."""
     generator = torch.Generator().manual_seed(seed)
     random = torch.rand(count, 8, generator=generator)
-    return Gaussians(
+    return Gaussians.of(
         means=random[:, :3] * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([-2.0, -1.5, 2.0]),
         quats=torch.randn(count, 4, generator=generator) * 3.0,
         scales=torch.exp(4.0 * random[:, 3:6] - 4.0),
@@ -116,7 +116,7 @@ def test_values_are_those_before_the_activations(tmp_path):
 def test_coefficients_stand_channel_by_channel(tmp_path):
     """Coefficient i of channel c is 100 c + i: f_rest has red's 1 to 15, then green's, then blue's."""
     sh = torch.arange(16.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])
-    shown = dataclasses.replace(some_gaussians(2), sh=sh.repeat(2, 1, 1))
+    shown = dataclasses.replace(some_gaussians(2), sh0=sh[:, :1].repeat(2, 1, 1), shN=sh[:, 1:].repeat(2, 1, 1))
     write_splat_ply(tmp_path / "splat.ply", shown, {})
     vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
     assert [float(vertices[f"f_dc_{i}"][1]) for i in range(3)] == [0.0, 100.0, 200.0]

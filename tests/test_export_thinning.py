@@ -15,7 +15,7 @@ def gaussians_of(scales: list[list[float]], opacities: list[float]) -> Gaussians
     count = len(scales)
     means = torch.arange(float(count))[:, None].repeat(1, 3)
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
-    return Gaussians(means, quats, torch.tensor(scales), torch.tensor(opacities), torch.zeros(count, 1, 3))
+    return Gaussians.of(means, quats, torch.tensor(scales), torch.tensor(opacities), torch.zeros(count, 1, 3))
 
 
 def places(gaussians: Gaussians) -> list[int]:
@@ -56,7 +56,7 @@ def test_enough_room_changes_nothing(count):
 def test_pieces_share_the_room_by_what_covers_most():
     """Of several degrees of spherical harmonics, too, which stay as they are."""
     one, other = (gaussians_of([[1.0] * 3] * 3, opacities) for opacities in ([0.9, 0.1, 0.8], [0.2, 0.7, 0.3]))
-    other = dataclasses.replace(other, sh=torch.zeros(3, 4, 3))
+    other = dataclasses.replace(other, shN=torch.zeros(3, 3, 3))
     kept = thinned_pieces({"a": SampledPiece(one), "b": SampledPiece(other)}, 3)
     assert {name: places(piece.gaussians) for name, piece in kept.items()} == {"a": [0, 2], "b": [1]}
     assert [piece.gaussians.sh_degree for piece in kept.values()] == [0, 1]

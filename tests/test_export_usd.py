@@ -32,7 +32,7 @@ def random_splats(count: int = COUNT, sh_degree: int = 2, seed: int = 0) -> Gaus
     random = torch.rand(count, 8, generator=generator)
     quats = torch.randn(count, 4, generator=generator)
     sh = torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator)
-    return Gaussians(20.0 * random[:, :3], quats, 0.01 + random[:, 3:6], 0.01 + 0.98 * random[:, 6], sh)
+    return Gaussians.of(20.0 * random[:, :3], quats, 0.01 + random[:, 3:6], 0.01 + 0.98 * random[:, 6], sh)
 
 
 def oblique_camera() -> tuple[np.ndarray, tuple[int, int], np.ndarray]:
@@ -120,7 +120,8 @@ def test_coefficients_of_a_gaussian_stand_together(tmp_path, degree):
     """Gaussian g's coefficient i in channel c is 1000 g + 10 i + c."""
     size = (degree + 1) ** 2
     g, i, c = torch.meshgrid(torch.arange(3.0), torch.arange(float(size)), torch.arange(3.0), indexing="ij")
-    splats = dataclasses.replace(random_splats(3), sh=1000 * g + 10 * i + c)
+    sh = 1000 * g + 10 * i + c
+    splats = dataclasses.replace(random_splats(3), sh0=sh[:, :1], shN=sh[:, 1:])
     write_usdz(tmp_path / "a.usdz", splat_stage({"background": SampledPiece(splats)}, [(0.0, Gf.Camera())], {}))
     again = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     splat = splat_at(again)

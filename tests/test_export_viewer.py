@@ -48,7 +48,7 @@ def splats(count: int = COUNT, sh_degree: int = 2) -> Gaussians:
     pose = torch.from_numpy(oblique_frame().camera_to_world).float()
     sh = torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator)
     sh[:, 1:] *= 0.2
-    return Gaussians(
+    return Gaussians.of(
         places @ pose[:3, :3].T + pose[:3, 3], torch.randn(count, 4, generator=generator),
         0.02 + 0.8 * random[:, 3:6] ** 3, 0.05 + 0.95 * random[:, 6], sh,
     )  # fmt: skip

@@ -179,7 +179,7 @@ class Riding(Part):
     def at(self, time: float) -> Gaussians:
         still = self._still.at(time)
         shift = torch.tensor([time, 0.0, 0.0])
-        return Gaussians(still.means + shift, still.quats, still.scales, still.opacities, still.sh)
+        return Gaussians.of(still.means + shift, still.quats, still.scales, still.opacities, still.sh)
 
     def learning_rates(self) -> dict[str, float]:
         return self._still.learning_rates()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+from gsplat.cuda._torch_impl import _eval_sh_bases_fast, _quat_scale_to_covar_preci
 from scipy.spatial.transform import Rotation
 from test_training import ALL_TERMS, guided_views, settings_of, untrained_street
 from torch import nn
@@ -97,6 +97,32 @@ def test_adams_steps_are_torchs():
         adam_step(mine, theirs.grad, states, rate, (0.9, 0.999), 1e-15)
         adam.step()
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("coefficients", [1, 4, 9])
+def test_a_camera_sees_the_colours_that_gsplat_says(degree, coefficients):
+    from drivesplat.on_gpu.harmonics import seen_colours
+
+    if degree == 1 and coefficients == 1:
+        pytest.skip("there are none of that degree")
+    torch.manual_seed(0)
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=0).as_matrix())
+    pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
+    sizes = ((700, 3), (700, 1, 3), (700, coefficients - 1, 3))
+    given = [torch.randn(size, device=DEVICE).requires_grad_() for size in sizes]
+    basis = _eval_sh_bases_fast(coefficients, F.normalize(given[0] - pose[:3, 3].to(DEVICE), dim=1))
+    used = (degree + 1) ** 2
+    expected = (basis[:, :used, None] * torch.cat(given[1:], dim=1)[:, :used]).sum(dim=1) + 0.5
+    found = seen_colours(*given, pose.to(DEVICE), degree)
+    expected = expected.clamp(min=0.0)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    weights = torch.randn_like(expected)
+    theirs = torch.autograd.grad(expected, given, weights, allow_unused=True, materialize_grads=True)
+    mine = torch.autograd.grad(found, given, weights)
+    for pulls in zip(mine, theirs, strict=True):
+        torch.testing.assert_close(*pulls, atol=1e-4, rtol=1e-4)
 
 
 def test_regularisers_hold_down_what_torch_says_and_as_much():
@@ -277,8 +303,8 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.on_gpu import adam, chunks, colours, colours_in_time, cube, exploration, placing, regularisers
-from drivesplat.on_gpu import tiles, trial
+from drivesplat.on_gpu import adam, chunks, colours, colours_in_time, cube, exploration, harmonics, placing
+from drivesplat.on_gpu import regularisers, tiles, trial
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "there": "*i1",
@@ -301,6 +327,9 @@ def compiled(kernel, **constants):
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
 
 compiled(trial._count)
+for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
+    compiled(harmonics._colours, OTHERS=k - 1, DEGREE=degree, BLOCK=harmonics.BLOCK)
+    compiled(harmonics._colours_back, OTHERS=k - 1, DEGREE=degree, BLOCK=harmonics.BLOCK)
 compiled(adam._step, BLOCK=adam.BLOCK)
 compiled(regularisers._sums, BLOCK=regularisers.BLOCK)
 compiled(regularisers._spread, BLOCK=regularisers.BLOCK)

@@ -34,7 +34,7 @@ def on_road(poses: np.ndarray, along: np.ndarray, aside: np.ndarray, above: np.n
 
 def gaussians_at(means: torch.Tensor, scales: torch.Tensor, quats: torch.Tensor) -> Gaussians:
     n = len(means)
-    return Gaussians(means, quats, scales, torch.full((n,), 0.5), torch.zeros(n, 1, 3))
+    return Gaussians.of(means, quats, scales, torch.full((n,), 0.5), torch.zeros(n, 1, 3))
 
 
 def round_at(means: torch.Tensor, size: float = 1e-4) -> Gaussians:

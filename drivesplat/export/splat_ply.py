@@ -88,14 +88,14 @@ def _property_names(coefficients: int) -> list[str]:
 
 def _vertices(gaussians: Gaussians) -> np.ndarray:
     """The Gaussians (n,) as records of the convention."""
-    count, coefficients = len(gaussians), gaussians.sh.shape[1] - 1
+    count, coefficients = gaussians.shN.shape[:2]
     names = _property_names(coefficients)
     opacities = gaussians.opacities.double().clamp(_TINY, _ALMOST_ONE)
     columns = [
         gaussians.means,
         torch.zeros(count, 3),
-        gaussians.sh[:, 0],
-        gaussians.sh[:, 1:].transpose(1, 2).reshape(count, 3 * coefficients),
+        gaussians.sh0[:, 0],
+        gaussians.shN.transpose(1, 2).reshape(count, 3 * coefficients),
         torch.logit(opacities)[:, None],
         torch.log(gaussians.scales.clamp_min(_TINY)),
         torch.nn.functional.normalize(gaussians.quats, dim=-1),
@@ -108,5 +108,4 @@ def _gaussians(values: Float[Tensor, "n columns"], coefficients: int) -> Gaussia
     """The Gaussians of the columns without normals."""
     means, sh0, rest, opacity, scales, quats = values.split([3, 3, 3 * coefficients, 1, 3, 4], dim=1)
     shN = rest.reshape(len(values), 3, coefficients).transpose(1, 2)
-    sh = torch.cat([sh0[:, None], shN], dim=1)
-    return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacity[:, 0]), sh)
+    return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacity[:, 0]), sh0[:, None], shN)

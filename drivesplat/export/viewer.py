@@ -69,7 +69,7 @@ def viewer_page(
     layout, payload = packed({**arrays, "sky": sky_faces(sky, SKY_SIZE)})
     scene = {
         "count": len(gaussians),
-        "coefficients": gaussians.sh.shape[1],
+        "coefficients": 1 + gaussians.shN.shape[1],
         "antialiased": antialiased,
         "sh_range": sh_range,
         "sky_size": SKY_SIZE,
@@ -90,7 +90,7 @@ def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
     `means` (n, 3) float32 and `scales` (n, 3) float16 in metres, unit `quats` (n, 4) float16, `opacities` (n,) of 255,
     `sh0` (n, 3) float16, `shN` (n, k - 1, 3) int8.
     """
-    shN = gaussians.sh[:, 1:].float()
+    shN = gaussians.shN.float()
     sh_range = float(shN.abs().max()) if shN.numel() else 0.0
     roots = torch.sign(shN) * torch.sqrt(shN.abs() / (sh_range or 1.0))
     largest = torch.finfo(torch.float16).max
@@ -99,7 +99,7 @@ def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
         "scales": gaussians.scales.clamp(max=largest).half(),
         "quats": torch.nn.functional.normalize(gaussians.quats.float(), dim=-1).half(),
         "opacities": torch.round(gaussians.opacities * 255.0).to(torch.uint8),
-        "sh0": gaussians.sh[:, 0].clamp(-largest, largest).half(),
+        "sh0": gaussians.sh0[:, 0].clamp(-largest, largest).half(),
         "shN": torch.round(roots * 127.0).to(torch.int8),
     }
     return {name: array.detach().contiguous().numpy() for name, array in arrays.items()}, sh_range

@@ -145,7 +145,7 @@ class Actors(Part):
         if sh.shape[1] > 1:  # colours turn by degrees at most: no gradient of theirs is worth its noise to the track
             sh = self._of_owners(rotation_of_harmonics(rotations.detach(), sh.shape[1])) @ sh
         turned = (self._of_owners(rotations) @ (scales * p["means"])[..., None])[..., 0]
-        return Gaussians(
+        return Gaussians.of(
             turned + self._of_owners(placements.translations),
             (self._of_owners(left_factor(placements.quats)) @ normalize(p["quats"], dim=-1)[..., None])[..., 0],
             scales * torch.exp(p["scales"]),
@@ -165,7 +165,7 @@ class Actors(Part):
         turns = rotation_of_harmonics(rotations.detach(), coefficients)
         series = self.timeline.at(time, owner.device).series
         sh = turned_colours(p["sh0"], p["shN"], series, turns, owner)
-        return Gaussians(*placed(shapes, objects, owner, self._owns), sh)
+        return Gaussians.of(*placed(shapes, objects, owner, self._owns), sh)
 
     def _of_owners(self, values: Float[Tensor, "a *v"]) -> Float[Tensor, "n *v"]:
         """For every Gaussian its actor's value: a product with the matrix of who owns what, exact, and with a gradient
@@ -219,7 +219,7 @@ class Actors(Part):
     def pieces(self, time: float) -> dict[str, Piece]:
         p = self.params
         scales, opacities = torch.exp(p["scales"]), torch.sigmoid(p["opacities"])
-        local = Gaussians(p["means"], p["quats"], scales, opacities, self.harmonics(time))
+        local = Gaussians.of(p["means"], p["quats"], scales, opacities, self.harmonics(time))
         return {
             track.id: Piece(local[p["owner"] == i], motion)
             for i, (track, motion) in enumerate(zip(self.timeline.tracks, self.motions(), strict=True))

@@ -37,7 +37,8 @@ class Background(Part):
             p["quats"],
             torch.exp(p["scales"]),
             torch.sigmoid(p["opacities"]),
-            torch.cat([p["sh0"], p["shN"]], dim=1),
+            p["sh0"],
+            p["shN"],
         )
 
     def learning_rates(self) -> dict[str, float]:

@@ -12,13 +12,27 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Gaussians:
-    """n Gaussians: `means` and `scales` metres, `quats` w, x, y, z, `opacities` in [0, 1], `sh` RGB coefficients."""
+    """n Gaussians: `means` and `scales` metres, `quats` w, x, y, z, `opacities` in [0, 1], coefficients of RGB colours:
+    the constant ones and the others, which are learned apart."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
     scales: Float[Tensor, "n 3"]
     opacities: Float[Tensor, " n"]
-    sh: Float[Tensor, "n k 3"]
+    sh0: Float[Tensor, "n 1 3"]
+    shN: Float[Tensor, "n k_less_1 3"]
+
+    @classmethod
+    def of(
+        cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Float[Tensor, "n k 3"]
+    ) -> "Gaussians":
+        """With all coefficients together."""
+        return cls(means, quats, scales, opacities, sh[:, :1], sh[:, 1:])
+
+    @property
+    def sh(self) -> Float[Tensor, "n k 3"]:
+        """All coefficients together."""
+        return torch.cat([self.sh0, self.shN], dim=1)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -30,7 +44,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """The degree that the number of coefficients stands for: k = (degree + 1)²."""
-        return math.isqrt(self.sh.shape[1]) - 1
+        return math.isqrt(1 + self.shN.shape[1]) - 1
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
@@ -38,6 +52,6 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     is."""
     if len(sets) == 1:
         return sets[0]
-    coefficients = max(s.sh.shape[1] for s in sets)
-    sets = [replace(s, sh=F.pad(s.sh, (0, 0, 0, coefficients - s.sh.shape[1]))) for s in sets]
+    coefficients = max(s.shN.shape[1] for s in sets)
+    sets = [replace(s, shN=F.pad(s.shN, (0, 0, 0, coefficients - s.shN.shape[1]))) for s in sets]
     return Gaussians(**{f.name: torch.cat([getattr(s, f.name) for s in sets]) for f in fields(Gaussians)})

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from drivesplat import on_gpu
 from drivesplat.errors import ResultError
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
@@ -116,10 +117,10 @@ class SplatModel(nn.Module):
         """
         shown = self.gaussians_at(view.time) if gaussians is None else gaussians
         seen_from = self.seen_from(view)
+        colors, degree = _colors(shown, seen_from, sh_degree)
         rendering = rasterize(
-            shown.means, shown.quats, shown.scales, shown.opacities, shown.sh,
-            seen_from.viewmat[None], view.K[None], view.width, view.height,
-            sh_degree=shown.sh_degree if sh_degree is None else min(sh_degree, shown.sh_degree),
+            shown.means, shown.quats, shown.scales, shown.opacities, colors,
+            seen_from.viewmat[None], view.K[None], view.width, view.height, sh_degree=degree,
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
         )  # fmt: skip
         splats, alpha = rendering.image[0], rendering.alpha[0]
@@ -155,3 +156,16 @@ class SplatModel(nn.Module):
             gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, values,
             self.seen_from(view).viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
         )  # fmt: skip
+
+
+def _colors(gaussians: Gaussians, view: View, sh_degree: int | None) -> tuple[Tensor, int | None]:
+    """What the rasterizer is given: coefficients and their degree, at most `sh_degree`; or, where there is a kernel for
+    it, the colours (n, 3) that the view's camera sees, and None."""
+    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+    if on_gpu.for_tensor(gaussians.means) and not view.camera_to_world.requires_grad:
+        from drivesplat.on_gpu import harmonics
+
+        if degree in harmonics.DEGREES:
+            own = gaussians.means, gaussians.sh0, gaussians.shN
+            return harmonics.seen_colours(*own, view.camera_to_world, degree), None
+    return gaussians.sh, degree
