@@ -11,10 +11,11 @@ from drivesplat.model.view import View
 from drivesplat.rasterize import rasterize
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.coarse_to_fine import LEAST_HEIGHT, TrainingImages, reduced
+from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.views import LidarDepth, TrainingView, order
 
 WIDTH, HEIGHT = 14, 9
+LEAST_HEIGHT = CoarseToFineSettings().least_height
 
 
 def a_view(width: int = WIDTH, height: int = HEIGHT) -> TrainingView:
@@ -82,15 +83,18 @@ def test_classes_are_those_of_the_blocks_middles():
     assert reduced(view, 4).classes.tolist() == [[0, 1, 2], [3, 4, 5]]
 
 
+NEVER = {"quarter_until": 0.0, "half_until": 0.0}
+
+
 def images_of(height: int, count: int = 3, **changes: float) -> TrainingImages:
-    settings = TrainSettings(iterations=100, coarse_to_fine=CoarseToFineSettings(**changes))
+    settings = TrainSettings(iterations=100, coarse_to_fine=CoarseToFineSettings(**{**NEVER, **changes}))
     return TrainingImages([a_view(16, height) for _ in range(count)], settings, seed=7)
 
 
-def test_images_are_whole_where_nothing_is_said():
+def test_images_are_whole_where_it_is_said():
     images = images_of(4 * LEAST_HEIGHT)
     assert {images.factor(step) for step in range(100)} == {1}
-    assert images.at(5) is images.views[order(3, 5, 7)]
+    assert images.at(5) is images.views[order(3, 5, 7)] is images.views[images.number(5)]
 
 
 @pytest.mark.parametrize(

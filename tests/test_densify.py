@@ -135,7 +135,9 @@ def settings_of(strategy: str, **changes: Any) -> TrainSettings:
     })  # fmt: skip
 
 
-def train_step(model: SplatModel, densifier: Densifier, step: int, optimizers: Optimizers) -> None:
+def train_step(
+    model: SplatModel, densifier: Densifier, step: int, optimizers: Optimizers, coarse: bool = False
+) -> None:
     """An iteration towards a random image, as the trainer makes it."""
     target = torch.from_numpy(np.random.default_rng(1).uniform(0, 1, (24, 32, 3))).float()
     picture = model.render(a_view(), 1)
@@ -144,7 +146,7 @@ def train_step(model: SplatModel, densifier: Densifier, step: int, optimizers: O
     for optimizer in optimizers.values():
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
-    densifier.after_step(step, optimizers, picture.info, model.rows[0])
+    densifier.after_step(step, optimizers, picture.info, model.rows[0], coarse)
 
 
 def densified(strategy: str, steps: int, count: int = 100, size: float = 0.05, **changes: Any) -> list[int]:
@@ -171,6 +173,19 @@ def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
 def test_mcmc_grows_by_the_share_it_is_told():
     counts = densified("mcmc", 8, cap_max=170, mcmc=McmcSettings(refine_every=2, growth=0.25))
     assert counts == [100, 100, 125, 125, 156, 156, 170, 170]
+
+
+def test_while_images_are_reduced_there_is_room_for_fewer():
+    model, settings = a_model(100), settings_of("mcmc", cap_max=200, mcmc=McmcSettings(refine_every=1, growth=0.5))
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    counts, full = [], []
+    for step, coarse in enumerate([True, True, True, False, False], start=2):
+        train_step(model, densifier, step, optimizers, coarse)
+        counts.append(len(model))
+        full.append(densifier.full(step, coarse))
+    assert counts == [120, 120, 120, 180, 200] and full == [True, True, True, False, True]
+    assert densifier.full(1000, coarse=True) and densifier.full(1000, coarse=False), "it has ended"
+    assert not Densifier(model.parts[0], settings_of("default", cap_max=100)).full(2, coarse=False), "it may prune"
 
 
 def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():

@@ -116,7 +116,7 @@ def test_values_are_those_before_the_activations(tmp_path):
 def test_coefficients_stand_channel_by_channel(tmp_path):
     """Coefficient i of channel c is 100 c + i: f_rest has red's 1 to 15, then green's, then blue's."""
     sh = torch.arange(16.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])
-    shown = dataclasses.replace(some_gaussians(2), sh0=sh[:, :1].repeat(2, 1, 1), shN=sh[:, 1:].repeat(2, 1, 1))
+    shown = dataclasses.replace(some_gaussians(2), sh0=sh[:1].repeat(2, 1, 1), shN=sh[1:].repeat(2, 1, 1))
     write_splat_ply(tmp_path / "splat.ply", shown, {})
     vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
     assert [float(vertices[f"f_dc_{i}"][1]) for i in range(3)] == [0.0, 100.0, 200.0]

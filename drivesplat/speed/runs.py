@@ -44,6 +44,7 @@ from drivesplat.training.run import (
 from drivesplat.training.train import Workspace, train
 
 Times = dict[str, Any]
+WHOLE_IMAGES = CoarseToFineSettings(quarter_until=0.0, half_until=0.0)
 WARM_UP = 20
 """So many iterations pass before stages are timed."""
 
@@ -146,7 +147,7 @@ def _go_on(
     inputs, _ = _inputs(task)
     begun = prepare(inputs, task.train, device)
     goes_on = {"iterations": iterations, "sh_every": 0.0, "refine_start": 0.0, "refine_stop": 1.0}
-    settings = begun.settings.model_copy(update={**goes_on, "coarse_to_fine": CoarseToFineSettings()})
+    settings = begun.settings.model_copy(update={**goes_on, "coarse_to_fine": WHOLE_IMAGES})
     workspace = Workspace(_aside(task) / "resume", _aside(task) / "tensorboard", "", task.label)
     trained = begun.model if model is None else model
     train(trained, begun.views, settings, task.seed, device, workspace, begun.surroundings, clock)

@@ -13,9 +13,6 @@ from drivesplat.model.view import View
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.views import LidarDepth, TrainingView, order
 
-LEAST_HEIGHT = 90
-"""Pixels: no image is reduced to fewer rows."""
-
 
 class TrainingImages:
     """What a training sees: `views` in a seeded order, in which every one comes once an epoch, each reduced as
@@ -43,12 +40,12 @@ class TrainingImages:
         """By how much width and height are reduced at an iteration."""
         done, coarse = step / self._settings.iterations, self._settings.coarse_to_fine
         wanted = 4 if done < coarse.quarter_until else 2 if done < coarse.half_until else 1
-        return next((factor for factor in (4, 2) if factor <= wanted and self._rows >= factor * LEAST_HEIGHT), 1)
+        return next((factor for factor in (4, 2) if factor <= wanted and self._rows >= factor * coarse.least_height), 1)
 
     @cached_property
     def _rows(self) -> int:
-        """Those of the lowest image."""
-        return min(view.view.height for view in self.views)
+        """Those of the lowest image, 0 without any."""
+        return min((view.view.height for view in self.views), default=0)
 
 
 def reduced(view: TrainingView, factor: int) -> TrainingView:

@@ -19,7 +19,8 @@ class Densifier:
 
         self._part = part
         self._by_gradient = settings.strategy == "default"
-        self._strategy = strategies.make_strategy(settings, part.cap_max or settings.cap_max)
+        self._cap, self._share = part.cap_max or settings.cap_max, settings.coarse_to_fine.share
+        self._strategy = strategies.make_strategy(settings, self._cap)
         self._on_cpu = strategies.torch_twins
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
@@ -30,24 +31,32 @@ class Densifier:
         """Whether Gaussians may be added, moved or removed after `step`."""
         return step % self._every == 0
 
-    def full(self, step: int) -> bool:
+    def full(self, step: int, coarse: bool) -> bool:
         """Whether after `step` their number stays as it is: as many as there may be, or no longer looked at."""
         ended = step >= self._strategy.refine_stop_iter
-        return ended or (not self._by_gradient and len(self._part) >= self._strategy.cap_max)
+        return ended or (not self._by_gradient and len(self._part) >= self._room(coarse))
+
+    def _room(self, coarse: bool) -> int:
+        """How many there may be."""
+        return max(1, int(self._share * self._cap)) if coarse else self._cap
 
     def any_alive(self) -> bool:
         """Whether a Gaussian is left; one that MCMC would relocate for its opacity is not."""
         opacities = self._part.params["opacities"]
         return bool(torch.sigmoid(opacities).gt(self._dead).any())
 
-    def after_step(self, step: int, optimizers: Optimizers, info: dict[str, Any], rows: slice) -> None:
-        """Grows, prunes and moves Gaussians after the optimizers have stepped; `rows` of what was rendered are theirs.
+    def after_step(
+        self, step: int, optimizers: Optimizers, info: dict[str, Any], rows: slice, coarse: bool = False
+    ) -> None:
+        """Grows, prunes and moves Gaussians after the optimizers have stepped; `rows` of what was rendered, `coarse` or
+        whole, are theirs.
 
         Draws from torch's global generator, as gsplat does.
         """
         params = self._part.params
         if len(self._part) == 0 or (self.due(step) and not self.any_alive()):
             return  # nothing is left to grow from; the model's other parts may go on
+        self._strategy.cap_max = self._room(coarse)
         if self._by_gradient:
             info = _own(info, rows)
         extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}

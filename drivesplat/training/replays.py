@@ -8,7 +8,7 @@ made when an image comes again after their number has stayed for a while, and dr
 
 import logging
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 import torch
@@ -48,13 +48,6 @@ def own_stream(device: torch.device) -> Iterator[None]:
     usual.wait_stream(own)
 
 
-def _draw_again(device: torch.device) -> None:
-    """Has torch's generator of a GPU draw again, which waits for the end of a recording that broke off."""
-    generator = torch.cuda.default_generators[torch.cuda.current_device() if device.index is None else device.index]
-    fresh = torch.Generator(device=device).manual_seed(generator.initial_seed())
-    generator.graphsafe_set_state(fresh.graphsafe_get_state())
-
-
 def can_be_replayed(settings: TrainSettings, device: torch.device) -> bool:
     """Whether iterations can be recorded, and shall be: densification by gradient reads what they leave behind."""
     wanted = settings.cuda_graphs and settings.strategy == "mcmc"
@@ -71,6 +64,19 @@ class Memory:
         self._kept.capture_begin(pool=self.pool)
         self._place = torch.zeros(1, device=device)
         self._kept.capture_end()
+
+
+def _tidy_up(device: torch.device, memory: Memory | None) -> None:
+    """Ends for torch what it still takes for a recording, which broke off: its generator draws again, and memory is
+    given back again."""
+    index = torch.cuda.current_device() if device.index is None else device.index
+    generator = torch.cuda.default_generators[index]
+    fresh = torch.Generator(device=device).manual_seed(generator.initial_seed())
+    generator.graphsafe_set_state(fresh.graphsafe_get_state())
+    end = getattr(torch._C, "_cuda_endAllocateToPool", None)
+    if memory is not None and end is not None:
+        with suppress(RuntimeError):
+            end(index, memory.pool)
 
 
 @dataclass
@@ -141,7 +147,7 @@ class Replays:
             log.warning("iterations cannot be recorded, which takes longer: %s", str(first).splitlines()[0])
             self.wanted = False
             self._forget()
-            _draw_again(self.device)
+            _tidy_up(self.device, self._memory)
             return None
         self._recorded[image] = recording = Recording(graph.replay, terms)
         return recording

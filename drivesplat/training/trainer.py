@@ -70,7 +70,8 @@ class Trainer:
         def once() -> Terms:
             return self._learn(view, step, rates)[0]
 
-        settled = all(densifier.full(self.step) for densifier in self.densifiers)
+        coarse = self.images.factor(self.step) > 1
+        settled = all(densifier.full(self.step, coarse) for densifier in self.densifiers)
         return self.replays.iterate(self.step, number, self._shape(), once, settled), None, view
 
     def _learn(
@@ -113,14 +114,14 @@ class Trainer:
 
     def densify(self, picture: Picture | None) -> None:
         """The second half: each part grows, prunes and moves its Gaussians."""
-        info = {} if picture is None else picture.info
+        info, coarse = {} if picture is None else picture.info, self.images.factor(self.step) > 1
         for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
-            densifier.after_step(self.step, optimizers, info, rows)
+            densifier.after_step(self.step, optimizers, info, rows, coarse)
         self.step += 1
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        return min(self.step // every, self.settings.gaussians.sh_degree)
+        return min(self.step // every, max(self.settings.gaussians.sh_degree, self.settings.actors.sh_degree))
 
     def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
