@@ -13,7 +13,7 @@ BLOCK = 256
 """Pixels a program."""
 HARDLY_SEEN = tl.constexpr(1e-3)
 """Where less than this comes through to the sky, it learns nothing: all that is opaque lets a trace of it through."""
-RUN = tl.constexpr(8)
+RUN = tl.constexpr(4)
 """Neighbouring pixels that most often look at the same texels."""
 
 
