@@ -18,6 +18,7 @@ from drivesplat.rigid import rigid
 from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.training.checkpoint import restore_model
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, schedule
 from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
@@ -148,6 +149,14 @@ def fitted(camera_poses: CameraPoses | None, iterations: int = 300) -> SplatMode
         trainer.fit_one()
         trainer.step += 1
     return model
+
+
+def test_a_training_that_was_ended_takes_up_what_it_had_learned():
+    had, again = fitted(poses(LOOSE), iterations=5), model_of(poses(LOOSE))
+    assert any(value.any() for value in had.camera_poses.params.values())
+    restore_model(again, {name: value.clone() for name, value in had.state_dict().items()})
+    assert again.state_dict().keys() == had.state_dict().keys()
+    assert all(torch.equal(value, had.state_dict()[name]) for name, value in again.state_dict().items())
 
 
 def off(model: SplatModel, time: float) -> tuple[float, float]:

@@ -344,9 +344,8 @@ def test_a_card_that_suffices_is_taken():
     assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU
 
 
-def replayed(record: bool, monkeypatch, iterations: int = 30, **settings) -> tuple[Trainer, list[float]]:
+def replayed(record: bool, iterations: int = 30, **settings) -> tuple[Trainer, list[float]]:
     """A training of background and cars by every term, recorded as soon as an image comes again, or not at all."""
-    monkeypatch.setattr(replays, "SETTLED", 0)
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
     model = untrained_street(chosen)
     for part in model.parts:  # no spheres, whose rotations learn from rounding
@@ -356,6 +355,7 @@ def replayed(record: bool, monkeypatch, iterations: int = 30, **settings) -> tup
     chosen = chosen.model_copy(update={"cuda_graphs": record, "iterations": iterations})
     with replays.own_stream(GPU):
         trainer = Trainer.begin(model.to(GPU), guided_views(GPU), chosen, 0, GPU)
+        trainer.replays.patience = 0
         losses = [float(torch.stack(list(goes_on(trainer).values())).sum()) for _ in range(iterations)]
     trainer.guard.check("nowhere")
     return trainer, losses
@@ -369,9 +369,9 @@ def goes_on(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
     return terms
 
 
-def test_a_training_that_is_replayed_learns_what_it_does_otherwise(monkeypatch, caplog):
-    recorded, mine = replayed(True, monkeypatch)
-    plain, theirs = replayed(False, monkeypatch)
+def test_a_training_that_is_replayed_learns_what_it_does_otherwise(caplog):
+    recorded, mine = replayed(True)
+    plain, theirs = replayed(False)
     assert not caplog.records, "nothing was refused"
     assert len(recorded.replays._recorded) == len(recorded.images.views) and not plain.replays._recorded
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
@@ -386,11 +386,11 @@ def test_a_training_that_is_replayed_learns_what_it_does_otherwise(monkeypatch, 
     assert steps == [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in plain.optimizers.all()]
 
 
-def test_recordings_outlive_relocation_and_not_growth(monkeypatch):
+def test_recordings_outlive_relocation_and_not_growth():
     """Gaussians that MCMC moves stay where they lie; more of them do not."""
     grows = {"mcmc": McmcSettings(noise_lr=0.0, refine_every=12), "refine_start": 0.0, "refine_stop": 1.0}
     settings = {"iterations": 60, **grows}
-    trainer, losses = replayed(True, monkeypatch, cap_max=100, **settings)
+    trainer, losses = replayed(True, cap_max=100, **settings)
     assert len(trainer.model.parts[0]) <= 100 and trainer.replays._recorded
     assert losses[-1] < losses[0]
     known = list(trainer.replays._recorded.values())
@@ -404,7 +404,7 @@ def test_recordings_outlive_relocation_and_not_growth(monkeypatch):
 def test_lists_that_outgrow_their_room_are_noticed(monkeypatch):
     monkeypatch.setattr(rooms, "LEAST", 0)
     monkeypatch.setattr(rooms, "MARGIN", 1.0)
-    trainer, _ = replayed(True, monkeypatch, iterations=8)
+    trainer, _ = replayed(True, iterations=8)
     trainer.model.parts[0].params["scales"].data += 1.0
     with replays.own_stream(GPU):
         goes_on(trainer, 4)
@@ -422,7 +422,7 @@ def test_what_cannot_be_recorded_is_done_all_the_same(monkeypatch, caplog):
         return found
 
     monkeypatch.setattr(trainer_module, "loss_terms", asks)
-    trainer, losses = replayed(True, monkeypatch, iterations=12)
+    trainer, losses = replayed(True, iterations=12)
     assert torch.rand(3, device=GPU).any(), "random numbers can still be drawn"
     assert [record.message.startswith("iterations cannot be recorded") for record in caplog.records] == [True]
     assert not trainer.replays.wanted and losses[-1] < losses[0] and all(map(math.isfinite, losses))

@@ -333,9 +333,9 @@ for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
 compiled(adam._step, BLOCK=adam.BLOCK)
 compiled(regularisers._sums, BLOCK=regularisers.BLOCK)
 compiled(regularisers._spread, BLOCK=regularisers.BLOCK)
-compiled(tiles._count, BLOCK=tiles.BLOCK)
+compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
 compiled(tiles._list, BLOCK=tiles.BLOCK)
-compiled(chunks._count, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
+compiled(chunks._count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
 for kernel in (chunks._take_apart, chunks._add_up):
     compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
 for kernel in (chunks._composite, chunks._pull_apart):

@@ -18,8 +18,10 @@ DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 TILE = 16
 
 
-def ellipses(cameras: int, count: int, width: int, height: int, seed: int = 0) -> tuple[Projected, torch.Tensor]:
-    """Gaussians of all sizes and shapes in and around images, and their depths."""
+def ellipses(
+    cameras: int, count: int, width: int, height: int, seed: int = 0
+) -> tuple[Projected, torch.Tensor, torch.Tensor]:
+    """Gaussians of all sizes and shapes in and around images, how far they reach across and down, and their depths."""
     rng = np.random.default_rng(seed)
     axes = np.exp(rng.uniform(-1.0, 2.5, (cameras, count, 2)))
     turns = Rotation.from_euler("z", rng.uniform(0, np.pi, (cameras * count, 1))).as_matrix()[:, :2, :2]
@@ -32,7 +34,10 @@ def ellipses(cameras: int, count: int, width: int, height: int, seed: int = 0) -
         rng.uniform(0.0, 1.0, (cameras, count)) ** 3,
     )
     on_device = Projected(*(torch.from_numpy(values).float().to(DEVICE) for values in shown))
-    return on_device, torch.from_numpy(rng.uniform(1, 9, (cameras, count))).float().to(DEVICE)
+    spread = np.sqrt(np.diagonal(np.linalg.inv(conics), axis1=-2, axis2=-1))
+    reach = np.sqrt(2.0 * np.log(np.maximum(255.0 * shown.opacities, 1.0)))
+    radii = torch.from_numpy(np.ceil(reach[..., None] * spread)).to(torch.int32).to(DEVICE)
+    return on_device, radii, torch.from_numpy(rng.uniform(1, 9, (cameras, count))).float().to(DEVICE)
 
 
 def covered(gaussians: Projected, width: int, height: int) -> np.ndarray:
@@ -57,8 +62,7 @@ def by_tile(lists: Lists) -> list[list[int]]:
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_tiles_list_what_they_show_from_near_to_far_and_little_else(cameras):
     width, height, count = 75, 40, 300
-    gaussians, depths = ellipses(cameras, count, width, height)
-    radii = torch.full((cameras, count, 2), 9, dtype=torch.int32, device=DEVICE)
+    gaussians, radii, depths = ellipses(cameras, count, width, height)
     radii[0, ::7, 0], radii[0, 1::7, 1] = 0, 0
     lists = lists_of(gaussians, radii, depths, width, height)
     shown = covered(gaussians, width, height) & (radii > 0).all(dim=-1).cpu().numpy()[..., None, None]
@@ -76,8 +80,7 @@ def test_tiles_list_what_they_show_from_near_to_far_and_little_else(cameras):
 
 
 def test_without_room_for_all_the_farthest_are_left_out(monkeypatch):
-    gaussians, depths = ellipses(1, 200, 75, 40)
-    radii = torch.full((1, 200, 2), 9, dtype=torch.int32, device=DEVICE)
+    gaussians, radii, depths = ellipses(1, 200, 75, 40)
     with rooms.counted() as needs:
         every = lists_of(gaussians, radii, depths, 75, 40)
     assert needs == [len(every.ids)]
@@ -94,8 +97,24 @@ def test_without_room_for_all_the_farthest_are_left_out(monkeypatch):
     assert left_out and depths[0, list(left_out)].min() >= depths[0, kept].max()
 
 
+def test_what_is_so_thin_that_rounding_leaves_no_determinant_is_listed_in_its_box():
+    """As gsplat bounds it, and nowhere else."""
+    wide, thin = 4000.0, 0.5
+    turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0)
+    conic = turn @ np.diag([1 / wide**2, 1 / thin**2]) @ turn.T
+    rounded = torch.tensor([[[conic[0, 0], conic[0, 1], conic[1, 1]]]], dtype=torch.float32, device=DEVICE)
+    rounded[..., 1] = -rounded[..., 0]
+    means = torch.tensor([[[40.0, 40.0]]], device=DEVICE)
+    gaussian = Projected(means, rounded, torch.ones(1, 1, 3, device=DEVICE), torch.ones(1, 1, device=DEVICE))
+    depths, radii = torch.ones(1, 1, device=DEVICE), torch.full((1, 1, 2), 20, dtype=torch.int32, device=DEVICE)
+    lists = lists_of(gaussian, radii, depths, 160, 160)
+    listed = [(tile // 10, tile % 10) for tile, found in enumerate(by_tile(lists)) if found]
+    assert {(1, 1), (2, 2), (3, 3)} <= set(listed)
+    assert all(1 <= row <= 3 and 1 <= column <= 3 for row, column in listed)
+
+
 def test_nothing_is_listed_of_what_is_not_there():
-    gaussians, depths = ellipses(1, 9, 20, 10)
+    gaussians, _, depths = ellipses(1, 9, 20, 10)
     unseen = lists_of(gaussians, torch.zeros(1, 9, 2, dtype=torch.int32, device=DEVICE), depths, 20, 10)
     empty = Projected(*(values[:, :0] for values in gaussians))
     none = lists_of(empty, torch.zeros(1, 0, 2, dtype=torch.int32, device=DEVICE), depths[:, :0], 20, 10)

@@ -19,6 +19,8 @@ from drivesplat.on_gpu.tiles import TILE, Lists, Projected
 
 LENGTH = 512
 """Most Gaussians of a chunk."""
+MOST_VALUES = 8
+"""Of a Gaussian: every entry of a list has its own copy of them."""
 BLOCK = 4096
 """Tiles that are counted at a time."""
 
@@ -55,7 +57,7 @@ class _Cut(torch.autograd.Function):
         starts, firsts = lists.ids.new_empty(chunks, 1, 1), lists.ids.new_empty(tiles + 1)
         there = torch.empty(chunks, 1, 1, dtype=torch.bool, device=means.device)
         apart = [means.new_empty(room, width) for width in (2, 3, values.shape[-1])] + [means.new_empty(room)]
-        _count[(1,)](lists.offsets, firsts, tiles, LENGTH, BLOCK)
+        _count_chunks[(1,)](lists.offsets, firsts, tiles, LENGTH, BLOCK)
         _take_apart[(chunks,)](
             *given, *lists[:3], firsts, *apart, starts, there,
             tiles, down * across, across, tiles.bit_length(), values.shape[-1], LENGTH,
@@ -106,7 +108,7 @@ class _PutTogether(torch.autograd.Function):
 
 @triton.jit(do_not_specialize=["tiles"])
 @no_type_check
-def _count(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.constexpr):
+def _count_chunks(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.constexpr):
     """The first chunk of every tile, and behind them how many chunks there are."""
     found = 0
     for begin in range(0, tiles, BLOCK):
@@ -137,9 +139,9 @@ def _take_apart(
     start = tl.where(is_one, start, tl.load(offsets + tiles))
     tl.store(starts + chunk, start)
     tl.store(there + chunk, is_one)
-    place = start + tl.arange(0, LENGTH)
+    place = start.to(tl.int64) + tl.arange(0, LENGTH)
     inside = is_one & (place < tl.load(offsets + low + 1))
-    i = tl.load(ids + tl.load(order + place, mask=inside, other=0), mask=inside, other=0)
+    i = tl.load(ids + tl.load(order + place, mask=inside, other=0), mask=inside, other=0).to(tl.int64)
     left, top = (low % per_camera) % across * TILE, (low % per_camera) // across * TILE
     tl.store(means_apart + 2 * place, tl.load(means + 2 * i, mask=inside, other=0.0) - left, mask=inside)
     tl.store(means_apart + 2 * place + 1, tl.load(means + 2 * i + 1, mask=inside, other=0.0) - top, mask=inside)
@@ -167,9 +169,9 @@ def _add_up(
     """The gradients of a chunk's Gaussians, added to those of all."""
     chunk = tl.program_id(0)
     is_one = chunk < tl.load(firsts + tiles)
-    place = tl.load(starts + chunk) + tl.arange(0, LENGTH)
+    place = tl.load(starts + chunk).to(tl.int64) + tl.arange(0, LENGTH)
     inside = is_one & (place < tl.load(starts + chunk + 1, mask=is_one, other=0))
-    i = tl.load(ids + tl.load(order + place, mask=inside, other=0), mask=inside, other=0)
+    i = tl.load(ids + tl.load(order + place, mask=inside, other=0), mask=inside, other=0).to(tl.int64)
     for k in tl.static_range(2):
         _add(v_means + 2 * i + k, tl.load(v_means_apart + 2 * place + k, mask=inside, other=0.0), inside)
     for k in tl.static_range(3):
@@ -199,7 +201,7 @@ def _composite(
     """A tile of the image, and how much light comes through to each of its chunks."""
     tile = tl.program_id(0)
     at, inside = _pixels(tile, width, height, across, per_camera)
-    pixel, channel = tl.arange(0, TILE * TILE), tl.arange(0, WIDTH)
+    pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
     passes = tl.full((TILE * TILE,), 1.0, tl.float32)
     total = tl.zeros((TILE * TILE, WIDTH), tl.float32)
     for chunk in range(tl.load(firsts + tile), tl.load(firsts + tile + 1)):
@@ -221,7 +223,7 @@ def _pull_apart(
     """The gradients of a tile's chunks, from the last to the first."""
     tile = tl.program_id(0)
     at, inside = _pixels(tile, width, height, across, per_camera)
-    pixel, channel = tl.arange(0, TILE * TILE), tl.arange(0, WIDTH)
+    pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
     there = (channel < CHANNELS)[None, :]
     pull = tl.load(v_image + at[:, None] * CHANNELS + channel, mask=inside[:, None] & there, other=0.0)
     pull_alpha = tl.load(v_whole + at, mask=inside, other=0.0)

@@ -64,7 +64,7 @@ def lists_of(
     seen, size = (means, conics, opacities, radii.contiguous()), (width, height, across, down * across)
     blocks = (triton.cdiv(count, BLOCK),)
     if count:
-        _count[blocks](*seen, depths.contiguous(), counts, nearness, count, each, *size[:2], BLOCK)
+        _count_tiles[blocks](*seen, depths.contiguous(), counts, nearness, count, each, *size[:2], BLOCK)
     nearest = torch.argsort(nearness)
     ends = torch.cumsum(counts[nearest], dim=0, dtype=torch.int32)
     room = rooms.room_for(ends[-1]) if count else 0
@@ -81,8 +81,11 @@ def lists_of(
 @triton.jit
 @no_type_check
 def _ellipse(means, conics, opacities, radii, i, there):
-    """Centres and conics of Gaussians, how far out they reach, in the conic's measure, and which can be seen."""
-    there &= (tl.load(radii + 2 * i, mask=there, other=0) > 0) & (tl.load(radii + 2 * i + 1, mask=there, other=0) > 0)
+    """Centres and conics of Gaussians, how far out they reach, in the conic's measure and at most in pixels, and which
+    can be seen."""
+    wide = tl.load(radii + 2 * i, mask=there, other=0).to(tl.float32)
+    high = tl.load(radii + 2 * i + 1, mask=there, other=0).to(tl.float32)
+    there &= (wide > 0.0) & (high > 0.0)
     x, y = tl.load(means + 2 * i, mask=there, other=0.0), tl.load(means + 2 * i + 1, mask=there, other=0.0)
     a = tl.load(conics + 3 * i, mask=there, other=1.0)
     b = tl.load(conics + 3 * i + 1, mask=there, other=0.0)
@@ -90,7 +93,14 @@ def _ellipse(means, conics, opacities, radii, i, there):
     opacity = tl.load(opacities + i, mask=there, other=0.0)
     there &= opacity > FAINTEST
     reach = 2.0 * tl.log(tl.where(there, opacity, 1.0) / FAINTEST)
-    return x, y, a, b, c, reach, there
+    return x, y, a, b, c, reach, wide, high, there
+
+
+@triton.jit
+@no_type_check
+def _determinant(a, b, c):
+    """Of conics; of long and thin ones rounding leaves little, or less than nothing."""
+    return tl.maximum(a * c - b * b, 1e-20)
 
 
 @triton.jit
@@ -109,26 +119,27 @@ def _last(edge):
 
 @triton.jit
 @no_type_check
-def _rows(y, a, b, c, reach, there, height):
+def _rows(y, a, b, c, reach, high, there, height):
     """The first row of tiles that shows Gaussians, and how many do."""
-    tall = tl.sqrt(reach * a / (a * c - b * b)) + SLACK
+    tall = tl.minimum(tl.sqrt(reach * a / _determinant(a, b, c)), high) + SLACK
     top, bottom = tl.maximum(_first(y - tall), 0), tl.minimum(_last(y + tall), height - 1)
     return top // TILE, tl.where(there & (top <= bottom), bottom // TILE - top // TILE + 1, 0)
 
 
 @triton.jit
 @no_type_check
-def _columns(row, x, y, a, b, c, reach, there, width):
+def _columns(row, x, y, a, b, c, reach, wide, high, there, width):
     """The first tile of a row that shows Gaussians, and how many do: between the outermost points of the ellipse among
     the rows of pixels of these tiles."""
-    det = a * c - b * b
-    tall = tl.sqrt(reach * a / det)
+    det = _determinant(a, b, c)
+    tall = tl.minimum(tl.sqrt(reach * a / det), high)
     top = tl.maximum((row * TILE).to(tl.float32) + 0.5 - y - SLACK, -tall)
     bottom = tl.minimum((row * TILE + TILE - 1).to(tl.float32) + 0.5 - y + SLACK, tall)
     tilt = b * tl.sqrt(reach / (c * det))  # of its outermost points, by height
     at_right, at_left = tl.maximum(tl.minimum(-tilt, bottom), top), tl.maximum(tl.minimum(tilt, bottom), top)
     right = (tl.sqrt(tl.maximum(a * reach - det * at_right * at_right, 0.0)) - b * at_right) / a + SLACK
     left = (-tl.sqrt(tl.maximum(a * reach - det * at_left * at_left, 0.0)) - b * at_left) / a - SLACK
+    left, right = tl.maximum(left, -wide), tl.minimum(right, wide)
     start, end = tl.maximum(_first(x + left), 0), tl.minimum(_last(x + right), width - 1)
     shown = there & (top <= bottom) & (start <= end)
     return start // TILE, tl.where(shown, end // TILE - start // TILE + 1, 0)
@@ -136,14 +147,16 @@ def _columns(row, x, y, a, b, c, reach, there, width):
 
 @triton.jit(do_not_specialize=["count", "each", "width", "height"])
 @no_type_check
-def _count(means, conics, opacities, radii, depths, counts, nearness, count, each, width, height, BLOCK: tl.constexpr):
+def _count_tiles(
+    means, conics, opacities, radii, depths, counts, nearness, count, each, width, height, BLOCK: tl.constexpr
+):
     """How many tiles show each Gaussian, and by what it is sorted: its depth, if any does."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    x, y, a, b, c, reach, there = _ellipse(means, conics, opacities, radii, i, i < count)
-    first, rows = _rows(y, a, b, c, reach, there, height)
+    x, y, a, b, c, reach, wide, high, there = _ellipse(means, conics, opacities, radii, i, i < count)
+    first, rows = _rows(y, a, b, c, reach, high, there, height)
     found = tl.zeros((BLOCK,), tl.int32)
     for step in range(tl.max(rows, 0)):
-        found += _columns(first + step, x, y, a, b, c, reach, step < rows, width)[1]
+        found += _columns(first + step, x, y, a, b, c, reach, wide, high, step < rows, width)[1]
     tl.store(counts + i, found, mask=i < count)
     depth = tl.load(depths + i, mask=found > 0, other=float("inf"))
     tl.store(nearness + i, depth, mask=i < count)
@@ -160,15 +173,16 @@ def _list(
     i = tl.load(nearest + place, mask=place < count, other=0)
     there = place < count
     there &= tl.load(counts + i, mask=there, other=0) > 0
-    free = tl.load(ends + place, mask=there, other=0) - tl.load(counts + i, mask=there, other=0)
-    x, y, a, b, c, reach, there = _ellipse(means, conics, opacities, radii, i, there)
-    first, rows = _rows(y, a, b, c, reach, there, height)
+    end = tl.load(ends + place, mask=there, other=0)
+    free = end - tl.load(counts + i, mask=there, other=0)
+    x, y, a, b, c, reach, wide, high, there = _ellipse(means, conics, opacities, radii, i, there)
+    first, rows = _rows(y, a, b, c, reach, high, there, height)
     camera = (i // each).to(tl.int32) * per_camera
     for step in range(tl.max(rows, 0)):
-        start, columns = _columns(first + step, x, y, a, b, c, reach, step < rows, width)
+        start, columns = _columns(first + step, x, y, a, b, c, reach, wide, high, step < rows, width)
         tile = camera + (first + step) * across + start
         for column in range(tl.max(columns, 0)):
-            fits = (column < columns) & (free + column < room)
+            fits = (column < columns) & (free + column < tl.minimum(end, room))
             tl.store(keys + free + column, tile + column, mask=fits)
             tl.store(ids + free + column, i.to(tl.int32), mask=fits)
         free += columns

@@ -41,22 +41,23 @@ def rasterize_gsplat(
     if with_depth:
         values = torch.cat([values, depths[..., None]], dim=-1)
     seen = means2d, conics, values, shown
-    if absgrad or not on_gpu.for_tensor(means):
-        composited, alpha = _by_whole_lists(seen, radii, depths, width, height, absgrad)
-    else:
-        from drivesplat.on_gpu import chunks, tiles
-
-        gaussians = tiles.Projected(*seen)
-        lists = tiles.lists_of(gaussians, radii, depths, width, height)
-        composited, alpha = chunks.composited(gaussians, lists, width, height, rasterize_to_pixels)
+    composited, alpha = _composited(seen, radii, depths, width, height, absgrad)
     projected: dict[str, Any] = {"means2d": means2d, "radii": radii, "depths": depths, "conics": conics}
     return assembled(composited, alpha, with_depth, **projected, opacities=shown)
 
 
-def _by_whole_lists(
+def _composited(
     seen: tuple[Tensor, Tensor, Tensor, Tensor], radii: Tensor, depths: Tensor, width: int, height: int, absgrad: bool
 ) -> tuple[Tensor, Tensor]:
-    """Gaussians `seen` by c cameras, (means2d, conics, values, opacities), composited as gsplat does."""
+    """Gaussians `seen` by c cameras, (means2d, conics, values, opacities), composited: by lists in chunks where Triton
+    compiles, and by whole ones as gsplat does."""
+    if not absgrad and on_gpu.for_tensor(seen[0]):
+        from drivesplat.on_gpu import chunks, tiles
+
+        gaussians = tiles.Projected(*seen)
+        if gaussians.values.shape[-1] <= chunks.MOST_VALUES:
+            lists = tiles.lists_of(gaussians, radii, depths, width, height)
+            return chunks.composited(gaussians, lists, width, height, rasterize_to_pixels)
     cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)
     _, isect_ids, flatten_ids = isect_tiles(seen[0], radii, depths, TILE, across, down, n_images=cameras)
     offsets = isect_offset_encode(isect_ids, cameras, across, down).reshape(cameras, down, across)

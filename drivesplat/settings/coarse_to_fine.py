@@ -16,4 +16,5 @@ class CoarseToFineSettings(Settings):
     least_height: int = Field(225, ge=16)
     """Pixels: no image is reduced to fewer rows. 900 rows are reduced to 225, 640x360 images are not reduced."""
     share: float = Field(0.6, gt=0, le=1)
-    """While images are reduced there are at most so large a share of the Gaussians that there may be."""
+    """While images are reduced, with strategy: mcmc, the number of Gaussians grows to no more than this share of what
+    there may be; it is given up in time for them to grow to all before densification stops."""

@@ -41,7 +41,7 @@ CHECKPOINT = "ckpt.pt"
 @dataclass(frozen=True)
 class PlainSummary:
     """What there is to say of a training that ended: the seconds of its loop, when its files were there (by
-    `time.monotonic`), the Gaussians, what torch allocated at its peak (GB; None on the CPU), and which SSIM it trained
+    `time.monotonic`), the Gaussians, what torch held at its peak (GB; None on the CPU), and which SSIM it trained
     with."""
 
     seconds: float
@@ -60,6 +60,7 @@ def fit(
     on_gpu = device.type == "cuda"
     torch.manual_seed(recipe.seed)
     if on_gpu:
+        torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
     training = PlainTraining(splats, make_optimizers(splats, scale), recipe, device, chosen_ssim(device), clock)
     data = endless(loader_of(images, recipe.workers, device))
@@ -71,7 +72,7 @@ def fit(
         seconds = time.monotonic() - began
     save(folder / CHECKPOINT, training.state())
     ended = time.monotonic()  # the processes that decode images take up to seconds to leave: no part of a training
-    peak = torch.cuda.max_memory_allocated(device) / 1e9 if on_gpu else None
+    peak = torch.cuda.max_memory_reserved(device) / 1e9 if on_gpu else None
     return PlainSummary(seconds, ended, len(splats["means"]), peak, training.ssim.name)
 
 

@@ -1,5 +1,6 @@
 """The densification of a model's parts: each part its own gsplat strategy and state."""
 
+import math
 from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,8 @@ class Densifier:
 
         self._part = part
         self._by_gradient = settings.strategy == "default"
-        self._cap, self._share = part.cap_max or settings.cap_max, settings.coarse_to_fine.share
+        self._cap = part.cap_max or settings.cap_max
+        self._few, self._few_until = few_at_first(self._cap, settings)
         self._strategy = strategies.make_strategy(settings, self._cap)
         self._on_cpu = strategies.torch_twins
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
@@ -34,11 +36,11 @@ class Densifier:
     def full(self, step: int, coarse: bool) -> bool:
         """Whether after `step` their number stays as it is: as many as there may be, or no longer looked at."""
         ended = step >= self._strategy.refine_stop_iter
-        return ended or (not self._by_gradient and len(self._part) >= self._room(coarse))
+        return ended or (not self._by_gradient and len(self._part) >= self._room(step, coarse))
 
-    def _room(self, coarse: bool) -> int:
-        """How many there may be."""
-        return max(1, int(self._share * self._cap)) if coarse else self._cap
+    def _room(self, step: int, coarse: bool) -> int:
+        """How many there may be after `step`, in which images were `coarse` or whole."""
+        return self._few if coarse and step < self._few_until else self._cap
 
     def any_alive(self) -> bool:
         """Whether a Gaussian is left; one that MCMC would relocate for its opacity is not."""
@@ -56,12 +58,22 @@ class Densifier:
         params = self._part.params
         if len(self._part) == 0 or (self.due(step) and not self.any_alive()):
             return  # nothing is left to grow from; the model's other parts may go on
-        self._strategy.cap_max = self._room(coarse)
+        self._strategy.cap_max = self._room(step, coarse)
         if self._by_gradient:
             info = _own(info, rows)
         extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}
         with nullcontext() if params["means"].is_cuda else self._on_cpu():
             self._strategy.step_post_backward(params, optimizers, self.state, step, info, **extra)
+
+
+def few_at_first(cap: int, settings: TrainSettings) -> tuple[int, int]:
+    """How many of `cap` Gaussians there may be while images are reduced, and until which iteration: late enough for
+    them to grow to all of them before densification stops."""
+    share, mcmc = settings.coarse_to_fine.share, settings.mcmc
+    if settings.strategy != "mcmc" or share == 1.0 or mcmc.growth == 0.0:
+        return cap, 0
+    times = math.ceil(-math.log(share) / math.log1p(mcmc.growth)) + 1
+    return max(1, int(share * cap)), int(settings.refine_stop * settings.iterations) - times * mcmc.refine_every
 
 
 def _own(info: dict[str, Any], rows: slice) -> dict[str, Any]:

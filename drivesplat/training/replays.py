@@ -7,9 +7,10 @@ made when an image comes again after their number has stayed for a while, and dr
 """
 
 import logging
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import torch
 from jaxtyping import Int
@@ -18,12 +19,15 @@ from torch import Tensor
 from drivesplat import on_gpu
 from drivesplat.on_gpu import rooms
 from drivesplat.settings.train import TrainSettings
+from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
 
 Terms = dict[str, Tensor]
-SETTLED = 150
-"""Iterations that the number of Gaussians has to have stayed: more than between two densifications."""
+T = TypeVar("T")
+MOST_IMAGES = 4096
+"""Of trainings with more nothing is recorded: what is known of a moment in time is not kept for more than twice as
+many, and recordings of it hold on to where it lies."""
 
 
 @dataclass(frozen=True)
@@ -48,50 +52,31 @@ def own_stream(device: torch.device) -> Iterator[None]:
     usual.wait_stream(own)
 
 
-def can_be_replayed(settings: TrainSettings, device: torch.device) -> bool:
-    """Whether iterations can be recorded, and shall be: densification by gradient reads what they leave behind."""
-    wanted = settings.cuda_graphs and settings.strategy == "mcmc"
-    return wanted and device.type == "cuda" and on_gpu.compiles()
-
-
-class Memory:
-    """What all recordings of a training work in, one after the other. It lasts while a recording does, so a small one
-    is kept."""
-
-    def __init__(self, device: torch.device):
-        self.pool = torch.cuda.graph_pool_handle()
-        self._kept = torch.cuda.CUDAGraph()
-        self._kept.capture_begin(pool=self.pool)
-        self._place = torch.zeros(1, device=device)
-        self._kept.capture_end()
-
-
-def _tidy_up(device: torch.device, memory: Memory | None) -> None:
-    """Ends for torch what it still takes for a recording, which broke off: its generator draws again, and memory is
-    given back again."""
-    index = torch.cuda.current_device() if device.index is None else device.index
-    generator = torch.cuda.default_generators[index]
-    fresh = torch.Generator(device=device).manual_seed(generator.initial_seed())
-    generator.graphsafe_set_state(fresh.graphsafe_get_state())
-    end = getattr(torch._C, "_cuda_endAllocateToPool", None)
-    if memory is not None and end is not None:
-        with suppress(RuntimeError):
-            end(index, memory.pool)
+def can_be_replayed(settings: TrainSettings, views: Sequence[TrainingView], device: torch.device) -> bool:
+    """Whether iterations can be recorded, and shall be. Densification by gradient reads what they leave behind; classes
+    are too many values for the lists whose room is known beforehand."""
+    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(views) <= MOST_IMAGES
+    possible = device.type == "cuda" and on_gpu.compiles()
+    return wanted and possible and all(view.classes is None for view in views)
 
 
 @dataclass
 class Replays:
-    """The recordings of a training's iterations, by its images; of a training that has none on a CPU, or by choice."""
+    """The recordings of a training's iterations, by its images; of a training that has none on a CPU, or by choice.
+
+    They are made when shapes have stayed for `patience` iterations, and where they will stay at once.
+    """
 
     wanted: bool
     device: torch.device
+    patience: int
     missing: Int[Tensor, ""] = field(init=False)
     """By how much the fullest lists of Gaussians outgrew the room that a recording has for them."""
     _shape: Hashable = None
     _since: int = 0
     _needs: dict[int, list[int]] = field(default_factory=dict)
     _recorded: dict[int, Recording] = field(default_factory=dict)
-    _memory: Memory | None = None
+    _pool: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         self.missing = torch.zeros((), dtype=torch.int32, device=self.device)
@@ -99,55 +84,86 @@ class Replays:
     def iterate(
         self, step: int, image: int, shape: Hashable, once: Callable[[], Terms], settled: bool = False
     ) -> Terms:
-        """An iteration with an image, known by a number: what is done `once`, or its recording replayed. `shape` is all
-        that a recording holds on to, beside the image; `settled` where the number of Gaussians will stay."""
+        """An iteration with an image, known by a number: what is done `once`, or its recording replayed. `shape` is
+        what changes where a recording no longer serves; `settled` where the number of Gaussians will stay."""
         if not self.wanted:
             return once()
         if shape != self._shape:
-            self._forget()
+            self.forget()
             self._shape, self._since = shape, step
         recording = self._recorded.get(image)
-        if recording is None and image in self._needs and (settled or step >= self._since + SETTLED):
+        if recording is None and image in self._needs and (settled or step >= self._since + self.patience):
             recording = self._record(image, once)
         if recording is None:
             with rooms.counted() as needs:
-                terms = once()
+                terms = self.make_room(once)
             self._needs[image] = needs
             return terms
         recording.replay()
         return recording.terms
 
+    def make_room(self, once: Callable[[], T]) -> T:
+        """What is done `once`; where memory does not suffice for it beside recordings, without these from now on."""
+        try:
+            return once()
+        except torch.cuda.OutOfMemoryError:
+            if not self._recorded:
+                raise
+        log.warning("no GPU memory is left for recorded iterations: without them it takes longer; lower train.cap_max")
+        self.wanted = False
+        self.forget()
+        torch.cuda.empty_cache()
+        return once()
+
     def check(self) -> None:
         """Drops what was recorded with too little room. Waits for the device."""
         if self._recorded and int(self.missing) > 0:
             log.debug("recorded iterations had room for %d entries too few: they are recorded anew", self.missing)
-            self._forget()
+            self.forget()
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """Drops what is recorded, and the memory it works in."""
+        if self._recorded:
+            torch.cuda.synchronize(self.device)
         self._recorded.clear()
         self._needs.clear()
+        self._pool = None
         self.missing.zero_()
 
     def _record(self, image: int, once: Callable[[], Terms]) -> Recording | None:
         """The recording of an iteration, which recording does not do; None, and none from now on, where the GPU or its
         driver refuses."""
-        graph = torch.cuda.CUDAGraph()
+        if self._pool is None:
+            torch.cuda.empty_cache()  # what torch holds in reserve is of no use to recordings
+            self._pool = torch.cuda.graph_pool_handle()
+        graph, drawn = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(self.device)
         try:
-            self._memory = self._memory or Memory(self.device)
             with rooms.given(self._needs[image]) as lists:
-                graph.capture_begin(pool=self._memory.pool)
+                graph.capture_begin(pool=self._pool)
                 try:
                     terms = once()
                     for needed, room in lists:
                         torch.maximum(self.missing, needed - room, out=self.missing)
                 finally:
                     graph.capture_end()
-        except RuntimeError as error:
+        except Exception as error:  # of the driver's, of torch's, of Triton's: all that is lost is time
             first = error.__context__ or error  # one that breaks a recording off lets its end fail, too
             log.warning("iterations cannot be recorded, which takes longer: %s", str(first).splitlines()[0])
+            _tidy_up(self.device, self._pool, drawn)
             self.wanted = False
-            self._forget()
-            _tidy_up(self.device, self._memory)
+            self.forget()
             return None
         self._recorded[image] = recording = Recording(graph.replay, terms)
         return recording
+
+
+def _tidy_up(device: torch.device, pool: tuple[int, int], drawn: Tensor) -> None:
+    """Ends for torch what it still takes for a recording, which broke off: its generator goes on from what had been
+    `drawn`, and memory is given back again."""
+    index = torch.cuda.current_device() if device.index is None else device.index
+    fresh = torch.Generator(device=device)
+    fresh.set_state(drawn)
+    torch.cuda.default_generators[index].graphsafe_set_state(fresh.graphsafe_get_state())
+    for name in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
+        with suppress(AttributeError, RuntimeError):
+            getattr(torch._C, name)(index, pool)

@@ -45,8 +45,8 @@ class Workspace:
 class TrainingSummary:
     """What `train.json` says of a finished training.
 
-    `peak_gpu_memory_gb` is None on the CPU; `seconds` counts resumed runs too; `of_cameras` has what was learned of
-    each camera, by name: gains and offsets, how far poses were corrected.
+    `peak_gpu_memory_gb`, what torch held at its peak, is None on the CPU; `seconds` counts resumed runs too;
+    `of_cameras` has what was learned of each camera, by name: gains and offsets, how far poses were corrected.
     """
 
     iterations: int
@@ -98,6 +98,7 @@ class Run:
     def begin(cls, trainer: Trainer, workspace: Workspace) -> "Run":
         """Takes up the workspace's resume state if this training wrote it; otherwise starts at 0."""
         if trainer.device.type == "cuda":
+            torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(trainer.device)
         saved = checkpoint.resumable(workspace.state, workspace.fingerprint)
         if saved is None:
@@ -148,7 +149,7 @@ class Run:
         t, on_gpu = self.trainer, self.trainer.device.type == "cuda"
         if on_gpu:
             torch.cuda.synchronize(t.device)
-        peak = torch.cuda.max_memory_allocated(t.device) / 1e9 if on_gpu else None
+        peak = torch.cuda.max_memory_reserved(t.device) / 1e9 if on_gpu else None
         return TrainingSummary(
             iterations=t.step,
             seconds=self.seconds,
@@ -173,7 +174,6 @@ def _iterate(run: Run, monitor: Monitor) -> None:
                 _densify(run, picture, empty)
             if trainer.step % settings.log_every == 0:
                 run.check()
-                trainer.replays.check()
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
             if shown and picture is not None:
                 monitor.image(trainer.step, view, picture)
@@ -187,6 +187,7 @@ def _densify(run: Run, picture: Picture | None, empty: EmptySpace) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     if trainer.densifies():
         run.check()  # a strategy fed with what is no number ends in an assertion on the GPU, beyond rescue
+        trainer.replays.check()
         for part in trainer.model.parts:
             part.confine()
     trainer.densify(picture)

@@ -52,7 +52,8 @@ class Trainer:
         densifiers = [Densifier(part, settings) for part in model.parts]
         optimizers, known = make_optimizers(model), surroundings.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        replays = Replays(can_be_replayed(settings, device) and clock is UNTIMED, device)
+        replayed = clock is UNTIMED and can_be_replayed(settings, views, device)
+        replays = Replays(replayed, device, patience=settings.mcmc.refine_every * 3 // 2)
         told = ToldDevice(device)
         return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, told)
 
@@ -64,7 +65,7 @@ class Trainer:
         schedule(self.model, self.optimizers, self.step, self.settings)
         step, rates = self.on_device.told(self.step, self.optimizers)
         if shown or not self.replays.wanted:
-            terms, picture = self._learn(view, step, rates)
+            terms, picture = self.replays.make_room(lambda: self._learn(view, step, rates))
             return terms, picture, view
 
         def once() -> Terms:
@@ -104,7 +105,7 @@ class Trainer:
         return {name: value.detach() for name, value in terms.items()}, picture
 
     def _shape(self) -> Hashable:
-        """All that a recorded iteration holds on to beside its view: how much is rendered, and where it lies."""
+        """What changes where a recorded iteration no longer serves: how much is rendered, and where it lies."""
         places = [(parameter.data_ptr(), parameter.numel()) for parameter in self.model.parameters()]
         return self.images.factor(self.step), self.sh_degree(), *places
 
@@ -121,7 +122,9 @@ class Trainer:
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        return min(self.step // every, max(self.settings.gaussians.sh_degree, self.settings.actors.sh_degree))
+        moving = any(part.moves for part in self.model.parts)
+        highest = max(self.settings.gaussians.sh_degree, self.settings.actors.sh_degree if moving else 0)
+        return min(self.step // every, highest)
 
     def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
