@@ -11,6 +11,7 @@ from drivesplat import on_gpu
 from drivesplat.on_gpu import rooms
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import replays
+from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.replays import Recording, Replays, can_be_replayed
 
 CPU = torch.device("cpu")
@@ -97,16 +98,17 @@ def test_where_nothing_is_to_be_recorded_all_is_done(monkeypatch):
 )
 def test_who_has_recordings(settings, device, compiles, expected, monkeypatch):
     monkeypatch.setattr(on_gpu, "compiles", lambda: compiles)
-    assert can_be_replayed(TrainSettings(**settings), guided_views(), torch.device(device)) == expected
+    chosen = TrainSettings(**settings)
+    assert can_be_replayed(chosen, TrainingImages(guided_views(), chosen, 0), torch.device(device)) == expected
 
 
 def test_of_classes_and_of_too_many_images_nothing_is_recorded(monkeypatch):
     monkeypatch.setattr(on_gpu, "compiles", lambda: True)
     views, gpu = guided_views(), torch.device("cuda")
     labelled = [dataclasses.replace(view, classes=torch.zeros_like(view.sky, dtype=torch.uint8)) for view in views]
-    assert not can_be_replayed(TrainSettings(), labelled, gpu)
+    assert not can_be_replayed(TrainSettings(), TrainingImages(labelled, TrainSettings(), 0), gpu)
     monkeypatch.setattr(replays, "MOST_IMAGES", len(views) - 1)
-    assert not can_be_replayed(TrainSettings(), views, gpu)
+    assert not can_be_replayed(TrainSettings(), TrainingImages(views, TrainSettings(), 0), gpu)
 
 
 def test_without_memory_for_both_what_is_recorded_goes(monkeypatch, caplog):

@@ -7,7 +7,7 @@ made when an image comes again after their number has stayed for a while, and dr
 """
 
 import logging
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -19,7 +19,7 @@ from torch import Tensor
 from drivesplat import on_gpu
 from drivesplat.on_gpu import rooms
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.views import TrainingView
+from drivesplat.training.coarse_to_fine import TrainingImages
 
 log = logging.getLogger(__name__)
 
@@ -52,12 +52,12 @@ def own_stream(device: torch.device) -> Iterator[None]:
     usual.wait_stream(own)
 
 
-def can_be_replayed(settings: TrainSettings, views: Sequence[TrainingView], device: torch.device) -> bool:
+def can_be_replayed(settings: TrainSettings, images: TrainingImages, device: torch.device) -> bool:
     """Whether iterations can be recorded, and shall be. Densification by gradient reads what they leave behind; classes
     are too many values for the lists whose room is known beforehand."""
-    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(views) <= MOST_IMAGES
+    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(images.views) <= MOST_IMAGES
     possible = device.type == "cuda" and on_gpu.compiles()
-    return wanted and possible and all(view.classes is None for view in views)
+    return wanted and possible and all(view.classes is None for view in images.views)
 
 
 @dataclass

@@ -52,7 +52,7 @@ class Trainer:
         densifiers = [Densifier(part, settings) for part in model.parts]
         optimizers, known = make_optimizers(model), surroundings.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        replayed = clock is UNTIMED and can_be_replayed(settings, views, device)
+        replayed = clock is UNTIMED and can_be_replayed(settings, images, device)
         replays = Replays(replayed, device, patience=settings.mcmc.refine_every * 3 // 2)
         told = ToldDevice(device)
         return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, told)
