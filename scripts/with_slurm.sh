@@ -22,7 +22,13 @@ folder=$(mktemp -d /tmp/slurm-trial-XXXXXX)
 node=$(hostname -s)
 stop() {
     for daemon in slurmd slurmctld munged; do
-        [ ! -s "$folder/$daemon.pid" ] || kill "$(cat "$folder/$daemon.pid")" 2>/dev/null || true
+        [ -s "$folder/$daemon.pid" ] || continue
+        pid=$(cat "$folder/$daemon.pid")
+        kill "$pid" 2>/dev/null || continue
+        for _ in $(seq 100); do # slurmctld writes its state down before it ends
+            kill -0 "$pid" 2>/dev/null || break
+            sleep 0.1
+        done
     done
     rm -f /etc/slurm/slurm.conf /etc/slurm/gres.conf
     rm -rf "$folder"
