@@ -4,6 +4,7 @@ import json
 import os
 import re
 from pathlib import Path
+from threading import Barrier
 from types import SimpleNamespace
 from typing import Any
 
@@ -104,7 +105,7 @@ def test_what_the_command_is_told_stands_in_place_of_the_file(tmp_path, monkeypa
     path = str(REPOSITORY / "benchmarks/speed/demo_1600.yaml")
     assert command.main([path, "--iterations", "5", "6", "--seeds", "9", "--", "--cores", "3"]) == 0
     assert command.main([path, "--out", "there"]) == 0
-    (short, out, words, _), (whole, there, none, _) = seen
+    (short, out, words, *_), (whole, there, none, *_) = seen
     assert (short.iterations, short.seeds, out, words) == (
         (5, 6), (9,), Path("results/speed/demo_1600"), ["--cores", "3"]
     )  # fmt: skip
@@ -331,6 +332,31 @@ def test_where_snakemake_only_plans_or_fails_nothing_is_trained(tmp_path, monkey
         monkeypatch.setattr(command, "run", lambda *told, status=status: Outcome(status, None, {}))
         assert command.measure(file, tmp_path / "out", arguments, Path()) == status
     assert not (tmp_path / "out").exists()
+
+
+def test_seeds_are_trained_side_by_side_where_there_are_cards(tmp_path, monkeypatch):
+    file, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
+    assert command.in_series(tasks, 1) == [tasks]
+    assert [{task.seed for task in series} for series in command.in_series(tasks, 2)] == [{4}, {5}]
+    monkeypatch.setattr(command, "visible_cards", lambda: 2)
+    monkeypatch.setattr(command, "run", lambda *_: Outcome(0, None, {}))
+    monkeypatch.setattr(command, "write", lambda record, _: record["runs"])
+    monkeypatch.setattr(command, "speed", lambda _, measured, profiles: {"runs": list(measured)})
+    both, trained = Barrier(2, timeout=60), []
+
+    def in_turn(function, task, *_):
+        if task.seed not in [seed for seed, *_ in trained]:
+            both.wait()
+        trained.append((task.seed, task.iterations, task.recipe))
+        return {"loop": 1.0} if function is runs.run else {}
+
+    monkeypatch.setattr(command, "in_own_process", in_turn)
+    assert command.measure(file, tmp_path, (), REPOSITORY, cards=2) == 0
+    order = [(task.seed, task.iterations, task.recipe) for task in tasks]
+    assert [it for it in trained[:8] if it[0] == 5] == [it for it in order if it[0] == 5]
+    assert sorted(trained[:8]) == sorted(order)
+    with pytest.raises(ConfigError, match="--cards 3: there are 2 GPUs"):
+        command.measure(file, tmp_path, (), REPOSITORY, cards=3)
 
 
 def test_it_is_called_where_snakemake_is(tmp_path):
