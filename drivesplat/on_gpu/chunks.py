@@ -24,7 +24,6 @@ MOST_VALUES = 8
 BLOCK = 4096
 """Tiles that are counted at a time."""
 
-
 Rasterizer = Callable[..., tuple[Tensor, Tensor]]
 
 

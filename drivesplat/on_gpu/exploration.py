@@ -8,6 +8,8 @@ import triton
 import triton.language as tl
 from torch import nn
 
+from drivesplat.on_gpu.rows import store_three, three, unit
+
 STEEPNESS = tl.constexpr(100.0)
 TURNING_POINT = tl.constexpr(0.005)
 """Of the logistic function of opacity by which the noise fades, as in gsplat."""
@@ -43,16 +45,11 @@ def _move(means, quats, log_scales, logits, strength, seed, count, BLOCK: tl.con
     there = i < count
     opacity = tl.sigmoid(tl.load(logits + i, mask=there, other=0.0))
     length = strength * tl.sigmoid(STEEPNESS * (TURNING_POINT - opacity))
-    w = tl.load(quats + 4 * i, mask=there, other=1.0)
-    x = tl.load(quats + 4 * i + 1, mask=there, other=0.0)
-    y = tl.load(quats + 4 * i + 2, mask=there, other=0.0)
-    z = tl.load(quats + 4 * i + 3, mask=there, other=0.0)
-    norm = tl.rsqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w * norm, x * norm, y * norm, z * norm
+    w, x, y, z, _ = unit(quats, i, there)
     noise_x, noise_y, noise_z, _ = tl.randn4x(seed, i)
-    length_0 = length * tl.exp(2.0 * tl.load(log_scales + 3 * i, mask=there, other=0.0))
-    length_1 = length * tl.exp(2.0 * tl.load(log_scales + 3 * i + 1, mask=there, other=0.0))
-    length_2 = length * tl.exp(2.0 * tl.load(log_scales + 3 * i + 2, mask=there, other=0.0))
+    size_0, size_1, size_2 = three(log_scales, i, there)
+    length_0, length_1 = length * tl.exp(2.0 * size_0), length * tl.exp(2.0 * size_1)
+    length_2 = length * tl.exp(2.0 * size_2)
     x_0, y_0, z_0 = _along(
         1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y), noise_x, noise_y, noise_z, length_0
     )
@@ -62,7 +59,5 @@ def _move(means, quats, log_scales, logits, strength, seed, count, BLOCK: tl.con
     x_2, y_2, z_2 = _along(
         2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y), noise_x, noise_y, noise_z, length_2
     )
-    at = means + 3 * i
-    tl.store(at, tl.load(at, mask=there, other=0.0) + x_0 + x_1 + x_2, mask=there)
-    tl.store(at + 1, tl.load(at + 1, mask=there, other=0.0) + y_0 + y_1 + y_2, mask=there)
-    tl.store(at + 2, tl.load(at + 2, mask=there, other=0.0) + z_0 + z_1 + z_2, mask=there)
+    x, y, z = three(means, i, there)
+    store_three(means, i, x + x_0 + x_1 + x_2, y + y_0 + y_1 + y_2, z + z_0 + z_1 + z_2, there)

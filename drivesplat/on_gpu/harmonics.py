@@ -9,11 +9,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from drivesplat.model.parameters import SH_C0
+from drivesplat.on_gpu.rows import store_three, three
+
 BLOCK = 256
 """Gaussians a program."""
 DEGREES = (0, 1)
 """Those that there are kernels for."""
-SH_C0, SH_C1 = tl.constexpr(0.28209479177387814), tl.constexpr(0.4886025119029199)
+CONSTANT, LINEAR = tl.constexpr(SH_C0), tl.constexpr(0.4886025119029199)
 """The factors of the functions of degree 0 and 1, in the order and with the signs of 3D Gaussian Splatting."""
 
 
@@ -60,9 +63,8 @@ class _SeenColours(torch.autograd.Function):
 @no_type_check
 def _direction(means, camera, i, there):
     """Unit vectors from the camera, and how long they were."""
-    x = tl.load(means + 3 * i, mask=there, other=1.0) - tl.load(camera + 3)
-    y = tl.load(means + 3 * i + 1, mask=there, other=1.0) - tl.load(camera + 7)
-    z = tl.load(means + 3 * i + 2, mask=there, other=1.0) - tl.load(camera + 11)
+    x, y, z = three(means, i, there)
+    x, y, z = x - tl.load(camera + 3), y - tl.load(camera + 7), z - tl.load(camera + 11)
     length = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
     return x / length, y / length, z / length, length
 
@@ -74,11 +76,11 @@ def _colours(means, sh0, shN, camera, colours, count, OTHERS: tl.constexpr, DEGR
     there = i < count
     x, y, z, _ = _direction(means, camera, i, there)
     for channel in tl.static_range(3):
-        colour = SH_C0 * tl.load(sh0 + 3 * i + channel, mask=there, other=0.0) + 0.5
+        colour = CONSTANT * tl.load(sh0 + 3 * i + channel, mask=there, other=0.0) + 0.5
         if DEGREE == 1:
             own = shN + 3 * OTHERS * i + channel
             by_y, by_z = tl.load(own, mask=there, other=0.0), tl.load(own + 3, mask=there, other=0.0)
-            colour += SH_C1 * (z * by_z - y * by_y - x * tl.load(own + 6, mask=there, other=0.0))
+            colour += LINEAR * (z * by_z - y * by_y - x * tl.load(own + 6, mask=there, other=0.0))
         tl.store(colours + 3 * i + channel, tl.maximum(colour, 0.0), mask=there)
 
 
@@ -96,9 +98,9 @@ def _colours_back(
     for channel in tl.static_range(3):
         pull = tl.load(v_colours + 3 * i + channel, mask=there, other=0.0)
         pull = tl.where(tl.load(colours + 3 * i + channel, mask=there, other=0.0) > 0.0, pull, 0.0)
-        tl.store(v_sh0 + 3 * i + channel, SH_C0 * pull, mask=there)
+        tl.store(v_sh0 + 3 * i + channel, CONSTANT * pull, mask=there)
         if DEGREE == 1:
-            own, pull = 3 * OTHERS * i + channel, SH_C1 * pull
+            own, pull = 3 * OTHERS * i + channel, LINEAR * pull
             tl.store(v_shN + own, -y * pull, mask=there)
             tl.store(v_shN + own + 3, z * pull, mask=there)
             tl.store(v_shN + own + 6, -x * pull, mask=there)
@@ -106,6 +108,5 @@ def _colours_back(
             along_y -= pull * tl.load(shN + own, mask=there, other=0.0)
             along_z += pull * tl.load(shN + own + 3, mask=there, other=0.0)
     radial = along_x * x + along_y * y + along_z * z
-    tl.store(v_means + 3 * i, (along_x - radial * x) / length, mask=there)
-    tl.store(v_means + 3 * i + 1, (along_y - radial * y) / length, mask=there)
-    tl.store(v_means + 3 * i + 2, (along_z - radial * z) / length, mask=there)
+    across_x, across_y, across_z = along_x - radial * x, along_y - radial * y, along_z - radial * z
+    store_three(v_means, i, across_x / length, across_y / length, across_z / length, there)

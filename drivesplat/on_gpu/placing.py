@@ -14,6 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from drivesplat.on_gpu.rows import quaternion, store_quaternion, store_three, three, unit
+
 BLOCK = 128
 """Gaussians a program."""
 
@@ -74,53 +76,6 @@ class _Placed(torch.autograd.Function):
 
 @triton.jit
 @no_type_check
-def _three(values, i, there):
-    """Row i of an array of threes."""
-    x = tl.load(values + 3 * i, mask=there, other=0.0)
-    y = tl.load(values + 3 * i + 1, mask=there, other=0.0)
-    z = tl.load(values + 3 * i + 2, mask=there, other=0.0)
-    return x, y, z
-
-
-@triton.jit
-@no_type_check
-def _store_three(values, i, x, y, z, there):
-    tl.store(values + 3 * i, x, mask=there)
-    tl.store(values + 3 * i + 1, y, mask=there)
-    tl.store(values + 3 * i + 2, z, mask=there)
-
-
-@triton.jit
-@no_type_check
-def _quaternion(values, i, there):
-    """Row i of an array of quaternions."""
-    w = tl.load(values + 4 * i, mask=there, other=1.0)
-    x = tl.load(values + 4 * i + 1, mask=there, other=0.0)
-    y = tl.load(values + 4 * i + 2, mask=there, other=0.0)
-    z = tl.load(values + 4 * i + 3, mask=there, other=0.0)
-    return w, x, y, z
-
-
-@triton.jit
-@no_type_check
-def _store_quaternion(values, i, w, x, y, z, there):
-    tl.store(values + 4 * i, w, mask=there)
-    tl.store(values + 4 * i + 1, x, mask=there)
-    tl.store(values + 4 * i + 2, y, mask=there)
-    tl.store(values + 4 * i + 3, z, mask=there)
-
-
-@triton.jit
-@no_type_check
-def _unit(values, i, there):
-    """Row i of an array of quaternions, and its length before it was made 1."""
-    w, x, y, z = _quaternion(values, i, there)
-    length = tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    return w / length, x / length, y / length, z / length, length
-
-
-@triton.jit
-@no_type_check
 def _product(aw, ax, ay, az, bw, bx, by, bz):
     """Of two quaternions."""
     w = aw * bw - ax * bx - ay * by - az * bz
@@ -151,18 +106,18 @@ def _place(
     there = i < count
     whose = tl.load(owner + i, mask=there, other=0)
     size = tl.load(sizes + whose, mask=there, other=1.0)
-    w, ux, uy, uz = _quaternion(object_quats, whose, there)
-    vx, vy, vz = _three(means, i, there)
+    w, ux, uy, uz = quaternion(object_quats, whose, there)
+    vx, vy, vz = three(means, i, there)
     x, y, z = _turned(w, ux, uy, uz, size * vx, size * vy, size * vz)
-    to_x, to_y, to_z = _three(translations, whose, there)
-    _store_three(world_means, i, x + to_x, y + to_y, z + to_z, there)
+    to_x, to_y, to_z = three(translations, whose, there)
+    store_three(world_means, i, x + to_x, y + to_y, z + to_z, there)
 
-    bw, bx, by, bz, _ = _unit(quats, i, there)
+    bw, bx, by, bz, _ = unit(quats, i, there)
     w, x, y, z = _product(w, ux, uy, uz, bw, bx, by, bz)
-    _store_quaternion(world_quats, i, w, x, y, z, there)
+    store_quaternion(world_quats, i, w, x, y, z, there)
 
-    x, y, z = _three(log_scales, i, there)
-    _store_three(world_scales, i, size * tl.exp(x), size * tl.exp(y), size * tl.exp(z), there)
+    x, y, z = three(log_scales, i, there)
+    store_three(world_scales, i, size * tl.exp(x), size * tl.exp(y), size * tl.exp(z), there)
     opacity = tl.sigmoid(tl.load(logits + i, mask=there, other=0.0))
     tl.store(world_opacities + i, opacity * tl.load(presence + whose, mask=there, other=0.0), mask=there)
 
@@ -178,12 +133,12 @@ def _place_back(
     there = i < count
     whose = tl.load(owner + i, mask=there, other=0)
     size = tl.load(sizes + whose, mask=there, other=1.0)
-    w, ux, uy, uz = _quaternion(object_quats, whose, there)
-    vx, vy, vz = _three(means, i, there)
+    w, ux, uy, uz = quaternion(object_quats, whose, there)
+    vx, vy, vz = three(means, i, there)
     vx, vy, vz = size * vx, size * vy, size * vz
-    gx, gy, gz = _three(v_world_means, i, there)
+    gx, gy, gz = three(v_world_means, i, there)
     x, y, z = _turned(w, -ux, -uy, -uz, gx, gy, gz)
-    _store_three(v_means, i, size * x, size * y, size * z, there)
+    store_three(v_means, i, size * x, size * y, size * z, there)
     together = gx * vx + gy * vy + gz * vz
     along_g, along_v = ux * gx + uy * gy + uz * gz, ux * vx + uy * vy + uz * vz
     cross_x, cross_y, cross_z = vy * gz - vz * gy, vz * gx - vx * gz, vx * gy - vy * gx
@@ -192,8 +147,8 @@ def _place_back(
     by_y = 2 * (vy * along_g + gy * along_v - uy * together + w * cross_y)
     by_z = 2 * (vz * along_g + gz * along_v - uz * together + w * cross_z)
 
-    bw, bx, by, bz, length = _unit(quats, i, there)
-    pw, px, py, pz = _quaternion(v_world_quats, i, there)
+    bw, bx, by, bz, length = unit(quats, i, there)
+    pw, px, py, pz = quaternion(v_world_quats, i, there)
     aw, ax, ay, az = _product(pw, px, py, pz, bw, -bx, -by, -bz)
     tl.store(v_owners + 7 * i, by_w + aw, mask=there)
     tl.store(v_owners + 7 * i + 1, by_x + ax, mask=there)
@@ -205,11 +160,11 @@ def _place_back(
     pw, px, py, pz = _product(w, -ux, -uy, -uz, pw, px, py, pz)
     radial = pw * bw + px * bx + py * by + pz * bz
     pw, px, py, pz = pw - radial * bw, px - radial * bx, py - radial * by, pz - radial * bz
-    _store_quaternion(v_quats, i, pw / length, px / length, py / length, pz / length, there)
+    store_quaternion(v_quats, i, pw / length, px / length, py / length, pz / length, there)
 
-    x, y, z = _three(world_scales, i, there)
-    gx, gy, gz = _three(v_world_scales, i, there)
-    _store_three(v_log_scales, i, x * gx, y * gy, z * gz, there)
+    x, y, z = three(world_scales, i, there)
+    gx, gy, gz = three(v_world_scales, i, there)
+    store_three(v_log_scales, i, x * gx, y * gy, z * gz, there)
     seen, opacity = (
         tl.load(presence + whose, mask=there, other=0.0),
         tl.load(world_opacities + i, mask=there, other=0.0),

@@ -64,7 +64,7 @@ def lists_of(
     seen, size = (means, conics, opacities, radii.contiguous()), (width, height, across, down * across)
     blocks = (triton.cdiv(count, BLOCK),)
     if count:
-        _count_tiles[blocks](*seen, depths.contiguous(), counts, nearness, count, each, *size[:2], BLOCK)
+        _count_tiles[blocks](*seen, depths.contiguous(), counts, nearness, count, *size[:2], BLOCK)
     nearest = torch.argsort(nearness)
     ends = torch.cumsum(counts[nearest], dim=0, dtype=torch.int32)
     room = rooms.room_for(ends[-1]) if count else 0
@@ -145,11 +145,9 @@ def _columns(row, x, y, a, b, c, reach, wide, high, there, width):
     return start // TILE, tl.where(shown, end // TILE - start // TILE + 1, 0)
 
 
-@triton.jit(do_not_specialize=["count", "each", "width", "height"])
+@triton.jit(do_not_specialize=["count", "width", "height"])
 @no_type_check
-def _count_tiles(
-    means, conics, opacities, radii, depths, counts, nearness, count, each, width, height, BLOCK: tl.constexpr
-):
+def _count_tiles(means, conics, opacities, radii, depths, counts, nearness, count, width, height, BLOCK: tl.constexpr):
     """How many tiles show each Gaussian, and by what it is sorted: its depth, if any does."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     x, y, a, b, c, reach, wide, high, there = _ellipse(means, conics, opacities, radii, i, i < count)
