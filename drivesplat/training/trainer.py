@@ -64,16 +64,14 @@ class Trainer:
             number, view = self.images.number(self.step), self.images.at(self.step)
         schedule(self.model, self.optimizers, self.step, self.settings)
         step, rates = self.on_device.told(self.step, self.optimizers)
+
+        def once() -> tuple[Terms, Picture]:
+            return self._learn(view, step, rates)
+
         if shown or not self.replays.wanted:
-            terms, picture = self.replays.make_room(lambda: self._learn(view, step, rates))
-            return terms, picture, view
-
-        def once() -> Terms:
-            return self._learn(view, step, rates)[0]
-
-        coarse = self.images.factor(self.step) > 1
-        settled = all(densifier.full(self.step, coarse) for densifier in self.densifiers)
-        return self.replays.iterate(self.step, number, self._shape(), once, settled), None, view
+            return *self.replays.make_room(once), view
+        settled = all(densifier.full(self.step, self._coarse) for densifier in self.densifiers)
+        return self.replays.iterate(self.step, number, self._shape(), lambda: once()[0], settled), None, view
 
     def _learn(
         self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
@@ -115,10 +113,15 @@ class Trainer:
 
     def densify(self, picture: Picture | None) -> None:
         """The second half: each part grows, prunes and moves its Gaussians."""
-        info, coarse = {} if picture is None else picture.info, self.images.factor(self.step) > 1
+        info = {} if picture is None else picture.info
         for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
-            densifier.after_step(self.step, optimizers, info, rows, coarse)
+            densifier.after_step(self.step, optimizers, info, rows, self._coarse)
         self.step += 1
+
+    @property
+    def _coarse(self) -> bool:
+        """Whether this iteration's images are reduced."""
+        return self.images.factor(self.step) > 1
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
