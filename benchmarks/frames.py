@@ -19,7 +19,7 @@ import torch
 
 from drivesplat.device import device_name
 from drivesplat.errors import DriveSplatError
-from drivesplat.film import Shot, film_frame, render_film
+from drivesplat.film import Shot, recorded_shot, render_film
 from drivesplat.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
@@ -34,12 +34,11 @@ def measure(scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_setti
     """Frames a second and the film's seconds, with what they are of: device, size, number of frames and Gaussians."""
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)
-    views = list(shot.views(device))
-    aside = max(1, int(WARM_UP * len(views)))
     began = time.perf_counter()
-    for number, view in enumerate(views):
+    count = len(shot.cameras)
+    aside = max(1, int(WARM_UP * count))
+    for number, _ in enumerate(recorded_shot(model, shot, device), start=1):
         began = time.perf_counter() if number == aside else began
-        film_frame(model, view)
     seconds = time.perf_counter() - began
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
@@ -50,10 +49,10 @@ def measure(scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_setti
         "width": job.width,
         "height": job.height,
         "gaussians": len(model),
-        "frames": len(views),
-        "frames_per_second": (len(views) - aside) / seconds,
+        "frames": count,
+        "frames_per_second": (count - aside) / seconds,
         "film_seconds": film,
-        "film_of_seconds": len(views) / job.fps,
+        "film_of_seconds": count / job.fps,
     }
 
 

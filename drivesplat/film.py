@@ -16,8 +16,7 @@ from tqdm import tqdm
 
 from drivesplat.ahead import in_advance
 from drivesplat.device import telling_out_of_memory
-from drivesplat.errors import ResultError
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.frames import film_frame, film_frames, in_bytes
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene import Scene
@@ -51,9 +50,14 @@ class Shot:
     def views(self, device: torch.device) -> Iterator[View]:
         """The cameras one by one, on the device."""
         intrinsics = torch.from_numpy(self.K).float().to(device)
-        for timestamp, camera_to_world in zip(self.cameras.timestamps, self.cameras.camera_to_world, strict=True):
-            pose = torch.from_numpy(camera_to_world).float().to(device)
-            yield View(intrinsics, pose, *self.size, time=self.scene.seconds(timestamp))
+        poses = torch.from_numpy(self.cameras.camera_to_world).float().to(device)
+        for pose, seconds in zip(poses, self.seconds, strict=True):
+            yield View(intrinsics, pose, *self.size, time=seconds)
+
+    @property
+    def seconds(self) -> list[float]:
+        """When each frame is seen, since the first image of the scene."""
+        return [self.scene.seconds(timestamp) for timestamp in self.cameras.timestamps]
 
     def record(self) -> dict[str, Any]:
         """What another program needs to see what the film sees.
@@ -87,7 +91,7 @@ def render_film(
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)
-    taken = write_film(path, (film_frame(model, view) for view in shot.views(device)), shot, model)
+    taken = write_film(path, recorded_shot(model, shot, device), shot, model)
     return {**shot.record(), "offset": job.trajectory.model_dump(), **taken}
 
 
@@ -100,6 +104,7 @@ def render_parts(
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
     model, device = open_model(checkpoint, device_settings)
+    model.expect(shot.seconds, device)
     taken = write_film(path, (_apart(model, view) for view in shot.views(device)), shot, model, columns=3)
     return {**shot.record(), "shows": ["all", "still", "moving"], **taken}
 
@@ -130,13 +135,10 @@ def write_film(
     return {"render_seconds": seconds, "bytes": path.stat().st_size}
 
 
-@torch.no_grad()
-def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
-    """What a view shows of `gaussians` (None: all at its time), (h, w, 3) uint8 RGB.
-
-    Raises ResultError where that is not finite.
-    """
-    return _bytes(model.render(view, gaussians=gaussians).image)
+def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterator[np.ndarray]:
+    """The frames of a shot of a model, everything being as it was recorded, (h, w, 3) uint8 RGB."""
+    model.expect(shot.seconds, device)
+    return film_frames(model, ((view, None) for view in shot.views(device)))
 
 
 @torch.no_grad()
@@ -146,14 +148,4 @@ def _apart(model: SplatModel, view: View) -> np.ndarray:
     objects = model.render(view, gaussians=gaussians[moving])
     before_grey = objects.splats + BACKDROP * (1.0 - objects.alpha[..., None])
     everything, still = (film_frame(model, view, shown) for shown in (gaussians, gaussians[~moving]))
-    return np.hstack([everything, still, _bytes(before_grey)])
-
-
-def _bytes(image: torch.Tensor) -> np.ndarray:
-    finite = torch.isfinite(image).all()
-    pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-    if pixels.is_cuda:  # into memory that the card writes by itself, several times as fast
-        pixels = torch.empty(pixels.shape, dtype=torch.uint8, pin_memory=True).copy_(pixels, non_blocking=True)
-    if not finite:  # which waits for the device, and so for the copy
-        raise ResultError("a frame of a film was rendered as no numbers; delete its checkpoint.pt and rerun")
-    return pixels.numpy()
+    return np.hstack([everything, still, in_bytes(before_grey).cpu().numpy()])

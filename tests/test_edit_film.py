@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,8 @@ from drivesplat.editing.cast import Actor, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, actors_of, appearances, crashes, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
-from drivesplat.film import film_frame, render_film
+from drivesplat.film import render_film
+from drivesplat.frames import film_frame
 from drivesplat.model.part import Appearance
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.motion import Motion
@@ -283,9 +285,10 @@ def test_an_edit_leaves_the_checkpoint_as_it_is(scene, model, tmp_path, monkeypa
 def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, model, tmp_path, monkeypatch):
     rendered = []
 
-    def counted(*_: Any) -> np.ndarray:
-        rendered.append(1)
-        return np.zeros((18, 32, 3), np.uint8)
+    def counted(_: SplatModel, shown: Iterable[Any]) -> Iterator[np.ndarray]:
+        for _ in shown:
+            rendered.append(1)
+            yield np.zeros((18, 32, 3), np.uint8)
 
     def encoder(path, frames, size, fps, crf, threads):
         for taken, _ in enumerate(frames, start=1):
@@ -293,7 +296,8 @@ def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, model
             assert 2 * taken <= len(rendered) <= 2 * (taken + THREADS + 1)
         path.write_bytes(b"")
 
-    monkeypatch.setattr("drivesplat.editing.film.film_frame", counted)
+    for module in ("drivesplat.editing.film", "drivesplat.film"):
+        monkeypatch.setattr(f"{module}.film_frames", counted)
     monkeypatch.setattr("drivesplat.film.write_video", encoder)
     render_edit(scene, checkpoint_of(model), a_job(*BUSY), CPU, files_in(tmp_path))
     assert len(rendered) == 2 * 19

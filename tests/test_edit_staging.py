@@ -22,7 +22,8 @@ from hand_made_traffic import placed
 from drivesplat.editing.cast import Role, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import actors_of, appearances
-from drivesplat.film import Shot, film_frame
+from drivesplat.film import Shot
+from drivesplat.frames import film_frame
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View

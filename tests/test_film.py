@@ -20,7 +20,8 @@ from hand_made_street import checkpoint_of
 
 from drivesplat import video
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.film import Shot, film_frame, render_film
+from drivesplat.film import Shot, render_film
+from drivesplat.frames import film_frame
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel

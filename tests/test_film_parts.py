@@ -10,7 +10,8 @@ import pytest
 from hand_made_street import Reels, a_format, checkpoint_of, street_actors, street_model, street_scene, views_of
 
 from drivesplat.ahead import THREADS
-from drivesplat.film import BACKDROP, film_frame, render_film, render_parts
+from drivesplat.film import BACKDROP, render_film, render_parts
+from drivesplat.frames import film_frame
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene import Scene
 from drivesplat.settings.device import DeviceSettings

@@ -27,17 +27,18 @@ def test_frames_are_counted_after_the_first_and_the_film_with_all_it_takes(scene
     """By a clock that only rendering moves: by a second a frame, 0.1 s once a tenth of them are rendered."""
     now, rendered = {"s": 0.0}, []
 
-    def rendering(model, view) -> np.ndarray:
-        rendered.append(view.time)
-        now["s"] += 1.0 if len(rendered) <= frames // 10 else 0.1
-        return np.zeros((18, 32, 3), np.uint8)
+    def rendering(model, shot, device):
+        for seconds in shot.seconds:
+            rendered.append(seconds)
+            now["s"] += 1.0 if len(rendered) <= frames // 10 else 0.1
+            yield np.zeros((18, 32, 3), np.uint8)
 
     def film(*_) -> None:
         now["s"] += 7.0
 
     frames = len(command.film_path(scene, "CAM_FRONT", 10, TrajectorySettings()).timestamps)
     assert frames >= 20
-    monkeypatch.setattr(command, "film_frame", rendering)
+    monkeypatch.setattr(command, "recorded_shot", rendering)
     monkeypatch.setattr(command, "render_film", film)
     monkeypatch.setattr(command, "time", SimpleNamespace(perf_counter=lambda: now["s"]))
     found = command.measure(scene, checkpoint_of(street_model()), JOB, DeviceSettings(kind="cpu"))

@@ -12,78 +12,83 @@ from drivesplat.on_gpu import rooms
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import replays
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.replays import Recording, Replays, can_be_replayed
+from drivesplat.training.replays import Extent, Recording, Replays, can_be_replayed
 
 CPU = torch.device("cpu")
+HUNDRED = Extent(100, 100)
 
 
 class Played:
     """Replays whose recordings write down what is done, in place of doing it."""
 
-    def __init__(self, monkeypatch, patience=0):
-        self.done = []
-        self.replays = Replays(True, CPU, patience)
+    def __init__(self, monkeypatch):
+        self.done, self.rooms = [], []
+        self.replays = Replays(True, CPU)
         monkeypatch.setattr(Replays, "_record", lambda _, *told: self.record(*told))
+        monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
 
-    def record(self, image, once):
+    def record(self, image, gaussians, once):
         self.done.append(("recorded", image))
+        self.rooms.append([need * gaussians for need in self.replays._needs[image]])
         replay = partial(self.done.append, ("replayed", image))
-        self.replays._recorded[image] = Recording(replay, {"l1": torch.tensor(float(image))})
+        self.replays._recorded[image] = Recording(replay, {"l1": torch.tensor(float(image))}, torch.tensor(0))
         return self.replays._recorded[image]
 
-    def iterate(self, step, image, shape=0, settled=False):
+    def iterate(self, image, shape=0, gaussians=HUNDRED):
         def once():
             self.done.append(("done", image))
+            rooms.room_for(torch.tensor(3000))
             return {"l1": torch.tensor(float(image))}
 
-        terms = self.replays.iterate(step, image, shape, once, settled)
+        terms = self.replays.iterate(image, shape, gaussians, once)
         assert float(terms["l1"]) == image
         said = [word for word, of in self.done if of == image]
         self.done.clear()
         return said
 
 
-def test_an_image_is_recorded_when_it_comes_again_and_the_number_of_gaussians_has_settled(monkeypatch):
-    played = Played(monkeypatch, patience=150)
-    assert played.iterate(10, 0) == ["done"]
-    assert played.iterate(12, 0) == ["done"], "their number may change any time"
-    assert played.iterate(160, 1) == ["done"], "how much room it needs is not known yet"
-    assert played.iterate(161, 0) == ["recorded", "replayed"]
-    assert played.iterate(162, 0) == ["replayed"]
-    assert played.iterate(163, 1) == ["recorded", "replayed"]
-
-
-def test_where_their_number_will_stay_nobody_waits(monkeypatch):
-    played = Played(monkeypatch, patience=150)
-    assert played.iterate(10, 0, settled=True) == ["done"]
-    assert played.iterate(11, 0, settled=True) == ["recorded", "replayed"]
-
-
-def test_nothing_recorded_outlives_another_number_of_gaussians(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
+def test_an_image_is_recorded_when_it_comes_again(monkeypatch):
     played = Played(monkeypatch)
-    assert [played.iterate(step, 0) for step in range(3)] == [["done"], ["recorded", "replayed"], ["replayed"]]
-    assert played.iterate(3, 0, shape=1) == ["done"]
-    assert played.iterate(4, 0, shape=1) == ["recorded", "replayed"]
+    assert played.iterate(0) == ["done"], "how much room it needs is not known yet"
+    assert played.iterate(0) == ["recorded", "replayed"]
+    assert played.iterate(1) == ["done"]
+    assert played.iterate(0) == ["replayed"]
+    assert played.iterate(1) == ["recorded", "replayed"]
+
+
+def test_what_tensors_elsewhere_were_recorded_for_is_recorded_anew(monkeypatch):
+    """How much room the image needs is known by then."""
+    played = Played(monkeypatch)
+    assert [played.iterate(0) for _ in range(3)] == [["done"], ["recorded", "replayed"], ["replayed"]]
+    assert [played.iterate(0, shape=1) for _ in range(2)] == [["recorded", "replayed"], ["replayed"]]
+
+
+def test_lists_get_the_room_that_all_gaussians_would_need_which_there_may_be(monkeypatch):
+    played = Played(monkeypatch)
+    played.iterate(0, gaussians=Extent(100, 180))
+    played.iterate(0, gaussians=Extent(120, 180))
+    played.iterate(0, shape=1, gaussians=Extent(180, 180))
+    played.iterate(0, shape=2, gaussians=Extent(200, 400))
+    assert [int(room) for (room,) in played.rooms] == [5400, 5400, 12_000]
 
 
 def test_what_had_too_little_room_is_recorded_anew(monkeypatch):
     played = Played(monkeypatch)
-    for step in range(2):
-        played.iterate(step, 0)
+    for image in (0, 0, 1, 1):
+        played.iterate(image)
     played.replays.check()
-    assert played.iterate(2, 0) == ["replayed"]
-    played.replays.missing += 1
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
+    assert played.iterate(0) == ["replayed"]
+    played.replays._recorded[0].missing.add_(1)
     played.replays.check()
-    assert int(played.replays.missing) == 0
-    assert played.iterate(3, 0) == ["done"], "it says anew how much it needs"
+    assert played.iterate(0) == ["done"], "it says anew how much it needs"
+    assert played.iterate(0) == ["recorded", "replayed"]
+    assert played.iterate(1) == ["replayed"], "it had room"
 
 
 def test_where_nothing_is_to_be_recorded_all_is_done(monkeypatch):
     played = Played(monkeypatch)
     played.replays.wanted = False
-    assert [played.iterate(step, 0) for step in range(3)] == [["done"]] * 3
+    assert [played.iterate(0) for _ in range(3)] == [["done"]] * 3
 
 
 @pytest.mark.parametrize(
@@ -112,10 +117,9 @@ def test_of_classes_and_of_too_many_images_nothing_is_recorded(monkeypatch):
 
 
 def test_without_memory_for_both_what_is_recorded_goes(monkeypatch, caplog):
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
     played, full = Played(monkeypatch), [False, True]
-    for step in range(2):
-        played.iterate(step, 0)
+    for _ in range(2):
+        played.iterate(0)
 
     def once():
         if full.pop():

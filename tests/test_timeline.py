@@ -6,6 +6,7 @@ import torch
 from hand_made import about_z, motion_through, track_of
 from scipy.spatial.transform import Rotation
 
+from drivesplat.model import timeline as timeline_module
 from drivesplat.model.timeline import ActorTrack, Timeline
 from drivesplat.training import checkpoint
 
@@ -101,6 +102,27 @@ def test_a_track_survives_a_checkpoint(tmp_path):
 def test_a_moment_is_computed_once():
     times = timeline()
     assert times.at(1.5, CPU) is times.at(1.5, CPU) and times.at(1.5, CPU) is not times.at(1.6, CPU)
+
+
+def test_moments_found_together_are_those_found_one_by_one():
+    seconds = np.linspace(-2.0, 6.0, 41)
+    together, one_by_one = timeline(), timeline()
+    together.prepare([*seconds, *seconds[:3]], CPU)
+    known = [*together._known.values()]
+    assert len(known) == 41 and sum(bool(moment.present.any()) for moment in known) > 10
+    for time, moment in zip(seconds, known, strict=True):
+        assert together.at(time, CPU) is moment
+        for name, value in vars(one_by_one.at(time, CPU)).items():
+            torch.testing.assert_close(getattr(moment, name), value)
+
+
+def test_of_too_many_moments_the_first_go(monkeypatch):
+    monkeypatch.setattr(timeline_module, "REMEMBERED", 3)
+    times = timeline()
+    times.prepare([0.1, 0.2, 0.3, 0.4, 0.5], CPU)
+    assert [time for time, _ in times._known] == [0.3, 0.4, 0.5]
+    times.at(0.1, CPU)
+    assert [time for time, _ in times._known] == [0.4, 0.5, 0.1]
 
 
 def test_the_moments_of_all_images_of_six_cameras_are_kept():

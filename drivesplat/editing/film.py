@@ -12,7 +12,8 @@ from drivesplat.editing.cast import Actor, Role, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.film import Shot, film_frame, write_film
+from drivesplat.film import Shot, recorded_shot, write_film
+from drivesplat.frames import film_frames
 from drivesplat.images import write_png
 from drivesplat.model.part import Appearance
 from drivesplat.model.splat_model import SplatModel
@@ -67,7 +68,8 @@ def render_edit(
         first, last = seconds[crashed][[0, -1]]
         log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
     present, still = appearances(roles, seconds), Still(crashed)
-    before = (film_frame(model, view) for view in left.views(device))
+    before = recorded_shot(model, left, device)
+    model.expect(right.seconds, device)
     after = staged_frames(model, right.views(device), present)
     write_film(files.film, still.side_by_side(before, after), right, model, columns=2)
     write_png(files.still, still.picture)
@@ -131,8 +133,8 @@ def staged_frames(
     model: SplatModel, views: Iterable[View], present: Iterable[Sequence[Appearance]]
 ) -> Iterator[np.ndarray]:
     """What each view shows of a model with those of its objects alone that appear then: (h, w, 3) uint8 each."""
-    for view, shown in zip(views, present, strict=True):
-        yield film_frame(model, view, model.staged_at(view.time, shown))
+    pairs = zip(views, present, strict=True)
+    return film_frames(model, ((view, model.staged_at(view.time, shown)) for view, shown in pairs))
 
 
 class Still:

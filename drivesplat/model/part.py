@@ -4,7 +4,7 @@ Each part owns its parameters, their learning rates and its densification. A met
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,16 +55,23 @@ class Part(nn.Module, ABC):
     cap_max: int | None = None
     """The most Gaussians that densification may make of it; None: as many as the training's settings say."""
     params: nn.ParameterDict
+    count: Float[Tensor, ""]
+    """The number of its Gaussians where the device reads it; only where rows are `spare`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.shared = nn.ParameterDict()
+        self._spare = 0
+        self.register_buffer("count", torch.zeros(()), persistent=False)
+
+    def expect(self, times: Sequence[float], device: torch.device) -> None:
+        """Is told at which times it will be looked at: many together may be made ready sooner than one by one."""
 
     @abstractmethod
     def at(self, time: float) -> Gaussians:
         """Its Gaussians in world coordinates at a time in seconds since the first image.
 
-        Always `len(self)` rows in one order; one that is absent then has opacity 0.
+        Always `self.rows` rows in one order; one that is absent then has opacity 0.
         """
 
     def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
@@ -103,7 +110,33 @@ class Part(nn.Module, ABC):
         return None
 
     def __len__(self) -> int:
+        """The number of its Gaussians."""
+        return self.rows - self.spare
+
+    @property
+    def rows(self) -> int:
+        """How many rows each of `params` has."""
         return len(self.params["means"])
+
+    @property
+    def spare(self) -> int:
+        """So many of the last rows are no Gaussians, but wait to become some (`drivesplat.training.spares`); none
+        outside trainings."""
+        return self._spare
+
+    @spare.setter
+    def spare(self, rows: int) -> None:
+        self._spare = rows
+        self.count.fill_(self.rows - rows)
+
+
+def filled(parts: Iterable[Part]) -> float | Float[Tensor, ""]:
+    """The share of the parts' rows that are Gaussians; where some are spare the device reads how many each time anew,
+    also in what is recorded."""
+    every = list(parts)
+    if not any(part.spare for part in every):
+        return 1.0
+    return sum(part.count if part.spare else len(part) for part in every) / sum(part.rows for part in every)
 
 
 class Sky(nn.Module, ABC):

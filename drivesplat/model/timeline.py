@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -66,7 +65,7 @@ class Timeline:
     def __init__(self, tracks: Sequence[ActorTrack], terms: int):
         self.tracks = tuple(tracks)
         self._terms = terms
-        self.at = lru_cache(REMEMBERED)(self._at)
+        self._known: dict[tuple[float, torch.device], Moment] = {}
 
     @property
     def owned(self) -> list[slice]:
@@ -93,21 +92,35 @@ class Timeline:
         ]
         return torch.tensor(triples, dtype=torch.long).reshape(-1, 3)
 
-    def _at(self, time: float, device: torch.device) -> Moment:
-        count, owned = len(self.tracks), self.owned
-        weights, poses = np.zeros(owned[-1].stop), np.tile(np.eye(4), (count, 1, 1))
-        present, progress = np.zeros(count, dtype=bool), np.zeros(count)
-        moment = np.array([time])
+    def at(self, time: float, device: torch.device) -> Moment:
+        """The moment at a time, in seconds since the scene's first image."""
+        if (time, device) not in self._known:
+            self.prepare([time], device)
+        return self._known[time, device]
+
+    def prepare(self, times: Sequence[float], device: torch.device) -> None:
+        """Finds the moments at many times together, which takes hardly longer than one, and keeps them."""
+        times = [time for time in dict.fromkeys(times) if (time, device) not in self._known]
+        for i in range(0, len(times), REMEMBERED):
+            some = times[i : i + REMEMBERED]
+            for time, moment in zip(some, self._moments(np.array(some), device), strict=True):
+                self._known[time, device] = moment
+        while len(self._known) > REMEMBERED:
+            del self._known[next(iter(self._known))]
+
+    def _moments(self, at: np.ndarray, device: torch.device) -> list[Moment]:
+        """Those at the seconds `at` (n,)."""
+        shape, owned = (len(at), len(self.tracks)), self.owned
+        weights, poses = np.zeros((len(at), owned[-1].stop)), np.tile(np.eye(4), (*shape, 1, 1))
+        present, progress = np.zeros(shape, dtype=bool), np.zeros(shape)
         for i, (track, own) in enumerate(zip(self.tracks, owned, strict=True)):
             motion = track.motion
-            present[i] = motion.present(moment)[0]
-            if present[i]:
-                weights[own], poses[i] = motion.weights(moment)[0], motion.poses(moment)[0]
-            progress[i] = np.clip((time - motion.times[0]) / (np.ptp(motion.times) or np.inf), 0.0, 1.0)
-        series = np.cos(np.pi * progress[:, None] * np.arange(self._terms))
-        quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
-        return Moment(
-            *(torch.from_numpy(values).float().to(device) for values in (quats, poses[:, :3, 3])),
-            torch.from_numpy(present).to(device),
-            *(torch.from_numpy(values).float().to(device) for values in (weights, series)),
-        )
+            there = present[:, i] = motion.present(at)
+            if there.any():
+                weights[there, own], poses[there, i] = motion.weights(at[there]), motion.poses(at[there])
+            progress[:, i] = np.clip((at - motion.times[0]) / (np.ptp(motion.times) or np.inf), 0.0, 1.0)
+        series = np.cos(np.pi * progress[..., None] * np.arange(self._terms))
+        quats = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
+        values = (quats.reshape(*shape, 4), poses[..., :3, 3], present, weights, series)
+        tensors = (torch.from_numpy(value if value.dtype == bool else value.astype(np.float32)) for value in values)
+        return [Moment(*each) for each in zip(*(tensor.to(device).unbind() for tensor in tensors), strict=True)]

@@ -13,16 +13,17 @@ from drivesplat.training.optimizers import Optimizers
 
 
 class Densifier:
-    """The densification of one part: call `after_step` at every iteration."""
+    """The densification of one part: call `after_step` at every iteration. One that `reserves` has it grow into spare
+    rows, so that its tensors stay where they lie for a while, until densification stops (with strategy: mcmc)."""
 
-    def __init__(self, part: Part, settings: TrainSettings):
+    def __init__(self, part: Part, settings: TrainSettings, reserves: bool = False):
         from drivesplat.training import strategies  # gsplat; the stage says in a sentence where it is missing
 
         self._part = part
         self._by_gradient = settings.strategy == "default"
         self._cap = part.cap_max or settings.cap_max
         self._few, self._few_until = few_at_first(self._cap, settings)
-        self._strategy = strategies.make_strategy(settings, self._cap)
+        self._strategy = strategies.make_strategy(settings, part, self._cap, reserves)
         self._on_cpu = strategies.torch_twins
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
@@ -32,11 +33,6 @@ class Densifier:
     def due(self, step: int) -> bool:
         """Whether Gaussians may be added, moved or removed after `step`."""
         return step % self._every == 0
-
-    def full(self, step: int, coarse: bool) -> bool:
-        """Whether after `step` their number stays as it is: as many as there may be, or no longer looked at."""
-        ended = step >= self._strategy.refine_stop_iter
-        return ended or (not self._by_gradient and len(self._part) >= self._room(step, coarse))
 
     def _room(self, step: int, coarse: bool) -> int:
         """How many there may be after `step`, in which images were `coarse` or whole."""
@@ -64,6 +60,15 @@ class Densifier:
         extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}
         with nullcontext() if params["means"].is_cuda else self._on_cpu():
             self._strategy.step_post_backward(params, optimizers, self.state, step, info, **extra)
+        if step >= self._strategy.refine_stop_iter:
+            self.end(optimizers)
+
+    def end(self, optimizers: Optimizers) -> None:
+        """Drops rows that have stayed spare."""
+        if self._part.spare:
+            from drivesplat.training import spares
+
+            spares.release(self._part, optimizers)
 
 
 def few_at_first(cap: int, settings: TrainSettings) -> tuple[int, int]:

@@ -8,6 +8,7 @@ from torch import Tensor
 from drivesplat import on_gpu
 from drivesplat.masks import UNLABELLED
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.part import filled
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.colours import colour_difference
@@ -33,8 +34,8 @@ def loss_terms(
         terms["dynamic"] = settings.dynamic_weight * colours.moving_l1
     regularisers = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
     if any(regularisers.values()):
-        means = mean_opacity_and_scale(shown)
-        terms |= {name: w * mean for (name, w), mean in zip(regularisers.items(), means, strict=True) if w}
+        means, share = mean_opacity_and_scale(shown), filled(model.parts)
+        terms |= {name: w * mean / share for (name, w), mean in zip(regularisers.items(), means, strict=True) if w}
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
@@ -64,7 +65,8 @@ def _moving_terms(
 
 
 def mean_opacity_and_scale(shown: Gaussians) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """The mean opacity, and the mean of all scales in metres, 0 for those of what is not there, of opacity 0."""
+    """The mean opacity, and the mean of all scales in metres, 0 for those of what is not there, of opacity 0; over all
+    rows, spare ones, too."""
     if on_gpu.for_tensor(shown.scales) and len(shown):
         from drivesplat.on_gpu import regularisers
 

@@ -2,8 +2,8 @@
 thousand times.
 
 At 640x360 an iteration's hundreds of kernels take the GPU less time than Python takes to ask for them. A recording
-holds on to the addresses of what it reads and writes, so it is of one image, and of Gaussians whose number stays: it is
-made when an image comes again after their number has stayed for a while, and dropped when they become more.
+holds on to the addresses of what it reads and writes, so it is of one image, and serves while the model's tensors lie
+where they do: their spare rows (`spares`) let Gaussians become more meanwhile. It is made when an image comes again.
 """
 
 import logging
@@ -32,10 +32,20 @@ many, and recordings of it hold on to where it lies."""
 
 @dataclass(frozen=True)
 class Recording:
-    """How to have the GPU do an iteration again, and where that leaves its loss terms."""
+    """How to have the GPU do an iteration again, and where that leaves its loss terms, and by how much the fullest
+    lists of Gaussians outgrew the room there is for them."""
 
     replay: Callable[[], None]
     terms: Terms
+    missing: Int[Tensor, ""]
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How many Gaussians there are `now`, and at `most` before tensors lie elsewhere."""
+
+    now: int
+    most: int
 
 
 @contextmanager
@@ -62,42 +72,31 @@ def can_be_replayed(settings: TrainSettings, images: TrainingImages, device: tor
 
 @dataclass
 class Replays:
-    """The recordings of a training's iterations, by its images; of a training that has none on a CPU, or by choice.
-
-    They are made when shapes have stayed for `patience` iterations, and where they will stay at once.
-    """
+    """The recordings of a training's iterations, by its images; of a training that has none on a CPU, or by choice."""
 
     wanted: bool
     device: torch.device
-    patience: int
-    missing: Int[Tensor, ""] = field(init=False)
-    """By how much the fullest lists of Gaussians outgrew the room that a recording has for them."""
     _shape: Hashable = None
-    _since: int = 0
-    _needs: dict[int, list[int]] = field(default_factory=dict)
-    _recorded: dict[int, Recording] = field(default_factory=dict)
+    _needs: dict[Hashable, list[float]] = field(default_factory=dict)
+    """How much room the lists of an image needed when it was last done by itself, a Gaussian."""
+    _recorded: dict[Hashable, Recording] = field(default_factory=dict)
     _pool: tuple[int, int] | None = None
 
-    def __post_init__(self) -> None:
-        self.missing = torch.zeros((), dtype=torch.int32, device=self.device)
-
-    def iterate(
-        self, step: int, image: int, shape: Hashable, once: Callable[[], Terms], settled: bool = False
-    ) -> Terms:
-        """An iteration with an image, known by a number: what is done `once`, or its recording replayed. `shape` is
-        what changes where a recording no longer serves; `settled` where the number of Gaussians will stay."""
+    def iterate(self, image: Hashable, shape: Hashable, gaussians: Extent, once: Callable[[], Terms]) -> Terms:
+        """An iteration with an image, by what it is known: what is done `once`, or its recording replayed. `shape` is
+        what changes where a recording no longer serves."""
         if not self.wanted:
             return once()
         if shape != self._shape:
             self.forget()
-            self._shape, self._since = shape, step
+            self._shape = shape
         recording = self._recorded.get(image)
-        if recording is None and image in self._needs and (settled or step >= self._since + self.patience):
-            recording = self._record(image, once)
+        if recording is None and image in self._needs:
+            recording = self._record(image, gaussians.most, once)
         if recording is None:
             with rooms.counted() as needs:
                 terms = self.make_room(once)
-            self._needs[image] = needs
+            self._needs[image] = [need / max(1, gaussians.now) for need in needs]
             return terms
         recording.replay()
         return recording.terms
@@ -116,34 +115,40 @@ class Replays:
         return once()
 
     def check(self) -> None:
-        """Drops what was recorded with too little room. Waits for the device."""
-        if self._recorded and int(self.missing) > 0:
-            log.debug("recorded iterations had room for %d entries too few: they are recorded anew", self.missing)
-            self.forget()
+        """Drops what was recorded with too little room, so that it is asked for again. Waits for the device."""
+        if not self._recorded:
+            return
+        missing = torch.stack([recording.missing for recording in self._recorded.values()]).tolist()
+        short = [image for image, more in zip(self._recorded, missing, strict=True) if more > 0]
+        for image in short:
+            del self._recorded[image], self._needs[image]
+        if short:
+            log.debug(
+                "%d recorded iterations had up to %d entries too few: they are recorded anew", len(short), max(missing)
+            )
 
     def forget(self) -> None:
         """Drops what is recorded, and the memory it works in."""
         if self._recorded:
             torch.cuda.synchronize(self.device)
         self._recorded.clear()
-        self._needs.clear()
         self._pool = None
-        self.missing.zero_()
 
-    def _record(self, image: int, once: Callable[[], Terms]) -> Recording | None:
-        """The recording of an iteration, which recording does not do; None, and none from now on, where the GPU or its
-        driver refuses."""
+    def _record(self, image: Hashable, gaussians: int, once: Callable[[], Terms]) -> Recording | None:
+        """The recording of an iteration with lists for so many Gaussians, which recording does not do; None, and none
+        from now on, where the GPU or its driver refuses."""
         if self._pool is None:
             torch.cuda.empty_cache()  # what torch holds in reserve is of no use to recordings
             self._pool = torch.cuda.graph_pool_handle()
         graph, drawn = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(self.device)
+        missing = torch.zeros((), dtype=torch.int32, device=self.device)
         try:
-            with rooms.given(self._needs[image]) as lists:
+            with rooms.given([int(need * gaussians) for need in self._needs[image]]) as lists:
                 graph.capture_begin(pool=self._pool)
                 try:
                     terms = once()
                     for needed, room in lists:
-                        torch.maximum(self.missing, needed - room, out=self.missing)
+                        torch.maximum(missing, needed - room, out=missing)
                 finally:
                     graph.capture_end()
         except Exception as error:  # of the driver's, of torch's, of Triton's: all that is lost is time
@@ -153,7 +158,7 @@ class Replays:
             self.wanted = False
             self.forget()
             return None
-        self._recorded[image] = recording = Recording(graph.replay, terms)
+        self._recorded[image] = recording = Recording(graph.replay, terms, missing)
         return recording
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
 
@@ -14,7 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat import on_gpu
+from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
+from drivesplat.training import spares
 from drivesplat.training.optimizers import Optimizers
 
 
@@ -47,10 +49,13 @@ class CappedDefaultStrategy(DefaultStrategy):
 
 @dataclass
 class ExploringStrategy(MCMCStrategy):
-    """gsplat's MCMCStrategy, which explores in one compiled pass, grows by `growth` at a time, and keeps the memory
-    that torch holds: what it would hand back after every densification has to be asked for again."""
+    """gsplat's MCMCStrategy for a `part`, which explores in one compiled pass, grows by `growth` at a time, into spare
+    rows where it `reserves` such, and keeps the memory that torch holds: what it would hand back after every
+    densification has to be asked for again."""
 
+    part: Part = field(kw_only=True)
     growth: float = 0.05
+    reserves: bool = False
 
     @torch.no_grad()
     def step_post_backward(
@@ -63,10 +68,24 @@ class ExploringStrategy(MCMCStrategy):
         _explore(params, optimizers, lr * self.noise_lr)
 
     @torch.no_grad()
+    def _relocate_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
+        dead = torch.sigmoid(params["opacities"]) <= self.min_opacity
+        dead[len(self.part) :] = False
+        count = int(dead.sum())
+        if count:
+            ops.relocate(params, optimizers, {}, dead, binoms, self.min_opacity)
+        return count
+
+    @torch.no_grad()
     def _add_new_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
-        count = len(params["means"])
+        count = len(self.part)
         more = max(0, min(self.cap_max, int((1.0 + self.growth) * count)) - count)
-        if more:
+        if self.reserves and more > self.part.spare:
+            rows = min(self.cap_max, max(2 * count, count + more))
+            spares.reserve(self.part, optimizers, rows)
+        if more and self.part.spare:
+            spares.wake(self.part, more, binoms, self.min_opacity)
+        elif more:
             ops.sample_add(params, optimizers, {}, more, binoms, self.min_opacity)
         return more
 
@@ -85,8 +104,11 @@ def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
         explore(params, strength)
 
 
-def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MCMCStrategy:
-    """The strategy that the settings name, for at most `cap_max` Gaussians."""
+def make_strategy(
+    settings: TrainSettings, part: Part, cap_max: int, reserves: bool
+) -> CappedDefaultStrategy | ExploringStrategy:
+    """The strategy that the settings name, for at most `cap_max` Gaussians of a part; with MCMC it may have them grow
+    into spare rows."""
     start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
     if settings.strategy == "mcmc":
         return ExploringStrategy(
@@ -97,6 +119,8 @@ def make_strategy(settings: TrainSettings, cap_max: int) -> DefaultStrategy | MC
             refine_stop_iter=stop,
             refine_every=settings.mcmc.refine_every,
             growth=settings.mcmc.growth,
+            part=part,
+            reserves=reserves,
         )
     strategy = CappedDefaultStrategy(
         grow_grad2d=settings.default.grow_grad2d,

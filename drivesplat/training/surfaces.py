@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.part import filled
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.cells import Cells
@@ -46,12 +47,11 @@ def surface_terms(
     """The weighted terms about the surfaces of what stands still."""
     if not settings.flatness_weight and surroundings.road is None:
         return {}
-    still = concatenate(
-        [picture.gaussians[rows] for part, rows in zip(model.parts, model.rows, strict=True) if not part.moves]
-    )
+    parts = [(part, rows) for part, rows in zip(model.parts, model.rows, strict=True) if not part.moves]
+    still = concatenate([picture.gaussians[rows] for _, rows in parts])
     terms = {}
     if settings.flatness_weight:
-        terms["flatness"] = settings.flatness_weight * thickness(still)
+        terms["flatness"] = settings.flatness_weight * thickness(still) / filled([part for part, _ in parts])
     if surroundings.road is not None:
         terms["road"] = settings.road_weight * road_loss(still, surroundings.road)
     return terms

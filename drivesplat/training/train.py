@@ -180,6 +180,7 @@ def _iterate(run: Run, monitor: Monitor) -> None:
             if run.save_due:
                 run.save()
     run.check()
+    trainer.end()
 
 
 def _densify(run: Run, picture: Picture | None, empty: EmptySpace) -> None:

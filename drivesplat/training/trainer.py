@@ -14,7 +14,7 @@ from drivesplat.training.densify import Densifier
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import ModelOptimizers, ToldDevice, make_optimizers, schedule
-from drivesplat.training.replays import Replays, Terms, can_be_replayed
+from drivesplat.training.replays import Extent, Replays, Terms, can_be_replayed
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
 from drivesplat.training.views import TrainingView
 
@@ -49,12 +49,11 @@ class Trainer:
         clock: Clock = UNTIMED,
     ) -> "Trainer":
         torch.manual_seed(seed)
-        densifiers = [Densifier(part, settings) for part in model.parts]
         optimizers, known = make_optimizers(model), surroundings.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
         replayed = clock is UNTIMED and can_be_replayed(settings, images, device)
-        replays = Replays(replayed, device, patience=settings.mcmc.refine_every * 3 // 2)
-        told = ToldDevice(device)
+        densifiers = [Densifier(part, settings, reserves=replayed) for part in model.parts]
+        replays, told = Replays(replayed, device), ToldDevice(device)
         return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, told)
 
     def fit_one(self, shown: bool = True) -> tuple[Terms, Picture | None, TrainingView]:
@@ -70,8 +69,9 @@ class Trainer:
 
         if shown or not self.replays.wanted:
             return *self.replays.make_room(once), view
-        settled = all(densifier.full(self.step, self._coarse) for densifier in self.densifiers)
-        return self.replays.iterate(self.step, number, self._shape(), lambda: once()[0], settled), None, view
+        image = self.images.factor(self.step), number
+        gaussians = Extent(len(self.model), sum(part.rows for part in self.model.parts))
+        return self.replays.iterate(image, self._shape(), gaussians, lambda: once()[0]), None, view
 
     def _learn(
         self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
@@ -117,6 +117,11 @@ class Trainer:
         for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
             densifier.after_step(self.step, optimizers, info, rows, self._coarse)
         self.step += 1
+
+    def end(self) -> None:
+        """Leaves nothing of the model that is no Gaussian."""
+        for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
+            densifier.end(optimizers)
 
     @property
     def _coarse(self) -> bool:
