@@ -232,8 +232,9 @@ def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(parser
 def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(parser, tmp_path):
     splats = started(parser["points"], parser["points_rgb"], seed=0).to("cuda")
     recipe = PlainRecipe(Schedule(120, sh_every=1, refine_start=0, refine_stop=120), 64, 0, workers=2)
+    before = torch.cuda.memory_reserved() / 1e9  # by other tests' recordings, whose memory torch does not give back
     summary = fit(splats, images_of(parser), scene_scale(parser), recipe, tmp_path)
-    assert summary.gaussians == 63 and 0 < summary.peak_gpu_memory_gb < 1
+    assert summary.gaussians == 63 and 0 < summary.peak_gpu_memory_gb < before + 1
     assert all(torch.isfinite(value).all() for value in load(tmp_path / "ckpt.pt", rule="train")["splats"].values())
 
 
