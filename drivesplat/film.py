@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from drivesplat.ahead import in_advance
 from drivesplat.device import telling_out_of_memory
-from drivesplat.frames import film_frame, film_frames, in_bytes
+from drivesplat.frames import as_bytes, film_frame, film_frames
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene import Scene
@@ -104,7 +104,7 @@ def render_parts(
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
     model, device = open_model(checkpoint, device_settings)
-    model.expect(shot.seconds, device)
+    model.expect(shot.seconds)
     taken = write_film(path, (_apart(model, view) for view in shot.views(device)), shot, model, columns=3)
     return {**shot.record(), "shows": ["all", "still", "moving"], **taken}
 
@@ -137,7 +137,7 @@ def write_film(
 
 def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterator[np.ndarray]:
     """The frames of a shot of a model, everything being as it was recorded, (h, w, 3) uint8 RGB."""
-    model.expect(shot.seconds, device)
+    model.expect(shot.seconds)
     return film_frames(model, ((view, None) for view in shot.views(device)))
 
 
@@ -148,4 +148,4 @@ def _apart(model: SplatModel, view: View) -> np.ndarray:
     objects = model.render(view, gaussians=gaussians[moving])
     before_grey = objects.splats + BACKDROP * (1.0 - objects.alpha[..., None])
     everything, still = (film_frame(model, view, shown) for shown in (gaussians, gaussians[~moving]))
-    return np.hstack([everything, still, in_bytes(before_grey).cpu().numpy()])
+    return np.hstack([everything, still, as_bytes(before_grey)])

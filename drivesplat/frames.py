@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from drivesplat.errors import ResultError
@@ -37,17 +37,20 @@ def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None
     return next(film_frames(model, [(view, gaussians)]))
 
 
-def in_bytes(image: Tensor) -> UInt8[Tensor, "h w 3"]:
-    """Colours in [0, 1] to the nearest byte, on their device."""
+def as_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
+    """Colours in [0, 1] to the nearest byte. Raises ResultError where they are not finite."""
+    if not torch.isfinite(image).all():
+        raise ResultError(NOT_FINITE)
+    return _bytes(image).cpu().numpy()
+
+
+def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
     return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
 @torch.no_grad()
 def _rendered(model: SplatModel, view: View, gaussians: Gaussians | None) -> np.ndarray:
-    image = model.render(view, gaussians=gaussians).image
-    if not torch.isfinite(image).all():
-        raise ResultError(NOT_FINITE)
-    return in_bytes(image).numpy()
+    return as_bytes(model.render(view, gaussians=gaussians).image)
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class _Device:
         spoilt = torch.stack([(~torch.isfinite(image)).any().int(), *(short.int() for short in missing)])
         told = torch.stack([spoilt[0], spoilt[1:].max() if missing else torch.zeros_like(spoilt[0])])
         come = torch.cuda.Event()
-        pixels, told = _to_host(in_bytes(image)), _to_host(told)
+        pixels, told = _to_host(_bytes(image)), _to_host(told)
         come.record()
         return _Asked(pixels, told, come.synchronize, lambda: self.asked(shown, by_itself=True))
 

@@ -348,6 +348,9 @@ def test_frames_in_a_row_are_those_by_themselves(monkeypatch):
     """Also where lists have less room than they turn out to need."""
     model = untrained_street(settings_of()).to(GPU).requires_grad_(False)
     views = [view.view for view in guided_views(GPU)]
+    model.expect([view.time for view in views])
+    timeline = model.parts[1].timeline
+    known = dict(timeline._known)
     expected = [film_frame(model, view) for view in views]
     for margin in (1.5, 0.2):
         monkeypatch.setattr(rooms, "LEAST", 0)
@@ -355,6 +358,7 @@ def test_frames_in_a_row_are_those_by_themselves(monkeypatch):
         found = [*film_frames(model, [(view, None) for view in views])]
         for frame, alone in zip(found, expected, strict=True):
             np.testing.assert_allclose(frame.astype(int), alone, atol=1)
+    assert timeline._known == known, "all of it was expected"
 
 
 def replayed(
@@ -414,7 +418,7 @@ def test_recordings_outlive_relocation_and_growth_into_spare_rows():
         goes_on(trainer, 10)  # step 48 is among them
         assert len(part) > count and part.spare < spare and trainer.replays._recorded == known
         terms = goes_on(trainer, 10)
-        assert part.spare == 0 and part.rows == len(part), "densification has stopped"
+        assert part.spare == 0 and part.row_count == len(part), "densification has stopped"
     assert all(bool(torch.isfinite(value)) for value in terms.values())
 
 
@@ -435,6 +439,11 @@ def test_lists_that_outgrow_their_room_are_noticed(monkeypatch):
         goes_on(trainer, 4)
     assert any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
     trainer.replays.check()
+    assert not any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
+    monkeypatch.setattr(rooms, "MARGIN", 1.5)
+    with replays.own_stream(GPU):
+        goes_on(trainer, 2 * len(trainer.images.views))
+    assert trainer.replays.wanted and len(trainer.replays._recorded) == len(trainer.images.views)
     assert not any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
 
 

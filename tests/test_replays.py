@@ -15,14 +15,14 @@ from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.replays import Extent, Recording, Replays, can_be_replayed
 
 CPU = torch.device("cpu")
-HUNDRED = Extent(100, 100)
+HUNDRED = Extent(100, 1.0)
 
 
 class Played:
     """Replays whose recordings write down what is done, in place of doing it."""
 
     def __init__(self, monkeypatch):
-        self.done, self.rooms = [], []
+        self.done, self.rooms, self.needed = [], [], 3000
         self.replays = Replays(True, CPU)
         monkeypatch.setattr(Replays, "_record", lambda _, *told: self.record(*told))
         monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
@@ -31,13 +31,15 @@ class Played:
         self.done.append(("recorded", image))
         self.rooms.append([need * gaussians for need in self.replays._needs[image]])
         replay = partial(self.done.append, ("replayed", image))
-        self.replays._recorded[image] = Recording(replay, {"l1": torch.tensor(float(image))}, torch.tensor(0))
+        self.replays._recorded[image] = Recording(
+            replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), torch.tensor(0)
+        )
         return self.replays._recorded[image]
 
     def iterate(self, image, shape=0, gaussians=HUNDRED):
         def once():
             self.done.append(("done", image))
-            rooms.room_for(torch.tensor(3000))
+            rooms.room_for(torch.tensor(self.needed))
             return {"l1": torch.tensor(float(image))}
 
         terms = self.replays.iterate(image, shape, gaussians, once)
@@ -65,11 +67,23 @@ def test_what_tensors_elsewhere_were_recorded_for_is_recorded_anew(monkeypatch):
 
 def test_lists_get_the_room_that_all_gaussians_would_need_which_there_may_be(monkeypatch):
     played = Played(monkeypatch)
-    played.iterate(0, gaussians=Extent(100, 180))
-    played.iterate(0, gaussians=Extent(120, 180))
-    played.iterate(0, shape=1, gaussians=Extent(180, 180))
-    played.iterate(0, shape=2, gaussians=Extent(200, 400))
-    assert [int(room) for (room,) in played.rooms] == [5400, 5400, 12_000]
+    played.iterate(0, gaussians=Extent(100, 2.0))
+    played.iterate(0, gaussians=Extent(120, 1.5))
+    assert [round(room) for (room,) in played.rooms] == [5400]
+    played.needed = 4200
+    played.replays._recorded[0].needed[0] = played.needed
+    played.iterate(0, gaussians=Extent(140, 1.2))
+    played.iterate(0, shape=1, gaussians=Extent(200, 2.0))
+    assert [round(room) for (room,) in played.rooms] == [5400, 2 * 200 * 4200 // 140], "what it needed the last time"
+
+
+def test_what_gives_way_is_recorded_again_unless_nothing_is_any_more(monkeypatch):
+    played = Played(monkeypatch)
+    for _ in range(2):
+        played.iterate(0)
+    assert played.replays.give_way() and played.iterate(0) == ["recorded", "replayed"]
+    played.replays.wanted = False
+    assert not played.replays.give_way() and not played.replays._recorded
 
 
 def test_what_had_too_little_room_is_recorded_anew(monkeypatch):
@@ -79,10 +93,25 @@ def test_what_had_too_little_room_is_recorded_anew(monkeypatch):
     played.replays.check()
     assert played.iterate(0) == ["replayed"]
     played.replays._recorded[0].missing.add_(1)
+    played.replays._recorded[0].needed[0] = 7000
     played.replays.check()
-    assert played.iterate(0) == ["done"], "it says anew how much it needs"
     assert played.iterate(0) == ["recorded", "replayed"]
+    assert [round(room) for (room,) in played.rooms] == [3000, 3000, 7000]
     assert played.iterate(1) == ["replayed"], "it had room"
+
+
+def test_memory_that_recordings_work_in_goes_with_the_last_of_them(monkeypatch):
+    """torch forgets it then, and does not know it again."""
+    played = Played(monkeypatch)
+    played.replays._pool = (0, 1)
+    for image in (0, 0, 1, 1):
+        played.iterate(image)
+    played.replays._recorded[0].missing.add_(1)
+    played.replays.check()
+    assert played.replays._pool == (0, 1)
+    played.replays._recorded[1].missing.add_(1)
+    played.replays.check()
+    assert played.replays._pool is None
 
 
 def test_where_nothing_is_to_be_recorded_all_is_done(monkeypatch):

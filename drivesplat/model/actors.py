@@ -108,8 +108,8 @@ class Actors(Part):
         params["owner"] = torch.repeat_interleave(torch.arange(len(sets)), torch.tensor([len(p) for p in points]))
         return cls(params, tracks, settings, gaussians)
 
-    def expect(self, times: Sequence[float], device: torch.device) -> None:
-        self.timeline.prepare(times, device)
+    def expect(self, times: Sequence[float]) -> None:
+        self.timeline.prepare(times, self.params["means"].device)
 
     def at(self, time: float) -> Gaussians:
         return self.placed(time, self.placements(time))

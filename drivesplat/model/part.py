@@ -55,23 +55,23 @@ class Part(nn.Module, ABC):
     cap_max: int | None = None
     """The most Gaussians that densification may make of it; None: as many as the training's settings say."""
     params: nn.ParameterDict
-    count: Float[Tensor, ""]
+    count_on_device: Float[Tensor, ""]
     """The number of its Gaussians where the device reads it; only where rows are `spare`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.shared = nn.ParameterDict()
         self._spare = 0
-        self.register_buffer("count", torch.zeros(()), persistent=False)
+        self.register_buffer("count_on_device", torch.zeros(()), persistent=False)
 
-    def expect(self, times: Sequence[float], device: torch.device) -> None:
+    def expect(self, times: Sequence[float]) -> None:
         """Is told at which times it will be looked at: many together may be made ready sooner than one by one."""
 
     @abstractmethod
     def at(self, time: float) -> Gaussians:
         """Its Gaussians in world coordinates at a time in seconds since the first image.
 
-        Always `self.rows` rows in one order; one that is absent then has opacity 0.
+        Always `self.row_count` rows in one order; one that is absent then has opacity 0.
         """
 
     def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
@@ -111,10 +111,10 @@ class Part(nn.Module, ABC):
 
     def __len__(self) -> int:
         """The number of its Gaussians."""
-        return self.rows - self.spare
+        return self.row_count - self.spare
 
     @property
-    def rows(self) -> int:
+    def row_count(self) -> int:
         """How many rows each of `params` has."""
         return len(self.params["means"])
 
@@ -127,7 +127,7 @@ class Part(nn.Module, ABC):
     @spare.setter
     def spare(self, rows: int) -> None:
         self._spare = rows
-        self.count.fill_(self.rows - rows)
+        self.count_on_device.fill_(self.row_count - rows)
 
 
 def filled(parts: Iterable[Part]) -> float | Float[Tensor, ""]:
@@ -136,7 +136,8 @@ def filled(parts: Iterable[Part]) -> float | Float[Tensor, ""]:
     every = list(parts)
     if not any(part.spare for part in every):
         return 1.0
-    return sum(part.count if part.spare else len(part) for part in every) / sum(part.rows for part in every)
+    there = sum(part.count_on_device if part.spare else len(part) for part in every)
+    return there / sum(part.row_count for part in every)
 
 
 class Sky(nn.Module, ABC):

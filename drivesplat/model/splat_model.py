@@ -60,10 +60,10 @@ class SplatModel(nn.Module):
         named = {"sky": self.sky, "exposure": self.exposure, "camera_poses": self.camera_poses}
         return {name: module for name, module in named.items() if module is not None}
 
-    def expect(self, times: Sequence[float], device: torch.device) -> None:
+    def expect(self, times: Sequence[float]) -> None:
         """Is told at which times it will be looked at: see `Part.expect`."""
         for part in self.parts:
-            part.expect(times, device)
+            part.expect(times)
 
     def gaussians_at(self, time: float) -> Gaussians:
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
@@ -92,19 +92,20 @@ class SplatModel(nn.Module):
         found = [part.of_track(track_id) for part in self.parts]
         if all(rows is None for rows in found):
             return None
-        nothing = (torch.zeros(part.rows, dtype=torch.bool, device=part.params["means"].device) for part in self.parts)
+        device = self.parts[0].params["means"].device
+        nothing = (torch.zeros(part.row_count, dtype=torch.bool, device=device) for part in self.parts)
         return torch.cat([none if rows is None else rows for rows, none in zip(found, nothing, strict=True)])
 
     @property
     def rows(self) -> list[slice]:
         """Which of `gaussians_at`'s rows are each part's."""
-        ends = [*accumulate(part.rows for part in self.parts)]
+        ends = [*accumulate(part.row_count for part in self.parts)]
         return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
     def moving(self) -> Bool[Tensor, " n"]:
         """Which of `gaussians_at`'s rows belong to parts that move."""
         device = self.parts[0].params["means"].device
-        return torch.cat([torch.full((part.rows,), part.moves, device=device) for part in self.parts])
+        return torch.cat([torch.full((part.row_count,), part.moves, device=device) for part in self.parts])
 
     def render(
         self,

@@ -1,6 +1,7 @@
 """The densification of a model's parts: each part its own gsplat strategy and state."""
 
 import math
+from collections.abc import Callable
 from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -13,10 +14,10 @@ from drivesplat.training.optimizers import Optimizers
 
 
 class Densifier:
-    """The densification of one part: call `after_step` at every iteration. One that `reserves` has it grow into spare
-    rows, so that its tensors stay where they lie for a while, until densification stops (with strategy: mcmc)."""
+    """The densification of one part: call `after_step` at every iteration. With strategy: mcmc, while `reserves` says
+    so, asked whenever tensors are about to lie elsewhere, it grows into spare rows, in which they stay for a while."""
 
-    def __init__(self, part: Part, settings: TrainSettings, reserves: bool = False):
+    def __init__(self, part: Part, settings: TrainSettings, reserves: Callable[[], bool] = lambda: False):
         from drivesplat.training import strategies  # gsplat; the stage says in a sentence where it is missing
 
         self._part = part

@@ -32,20 +32,21 @@ many, and recordings of it hold on to where it lies."""
 
 @dataclass(frozen=True)
 class Recording:
-    """How to have the GPU do an iteration again, and where that leaves its loss terms, and by how much the fullest
-    lists of Gaussians outgrew the room there is for them."""
+    """How to have the GPU do an iteration again, and where that leaves its loss terms; how many entries its lists of
+    Gaussians needed the last time, and by how many the fullest has outgrown the room there is for it."""
 
     replay: Callable[[], None]
     terms: Terms
+    needed: Int[Tensor, " lists"]
     missing: Int[Tensor, ""]
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How many Gaussians there are `now`, and at `most` before tensors lie elsewhere."""
+    """How many Gaussians there are `now`, and how many times as many there may be before tensors lie elsewhere."""
 
     now: int
-    most: int
+    times: float
 
 
 @contextmanager
@@ -78,8 +79,9 @@ class Replays:
     device: torch.device
     _shape: Hashable = None
     _needs: dict[Hashable, list[float]] = field(default_factory=dict)
-    """How much room the lists of an image needed when it was last done by itself, a Gaussian."""
+    """How much room the lists of an image needed when that was last asked, a Gaussian."""
     _recorded: dict[Hashable, Recording] = field(default_factory=dict)
+    _now: int = 1
     _pool: tuple[int, int] | None = None
 
     def iterate(self, image: Hashable, shape: Hashable, gaussians: Extent, once: Callable[[], Terms]) -> Terms:
@@ -88,15 +90,16 @@ class Replays:
         if not self.wanted:
             return once()
         if shape != self._shape:
-            self.forget()
+            self._drop(list(self._recorded))
             self._shape = shape
+        self._now = max(1, gaussians.now)
         recording = self._recorded.get(image)
         if recording is None and image in self._needs:
-            recording = self._record(image, gaussians.most, once)
+            recording = self._record(image, self._now * gaussians.times, once)
         if recording is None:
             with rooms.counted() as needs:
                 terms = self.make_room(once)
-            self._needs[image] = [need / max(1, gaussians.now) for need in needs]
+            self._needs[image] = [need / self._now for need in needs]
             return terms
         recording.replay()
         return recording.terms
@@ -109,45 +112,60 @@ class Replays:
             if not self._recorded:
                 raise
         log.warning("no GPU memory is left for recorded iterations: without them it takes longer; lower train.cap_max")
-        self.wanted = False
-        self.forget()
+        self._forget()
         torch.cuda.empty_cache()
         return once()
 
     def check(self) -> None:
-        """Drops what was recorded with too little room, so that it is asked for again. Waits for the device."""
+        """Drops what was recorded with too little room, to be recorded with what it needs. Waits for the device."""
         if not self._recorded:
             return
         missing = torch.stack([recording.missing for recording in self._recorded.values()]).tolist()
         short = [image for image, more in zip(self._recorded, missing, strict=True) if more > 0]
-        for image in short:
-            del self._recorded[image], self._needs[image]
         if short:
-            log.debug(
-                "%d recorded iterations had up to %d entries too few: they are recorded anew", len(short), max(missing)
-            )
+            log.debug("%d recorded iterations had up to %d entries too few", len(short), max(missing))
+        self._drop(short)
 
-    def forget(self) -> None:
-        """Drops what is recorded, and the memory it works in."""
+    def give_way(self) -> bool:
+        """Drops what is recorded, since tensors are about to lie elsewhere; whether anything will be recorded again."""
+        self._drop(list(self._recorded))
+        return self.wanted
+
+    def _drop(self, images: list[Hashable]) -> None:
+        """Drops some recordings; how much room they needed at last stays known. Waits for the device."""
+        if not images:
+            return
+        needs = iter(torch.cat([self._recorded[image].needed for image in images]).tolist())
+        for image in images:
+            self._needs[image] = [next(needs) / self._now for _ in self._recorded.pop(image).needed]
+        if not self._recorded:
+            self._pool = None  # torch forgets it with the last recording
+
+    def _forget(self) -> None:
+        """Drops all there is: nothing will be recorded any more."""
+        self.wanted = False
         if self._recorded:
             torch.cuda.synchronize(self.device)
         self._recorded.clear()
         self._pool = None
 
-    def _record(self, image: Hashable, gaussians: int, once: Callable[[], Terms]) -> Recording | None:
+    def _record(self, image: Hashable, gaussians: float, once: Callable[[], Terms]) -> Recording | None:
         """The recording of an iteration with lists for so many Gaussians, which recording does not do; None, and none
         from now on, where the GPU or its driver refuses."""
         if self._pool is None:
             torch.cuda.empty_cache()  # what torch holds in reserve is of no use to recordings
             self._pool = torch.cuda.graph_pool_handle()
         graph, drawn = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(self.device)
+        expected = [int(need * gaussians) for need in self._needs[image]]
         missing = torch.zeros((), dtype=torch.int32, device=self.device)
+        needed_then = torch.zeros(len(expected), dtype=torch.int32, device=self.device)
         try:
-            with rooms.given([int(need * gaussians) for need in self._needs[image]]) as lists:
+            with rooms.given(expected) as lists:
                 graph.capture_begin(pool=self._pool)
                 try:
                     terms = once()
-                    for needed, room in lists:
+                    for place, (needed, room) in zip(needed_then, lists, strict=True):
+                        place.copy_(needed)
                         torch.maximum(missing, needed - room, out=missing)
                 finally:
                     graph.capture_end()
@@ -155,10 +173,9 @@ class Replays:
             first = error.__context__ or error  # one that breaks a recording off lets its end fail, too
             log.warning("iterations cannot be recorded, which takes longer: %s", str(first).splitlines()[0])
             _tidy_up(self.device, self._pool, drawn)
-            self.wanted = False
-            self.forget()
+            self._forget()
             return None
-        self._recorded[image] = recording = Recording(graph.replay, terms, missing)
+        self._recorded[image] = recording = Recording(graph.replay, terms, needed_then, missing)
         return recording
 
 

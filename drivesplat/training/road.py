@@ -48,15 +48,16 @@ def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
 
     With the plane's normal n, d the height of the centre over it, and Σ the covariance, d² + nᵀ Σ n is the mean square
     distance of a Gaussian's mass from the plane: least where the centre lies in it and the shortest axis along its
-    normal. c is ROUGHNESS: quadratic below, linear above. Gaussians farther out than `reach` are not the road's. 0
-    where there are none.
+    normal. c is ROUGHNESS: quadratic below, linear above. Gaussians farther out than `reach` are not the road's, nor is
+    what is not there, of opacity 0. 0 where there are none.
     """
     if len(road.weights) == 0:
         return gaussians.means.sum() * 0.0
     place, on_it = road.cells.find(gaussians.means[:, :2])
     normals = road.normals[place]
     heights = (gaussians.means * normals).sum(dim=1) - road.offsets[place]
-    weights = road.weights[place] * (on_it & (heights.detach().abs() < road.reach))
+    on_it &= (heights.detach().abs() < road.reach) & (gaussians.opacities.detach() > 0.0)
+    weights = road.weights[place] * on_it
     axes = rotation_matrix(F.normalize(gaussians.quats, dim=1))
     along = torch.einsum("nij,ni->nj", axes, normals) * gaussians.scales
     distance = torch.sqrt(heights.square() + along.square().sum(dim=1) + ROUGHNESS**2) - ROUGHNESS

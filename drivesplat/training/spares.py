@@ -20,7 +20,7 @@ NOTHING = -1000.0
 @torch.no_grad()
 def reserve(part: Part, optimizers: Optimizers, rows: int) -> None:
     """Adds spare rows up to so many in all."""
-    more, there = rows - part.rows, len(part)
+    more, there = rows - part.row_count, len(part)
 
     def longer(name: str, values: Tensor) -> nn.Parameter:
         added = values[:1].expand(more, *values.shape[1:])
@@ -52,7 +52,7 @@ def wake(part: Part, count: int, binoms: Float[Tensor, "n_max n_max"], min_opaci
     """Makes Gaussians of so many spare rows, as gsplat's `sample_add` makes new ones: each is a copy of one drawn by
     opacity, and both together look as that one did (Kheradmand et al. 2024, equation 9)."""
     params, there = part.params, len(part)
-    opacities, scales = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
+    opacities, scales = torch.sigmoid(params["opacities"][:there]), torch.exp(params["scales"][:there])
     drawn = ops._multinomial_sample(opacities, count)
     times = torch.bincount(drawn)[drawn] + 1
     opacities, scales = ops.compute_relocation(opacities[drawn], scales[drawn], times, binoms)

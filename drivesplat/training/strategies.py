@@ -1,6 +1,6 @@
 """gsplat's densification strategies as this workflow runs them: capped, resetting, and on the CPU."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -50,12 +50,12 @@ class CappedDefaultStrategy(DefaultStrategy):
 @dataclass
 class ExploringStrategy(MCMCStrategy):
     """gsplat's MCMCStrategy for a `part`, which explores in one compiled pass, grows by `growth` at a time, into spare
-    rows where it `reserves` such, and keeps the memory that torch holds: what it would hand back after every
-    densification has to be asked for again."""
+    rows where `reserves`, asked whenever there are too few, has it so, and keeps the memory that torch holds: what it
+    would hand back after every densification has to be asked for again."""
 
     part: Part = field(kw_only=True)
     growth: float = 0.05
-    reserves: bool = False
+    reserves: Callable[[], bool] = field(kw_only=True)
 
     @torch.no_grad()
     def step_post_backward(
@@ -80,9 +80,11 @@ class ExploringStrategy(MCMCStrategy):
     def _add_new_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
         count = len(self.part)
         more = max(0, min(self.cap_max, int((1.0 + self.growth) * count)) - count)
-        if self.reserves and more > self.part.spare:
-            rows = min(self.cap_max, max(2 * count, count + more))
-            spares.reserve(self.part, optimizers, rows)
+        if more > self.part.spare:
+            if self.reserves():
+                spares.reserve(self.part, optimizers, min(self.cap_max, max(2 * count, count + more)))
+            else:
+                spares.release(self.part, optimizers)
         if more and self.part.spare:
             spares.wake(self.part, more, binoms, self.min_opacity)
         elif more:
@@ -105,10 +107,10 @@ def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
 
 
 def make_strategy(
-    settings: TrainSettings, part: Part, cap_max: int, reserves: bool
+    settings: TrainSettings, part: Part, cap_max: int, reserves: Callable[[], bool]
 ) -> CappedDefaultStrategy | ExploringStrategy:
-    """The strategy that the settings name, for at most `cap_max` Gaussians of a part; with MCMC it may have them grow
-    into spare rows."""
+    """The strategy that the settings name, for at most `cap_max` Gaussians of a part; with MCMC it has them grow
+    into spare rows where `reserves`."""
     start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
     if settings.strategy == "mcmc":
         return ExploringStrategy(

@@ -52,8 +52,8 @@ class Trainer:
         optimizers, known = make_optimizers(model), surroundings.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
         replayed = clock is UNTIMED and can_be_replayed(settings, images, device)
-        densifiers = [Densifier(part, settings, reserves=replayed) for part in model.parts]
         replays, told = Replays(replayed, device), ToldDevice(device)
+        densifiers = [Densifier(part, settings, replays.give_way) for part in model.parts]
         return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, told)
 
     def fit_one(self, shown: bool = True) -> tuple[Terms, Picture | None, TrainingView]:
@@ -70,7 +70,7 @@ class Trainer:
         if shown or not self.replays.wanted:
             return *self.replays.make_room(once), view
         image = self.images.factor(self.step), number
-        gaussians = Extent(len(self.model), sum(part.rows for part in self.model.parts))
+        gaussians = Extent(len(self.model), max(part.row_count / max(1, len(part)) for part in self.model.parts))
         return self.replays.iterate(image, self._shape(), gaussians, lambda: once()[0]), None, view
 
     def _learn(
