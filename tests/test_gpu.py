@@ -444,7 +444,6 @@ def test_lists_that_outgrow_their_room_are_noticed(monkeypatch):
     with replays.own_stream(GPU):
         goes_on(trainer, 2 * len(trainer.images.views))
     assert trainer.replays.wanted and len(trainer.replays._recorded) == len(trainer.images.views)
-    assert not any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
 
 
 def test_what_cannot_be_recorded_is_done_all_the_same(monkeypatch, caplog):

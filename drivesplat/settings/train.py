@@ -99,7 +99,7 @@ class TrainSettings(Settings):
     strategy: Literal["mcmc", "default"] = "mcmc"
     """Densification: 'mcmc', or 'default' by gradient, which fills the air before the few cameras of a driving log."""
     cap_max: int = Field(1_500_000, ge=100, le=20_000_000)
-    """Most Gaussians. Memory grows with it: about 1 GB per million, and as much again while rendering."""
+    """Most Gaussians. Memory grows with it: about 0.4 GB per million, and as much again while rendering."""
     pixels_per_gaussian: float = Field(20.0, ge=0)
     """At most one Gaussian per so many training pixels (0 = no such limit). More Gaussians than that fit what no other
     view shows."""
