@@ -1,6 +1,7 @@
 """Shape checks switched on for the whole library, and the tiny world."""
 
 import os
+from itertools import groupby
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch comes: its threads times pytest's workers is slow
@@ -17,6 +18,21 @@ if not torch.cuda.is_available():
 install_import_hook("drivesplat", "beartype.beartype")
 
 REPOSITORY = Path(__file__).parent.parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Has each of pytest's workers, who begin with equal shares, start with what runs Snakemake, whose modules take long
+    and share what they make: what one takes from another at the end is short."""
+    runs = [item for item in items if item.get_closest_marker("workflow")]
+    others = [item for item in items if not item.get_closest_marker("workflow")]
+    modules = [list(module) for _, module in groupby(runs, key=lambda item: item.path)]
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    shares = [[item for module in modules[i::workers] for item in module] for i in range(workers)]
+    for i, share in enumerate(shares):
+        rest = len(items) * (i + 1) // workers - len(items) * i // workers - len(share)
+        share += others[: max(0, rest)]
+        others = others[max(0, rest) :]
+    items[:] = [item for share in shares for item in share] + others
 
 
 @pytest.fixture(scope="module")
