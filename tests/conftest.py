@@ -21,8 +21,8 @@ REPOSITORY = Path(__file__).parent.parent
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Has each of pytest's workers, who begin with equal shares, start with what runs Snakemake, whose modules take long
-    and share what they make: what one takes from another at the end is short."""
+    """Has each of pytest's workers, who begin with equal shares, start with what runs Snakemake: modules that take long
+    and make what their tests share. What one worker takes from another at the end is then short."""
     runs = [item for item in items if item.get_closest_marker("workflow")]
     others = [item for item in items if not item.get_closest_marker("workflow")]
     modules = [list(module) for _, module in groupby(runs, key=lambda item: item.path)]

@@ -268,7 +268,7 @@ def stretch(model):
 
 @pytest.mark.parametrize("body", [False, True])
 def test_a_training_by_kernels_is_that_by_torch(body, monkeypatch):
-    """Four iterations of background, cars and a cube map, with every term of the loss, and the own car's body."""
+    """Two iterations of background, cars and a cube map, with every term of the loss, and the own car's body."""
     ends = []
     for kernels in (True, False):
         monkeypatch.setattr(on_gpu, "for_tensor", lambda tensor, kernels=kernels: kernels)
@@ -283,7 +283,7 @@ def test_a_training_by_kernels_is_that_by_torch(body, monkeypatch):
             views = [dataclasses.replace(view, own_car=own_car) for view in views]
         before = {name: value.clone() for name, value in model.state_dict().items()}
         trainer = Trainer.begin(model.to(DEVICE), views, settings, 0, DEVICE)
-        for _ in range(4):
+        for _ in range(2):
             terms, picture, _ = trainer.fit_one()
             trainer.densify(picture)
         ends.append((terms, model.state_dict()))
