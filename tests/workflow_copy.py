@@ -83,6 +83,10 @@ class WorkflowCopy:
         copy.write_config()
         return copy
 
+    def again(self, folder: Path) -> "WorkflowCopy":
+        """Another copy, with all that this one has made by now."""
+        return WorkflowCopy(Path(shutil.copytree(self.folder, folder, symlinks=True)), dict(self.config))
+
     def write_config(self, text: str | None = None) -> None:
         (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))
 
