@@ -29,9 +29,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     shares = [[item for module in modules[i::workers] for item in module] for i in range(workers)]
     for i, share in enumerate(shares):
-        rest = len(items) * (i + 1) // workers - len(items) * i // workers - len(share)
-        share += others[: max(0, rest)]
-        others = others[max(0, rest) :]
+        room = max(0, len(items) * (i + 1) // workers - len(items) * i // workers - len(share))
+        share += others[:room]
+        others = others[room:]
     items[:] = [item for share in shares for item in share] + others
 
 
