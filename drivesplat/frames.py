@@ -5,7 +5,7 @@ the GPU renders one, Python asks for the next.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -55,11 +55,13 @@ def _rendered(model: SplatModel, view: View, gaussians: Gaussians | None) -> np.
 
 @dataclass(frozen=True)
 class _Asked:
-    """A frame that the device was asked for: `pixels` and whether it was `spoilt` (2,), by what is not finite and by
-    how many entries its lists had too few, in main memory after `wait`; and how to ask for it `again`."""
+    """A frame that the device was asked for: `pixels`, and what is `told` of it, whether anything was not finite and
+    how many entries each of its lists needs, in main memory after `wait`; the `rooms` that these lists have; and how to
+    ask for it `again`."""
 
     pixels: UInt8[Tensor, "h w 3"]
-    spoilt: Int[Tensor, " 2"]
+    told: Int[Tensor, " told"]
+    rooms: Sequence[int]
     wait: Callable[[], None]
     again: Callable[[], "_Asked"]
 
@@ -84,13 +86,12 @@ class _Device:
         else:
             with rooms.given(self._needs) as lists:
                 image = self._model.render(view, gaussians=gaussians).image
-        missing = [needed - room for needed, room in lists]
-        spoilt = torch.stack([(~torch.isfinite(image)).any().int(), *(short.int() for short in missing)])
-        told = torch.stack([spoilt[0], spoilt[1:].max() if missing else torch.zeros_like(spoilt[0])])
+        told = torch.stack([(~torch.isfinite(image)).any().long(), *(needed.long() for needed, _ in lists)])
         come = torch.cuda.Event()
         pixels, told = _to_host(_bytes(image)), _to_host(told)
         come.record()
-        return _Asked(pixels, told, come.synchronize, lambda: self.asked(shown, by_itself=True))
+        room = [room for _, room in lists]
+        return _Asked(pixels, told, room, come.synchronize, lambda: self.asked(shown, by_itself=True))
 
 
 def _in_a_row(ask: Callable[[A], _Asked], shown: Iterable[A]) -> Iterator[np.ndarray]:
@@ -106,8 +107,8 @@ def _in_a_row(ask: Callable[[A], _Asked], shown: Iterable[A]) -> Iterator[np.nda
 
 def _come(frame: _Asked) -> np.ndarray:
     frame.wait()
-    not_finite, missing = frame.spoilt.tolist()
-    if missing > 0:
+    not_finite, *needed = frame.told.tolist()
+    if any(need > room for need, room in zip(needed, frame.rooms, strict=True)):
         return _come(frame.again())
     if not_finite:
         raise ResultError(NOT_FINITE)

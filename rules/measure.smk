@@ -51,7 +51,7 @@ rule evaluate:
         "<benchmarks>/{scene}/{method}/evaluate.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: plan.threads(on_gpu=4)
+    threads: plan.threads(on_gpu=8)
     resources:
         gpu=plan.cards,
         device=plan.device,

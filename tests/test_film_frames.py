@@ -9,21 +9,25 @@ import torch
 from drivesplat.errors import ResultError
 from drivesplat.frames import _Asked, _in_a_row
 
+ROOM = 7
+
 
 @dataclass
 class Card:
-    """A device that renders numbers as pixels, and remembers what happened when."""
+    """A device that renders numbers as pixels, and remembers what happened when. `spoilt` frames, once: whether they
+    are no numbers, and how many entries the second of their two lists needs."""
 
     spoilt: dict[int, tuple[int, int]] = field(default_factory=dict)
     done: list[str] = field(default_factory=list)
 
     def ask(self, number: int, again: bool = False) -> _Asked:
         self.done.append(f"ask {number}")
-        spoilt = self.spoilt.pop(number, (0, 0))
+        not_finite, needed = self.spoilt.pop(number, (0, ROOM))
         pixels = torch.full((1, 1, 3), 100 * again + number, dtype=torch.uint8)
         return _Asked(
             pixels,
-            torch.tensor(spoilt),
+            torch.tensor([not_finite, 1, needed]),
+            [ROOM, ROOM],
             lambda: self.done.append(f"wait {number}"),
             lambda: self.ask(number, again=True),
         )
@@ -41,11 +45,11 @@ def test_a_frame_is_asked_for_before_the_one_before_it_is_waited_for():
 
 
 def test_a_frame_whose_lists_had_too_little_room_is_asked_for_again():
-    assert frames(Card({1: (0, 7), 2: (1, 7)}), 4) == [0, 101, 102, 3]
+    assert frames(Card({1: (0, ROOM + 1), 2: (1, ROOM + 1)}), 4) == [0, 101, 102, 3]
 
 
 def test_a_frame_that_is_no_numbers_is_told_when_it_is_its_turn():
-    shown = _in_a_row(Card({1: (1, 0)}).ask, range(3))
+    shown = _in_a_row(Card({1: (1, ROOM)}).ask, range(3))
     np.testing.assert_array_equal(next(shown), np.zeros((1, 1, 3)))
     with pytest.raises(ResultError, match="no numbers"):
         next(shown)

@@ -21,7 +21,7 @@ from drivesplat.regions import fill, hull_of
 from drivesplat.rigid import inverse, rigid
 from drivesplat.scene import Scene
 from drivesplat.seeding.coloring import ColorView, color_by_visibility
-from drivesplat.seeding.far_points import far_points
+from drivesplat.seeding.far_points import far_points, uncovered
 from drivesplat.seeding.seed import color_view, lidar_points, seed_points
 from drivesplat.seeding.sweeps import outside_boxes, read_sweep, thin, without_own_car
 from drivesplat.settings.extract import SceneSource
@@ -278,7 +278,8 @@ GROUND = 3.0
 
 
 def some_far_points(count: int, covered: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    return far_points(far_view(), GROUND, covered, count, (3.0, 300.0), np.random.default_rng(seed))
+    candidates = uncovered(far_view(), covered)
+    return far_points(far_view(), GROUND, candidates, count, (3.0, 300.0), np.random.default_rng(seed))
 
 
 def test_far_points_lie_along_distinct_pixels_between_the_depths_and_have_their_colours():
@@ -327,7 +328,8 @@ def test_far_points_leave_out_the_cells_that_are_covered():
 def test_no_free_pixel_gives_no_far_points():
     everywhere = far_view()
     unusable = dataclasses.replace(everywhere, usable=np.zeros_like(everywhere.usable))
-    positions, colors = far_points(unusable, GROUND, np.empty((0, 3)), 10, (3.0, 300.0), np.random.default_rng(0))
+    candidates = uncovered(unusable, np.empty((0, 3)))
+    positions, colors = far_points(unusable, GROUND, candidates, 10, (3.0, 300.0), np.random.default_rng(0))
     assert positions.shape == (0, 3) and colors.shape == (0, 3)
 
 

@@ -1,19 +1,22 @@
 """The stage `evaluate`: held-out images against renderings, split into static and moving pixels."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import torch
 
+from drivesplat.ahead import ahead
 from drivesplat.device import telling_out_of_memory
 from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.drive import drive_record
 from drivesplat.evaluation.held_out import held_out_images, measured_images
 from drivesplat.evaluation.lpips_map import unavailable_or_map
-from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics, with_gap
+from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.shown import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
@@ -159,16 +162,37 @@ def evaluate_groups(
     """The metrics of every held-out group, by region; `depth` where LiDAR tells the `depths` of held-out images, by
     their numbers; with several cameras `overlap` and `no_overlap`, the static pixels where others look, too, and where
     none does."""
-    groups, rig = {}, len(recording.parser["camera_names"]) > 1
-    for group, images in measured_images(recording.parser, camera).items():
-        metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if rig else ()))), DepthErrors()
+    of_group = partial(_group, model, recording, lpips_map, device, depths)
+    return {group: of_group(images) for group, images in measured_images(recording.parser, camera).items()}
+
+
+def _group(
+    model: SplatModel,
+    recording: Recording,
+    lpips_map: LpipsMap | None,
+    device: torch.device,
+    depths: Mapping[int, Depths],
+    images: list[int],
+) -> dict[str, Any]:
+    """The metrics of a held-out group of `images`."""
+    parser = recording.parser
+    rig = len(parser["camera_names"]) > 1
+    metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if rig else ()))), DepthErrors()
+
+    def shown() -> Iterator[tuple[int, np.ndarray]]:
         for index in images:
-            image, metres = rendered_with_depth(model, view_of(recording.parser, index, device))
-            masks = region_masks(recording.labels(index))
-            if rig:
-                masks |= overlap_masks(recording.parser, index, masks["static"])
-            metrics.add(image, recording.image(index), masks)
+            image, metres = rendered_with_depth(model, view_of(parser, index, device))
             if index in depths:
                 depth.add(metres, depths[index])
-        groups[group] = {**with_gap(metrics.summary()), **depth.summary()}
-    return groups
+            yield index, image
+
+    def measured(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:
+        index, image = one
+        masks = region_masks(recording.labels(index))
+        if rig:
+            masks |= overlap_masks(parser, index, masks["static"])
+        return metrics.measured(image, recording.image(index), masks)
+
+    for frame in ahead(measured, shown(), torch.get_num_threads()):
+        metrics.add(frame)
+    return {**with_gap(metrics.summary()), **depth.summary()}

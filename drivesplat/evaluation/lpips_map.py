@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -37,11 +38,13 @@ def lpips_map(backbone: Path, device: torch.device) -> LpipsMap:
         network = lpips.LPIPS(net="alex", spatial=True, pnet_rand=True, verbose=False)
     load_alexnet(network.net, backbone)
     network = network.to(device).eval()
+    alone = Lock()  # of threads that measure frames: the device has room for what the network makes of one
 
     @torch.no_grad()
     def distance(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-        pair = [torch.from_numpy(x).float().permute(2, 0, 1)[None].to(device) * 2.0 - 1.0 for x in (image, truth)]
-        return network(*pair)[0, 0].cpu().numpy()
+        with alone:
+            pair = [torch.from_numpy(x).float().permute(2, 0, 1)[None].to(device) * 2.0 - 1.0 for x in (image, truth)]
+            return network(*pair)[0, 0].cpu().numpy()
 
     return distance
 

@@ -52,6 +52,16 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return full.mean(axis=2)
 
 
+@dataclass(frozen=True)
+class FrameErrors:
+    """What a frame adds to a region of `pixels`: sums over these of the squared error, of SSIM and of LPIPS."""
+
+    pixels: int
+    squared_error: float
+    ssim: float
+    lpips: float
+
+
 @dataclass
 class _Sums:
     pixels: int = 0
@@ -60,38 +70,46 @@ class _Sums:
     lpips: float = 0.0
     frame_psnrs: list[float] = field(default_factory=list)
 
+    def add(self, errors: FrameErrors) -> None:
+        if errors.pixels == 0:
+            return
+        self.pixels += errors.pixels
+        self.squared_error += errors.squared_error
+        self.ssim += errors.ssim
+        self.lpips += errors.lpips
+        frame_psnr = psnr(errors.squared_error / errors.pixels)
+        if errors.pixels >= LEAST_FRAME_PIXELS and frame_psnr is not None:
+            self.frame_psnrs.append(frame_psnr)
+
 
 class RegionMetrics:
-    """Metrics of one group of frames over named regions: `add` each frame, then `summary`."""
+    """Metrics of one group of frames over named regions: `add` what is `measured` of each frame, then `summary`."""
 
     def __init__(self, lpips_map: LpipsMap | None, regions: Iterable[str] = REGIONS):
         self._lpips_map = lpips_map
         self._sums = {region: _Sums() for region in regions}
 
-    def add(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> None:
-        """A rendered and a true image (h, w, 3) in [0, 1], and the frame's pixels (h, w) bool of every region.
+    def measured(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> dict[str, FrameErrors]:
+        """What a rendered and a true image (h, w, 3) in [0, 1] add to each region, whose pixels are `masks` (h, w)
+        bool. Nothing is added yet: several threads may measure frames.
 
         Raises ResultError where the rendering is not finite.
         """
         if not np.isfinite(image).all():
             raise ResultError("a held-out image was rendered as no numbers; delete its checkpoint.pt and rerun")
         image, truth = image.clip(0.0, 1.0).astype(np.float64), truth.astype(np.float64)
-        squared_error = ((image - truth) ** 2).mean(axis=2)
-        similarity = ssim_map(image, truth)
-        perceptual = self._lpips_map(image, truth) if self._lpips_map else np.zeros_like(similarity)
+        maps = [((image - truth) ** 2).mean(axis=2), ssim_map(image, truth)]
+        maps.append(self._lpips_map(image, truth) if self._lpips_map else np.zeros_like(maps[0]))
+        return {
+            region: FrameErrors(int(masks[region].sum()), *(float(values[masks[region]].sum()) for values in maps))
+            for region in self._sums
+        }
+
+    def add(self, frame: Mapping[str, FrameErrors]) -> None:
+        """Adds what was measured of a frame. In whatever order frames are measured, they are added in their own:
+        sums are then the same to the last bit."""
         for region, sums in self._sums.items():
-            mask = masks[region]
-            pixels = int(mask.sum())
-            if pixels == 0:
-                continue
-            frame_error = float(squared_error[mask].sum())
-            sums.pixels += pixels
-            sums.squared_error += frame_error
-            sums.ssim += float(similarity[mask].sum())
-            sums.lpips += float(perceptual[mask].sum())
-            frame_psnr = psnr(frame_error / pixels)
-            if pixels >= LEAST_FRAME_PIXELS and frame_psnr is not None:
-                sums.frame_psnrs.append(frame_psnr)
+            sums.add(frame[region])
 
     def summary(self) -> dict[str, dict[str, Any] | None]:
         """A record per region; None where a region has too few pixels."""

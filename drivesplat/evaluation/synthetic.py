@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.evaluation.metrics import LpipsMap, RegionMetrics
+from drivesplat.ahead import ahead
+from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics
 from drivesplat.images import continuous_intrinsics, read_image
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
@@ -19,6 +20,7 @@ from drivesplat.model.view import View
 from drivesplat.recording import Recording
 from drivesplat.regions import fill, hull_of, label_image, region_masks
 from drivesplat.rigid import inverse
+from drivesplat.scene import Frame
 from drivesplat.tracks import Box, box_at
 from drivesplat.training.views import view_of
 from drivesplat.truth import Truth, TruthFrame, truth_image
@@ -59,6 +61,18 @@ class KnownTruth:
         return (box, inside) if inside.any() else None
 
 
+@dataclass(frozen=True)
+class Emptied:
+    """Image `index` as a model shows it (h, w, 3), with the leading car `removed` and `untouched`, beside the name of
+    the true image of the empty `street`; `inside` (h, w) bool are the pixels of the car's hull."""
+
+    index: int
+    street: str
+    inside: np.ndarray
+    removed: np.ndarray
+    untouched: np.ndarray
+
+
 @torch.no_grad()
 def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
     """What the model shows (h, w, 3) float32, not clamped; with `gaussians` in place of its own where given."""
@@ -83,14 +97,23 @@ def lateral_metrics(
     """
     metrics, recording = RegionMetrics(lpips_map, LATERAL_REGIONS), known.recording
     frames = list(known.frames(camera))
-    for index, truth in frames:
-        frame, size = recording.frame(index), recording.size(index)
-        to_left = inverse(np.array(truth.camera_to_global)) @ np.array(truth.lateral_camera_to_global)
-        aside = dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ to_left)
-        pose = torch.from_numpy(aside.camera_to_world).float().to(device)
-        view = dataclasses.replace(view_of(recording.parser, index, device), camera_to_world=pose)
+
+    def shown() -> Iterator[tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]]:
+        for index, truth in frames:
+            frame = recording.frame(index)
+            to_left = inverse(np.array(truth.camera_to_global)) @ np.array(truth.lateral_camera_to_global)
+            aside = dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ to_left)
+            pose = torch.from_numpy(aside.camera_to_world).float().to(device)
+            view = dataclasses.replace(view_of(recording.parser, index, device), camera_to_world=pose)
+            yield aside, rendered(model, view), truth, recording.size(index)
+
+    def measured(one: tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]) -> dict[str, FrameErrors]:
+        aside, image, truth, size = one
         masks = region_masks(label_image(recording.scene, aside, size))
-        metrics.add(rendered(model, view), known.image(truth.lateral, size), masks)
+        return metrics.measured(image, known.image(truth.lateral, size), masks)
+
+    for errors in ahead(measured, shown(), torch.get_num_threads()):
+        metrics.add(errors)
     return {str(known.truth.lateral_left_m): metrics.summary()} if frames else None
 
 
@@ -102,19 +125,27 @@ def removal_metrics(
     what the removal is to beat. None where there is no truth."""
     recording = known.recording
     removed, untouched = RegionMetrics(lpips_map, REMOVAL_REGIONS), RegionMetrics(lpips_map, REMOVAL_REGIONS)
-    measured = False
-    for index, truth in known.frames(camera):
-        seen = known.leading_in(index) if truth.without_leading else None
-        if seen is None:
-            continue
-        box, inside = seen
-        view, own_car = view_of(recording.parser, index, device), recording.own_car(index)
-        with torch.no_grad():
-            gaussians = model.gaussians_at(view.time)
-            kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
-        street = known.image(truth.without_leading, recording.size(index))
-        masks = {"box": inside & ~own_car, "outside": ~inside & ~own_car}
-        removed.add(rendered(model, view, kept), street, masks)
-        untouched.add(rendered(model, view, gaussians), street, masks)
-        measured = True
-    return {**removed.summary(), "not_removed": untouched.summary()} if measured else None
+
+    def shown() -> Iterator[Emptied]:
+        for index, truth in known.frames(camera):
+            seen = known.leading_in(index) if truth.without_leading else None
+            if seen is None:
+                continue
+            box, inside = seen
+            view = view_of(recording.parser, index, device)
+            with torch.no_grad():
+                gaussians = model.gaussians_at(view.time)
+                kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
+            pictures = rendered(model, view, kept), rendered(model, view, gaussians)
+            yield Emptied(index, truth.without_leading, inside, *pictures)
+
+    def measured(one: Emptied) -> tuple[dict[str, FrameErrors], dict[str, FrameErrors]]:
+        street, own_car = known.image(one.street, recording.size(one.index)), recording.own_car(one.index)
+        masks = {"box": one.inside & ~own_car, "outside": ~one.inside & ~own_car}
+        return removed.measured(one.removed, street, masks), untouched.measured(one.untouched, street, masks)
+
+    frames = list(ahead(measured, shown(), torch.get_num_threads()))
+    for without, with_it in frames:
+        removed.add(without)
+        untouched.add(with_it)
+    return {**removed.summary(), "not_removed": untouched.summary()} if frames else None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.images import project
+from drivesplat.ahead import ahead
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,22 @@ def color_by_visibility(
     `points` (n, 3) world; `times` (n,) microseconds. Returns colours (n, 3) uint8 and the number of views that see each
     point (n,): where it is 0 the colour is meaningless.
     """
+
+    def seen_by(view: ColorView) -> tuple[np.ndarray, np.ndarray, int]:
+        """The points that a view sees, their colours in it, and its time."""
+        index, rows, columns, _ = visible(points, view.world_to_camera, view.intrinsics, view.pixels.shape[:2])
+        usable = view.usable[rows, columns]
+        return index[usable], view.pixels[rows[usable], columns[usable]], view.timestamp
+
     colors = np.zeros((len(points), 3), dtype=np.uint8)
     best = np.full(len(points), np.inf)
     seen = np.zeros(len(points), dtype=np.int64)
-    for view in views:
-        index, rows, columns, _ = visible(points, view.world_to_camera, view.intrinsics, view.pixels.shape[:2])
-        usable = view.usable[rows, columns]
-        index, rows, columns = index[usable], rows[usable], columns[usable]
+    for index, in_view, timestamp in ahead(seen_by, views):
         seen[index] += 1
-        distance = np.abs(times[index] - view.timestamp)
+        distance = np.abs(times[index] - timestamp)
         better = distance < best[index]
-        index, rows, columns = index[better], rows[better], columns[better]
-        best[index] = distance[better]
-        colors[index] = view.pixels[rows, columns]
+        best[index[better]] = distance[better]
+        colors[index[better]] = in_view[better]
     return colors, seen
 
 
@@ -78,11 +81,12 @@ def in_image(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices (m,), pixel rows (m,) and columns (m,) and depths (m,) along the axis, in metres, of the points (n, 3)
     that lie in an image of `shape` (h, w), farther before it than NEAREST; whether anything hides them is not asked."""
-    pixels, depth = project(points, world_to_camera, intrinsics)
     height, width = shape
-    inside = (
-        (depth > NEAREST) & (pixels[:, 0] >= 0) & (pixels[:, 0] < width) & (pixels[:, 1] >= 0) & (pixels[:, 1] < height)
-    )
-    index = np.flatnonzero(inside)
-    columns, rows = pixels[index].astype(np.int64).T
-    return index, rows, columns, depth[index]
+    to_image = intrinsics @ world_to_camera[:3]
+    rotation, translation = to_image[:, :3], to_image[:, 3]  # a row at a time: most points are behind the camera
+    depth = points @ rotation[2] + translation[2]
+    before = np.flatnonzero(depth > NEAREST)
+    depth = depth[before]
+    x, y = (((points @ rotation[i])[before] + translation[i]) / depth for i in range(2))
+    inside = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
+    return before[inside], y[inside].astype(np.int64), x[inside].astype(np.int64), depth[inside]

@@ -25,7 +25,7 @@ from drivesplat.regions import fill, hulls_in
 from drivesplat.rigid import apply, inverse
 from drivesplat.scene import Frame, Scene
 from drivesplat.seeding.coloring import ColorView, color_by_visibility
-from drivesplat.seeding.far_points import far_points
+from drivesplat.seeding.far_points import far_points, uncovered
 from drivesplat.seeding.sweeps import outside_boxes, read_sweep, sweep_fault, thin, without_own_car
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
@@ -165,12 +165,17 @@ def _far_points(
     own_car: OwnCar,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
+
+    def view_of(frame: Frame) -> tuple[ColorView, np.ndarray]:
+        view = color_view(scene, frame, job.images, own_car)
+        return view, uncovered(view, covered)
+
     settings = job.lidar_seed
     positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
     shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
-    for frame, view, count in zip(frames, color_views(scene, frames, job.images, own_car), shares, strict=True):
+    for frame, (view, candidates), count in zip(frames, ahead(view_of, frames), shares, strict=True):
         ground_z = float(frame.ego_to_world[2, 3])
-        p, c = far_points(view, ground_z, covered, count, settings.far_depths, random)
+        p, c = far_points(view, ground_z, candidates, count, settings.far_depths, random)
         positions.append(p)
         colors.append(c)
     return np.concatenate(positions), np.concatenate(colors)

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from drivesplat.ahead import ahead
 from drivesplat.device import choose_device, telling_out_of_memory
 from drivesplat.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
@@ -50,12 +51,14 @@ class TrainingInputs:
         """What `job` wants to know of the training images."""
         images = [int(i) for i in self.parser["splits"]["train"]]
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
+        moving_wanted = self.actors and job.train.dynamic_weight
+        seeing = [i for i in images if camera_of(self.parser, i) in self.seeing_own_car]
         return Guides(
-            sky={i: self._sky(i) for i in images} if sky_wanted else {},
-            moving={i: self._moving(i) for i in images} if self.actors and job.train.dynamic_weight else {},
+            sky=_of_each(images, self._sky) if sky_wanted else {},
+            moving=_of_each(images, self._moving) if moving_wanted else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
-            classes={i: read_classes(self.masks, *self._image(i)) for i in images} if self.told_apart(job) else {},
-            own_car={i: self._own_car(i) for i in images if camera_of(self.parser, i) in self.seeing_own_car},
+            classes=_of_each(images, self._classes) if self.told_apart(job) else {},
+            own_car=_of_each(seeing, self._own_car),
         )
 
     def told_apart(self, job: TrainJob) -> int:
@@ -71,6 +74,9 @@ class TrainingInputs:
             return ()
         seen = {camera_of(self.parser, int(i)) for i in self.parser["splits"]["train"]}
         return tuple(sorted(seen - {job.reference_camera}))
+
+    def _classes(self, index: int) -> np.ndarray:
+        return read_classes(self.masks, *self._image(index))
 
     def _own_car(self, index: int) -> np.ndarray:
         return read_labels(self.masks, *self._image(index)) == LABELS["own_car"]
@@ -211,6 +217,11 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
     model, _ = trained_model(checkpoint)
     with telling_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device
+
+
+def _of_each(images: Sequence[int], read: Callable[[int], np.ndarray]) -> dict[int, np.ndarray]:
+    """What is read of each image, by its number."""
+    return dict(zip(images, ahead(read, images), strict=True))
 
 
 def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
