@@ -8,6 +8,7 @@ cd "$(dirname "$0")/.."
 PATH=$PATH:/usr/lib/wsl/lib  # where Windows' Linux keeps nvidia-smi
 
 readonly stamp=.venv/.made-from
+readonly compiled=.venv/.compiled-ahead
 readonly torch_index=${TORCH_INDEX:-https://download.pytorch.org/whl}
 readonly os_release=${OS_RELEASE:-/etc/os-release}
 
@@ -118,6 +119,16 @@ make_venv() {
   stamp_for "$build" > "$stamp"
 }
 
+# What is compiled at its first use otherwise, and waited for then: bytecode, and what trains on processors.
+compile_ahead() {
+  say "compiling what trains on processors; half a minute at most"
+  .venv/bin/python -m compileall -q drivesplat workflow_scripts ||
+    say "no bytecode could be kept: is the checkout read-only? Every job will compile it anew"
+  .venv/bin/python -m drivesplat.training.rehearsal ||
+    fail "all packages are in place, but a first training on the processors fails (see above); make doctor says more"
+  : > "$compiled"
+}
+
 build=${TORCH_CUDA:-$(build_made)}
 
 if [ "${1:-}" = --check ]; then
@@ -131,9 +142,6 @@ fi
 
 if [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(stamp_for "$build")" ]; then
   quiet=--if-needed
-  if [ -z "${GSPLAT_ARCHS:-}" ] && ! command -v nvidia-smi >/dev/null 2>&1; then
-    exit 0  # nothing to compile for
-  fi
 else
   quiet=
   python=$(find_python) || exit 1
@@ -141,5 +149,9 @@ else
   check_disk "$(disk_needed_mb "$build")" || exit 1
   make_venv "$build"
 fi
-.venv/bin/python -m drivesplat.gsplat_build $quiet ||
-  fail "everything but gsplat's kernels is in place; GSPLAT_ARCHS=none make setup goes without them (CPU only)"
+no_card() { [ -z "${GSPLAT_ARCHS:-}" ] && ! command -v nvidia-smi >/dev/null 2>&1; }
+if [ -z "$quiet" ] || ! no_card; then
+  .venv/bin/python -m drivesplat.gsplat_build $quiet ||
+    fail "everything but gsplat's kernels is in place; GSPLAT_ARCHS=none make setup goes without them (CPU only)"
+fi
+[ -e "$compiled" ] || compile_ahead

@@ -25,8 +25,13 @@ def small_package(root: Path) -> Path:
 
 
 def show(root: Path, **environment: str) -> tuple[float, int]:
-    """The kernel's value in a fresh process, and how often it was found on disk."""
-    env = {**{k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}, "PYTHONPATH": str(root), **environment}
+    """The kernel's value in a fresh process, and how often it was found on disk.
+
+    The process leaves no bytecode behind: Python would take it for that of a file of the same size which a test writes
+    in the same second.
+    """
+    known = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    env = {**known, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1", **environment}
     done = subprocess.run([sys.executable, "-c", SHOW], env=env, cwd=root, capture_output=True, text=True, check=True)
     value, hits = done.stdout.split()
     return float(value), int(hits)

@@ -1,0 +1,26 @@
+"""What the set-up compiles beforehand is what a training on processors would wait for."""
+
+import subprocess
+import sys
+
+LEFT = """
+import importlib, pathlib, pkgutil, tempfile
+from numba.core.registry import CPUDispatcher
+from drivesplat import on_cpu
+from drivesplat.rasterize import cpu
+from drivesplat.training.rehearsal import rehearse
+
+rehearse(pathlib.Path(tempfile.mkdtemp(dir=".")))
+for package in (on_cpu, cpu):
+    for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+        for name, kernel in vars(importlib.import_module(found.name)).items():
+            if isinstance(kernel, CPUDispatcher) and kernel.stats.cache_path:  # without: kept with its callers
+                print(name, len(kernel.signatures))
+"""
+
+
+def test_every_kernel_of_a_training_is_compiled_by_the_rehearsal(tmp_path):
+    done = subprocess.run([sys.executable, "-c", LEFT], cwd=tmp_path, capture_output=True, text=True, check=True)
+    compiled = dict(line.rsplit(" ", 1) for line in done.stdout.splitlines())
+    assert len(compiled) > 12
+    assert {name: count for name, count in compiled.items() if count == "0"} == {}
