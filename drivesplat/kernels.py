@@ -31,7 +31,7 @@ callee = numba.njit(**OPTIONS)
 def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Callable[..., Any]:
     """Compiles a function (or makes a decorator that does) to run without the GIL.
 
-    What has been compiled is kept in NUMBA_CACHE_DIR, or beside the file, or in the user's cache. Where none of these
+    What has been compiled is kept in NUMBA_CACHE_DIR, or beside this file, or in the user's cache. Where none of these
     can be written, each process compiles anew.
     """
     if function is None:
@@ -64,8 +64,8 @@ def _kept_source(file: Path, given: str) -> Path:
 
 def _cache_folder(file: Path, given: str) -> Path:
     """The folder for what is compiled from `file` and the code it imports, below the first that can be written of
-    `given`, __pycache__ beside the file, and the user's cache. What went unused there for weeks is removed."""
-    beside, users = file.parent / "__pycache__", Path.home() / ".cache" / "drivesplat"
+    `given`, the package's __pycache__, and the user's cache. What went unused there for weeks is removed."""
+    beside, users = Path(__file__).parent / "__pycache__", Path.home() / ".cache" / "drivesplat"
     parent = Path(given) if given else next((folder for folder in (beside, users) if _writable(folder)), beside)
     folder = parent / f"kernels-{file.stem}-{code_digest(file)[:16]}"
     for other in parent.glob(f"kernels-{file.stem}-*"):

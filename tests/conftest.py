@@ -5,8 +5,8 @@ from itertools import groupby
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch comes: its threads times pytest's workers is slow
-# Copies of the workflow run the same kernels as the tests themselves: they are compiled once.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drivesplat/rasterize/cpu/__pycache__"))
+# Copies of the workflow run the same kernels as the tests themselves: those that the set-up compiled.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drivesplat/__pycache__"))
 
 import pytest
 import torch

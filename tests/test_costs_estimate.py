@@ -9,7 +9,7 @@ from workflow_copy import WorkflowCopy
 from drivesplat.config import load, merged
 from drivesplat.costs.disk import MEGABYTES, Leaves, disk_need
 from drivesplat.costs.estimate import Machine, PlannedJob, estimate, in_full, in_one_line, spelled
-from drivesplat.costs.expected import SECONDS, Expectations, Work, wall_seconds
+from drivesplat.costs.expected import SECONDS, START_SECONDS, Expectations, Work, wall_seconds
 from drivesplat.costs.measured import Cost, Job
 
 DEFAULTS = yaml.safe_load((Path(__file__).parent.parent / "config.yaml").read_text())
@@ -45,12 +45,22 @@ def test_a_training_goes_with_its_iterations():
     assert not more.measured, "a method without parts that move tells nothing of one with them"
     unknown = expectations(train={"iterations": 30000})
     double = expectations(train={"iterations": 60000})
-    for method, seconds in (("vanilla", 2 * 114.0), ("street", 2 * 245.0)):
+    for method, seconds in (("vanilla", 2 * 20.5), ("street", 2 * 37.5)):
         job = Job("train", "0103", method)
-        assert unknown.of(job).seconds == pytest.approx(seconds, rel=0.05), "as the README's table on that machine"
+        assert unknown.of(job).seconds == pytest.approx(START_SECONDS + seconds, rel=0.05), "as on that machine"
         assert double.of(job).seconds - unknown.of(job).seconds == pytest.approx(seconds, rel=0.05)
     slow = expectations(train={"iterations": 30000}, device="cpu").of(Job("train", "0103", "street"))
     assert slow.seconds > 5 * unknown.of(Job("train", "0103", "street")).seconds
+
+
+def test_a_synthetic_world_goes_with_its_images():
+    worlds = {"large": {"width": 1600, "key_frames": 40, "sweeps": []}, "demo": {}}
+    datasets = {
+        name: {"dataroot": name, "scenes": [name], "batch": False, "world": world} for name, world in worlds.items()
+    }
+    seconds = {name: expectations(datasets=datasets).of(Job("demo_world", film=name)).seconds for name in worlds}
+    assert seconds["demo"] == SECONDS["demo_world"]
+    assert seconds["large"] / seconds["demo"] == pytest.approx(320 * 16 / 255)
 
 
 def test_scenes_and_methods_share_cores_and_cards():

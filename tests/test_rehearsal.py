@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
+REPOSITORY = Path(__file__).parent.parent
 LEFT = """
 import importlib, pathlib, pkgutil, tempfile
 from numba.core.registry import CPUDispatcher
@@ -10,7 +12,8 @@ from drivesplat import on_cpu
 from drivesplat.rasterize import cpu
 from drivesplat.training.rehearsal import rehearse
 
-rehearse(pathlib.Path(tempfile.mkdtemp(dir=".")))
+with tempfile.TemporaryDirectory() as folder:
+    rehearse(pathlib.Path(folder))
 for package in (on_cpu, cpu):
     for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
         for name, kernel in vars(importlib.import_module(found.name)).items():
@@ -19,8 +22,8 @@ for package in (on_cpu, cpu):
 """
 
 
-def test_every_kernel_of_a_training_is_compiled_by_the_rehearsal(tmp_path):
-    done = subprocess.run([sys.executable, "-c", LEFT], cwd=tmp_path, capture_output=True, text=True, check=True)
+def test_every_kernel_of_a_training_is_compiled_by_the_rehearsal():
+    done = subprocess.run([sys.executable, "-c", LEFT], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     compiled = dict(line.rsplit(" ", 1) for line in done.stdout.splitlines())
     assert len(compiled) > 12
     assert {name: count for name, count in compiled.items() if count == "0"} == {}

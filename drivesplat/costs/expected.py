@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from drivesplat.config import Config, for_scene
-from drivesplat.costs.measured import TRAIN, Cost, Job
+from drivesplat.costs.measured import TRAIN, WORLD, Cost, Job
 from drivesplat.settings.train import MOVING_PARTS
+from drivesplat.settings.world import WorldSettings
 
 KNOWN_MACHINE = "two processor cores and the demo drive; trainings on one NVIDIA H200 at 640x360"
 SECONDS = {
@@ -21,7 +22,7 @@ OTHERS = 10.0
 START_SECONDS = 8.0
 """Of every training: images are read, the model is made, files are written."""
 ITERATIONS_PER_SECOND = {
-    ("gpu", False): 131.0, ("gpu", True): 61.0, ("cpu", False): 11.8, ("cpu", True): 8.8
+    ("gpu", False): 730.0, ("gpu", True): 400.0, ("cpu", False): 11.8, ("cpu", True): 8.8
 }  # fmt: skip
 """By device, and by whether a method has parts that move; on CPUs those of the demo."""
 
@@ -73,6 +74,9 @@ class Expectations:
         return cost.seconds * self._planned_iterations(job) / cost.iterations if cost.iterations else None
 
     def _rough(self, job: Job) -> float:
+        if job.stage == WORLD and job.film in self._config.datasets:
+            world = self._config.datasets[job.film].world or WorldSettings()
+            return SECONDS[WORLD] * rays_of(world) / rays_of(WorldSettings())
         if job.stage != TRAIN:
             return SECONDS.get(job.stage, OTHERS)
         kind = for_scene(self._config, job.scene).device.kind
@@ -89,6 +93,14 @@ class Expectations:
     def _moves(self, method: str) -> bool:
         known = self._config.all_methods
         return method in known and bool(set(known[method].parts) & MOVING_PARTS)
+
+
+def rays_of(world: WorldSettings) -> int:
+    """How many rays a synthetic world is cast by, about, in rays of one pixel: six images a key frame, two more of
+    truth, and five between two key frames of each camera that also records there."""
+    between = sum(channel.startswith("CAM") for channel in world.sweeps)
+    images = 8 * world.key_frames + 5 * (world.key_frames - 1) * between
+    return images * world.width**2 * world.samples_per_pixel
 
 
 @dataclass(frozen=True)
