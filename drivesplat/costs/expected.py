@@ -11,9 +11,9 @@ from drivesplat.settings.world import WorldSettings
 
 KNOWN_MACHINE = "two processor cores and the demo drive; trainings on one NVIDIA H200 at 640x360"
 SECONDS = {
-    "demo_world": 95.0, "lpips_backbone": 2.0, "extract": 3.0, "own_car": 5.0, "refine_poses": 60.0, "lidar_seed": 10.0,
-    "parser": 1.0, "masks": 6.0, "actors": 5.0, "lidar_depth": 5.0, "free_space": 10.0, "evaluate": 9.0, "tracks": 4.0,
-    "scene_metrics": 1.0, "film": 18.0, "film_parts": 16.0, "edit": 17.0, "ghost_panel": 5.0, "remove_actor": 6.0,
+    "demo_world": 37.0, "lpips_backbone": 2.0, "extract": 3.0, "own_car": 5.0, "refine_poses": 60.0, "lidar_seed": 10.0,
+    "parser": 1.0, "masks": 6.0, "actors": 5.0, "lidar_depth": 5.0, "free_space": 10.0, "evaluate": 6.5, "tracks": 4.0,
+    "scene_metrics": 1.0, "film": 13.5, "film_parts": 9.0, "edit": 12.0, "ghost_panel": 5.0, "remove_actor": 6.0,
     "export": 3.0, "export_usd": 4.0, "export_viewer": 3.0, "ablation": 1.0, "gap_report": 2.0,
 }  # fmt: skip
 """Seconds of stages on KNOWN_MACHINE."""
@@ -22,7 +22,7 @@ OTHERS = 10.0
 START_SECONDS = 8.0
 """Of every training: images are read, the model is made, files are written."""
 ITERATIONS_PER_SECOND = {
-    ("gpu", False): 730.0, ("gpu", True): 400.0, ("cpu", False): 11.8, ("cpu", True): 8.8
+    ("gpu", False): 730.0, ("gpu", True): 400.0, ("cpu", False): 17.5, ("cpu", True): 13.2
 }  # fmt: skip
 """By device, and by whether a method has parts that move; on CPUs those of the demo."""
 
