@@ -51,7 +51,7 @@ rule evaluate:
         "<benchmarks>/{scene}/{method}/evaluate.tsv"
     conda:
         "../envs/drivesplat.yaml"
-    threads: plan.threads(on_gpu=8)
+    threads: plan.threads(on_gpu=4)
     resources:
         gpu=plan.cards,
         device=plan.device,

@@ -104,6 +104,7 @@ rule lidar_seed:
         "<benchmarks>/{scene}/lidar_seed.tsv"
     conda:
         "../envs/drivesplat.yaml"
+    threads: 4
     resources:
         mem_mb=8000,
         runtime=30,

@@ -61,6 +61,11 @@ def test_a_synthetic_world_goes_with_its_images():
     seconds = {name: expectations(datasets=datasets).of(Job("demo_world", film=name)).seconds for name in worlds}
     assert seconds["demo"] == SECONDS["demo_world"]
     assert seconds["large"] / seconds["demo"] == pytest.approx(320 * 16 / 255)
+    measured = expectations(Cost(Job("demo_world", film="demo"), 50.0, ""), datasets=datasets)
+    assert measured.of(Job("demo_world", film="large")).seconds == pytest.approx(50.0 * 320 * 16 / 255)
+    assert measured.of(Job("demo_world", film="demo")).seconds == 50.0
+    gone = expectations(Cost(Job("demo_world", film="gone"), 50.0, ""), datasets=datasets)
+    assert gone.of(Job("demo_world", film="demo")).seconds == SECONDS["demo_world"], "who knows how large it was"
 
 
 def test_scenes_and_methods_share_cores_and_cards():

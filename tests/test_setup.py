@@ -108,10 +108,12 @@ def test_a_good_venv_is_left_alone(machine):
 
 def test_a_machine_on_which_nothing_can_be_trained_is_told_at_once(machine):
     result = machine.run(FAKE_REHEARSAL_FAILS="1")
-    assert result.returncode == 1
+    assert result.returncode == 0, "who has a GPU may do without"
     assert "a first training on the processors fails" in result.stderr and "make doctor" in result.stderr
     machine.done()
-    assert machine.run(FAKE_REHEARSAL_FAILS="1").returncode == 1, "and again, though all packages are there"
+    assert "a first training" in machine.run(FAKE_REHEARSAL_FAILS="1").stderr, (
+        "and again, though all packages are there"
+    )
     assert [line.split()[0] for line in machine.done()] == ["compileall", "rehearsal"]
     assert machine.run().returncode == 0 and [line.split()[0] for line in machine.done()] == ["compileall", "rehearsal"]
     assert machine.run().returncode == 0 and machine.done() == []

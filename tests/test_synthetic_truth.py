@@ -16,7 +16,7 @@ from skimage.metrics import structural_similarity
 
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.evaluation.evaluate import EvaluationInputs, against_truth
-from drivesplat.evaluation.metrics import RegionMetrics
+from drivesplat.evaluation.metrics import RegionMetrics, measuring_threads
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.extract import extract_scene
 from drivesplat.model.background import Background
@@ -482,3 +482,17 @@ def test_a_true_image_that_is_truncated_is_named(known, tmp_path):
     moved = dataclasses.replace(changed(known, lateral="half.png"), path=tmp_path / "truth.json")
     with pytest.raises((ResultError, DatasetError), match=r"half\.png"):
         lateral_metrics(flat_model(), moved, "CAM_FRONT", None, CPU)
+
+
+def test_figures_are_the_same_to_the_last_bit_by_however_many_threads_frames_are_measured(known):
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            assert measuring_threads() == threads
+            model = flat_model(parts=[Riding(known, True)])
+            lateral = lateral_metrics(model, known, "CAM_FRONT", None, CPU)
+            found.append((lateral, removal_metrics(model, known, "CAM_FRONT", MARGIN, None, CPU)))
+    finally:
+        torch.set_num_threads(before)
+    assert found[0] == found[1] and all(figures is not None for figures in found[0])

@@ -69,20 +69,27 @@ class Expectations:
         return self._config.dataset_of(scene) if scene in self._config.scenes else f"?{scene}" if scene else ""
 
     def _scaled(self, cost: Cost, job: Job) -> float | None:
+        if job.stage == WORLD and cost.job != job:
+            made, wanted = self._world(cost.job), self._world(job)
+            return cost.seconds * rays_of(wanted) / rays_of(made) if made and wanted else None
         if job.stage != TRAIN:
             return cost.seconds
         return cost.seconds * self._planned_iterations(job) / cost.iterations if cost.iterations else None
 
     def _rough(self, job: Job) -> float:
-        if job.stage == WORLD and job.film in self._config.datasets:
-            world = self._config.datasets[job.film].world or WorldSettings()
-            return SECONDS[WORLD] * rays_of(world) / rays_of(WorldSettings())
+        if job.stage == WORLD:
+            return SECONDS[WORLD] * rays_of(self._world(job) or WorldSettings()) / rays_of(WorldSettings())
         if job.stage != TRAIN:
             return SECONDS.get(job.stage, OTHERS)
         kind = for_scene(self._config, job.scene).device.kind
         synthetic = self._config.datasets[self._config.dataset_of(job.scene)].world is not None
         where = "cpu" if kind == "cpu" or (kind == "auto" and synthetic) else "gpu"
         return START_SECONDS + self._planned_iterations(job) / ITERATIONS_PER_SECOND[where, self._moves(job.method)]
+
+    def _world(self, job: Job) -> WorldSettings | None:
+        """The synthetic world that a job makes; None where it is not configured any more."""
+        dataset = self._config.datasets.get(job.film)
+        return dataset.world if dataset is not None else None
 
     def _planned_iterations(self, job: Job) -> int:
         key = job.scene, job.method

@@ -16,7 +16,7 @@ from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.drive import drive_record
 from drivesplat.evaluation.held_out import held_out_images, measured_images
 from drivesplat.evaluation.lpips_map import unavailable_or_map
-from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, with_gap
+from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.shown import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
@@ -193,6 +193,6 @@ def _group(
             masks |= overlap_masks(parser, index, masks["static"])
         return metrics.measured(image, recording.image(index), masks)
 
-    for frame in ahead(measured, shown(), torch.get_num_threads()):
+    for frame in ahead(measured, shown(), measuring_threads()):
         metrics.add(frame)
     return {**with_gap(metrics.summary()), **depth.summary()}

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from drivesplat.ahead import ahead
-from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics
+from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads
 from drivesplat.images import continuous_intrinsics, read_image
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
@@ -112,7 +112,7 @@ def lateral_metrics(
         masks = region_masks(label_image(recording.scene, aside, size))
         return metrics.measured(image, known.image(truth.lateral, size), masks)
 
-    for errors in ahead(measured, shown(), torch.get_num_threads()):
+    for errors in ahead(measured, shown(), measuring_threads()):
         metrics.add(errors)
     return {str(known.truth.lateral_left_m): metrics.summary()} if frames else None
 
@@ -144,7 +144,7 @@ def removal_metrics(
         masks = {"box": one.inside & ~own_car, "outside": ~one.inside & ~own_car}
         return removed.measured(one.removed, street, masks), untouched.measured(one.untouched, street, masks)
 
-    frames = list(ahead(measured, shown(), torch.get_num_threads()))
+    frames = list(ahead(measured, shown(), measuring_threads()))
     for without, with_it in frames:
         removed.add(without)
         untouched.add(with_it)

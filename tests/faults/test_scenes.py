@@ -84,15 +84,16 @@ def test_a_scene_more_runs_its_chain_and_the_report_and_a_scene_less_the_report_
     healed.scenes("0001", "0002")
 
 
-def test_results_without_records_are_recognised_as_stale_by_their_provenance(healed):
+def test_results_without_records_are_recognised_as_stale_by_their_provenance(healed, tmp_path):
     """As on another machine: Snakemake has no record of how these files were made, and takes them for good."""
-    shutil.rmtree(healed.copy.folder / ".snakemake")
-    healed.copy.config["train"] = TINY_TRAINING | {"iterations": 21}
-    healed.copy.write_config()
-    (healed.copy.folder / "results/gap_report.json").unlink()
-    done = healed.copy.run("report")
+    copy = healed.copy.again(tmp_path / "workflow")
+    shutil.rmtree(copy.folder / ".snakemake")
+    copy.config["train"] = TINY_TRAINING | {"iterations": 21}
+    copy.write_config()
+    (copy.folder / "results/gap_report.json").unlink()
+    done = copy.run("report")
     assert done.returncode == 0, done.stdout
-    report = healed.copy.read("results/gap_report.json")
+    report = copy.read("results/gap_report.json")
     assert report["partial"] is True and report["rows"] == []
     assert {item["scene"] for item in report["left_out"]} == {"0001", "0002"}
     assert all("train.iterations" in item["why"] and "21" in item["why"] for item in report["left_out"])
