@@ -5,20 +5,21 @@ the GPU renders one, Python asks for the next.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.on_gpu import rooms
+
+if TYPE_CHECKING:
+    from drivesplat.on_gpu.frames import Asked
 
 A = TypeVar("A")
 Shown = tuple[View, Gaussians | None]
@@ -28,8 +29,12 @@ NOT_FINITE = "a frame of a film was rendered as no numbers; delete its checkpoin
 
 def film_frames(model: SplatModel, shown: Iterable[Shown]) -> Iterator[np.ndarray]:
     """What each view shows, (h, w, 3) uint8 RGB. Raises ResultError where one is not finite."""
-    on_device = model.parts[0].params["means"].is_cuda
-    yield from (_in_a_row(_Device(model).asked, shown) if on_device else (_rendered(model, *one) for one in shown))
+    if not model.parts[0].params["means"].is_cuda:
+        yield from (_rendered(model, *one) for one in shown)
+        return
+    from drivesplat.on_gpu.frames import FramesOnGpu
+
+    yield from _in_a_row(FramesOnGpu(model).asked, shown)
 
 
 def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
@@ -38,13 +43,14 @@ def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None
 
 
 def as_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Colours in [0, 1] to the nearest byte. Raises ResultError where they are not finite."""
+    """Colours in [0, 1] to the nearest byte, in main memory. Raises ResultError where they are not finite."""
     if not torch.isfinite(image).all():
         raise ResultError(NOT_FINITE)
-    return _bytes(image).cpu().numpy()
+    return nearest_bytes(image).cpu().numpy()
 
 
-def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
+def nearest_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
+    """Colours in [0, 1] to the nearest byte, where they are."""
     return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
@@ -53,50 +59,9 @@ def _rendered(model: SplatModel, view: View, gaussians: Gaussians | None) -> np.
     return as_bytes(model.render(view, gaussians=gaussians).image)
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """A frame that the device was asked for: `pixels`, and what is `told` of it, whether anything was not finite and
-    how many entries each of its lists needs, in main memory after `wait`; the `rooms` that these lists have; and how to
-    ask for it `again`."""
-
-    pixels: UInt8[Tensor, "h w 3"]
-    told: Int[Tensor, " told"]
-    rooms: Sequence[int]
-    wait: Callable[[], None]
-    again: Callable[[], "_Asked"]
-
-
-class _Device:
-    """A model on a GPU, which is asked for frames: for the first it says how much room its lists of Gaussians need, the
-    others get that and a margin."""
-
-    def __init__(self, model: SplatModel):
-        self._model = model
-        self._needs: list[int] | None = None
-
-    @torch.no_grad()
-    def asked(self, shown: Shown, by_itself: bool = False) -> _Asked:
-        """A frame that was asked for; `by_itself` with all the room it needs, for which the device is waited for."""
-        view, gaussians = shown
-        lists: list[tuple[Int[Tensor, ""], int]] = []
-        if self._needs is None or by_itself:
-            with rooms.counted() as needs:
-                image = self._model.render(view, gaussians=gaussians).image
-            self._needs = [max(pair) for pair in zip(needs, self._needs or needs, strict=True)]
-        else:
-            with rooms.given(self._needs) as lists:
-                image = self._model.render(view, gaussians=gaussians).image
-        told = torch.stack([(~torch.isfinite(image)).any().long(), *(needed.long() for needed, _ in lists)])
-        come = torch.cuda.Event()
-        pixels, told = _to_host(_bytes(image)), _to_host(told)
-        come.record()
-        room = [room for _, room in lists]
-        return _Asked(pixels, told, room, come.synchronize, lambda: self.asked(shown, by_itself=True))
-
-
-def _in_a_row(ask: Callable[[A], _Asked], shown: Iterable[A]) -> Iterator[np.ndarray]:
+def _in_a_row(ask: Callable[[A], "Asked"], shown: Iterable[A]) -> Iterator[np.ndarray]:
     """The frames in order, each asked for before the one before it is waited for."""
-    waiting: deque[_Asked] = deque()
+    waiting: deque[Asked] = deque()
     for one in shown:
         waiting.append(ask(one))
         if len(waiting) > 1:
@@ -105,16 +70,10 @@ def _in_a_row(ask: Callable[[A], _Asked], shown: Iterable[A]) -> Iterator[np.nda
         yield _come(waiting.popleft())
 
 
-def _come(frame: _Asked) -> np.ndarray:
-    frame.wait()
-    not_finite, *needed = frame.told.tolist()
-    if any(need > room for need, room in zip(needed, frame.rooms, strict=True)):
-        return _come(frame.again())
-    if not_finite:
+def _come(asked: "Asked") -> np.ndarray:
+    asked.wait()
+    if asked.cut_short:
+        return _come(asked.again())
+    if not asked.frame.finite:
         raise ResultError(NOT_FINITE)
-    return frame.pixels.numpy()
-
-
-def _to_host(values: Tensor) -> Tensor:
-    """Into memory that the card writes by itself, several times as fast, once it comes to it."""
-    return torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
+    return asked.frame.pixels.numpy()

@@ -3,7 +3,8 @@
 import math
 import re
 import signal
-from dataclasses import fields
+from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +36,13 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
+from drivesplat.on_gpu import frames as frames_on_gpu
 from drivesplat.on_gpu import rooms
+from drivesplat.on_gpu.recording import own_stream
 from drivesplat.rasterize import gpu, rasterize
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
-from drivesplat.training import replays
 from drivesplat.training import trainer as trainer_module
 from drivesplat.training.strategies import relocation
 from drivesplat.training.trainer import Trainer
@@ -344,21 +346,58 @@ def test_a_card_that_suffices_is_taken():
     assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU
 
 
-def test_frames_in_a_row_are_those_by_themselves(monkeypatch):
-    """Also where lists have less room than they turn out to need."""
+@pytest.fixture
+def street_film() -> tuple[SplatModel, list[View], list[np.ndarray]]:
+    """A model with cars, views of it by a lens that zooms, and what these show, one by one."""
     model = untrained_street(settings_of()).to(GPU).requires_grad_(False)
-    views = [view.view for view in guided_views(GPU)]
+    views = [replace(view.view, camera=None) for view in guided_views(GPU)]
+    views = [replace(view, K=view.K * view.K.new_tensor([1.0 + 0.1 * i, 1.0, 1.0])) for i, view in enumerate(views)]
     model.expect([view.time for view in views])
+    return model, views, [film_frame(model, view) for view in views]
+
+
+def assert_frames(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
+    assert max(np.abs(a.astype(int) - b).mean() for a, b in pairwise(expected)) > 1.0, "they differ"
+    for frame, alone in zip(found, expected, strict=True):
+        np.testing.assert_allclose(frame.astype(int), alone, atol=1)
+
+
+def test_frames_in_a_row_are_those_by_themselves(street_film, monkeypatch):
+    """Also where lists have less room than they turn out to need, and where other Gaussians come between."""
+    model, views, expected = street_film
     timeline = model.parts[1].timeline
-    known = dict(timeline._known)
-    expected = [film_frame(model, view) for view in views]
-    for margin in (1.5, 0.2):
-        monkeypatch.setattr(rooms, "LEAST", 0)
+    known, recordings, record = dict(timeline._known), [], frames_on_gpu.recorded
+    monkeypatch.setattr(frames_on_gpu, "recorded", lambda *told: recordings.append(record(*told)) or recordings[-1])
+    monkeypatch.setattr(rooms, "LEAST", 0)
+    for margin in (4.0, 0.2):
         monkeypatch.setattr(rooms, "MARGIN", margin)
-        found = [*film_frames(model, [(view, None) for view in views])]
-        for frame, alone in zip(found, expected, strict=True):
-            np.testing.assert_allclose(frame.astype(int), alone, atol=1)
+        assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
+        assert None not in recordings and (len(recordings) == 1 or margin < 1.0)
+    edited = [(view, model.gaussians_at(view.time) if i % 2 else None) for i, view in enumerate(views)]
+    assert_frames([*film_frames(model, edited)], expected)
     assert timeline._known == known, "all of it was expected"
+
+
+def test_frames_for_a_camera_of_the_rig_are_not_recorded(street_film, monkeypatch):
+    """Where it was, and how it exposes, may be known by Python."""
+    model, views, expected = street_film
+    monkeypatch.setattr(frames_on_gpu, "recorded", None)
+    of_rig = [(replace(view, camera="CAM_BACK"), None) for view in views]
+    assert_frames([*film_frames(model, of_rig)], expected)
+
+
+def test_frames_that_cannot_be_recorded_come_all_the_same(street_film, monkeypatch, caplog):
+    model, views, expected = street_film
+    together = SplatModel.gaussians_in
+
+    def asks(self, moments):
+        found = together(self, moments)
+        assert float(found.means.sum()) < 1e9
+        return found
+
+    monkeypatch.setattr(SplatModel, "gaussians_in", asks)
+    assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
+    assert [record.message.split(",")[0] for record in caplog.records] == ["frames of films cannot be recorded"]
 
 
 def replayed(
@@ -372,7 +411,7 @@ def replayed(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
         )
     chosen = chosen.model_copy(update={"cuda_graphs": record, "iterations": iterations})
-    with replays.own_stream(GPU):
+    with own_stream(GPU):
         trainer = Trainer.begin(model.to(GPU), guided_views(GPU), chosen, 0, GPU)
         losses = [
             float(torch.stack(list(goes_on(trainer).values())).sum()) for _ in range(iterations_done or iterations)
@@ -414,7 +453,7 @@ def test_recordings_outlive_relocation_and_growth_into_spare_rows():
     part = trainer.model.parts[0]
     count, known, spare = len(part), dict(trainer.replays._recorded), part.spare
     assert known and spare and losses[-1] < losses[0]
-    with replays.own_stream(GPU):
+    with own_stream(GPU):
         goes_on(trainer, 10)  # step 48 is among them
         assert len(part) > count and part.spare < spare and trainer.replays._recorded == known
         terms = goes_on(trainer, 10)
@@ -435,13 +474,13 @@ def test_lists_that_outgrow_their_room_are_noticed(monkeypatch):
     monkeypatch.setattr(rooms, "MARGIN", 1.0)
     trainer, _ = replayed(True, iterations=8)
     trainer.model.parts[0].params["scales"].data += 1.0
-    with replays.own_stream(GPU):
+    with own_stream(GPU):
         goes_on(trainer, 4)
     assert any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
     trainer.replays.check()
     assert not any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
     monkeypatch.setattr(rooms, "MARGIN", 1.5)
-    with replays.own_stream(GPU):
+    with own_stream(GPU):
         goes_on(trainer, 2 * len(trainer.images.views))
     assert trainer.replays.wanted and len(trainer.replays._recorded) == len(trainer.images.views)
 

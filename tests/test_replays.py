@@ -9,10 +9,11 @@ from test_training import guided_views
 
 from drivesplat import on_gpu
 from drivesplat.on_gpu import rooms
+from drivesplat.on_gpu.recording import Recording
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import replays
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.replays import Extent, Recording, Replays, can_be_replayed
+from drivesplat.training.replays import Extent, Replays, can_be_replayed
 
 CPU = torch.device("cpu")
 HUNDRED = Extent(100, 1.0)
@@ -32,8 +33,9 @@ class Played:
         self.rooms.append([need * gaussians for need in self.replays._needs[image]])
         replay = partial(self.done.append, ("replayed", image))
         self.replays._recorded[image] = Recording(
-            replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), torch.tensor(0)
-        )
+            replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), [self.needed],
+            torch.tensor(0),
+        )  # fmt: skip
         return self.replays._recorded[image]
 
     def iterate(self, image, shape=0, gaussians=HUNDRED):

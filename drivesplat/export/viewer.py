@@ -24,6 +24,7 @@ from torch import Tensor
 from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.export.viewer_page import filled_page
+from drivesplat.frames import nearest_bytes
 from drivesplat.images import continuous_intrinsics
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
@@ -110,7 +111,7 @@ def sky_faces(sky: Sky | None, size: int) -> np.ndarray:
     """The sky (6, size, size, 3) uint8 as OpenGL's cube map in world directions: faces +x -x +y -y +z -z."""
     if sky is None:
         return np.zeros((6, size, size, 3), np.uint8)
-    return torch.stack([_bytes(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
+    return torch.stack([nearest_bytes(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
 
 
 def cube_rays(size: int) -> Float[Tensor, "6 size size 3"]:
@@ -140,10 +141,6 @@ def packed(arrays: dict[str, np.ndarray]) -> tuple[list[dict[str, Any]], bytes]:
         layout.append({"name": name, "dtype": array.dtype.name, "offset": len(content), "length": array.size})
         content.extend(array.astype(array.dtype.newbyteorder("<")).tobytes())
     return layout, zlib.compress(bytes(content), level=9)
-
-
-def _bytes(colors: Tensor) -> Tensor:
-    return torch.round(colors.clamp(0.0, 1.0) * 255.0).to(torch.uint8)
 
 
 def _json_in_html(value: Any) -> str:

@@ -22,7 +22,7 @@ from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import learning_rates, optimised, started_at
 from drivesplat.model.part import Appearance, Part, Piece
 from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
-from drivesplat.model.timeline import ActorTrack, Timeline
+from drivesplat.model.timeline import ActorTrack, Moment, Timeline
 from drivesplat.motion import Motion
 from drivesplat.settings.actors import ActorSettings, TrackSettings
 from drivesplat.settings.gaussians import GaussianSettings
@@ -112,11 +112,17 @@ class Actors(Part):
         self.timeline.prepare(times, self.params["means"].device)
 
     def at(self, time: float) -> Gaussians:
-        return self.placed(time, self.placements(time))
+        return self.at_moment(self.moment(time))
 
-    def placements(self, time: float) -> Placements:
-        """Where the actors are at a time, by their annotations and the learned corrections."""
-        moment = self.timeline.at(time, self.params["means"].device)
+    def moment(self, time: float) -> Moment:
+        return self.timeline.at(time, self.params["means"].device)
+
+    def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
+        known = Moment(*moment)
+        return self.placed(known, self.placements(known))
+
+    def placements(self, moment: Moment) -> Placements:
+        """Where the actors are, by their annotations and the learned corrections."""
         weights = moment.weights * self._annotated
         turns = about_vertical(weights @ self.shared["yaw"])
         return Placements(
@@ -127,24 +133,25 @@ class Actors(Part):
         )
 
     def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
-        own, known = self.placements(time), [track.id for track in self.timeline.tracks]
+        moment, known = self.moment(time), [track.id for track in self.timeline.tracks]
+        own = self.placements(moment)
         first, again = [], []
         for appearance in (appearance for appearance in appearances if appearance.source in known):
             twice = appearance.source in {other.source for other in first}
             (again if twice else first).append(appearance)
-        sets = [self.placed(time, own.staged(known, first))]
+        sets = [self.placed(moment, own.staged(known, first))]
         for appearance in again:  # all are placed for the sake of one: copies are few
-            placed = self.placed(time, own.staged(known, [appearance]))
+            placed = self.placed(moment, own.staged(known, [appearance]))
             sets.append(placed[self.params["owner"] == known.index(appearance.source)])
         return concatenate(sets)
 
-    def placed(self, time: float, placements: Placements) -> Gaussians:
-        """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time."""
+    def placed(self, moment: Moment, placements: Placements) -> Gaussians:
+        """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a moment."""
         p, rotations = self.params, rotation_matrix(placements.quats)
         if on_gpu.for_tensor(p["means"]):
-            return self._placed_on_gpu(time, placements, rotations)
+            return self._placed_on_gpu(moment, placements, rotations)
         scales = self._of_owners(placements.scales)[:, None]
-        sh = self.harmonics(time)
+        sh = self.harmonics(moment)
         if sh.shape[1] > 1:  # colours turn by degrees at most: no gradient of theirs is worth its noise to the track
             sh = self._of_owners(rotation_of_harmonics(rotations.detach(), sh.shape[1])) @ sh
         turned = (self._of_owners(rotations) @ (scales * p["means"])[..., None])[..., 0]
@@ -156,7 +163,7 @@ class Actors(Part):
             sh,
         )
 
-    def _placed_on_gpu(self, time: float, placements: Placements, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
+    def _placed_on_gpu(self, moment: Moment, placements: Placements, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
         """The same by two kernels."""
         from drivesplat.on_gpu.colours_in_time import turned_colours
         from drivesplat.on_gpu.placing import Objects, Shapes, placed
@@ -166,8 +173,7 @@ class Actors(Part):
         presence = placements.present.to(rotations.dtype)
         objects = Objects(placements.quats, placements.translations, placements.scales, presence)
         turns = rotation_of_harmonics(rotations.detach(), coefficients)
-        series = self.timeline.at(time, owner.device).series
-        sh = turned_colours(p["sh0"], p["shN"], series, turns, owner)
+        sh = turned_colours(p["sh0"], p["shN"], moment.series, turns, owner)
         return Gaussians.of(*placed(shapes, objects, owner, self._owns), sh)
 
     def _of_owners(self, values: Float[Tensor, "a *v"]) -> Float[Tensor, "n *v"]:
@@ -180,20 +186,20 @@ class Actors(Part):
         """1 where a Gaussian is an actor's, else 0; made anew where densification has changed whose they are, and
         wherever an iteration is recorded, to be replayed when it has."""
         owner, (known, version, matrix) = self.params["owner"], self._known_owners
-        if owner.is_cuda and torch.cuda.is_current_stream_capturing():
+        if owner.is_cuda and torch.is_grad_enabled() and torch.cuda.is_current_stream_capturing():
             return one_hot(owner, len(self.timeline.tracks)).float()
         if matrix is None or known is not owner or version != owner._version or matrix.device != owner.device:
             matrix = one_hot(owner, len(self.timeline.tracks)).float()
             self._known_owners = owner, owner._version, matrix
         return matrix
 
-    def harmonics(self, time: float) -> Float[Tensor, "n k 3"]:
-        """The coefficients of the colours at a time, in the object's frame: the sum over i of f_i cos(i pi t / T), t
+    def harmonics(self, moment: Moment) -> Float[Tensor, "n k 3"]:
+        """The coefficients of the colours at a moment, in the object's frame: the sum over i of f_i cos(i pi t / T), t
         running from 0 to T over the actor's annotations (equation 5 of the paper)."""
         coefficients = torch.cat([self.params["sh0"], self.params["shN"]], dim=2)
         if coefficients.shape[1] == 1:
             return coefficients[:, 0]
-        series = self._of_owners(self.timeline.at(time, coefficients.device).series)
+        series = self._of_owners(moment.series)
         return (series[:, :, None, None] * coefficients).sum(dim=1)
 
     def learning_rates(self) -> dict[str, float]:
@@ -222,7 +228,7 @@ class Actors(Part):
     def pieces(self, time: float) -> dict[str, Piece]:
         p = self.params
         scales, opacities = torch.exp(p["scales"]), torch.sigmoid(p["opacities"])
-        local = Gaussians.of(p["means"], p["quats"], scales, opacities, self.harmonics(time))
+        local = Gaussians.of(p["means"], p["quats"], scales, opacities, self.harmonics(self.moment(time)))
         return {
             track.id: Piece(local[p["owner"] == i], motion)
             for i, (track, motion) in enumerate(zip(self.timeline.tracks, self.motions(), strict=True))

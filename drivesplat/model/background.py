@@ -1,5 +1,6 @@
 """The static world: one set of Gaussians, fixed in world coordinates."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,12 @@ class Background(Part):
         return cls(started_at(positions, colors, settings, classes), settings, extent)
 
     def at(self, time: float) -> Gaussians:
+        return self.at_moment(self.moment(time))
+
+    def moment(self, time: float) -> Sequence[Tensor]:
+        return ()
+
+    def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
         p = self.params
         return Gaussians(
             p["means"],

@@ -74,6 +74,16 @@ class Part(nn.Module, ABC):
         Always `self.row_count` rows in one order; one that is absent then has opacity 0.
         """
 
+    def moment(self, time: float) -> Sequence[Tensor] | None:
+        """All that a time means to its Gaussians, as tensors on its device, of the same shapes at every time:
+        `at_moment` of it is `at`. None where that cannot be said in tensors."""
+        return None
+
+    def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
+        """Its Gaussians as the tensors of a `moment` have them, which may be those of another time when what this asks
+        of the device is replayed."""
+        raise NotImplementedError(f"the part {self.name!r} has no moments")
+
     def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
         """As `at`, with these of its objects and no others: an object that does not appear is absent, a second
         appearance of one follows in rows of its own."""

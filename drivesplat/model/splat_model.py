@@ -69,6 +69,15 @@ class SplatModel(nn.Module):
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
         return concatenate([part.at(time) for part in self.parts])
 
+    def moments(self, time: float) -> list[Sequence[Tensor]] | None:
+        """What a time means to the parts, each: see `Part.moment`. None where one cannot say it in tensors."""
+        moments = [part.moment(time) for part in self.parts]
+        return None if any(moment is None for moment in moments) else moments
+
+    def gaussians_in(self, moments: Sequence[Sequence[Tensor]]) -> Gaussians:
+        """As `gaussians_at`, by what a time means to the parts."""
+        return concatenate([part.at_moment(moment) for part, moment in zip(self.parts, moments, strict=True)])
+
     def staged_at(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
         """As `gaussians_at`, with the objects that appear and no others: see `Part.staged`."""
         return concatenate([part.staged(time, appearances) for part in self.parts])

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -44,8 +44,7 @@ class ActorTrack:
         return cls(plain["id"], plain["size"].numpy(), motion)
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """a actors with m annotations together, at one time.
 
     `quats` (w, x, y, z) and `translations` (metres) are the annotated object to world; `weights` how much each

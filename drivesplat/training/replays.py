@@ -7,17 +7,16 @@ where they do: their spare rows (`spares`) let Gaussians become more meanwhile. 
 """
 
 import logging
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from drivesplat import on_gpu
 from drivesplat.on_gpu import rooms
+from drivesplat.on_gpu.recording import Pool, Recording, fresh_pool, recorded
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
 
@@ -31,36 +30,11 @@ many, and recordings of it hold on to where it lies."""
 
 
 @dataclass(frozen=True)
-class Recording:
-    """How to have the GPU do an iteration again, and where that leaves its loss terms; how many entries its lists of
-    Gaussians needed the last time, and by how many the fullest has outgrown the room there is for it."""
-
-    replay: Callable[[], None]
-    terms: Terms
-    needed: Int[Tensor, " lists"]
-    missing: Int[Tensor, ""]
-
-
-@dataclass(frozen=True)
 class Extent:
     """How many Gaussians there are `now`, and how many times as many there may be before tensors lie elsewhere."""
 
     now: int
     times: float
-
-
-@contextmanager
-def own_stream(device: torch.device) -> Iterator[None]:
-    """Work for the device goes into a queue of its own: what the usual one is asked for cannot be recorded, nor what
-    autograd once did there."""
-    if device.type != "cuda":
-        yield
-        return
-    usual, own = torch.cuda.current_stream(device), torch.cuda.Stream(device)
-    own.wait_stream(usual)
-    with torch.cuda.stream(own):
-        yield
-    usual.wait_stream(own)
 
 
 def can_be_replayed(settings: TrainSettings, images: TrainingImages, device: torch.device) -> bool:
@@ -80,9 +54,9 @@ class Replays:
     _shape: Hashable = None
     _needs: dict[Hashable, list[float]] = field(default_factory=dict)
     """How much room the lists of an image needed when that was last asked, a Gaussian."""
-    _recorded: dict[Hashable, Recording] = field(default_factory=dict)
+    _recorded: dict[Hashable, Recording[Terms]] = field(default_factory=dict)
     _now: int = 1
-    _pool: tuple[int, int] | None = None
+    _pool: Pool | None = None
 
     def iterate(self, image: Hashable, shape: Hashable, gaussians: Extent, once: Callable[[], Terms]) -> Terms:
         """An iteration with an image, by what it is known: what is done `once`, or its recording replayed. `shape` is
@@ -102,7 +76,7 @@ class Replays:
             self._needs[image] = [need / self._now for need in needs]
             return terms
         recording.replay()
-        return recording.terms
+        return recording.result
 
     def make_room(self, once: Callable[[], T]) -> T:
         """What is done `once`; where memory does not suffice for it beside recordings, without these from now on."""
@@ -149,43 +123,14 @@ class Replays:
         self._recorded.clear()
         self._pool = None
 
-    def _record(self, image: Hashable, gaussians: float, once: Callable[[], Terms]) -> Recording | None:
+    def _record(self, image: Hashable, gaussians: float, once: Callable[[], Terms]) -> Recording[Terms] | None:
         """The recording of an iteration with lists for so many Gaussians, which recording does not do; None, and none
         from now on, where the GPU or its driver refuses."""
-        if self._pool is None:
-            torch.cuda.empty_cache()  # what torch holds in reserve is of no use to recordings
-            self._pool = torch.cuda.graph_pool_handle()
-        graph, drawn = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(self.device)
+        self._pool = self._pool or fresh_pool()
         expected = [int(need * gaussians) for need in self._needs[image]]
-        missing = torch.zeros((), dtype=torch.int32, device=self.device)
-        needed_then = torch.zeros(len(expected), dtype=torch.int32, device=self.device)
-        try:
-            with rooms.given(expected) as lists:
-                graph.capture_begin(pool=self._pool)
-                try:
-                    terms = once()
-                    for place, (needed, room) in zip(needed_then, lists, strict=True):
-                        place.copy_(needed)
-                        torch.maximum(missing, needed - room, out=missing)
-                finally:
-                    graph.capture_end()
-        except Exception as error:  # of the driver's, of torch's, of Triton's: all that is lost is time
-            first = error.__context__ or error  # one that breaks a recording off lets its end fail, too
-            log.warning("iterations cannot be recorded, which takes longer: %s", str(first).splitlines()[0])
-            _tidy_up(self.device, self._pool, drawn)
+        recording = recorded(once, expected, self._pool, self.device, "iterations")
+        if recording is None:
             self._forget()
-            return None
-        self._recorded[image] = recording = Recording(graph.replay, terms, needed_then, missing)
+        else:
+            self._recorded[image] = recording
         return recording
-
-
-def _tidy_up(device: torch.device, pool: tuple[int, int], drawn: Tensor) -> None:
-    """Ends for torch what it still takes for a recording, which broke off: its generator goes on from what had been
-    `drawn`, and memory is given back again."""
-    index = torch.cuda.current_device() if device.index is None else device.index
-    fresh = torch.Generator(device=device)
-    fresh.set_state(drawn)
-    torch.cuda.default_generators[index].graphsafe_set_state(fresh.graphsafe_get_state())
-    for name in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
-        with suppress(AttributeError, RuntimeError):
-            getattr(torch._C, name)(index, pool)

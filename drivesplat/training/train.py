@@ -11,12 +11,12 @@ import torch
 from drivesplat.device import device_name, telling_out_of_memory
 from drivesplat.errors import TrainingError
 from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.on_gpu.recording import own_stream
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.monitor import Monitor
-from drivesplat.training.replays import own_stream
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView

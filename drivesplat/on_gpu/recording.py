@@ -1,0 +1,94 @@
+"""Work for the GPU recorded as a CUDA graph and replayed: Python says once what the GPU does, not a thousand times.
+
+A recording holds on to the addresses of what it reads and writes: it sees what lies there when it is replayed, and
+leaves its result where it was. It must ask the device nothing; how many Gaussians tiles list is not asked for either
+(`rooms`).
+"""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from drivesplat.on_gpu import rooms
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Pool = tuple[int, int]
+"""Memory that recordings work in, as torch knows it."""
+
+
+@dataclass(frozen=True)
+class Recording(Generic[T]):
+    """How to have the GPU do something again, and what it leaves, where it always does: `result`; how many entries its
+    lists of Gaussians `needed` the last time, of `rooms`; and by how many, at most, one was ever `missing`."""
+
+    replay: Callable[[], None]
+    result: T
+    needed: Int[Tensor, " lists"]
+    rooms: Sequence[int]
+    missing: Int[Tensor, ""]
+
+
+@contextmanager
+def own_stream(device: torch.device) -> Iterator[None]:
+    """Work for the device goes into a queue of its own: what the usual one is asked for cannot be recorded, nor what
+    autograd once did there."""
+    if device.type != "cuda":
+        yield
+        return
+    usual, own = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+    own.wait_stream(usual)
+    with torch.cuda.stream(own):
+        yield
+    usual.wait_stream(own)
+
+
+def fresh_pool() -> Pool:
+    """Memory for recordings; what torch holds in reserve, which is of no use to them, is given back."""
+    torch.cuda.empty_cache()
+    return torch.cuda.graph_pool_handle()
+
+
+def recorded(
+    once: Callable[[], T], needs: Sequence[int], pool: Pool, device: torch.device, what: str
+) -> Recording[T] | None:
+    """The recording of what is done `once`, in a stream of its own and with lists that needed so many entries, which is
+    not done thereby. None, and a warning that names `what`, where the GPU or its driver refuses."""
+    graph, drawn = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(device)
+    missing = torch.zeros((), dtype=torch.int32, device=device)
+    needed_then = torch.zeros(len(needs), dtype=torch.int32, device=device)
+    try:
+        with rooms.given(needs) as lists:
+            graph.capture_begin(pool=pool)
+            try:
+                result = once()
+                for place, (needed, room) in zip(needed_then, lists, strict=True):
+                    place.copy_(needed)
+                    torch.maximum(missing, needed - room, out=missing)
+            finally:
+                graph.capture_end()
+    except Exception as error:  # of the driver's, of torch's, of Triton's: all that is lost is time
+        first = error.__context__ or error  # one that breaks a recording off lets its end fail, too
+        log.warning("%s cannot be recorded, which takes longer: %s", what, str(first).splitlines()[0])
+        _tidy_up(device, pool, drawn)
+        return None
+    return Recording(graph.replay, result, needed_then, [room for _, room in lists], missing)
+
+
+def _tidy_up(device: torch.device, pool: Pool, drawn: Tensor) -> None:
+    """Ends for torch what it still takes for a recording, which broke off: its generator goes on from what had been
+    `drawn`, and memory is given back again."""
+    index = torch.cuda.current_device() if device.index is None else device.index
+    fresh = torch.Generator(device=device)
+    fresh.set_state(drawn)
+    torch.cuda.default_generators[index].graphsafe_set_state(fresh.graphsafe_get_state())
+    for name in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
+        with suppress(AttributeError, RuntimeError):
+            getattr(torch._C, name)(index, pool)
