@@ -195,6 +195,13 @@ def train_until_killed(folder: str) -> None:
     trained(Path(folder), settings_of(), EndingViews(recorded_views(), ENDED_AT, kill=True))
 
 
+def print_whether_torchs_compiler_is_read(folder: str) -> None:
+    """For a subprocess: a whole training with resume states."""
+    torch.set_num_threads(1)
+    trained(Path(folder), settings_of())
+    print("torch._dynamo" in sys.modules)
+
+
 def hold_the_lock(folder: str) -> None:
     """For a subprocess: a trainer that works until it is killed."""
     with checkpoint.sole_trainer(Path(folder)):
@@ -914,6 +921,12 @@ def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):
     pixels = 4 * WIDTH * HEIGHT
     files = run(tmp_path, job_of(pixels_per_gaussian=pixels / 95, cap_max=1000, iterations=40, refine_start=0.0))
     assert json.loads(files.summary.read_text())["gaussians"] == 95
+
+
+def test_a_training_does_not_wait_for_torchs_compiler(tmp_path):
+    """Torch's own optimizers read it, for a second or more of every training."""
+    output, errors = in_subprocess(print_whether_torchs_compiler_is_read, str(tmp_path)).communicate(timeout=120)
+    assert output == "False\n", output + errors[-3000:]
 
 
 def test_a_failed_training_leaves_no_result_but_its_resume_state(tmp_path):

@@ -12,10 +12,43 @@ from drivesplat import on_gpu
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
-Optimizers = dict[str, torch.optim.Optimizer]
-
 DECAY = 0.01
 """Positions, and what is learned of cameras, learn at the end at this fraction of their initial rate."""
+
+
+class Adam(torch.optim.Adam):
+    """torch.optim.Adam, fused, of one parameter, for `ModelOptimizers`: its fields and the format of its state, had
+    without torch's compiler. Torch's own methods read that when they are first called, which takes a second or more,
+    and no training compiles."""
+
+    def __init__(self, parameter: nn.Parameter, rate: float):
+        super().__init__([parameter], lr=rate, eps=1e-15, fused=True)
+
+    @property
+    def parameter(self) -> nn.Parameter:
+        (group,) = self.param_groups
+        (parameter,) = group["params"]
+        return parameter
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        self.param_groups.append({**self.defaults, **param_group})
+
+    def started(self) -> dict[str, Tensor]:
+        """What is known of the parameter, which begins with nothing."""
+        parameter = self.parameter
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        return state
+
+    def state_dict(self) -> dict[str, Any]:
+        known = self.state.get(self.parameter)
+        groups = [{**group, "params": [0]} for group in self.param_groups]
+        return {"state": {0: known} if known else {}, "param_groups": groups}
+
+
+Optimizers = dict[str, Adam]
 
 
 @dataclass
@@ -27,7 +60,7 @@ class ModelOptimizers:
     shared: list[Optimizers]
     beside_parts: dict[str, Optimizers]
 
-    def all(self) -> list[tuple[str, torch.optim.Optimizer]]:
+    def all(self) -> list[tuple[str, Adam]]:
         return [
             *((f"{i}.{k}", o) for i, group in enumerate(self.parts) for k, o in group.items()),
             *((f"{i}.shared.{k}", o) for i, group in enumerate(self.shared) for k, o in group.items()),
@@ -44,16 +77,10 @@ class ModelOptimizers:
         """
         ready: list[tuple[nn.Parameter, dict[str, Tensor], float | Tensor, dict[str, Any]]] = []
         for name, optimizer in self.all():
-            (group,) = optimizer.param_groups
-            (parameter,) = group["params"]
-            if parameter.grad is None:
-                continue
-            if optimizer.state.get(parameter):
+            parameter, (group,) = optimizer.parameter, optimizer.param_groups
+            if parameter.grad is not None:
                 rate = group["lr"] if rates is None else rates[name]
-                ready.append((parameter, optimizer.state[parameter], rate, group))
-            else:
-                optimizer.step()  # which makes the state
-                parameter.grad = None
+                ready.append((parameter, optimizer.started(), rate, group))
         if ready:
             torch._foreach_add_([state["step"] for _, state, _, _ in ready], 1)
         for parameter, state, rate, group in ready:
@@ -112,9 +139,7 @@ def make_optimizers(model: SplatModel) -> ModelOptimizers:
 
 def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     return {
-        name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15, fused=True)
-        for name, rate in rates.items()
-        if name in params and params[name].requires_grad
+        name: Adam(params[name], rate) for name, rate in rates.items() if name in params and params[name].requires_grad
     }
 
 
