@@ -6,35 +6,28 @@ the GPU renders one, Python asks for the next.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.colour_bytes import nearest_bytes
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-
-if TYPE_CHECKING:
-    from drivesplat.on_gpu.frames import Asked
+from drivesplat.on_gpu.frames import Asked, FramesOnGpu, Shown
 
 A = TypeVar("A")
-Shown = tuple[View, Gaussians | None]
-"""A view, and the Gaussians that stand in for those that the model has at its time (None: none do)."""
 NOT_FINITE = "a frame of a film was rendered as no numbers; delete its checkpoint.pt and rerun"
 
 
 def film_frames(model: SplatModel, shown: Iterable[Shown]) -> Iterator[np.ndarray]:
     """What each view shows, (h, w, 3) uint8 RGB. Raises ResultError where one is not finite."""
-    if not model.parts[0].params["means"].is_cuda:
-        yield from (_rendered(model, *one) for one in shown)
-        return
-    from drivesplat.on_gpu.frames import FramesOnGpu
-
-    yield from _in_a_row(FramesOnGpu(model).asked, shown)
+    on_device = model.parts[0].params["means"].is_cuda
+    yield from (_in_a_row(FramesOnGpu(model).asked, shown) if on_device else (_rendered(model, *one) for one in shown))
 
 
 def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
@@ -49,17 +42,12 @@ def as_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     return nearest_bytes(image).cpu().numpy()
 
 
-def nearest_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
-    """Colours in [0, 1] to the nearest byte, where they are."""
-    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-
-
 @torch.no_grad()
 def _rendered(model: SplatModel, view: View, gaussians: Gaussians | None) -> np.ndarray:
     return as_bytes(model.render(view, gaussians=gaussians).image)
 
 
-def _in_a_row(ask: Callable[[A], "Asked"], shown: Iterable[A]) -> Iterator[np.ndarray]:
+def _in_a_row(ask: Callable[[A], Asked], shown: Iterable[A]) -> Iterator[np.ndarray]:
     """The frames in order, each asked for before the one before it is waited for."""
     waiting: deque[Asked] = deque()
     for one in shown:
@@ -70,7 +58,7 @@ def _in_a_row(ask: Callable[[A], "Asked"], shown: Iterable[A]) -> Iterator[np.nd
         yield _come(waiting.popleft())
 
 
-def _come(asked: "Asked") -> np.ndarray:
+def _come(asked: Asked) -> np.ndarray:
     asked.wait()
     if asked.cut_short:
         return _come(asked.again())

@@ -28,17 +28,18 @@ from test_training import (
     untrained_street,
 )
 
+from drivesplat.ahead import in_advance
 from drivesplat.device import choose_device
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
 from drivesplat.frames import film_frame, film_frames
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.sky import ConstantSky
+from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.on_gpu import frames as frames_on_gpu
-from drivesplat.on_gpu import rooms
-from drivesplat.on_gpu.recording import own_stream
+from drivesplat.on_gpu import graphs, rooms
+from drivesplat.on_gpu.graphs import own_stream
 from drivesplat.rasterize import gpu, rasterize
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
@@ -346,14 +347,30 @@ def test_a_card_that_suffices_is_taken():
     assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU
 
 
+Film = tuple[SplatModel, list[View], list[np.ndarray]]
+
+
 @pytest.fixture
-def street_film() -> tuple[SplatModel, list[View], list[np.ndarray]]:
-    """A model with cars, views of it by a lens that zooms, and what these show, one by one."""
-    model = untrained_street(settings_of()).to(GPU).requires_grad_(False)
+def street_film() -> Film:
+    """A model with cars and a sky, views of it by a lens that zooms, and what these show, one by one."""
+    model = untrained_street(settings_of()).to(GPU)
+    model.sky = CubemapSky(4, torch.full((3,), 0.5), 1e-2).to(GPU)
+    model.sky.params["texels"].data.normal_(generator=torch.Generator(GPU).manual_seed(0))
+    model.requires_grad_(False)
     views = [replace(view.view, camera=None) for view in guided_views(GPU)]
     views = [replace(view, K=view.K * view.K.new_tensor([1.0 + 0.1 * i, 1.0, 1.0])) for i, view in enumerate(views)]
     model.expect([view.time for view in views])
     return model, views, [film_frame(model, view) for view in views]
+
+
+@pytest.fixture
+def captures(monkeypatch) -> list[graphs.Graph]:
+    """What is captured from now on, with lists that have exactly the room that those before them needed."""
+    made, capture = [], frames_on_gpu.captured
+    monkeypatch.setattr(frames_on_gpu, "captured", lambda *t, **named: made.append(capture(*t, **named)) or made[-1])
+    monkeypatch.setattr(rooms, "LEAST", 0)
+    monkeypatch.setattr(rooms, "MARGIN", 1.0)
+    return made
 
 
 def assert_frames(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
@@ -362,31 +379,59 @@ def assert_frames(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
         np.testing.assert_allclose(frame.astype(int), alone, atol=1)
 
 
-def test_frames_in_a_row_are_those_by_themselves(street_film, monkeypatch):
-    """Also where lists have less room than they turn out to need, and where other Gaussians come between."""
+def test_frames_in_a_row_are_those_by_themselves(street_film, captures, monkeypatch):
+    """Captured once; also with other Gaussians and another size between them, and for two films by turns."""
     model, views, expected = street_film
     timeline = model.parts[1].timeline
-    known, recordings, record = dict(timeline._known), [], frames_on_gpu.recorded
-    monkeypatch.setattr(frames_on_gpu, "recorded", lambda *told: recordings.append(record(*told)) or recordings[-1])
-    monkeypatch.setattr(rooms, "LEAST", 0)
-    for margin in (4.0, 0.2):
-        monkeypatch.setattr(rooms, "MARGIN", margin)
-        assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
-        assert None not in recordings and (len(recordings) == 1 or margin < 1.0)
+    known = dict(timeline._known)
+    monkeypatch.setattr(rooms, "MARGIN", 4.0)
+    assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
+    assert len(captures) == 1 and captures[0] is not None
     edited = [(view, model.gaussians_at(view.time) if i % 2 else None) for i, view in enumerate(views)]
-    assert_frames([*film_frames(model, edited)], expected)
-    assert timeline._known == known, "all of it was expected"
+    by_turns = zip(film_frames(model, [(view, None) for view in views]), film_frames(model, edited), strict=True)
+    for together in zip(*by_turns, strict=True):
+        assert_frames(list(together), expected)
+    smaller = [replace(view, width=64) for view in views]
+    mixed = [*film_frames(model, [(view, None) for pair in zip(views, smaller, strict=True) for view in pair])]
+    assert_frames(mixed[::2], expected)
+    assert_frames(mixed[1::2], [film_frame(model, view) for view in smaller])
+    assert None not in captures and timeline._known == known, "all of it was expected"
 
 
-def test_frames_for_a_camera_of_the_rig_are_not_recorded(street_film, monkeypatch):
-    """Where it was, and how it exposes, may be known by Python."""
+def test_a_film_that_outgrows_its_room_is_captured_anew(street_film, captures):
+    """Beside a thread that uses its frames; the second time all of it has room, in what was captured last."""
     model, views, expected = street_film
-    monkeypatch.setattr(frames_on_gpu, "recorded", None)
+    found = [*in_advance(film_frames(model, [(view, None) for view in [*views, *views]]))]
+    assert len(captures) > 1 and None not in captures
+    assert any(bool(graph.missing > 0) for graph in captures[:-1]) and not captures[-1].missing > 0
+    assert_frames(found, [*expected, *expected])
+
+
+def test_a_film_that_is_given_up_leaves_the_next_as_it_is(street_film, captures):
+    model, views, expected = street_film
+    given_up = film_frames(model, [(view, None) for view in [*views, *views]])
+    for _ in range(7):
+        next(given_up)
+    given_up.close()
+    assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
+
+
+def test_a_film_of_what_stands_still_is_captured_too(street_film, captures, monkeypatch):
+    model, views, _ = street_film
+    monkeypatch.setattr(rooms, "MARGIN", 4.0)
+    alone = SplatModel([model.parts[0]], model.sky)
+    assert_frames([*film_frames(alone, [(view, None) for view in views])], [film_frame(alone, view) for view in views])
+    assert len(captures) == 1
+
+
+def test_frames_of_a_camera_of_the_rig_are_not_captured(street_film, captures):
+    model, views, expected = street_film
     of_rig = [(replace(view, camera="CAM_BACK"), None) for view in views]
     assert_frames([*film_frames(model, of_rig)], expected)
+    assert not captures
 
 
-def test_frames_that_cannot_be_recorded_come_all_the_same(street_film, monkeypatch, caplog):
+def test_frames_that_cannot_be_captured_come_all_the_same(street_film, monkeypatch, caplog):
     model, views, expected = street_film
     together = SplatModel.gaussians_in
 

@@ -9,7 +9,7 @@ from test_training import guided_views
 
 from drivesplat import on_gpu
 from drivesplat.on_gpu import rooms
-from drivesplat.on_gpu.recording import Recording
+from drivesplat.on_gpu.graphs import Graph
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import replays
 from drivesplat.training.coarse_to_fine import TrainingImages
@@ -32,7 +32,7 @@ class Played:
         self.done.append(("recorded", image))
         self.rooms.append([need * gaussians for need in self.replays._needs[image]])
         replay = partial(self.done.append, ("replayed", image))
-        self.replays._recorded[image] = Recording(
+        self.replays._recorded[image] = Graph(
             replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), [self.needed],
             torch.tensor(0),
         )  # fmt: skip

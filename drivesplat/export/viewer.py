@@ -21,10 +21,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.colour_bytes import nearest_bytes
 from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.export.viewer_page import filled_page
-from drivesplat.frames import nearest_bytes
 from drivesplat.images import continuous_intrinsics
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky

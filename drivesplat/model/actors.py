@@ -184,13 +184,14 @@ class Actors(Part):
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
         """1 where a Gaussian is an actor's, else 0; made anew where densification has changed whose they are, and
-        wherever an iteration is recorded, to be replayed when it has."""
+        wherever an iteration of a training is captured, to be replayed when it has."""
         owner, (known, version, matrix) = self.params["owner"], self._known_owners
-        if owner.is_cuda and torch.is_grad_enabled() and torch.cuda.is_current_stream_capturing():
-            return one_hot(owner, len(self.timeline.tracks)).float()
-        if matrix is None or known is not owner or version != owner._version or matrix.device != owner.device:
+        captured = owner.is_cuda and torch.cuda.is_current_stream_capturing()
+        changed = known is not owner or version != owner._version or (captured and torch.is_grad_enabled())
+        if matrix is None or changed or matrix.device != owner.device:
             matrix = one_hot(owner, len(self.timeline.tracks)).float()
-            self._known_owners = owner, owner._version, matrix
+            if not captured:  # which is computed when it is replayed, and not yet
+                self._known_owners = owner, owner._version, matrix
         return matrix
 
     def harmonics(self, moment: Moment) -> Float[Tensor, "n k 3"]:

@@ -80,8 +80,9 @@ class Part(nn.Module, ABC):
         return None
 
     def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
-        """Its Gaussians as the tensors of a `moment` have them, which may be those of another time when what this asks
-        of the device is replayed."""
+        """Its Gaussians as the tensors of a `moment` have them. It asks the device nothing and goes by these tensors
+        alone: what it has the device do may be replayed when they are another time's. Raises NotImplementedError where
+        there are no moments."""
         raise NotImplementedError(f"the part {self.name!r} has no moments")
 
     def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:

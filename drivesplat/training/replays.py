@@ -16,7 +16,7 @@ from torch import Tensor
 
 from drivesplat import on_gpu
 from drivesplat.on_gpu import rooms
-from drivesplat.on_gpu.recording import Pool, Recording, fresh_pool, recorded
+from drivesplat.on_gpu.graphs import Graph, Pool, captured, fresh_pool
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
 
@@ -54,7 +54,7 @@ class Replays:
     _shape: Hashable = None
     _needs: dict[Hashable, list[float]] = field(default_factory=dict)
     """How much room the lists of an image needed when that was last asked, a Gaussian."""
-    _recorded: dict[Hashable, Recording[Terms]] = field(default_factory=dict)
+    _recorded: dict[Hashable, Graph[Terms]] = field(default_factory=dict)
     _now: int = 1
     _pool: Pool | None = None
 
@@ -123,12 +123,12 @@ class Replays:
         self._recorded.clear()
         self._pool = None
 
-    def _record(self, image: Hashable, gaussians: float, once: Callable[[], Terms]) -> Recording[Terms] | None:
+    def _record(self, image: Hashable, gaussians: float, once: Callable[[], Terms]) -> Graph[Terms] | None:
         """The recording of an iteration with lists for so many Gaussians, which recording does not do; None, and none
         from now on, where the GPU or its driver refuses."""
         self._pool = self._pool or fresh_pool()
         expected = [int(need * gaussians) for need in self._needs[image]]
-        recording = recorded(once, expected, self._pool, self.device, "iterations")
+        recording = captured(once, expected, self._pool, self.device, "iterations")
         if recording is None:
             self._forget()
         else:

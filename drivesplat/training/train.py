@@ -11,7 +11,7 @@ import torch
 from drivesplat.device import device_name, telling_out_of_memory
 from drivesplat.errors import TrainingError
 from drivesplat.model.splat_model import Picture, SplatModel
-from drivesplat.on_gpu.recording import own_stream
+from drivesplat.on_gpu.graphs import own_stream
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock

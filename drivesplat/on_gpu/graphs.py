@@ -1,7 +1,7 @@
-"""Work for the GPU recorded as a CUDA graph and replayed: Python says once what the GPU does, not a thousand times.
+"""Work for the GPU captured as a CUDA graph and replayed: Python says once what the GPU does, not a thousand times.
 
-A recording holds on to the addresses of what it reads and writes: it sees what lies there when it is replayed, and
-leaves its result where it was. It must ask the device nothing; how many Gaussians tiles list is not asked for either
+A graph holds on to the addresses of what it reads and writes: it sees what lies there when it is replayed, and leaves
+its result where it did before. What is captured must ask the device nothing, nor how many Gaussians tiles list
 (`rooms`).
 """
 
@@ -21,13 +21,13 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Pool = tuple[int, int]
-"""Memory that recordings work in, as torch knows it."""
+"""Memory that graphs work in, as torch knows it."""
 
 
 @dataclass(frozen=True)
-class Recording(Generic[T]):
-    """How to have the GPU do something again, and what it leaves, where it always does: `result`; how many entries its
-    lists of Gaussians `needed` the last time, of `rooms`; and by how many, at most, one was ever `missing`."""
+class Graph(Generic[T]):
+    """How to have the GPU do something again, and what that leaves, always in the same place: `result`; how many
+    entries each of its lists of Gaussians `needed` the last time, of `rooms`; and how many one was ever `missing`."""
 
     replay: Callable[[], None]
     result: T
@@ -38,7 +38,7 @@ class Recording(Generic[T]):
 
 @contextmanager
 def own_stream(device: torch.device) -> Iterator[None]:
-    """Work for the device goes into a queue of its own: what the usual one is asked for cannot be recorded, nor what
+    """Work for the device goes into a queue of its own: what the usual one is asked for cannot be captured, nor what
     autograd once did there."""
     if device.type != "cuda":
         yield
@@ -51,22 +51,23 @@ def own_stream(device: torch.device) -> Iterator[None]:
 
 
 def fresh_pool() -> Pool:
-    """Memory for recordings; what torch holds in reserve, which is of no use to them, is given back."""
+    """Memory for graphs; what torch holds in reserve, which is of no use to them, is given back."""
     torch.cuda.empty_cache()
     return torch.cuda.graph_pool_handle()
 
 
-def recorded(
-    once: Callable[[], T], needs: Sequence[int], pool: Pool, device: torch.device, what: str
-) -> Recording[T] | None:
-    """The recording of what is done `once`, in a stream of its own and with lists that needed so many entries, which is
-    not done thereby. None, and a warning that names `what`, where the GPU or its driver refuses."""
+def captured(
+    once: Callable[[], T], needs: Sequence[int], pool: Pool, device: torch.device, what: str, errors: str = "global"
+) -> Graph[T] | None:
+    """What is done `once`, which is not done thereby. Within `own_stream`; `needs` are how many entries each list of
+    Gaussians that it makes has needed, `errors` is torch's `capture_error_mode`. None, and a warning that names `what`,
+    where the GPU or its driver refuses."""
     graph, drawn = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(device)
     missing = torch.zeros((), dtype=torch.int32, device=device)
     needed_then = torch.zeros(len(needs), dtype=torch.int32, device=device)
     try:
         with rooms.given(needs) as lists:
-            graph.capture_begin(pool=pool)
+            graph.capture_begin(pool=pool, capture_error_mode=errors)
             try:
                 result = once()
                 for place, (needed, room) in zip(needed_then, lists, strict=True):
@@ -74,16 +75,20 @@ def recorded(
                     torch.maximum(missing, needed - room, out=missing)
             finally:
                 graph.capture_end()
+        return Graph(graph.replay, result, needed_then, [room for _, room in lists], missing)
     except Exception as error:  # of the driver's, of torch's, of Triton's: all that is lost is time
-        first = error.__context__ or error  # one that breaks a recording off lets its end fail, too
-        log.warning("%s cannot be recorded, which takes longer: %s", what, str(first).splitlines()[0])
-        _tidy_up(device, pool, drawn)
-        return None
-    return Recording(graph.replay, result, needed_then, [room for _, room in lists], missing)
+        log.warning("%s cannot be recorded, which takes longer: %s", what, _first_line(error))
+    _tidy_up(device, pool, drawn)  # when nothing holds on to what was to be captured any more
+    return None
+
+
+def _first_line(error: Exception) -> str:
+    """Of what went wrong first: what breaks a capture off lets its end fail, too."""
+    return str(error.__context__ or error).splitlines()[0]
 
 
 def _tidy_up(device: torch.device, pool: Pool, drawn: Tensor) -> None:
-    """Ends for torch what it still takes for a recording, which broke off: its generator goes on from what had been
+    """Ends for torch what it still takes for a capture, which broke off: its generator goes on from what had been
     `drawn`, and memory is given back again."""
     index = torch.cuda.current_device() if device.index is None else device.index
     fresh = torch.Generator(device=device)
