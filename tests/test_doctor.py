@@ -1,5 +1,6 @@
 """What the doctor makes of a machine: facts go in, findings come out."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -52,6 +53,23 @@ def levels(facts: Facts) -> set[str]:
 
 def test_where_all_is_well_nothing_but_ok_is_said():
     assert levels(WORKSTATION) == {"ok"}
+
+
+def test_modules_that_every_job_compiles_are_told_where_they_are_many():
+    level, text = only(replace(WORKSTATION, read_as_source=1240), "bytecode")
+    assert level == "note" and "1,240 modules" in text and "PYTHONPYCACHEPREFIX" in text
+    assert not of(replace(WORKSTATION, read_as_source=30), "bytecode")
+
+
+def test_modules_are_counted_whose_bytecode_is_nowhere(tmp_path):
+    script = "import sys, json, http.server; from drivesplat.doctor.facts import _read_as_source as f; print(f())"
+    counts = []
+    for keeps in ({"PYTHONDONTWRITEBYTECODE": "1"}, {}, {"PYTHONDONTWRITEBYTECODE": "1"}):
+        clean = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+        environment = {**clean, "PYTHONPYCACHEPREFIX": str(tmp_path), **keeps}
+        run = [sys.executable, "-c", script]
+        counts.append(int(subprocess.run(run, env=environment, cwd=REPOSITORY, capture_output=True, check=True).stdout))
+    assert counts[0] > 100 and counts[1:] == [0, 0], "none are kept; all are kept; all were kept before"
 
 
 def test_no_gpu_is_a_note_with_its_consequence():

@@ -11,6 +11,8 @@ from drivesplat.gsplat_build.toolkit import FROM_PYPI_SINCE, same_major
 from drivesplat.settings.evaluate import BACKBONE
 
 LOWEST_DISK_GB, ROOMY_DISK_GB = 1.0, 10.0
+FEW_MODULES = 200
+"""So many take a few tenths of a second to compile; torch has more than a thousand."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Finding:
 
 def examine(facts: Facts) -> list[Finding]:
     """All findings, in the order in which things depend on each other."""
-    checks = (python, torch_build, gpu, gsplat, compiler, triton, config, datasets, disk, backbone, ffmpeg)
+    checks = (python, bytecode, torch_build, gpu, gsplat, compiler, triton, config, datasets, disk, backbone, ffmpeg)
     return [finding for check in checks for finding in check(facts)]
 
 
@@ -39,6 +41,16 @@ def python(facts: Facts) -> Iterator[Finding]:
         yield Finding("fix", "Python", ".venv was made from other requirements than the present ones: run make setup")
     else:
         yield Finding("ok", "Python", f"{version} ({facts.executable})")
+
+
+def bytecode(facts: Facts) -> Iterator[Finding]:
+    """Whether every job compiles its packages' Python anew; nothing to say where it does not."""
+    if facts.read_as_source > FEW_MODULES:
+        yield Finding(
+            "note", "bytecode", f"Python compiles {facts.read_as_source:,} modules anew in every job, for seconds: "
+            "unset PYTHONDONTWRITEBYTECODE, or, where packages cannot be written to, set PYTHONPYCACHEPREFIX to a "
+            "folder that can",
+        )  # fmt: skip
 
 
 def torch_build(facts: Facts) -> Iterator[Finding]:

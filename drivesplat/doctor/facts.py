@@ -99,6 +99,8 @@ class Facts:
     ffmpeg: str | None = None
     triton_problem: str | None = None
     """Why kernels that train faster cannot be compiled for the GPU that torch sees."""
+    read_as_source: int = 0
+    """How many of the modules read here Python has not kept compiled, and cannot keep: every process compiles them."""
 
 
 def gather(root: Path, config_files: Sequence[Path]) -> Facts:
@@ -127,6 +129,7 @@ def gather(root: Path, config_files: Sequence[Path]) -> Facts:
         backbone=_backbone(root),
         ffmpeg=_ffmpeg(),
         triton_problem=on_gpu.problem() if torch and torch.card else None,
+        read_as_source=_read_as_source(),
     )
 
 
@@ -145,6 +148,12 @@ def _torch() -> tuple[Torch | None, str | None]:
     except RuntimeError as error:
         return Torch(**known), f"the GPU cannot be used: {error}"
     return Torch(**known, card=name, capability=capability, free_gb=free / 1e9, total_gb=total / 1e9), None
+
+
+def _read_as_source() -> int:
+    specs = [getattr(module, "__spec__", None) for module in list(sys.modules.values())]
+    kept = [spec.cached for spec in specs if spec is not None and spec.has_location and spec.cached]
+    return sum(not Path(file).exists() for file in kept)
 
 
 def _gsplat(cuda: bool) -> tuple[Gsplat | None, str | None]:
