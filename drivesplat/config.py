@@ -42,7 +42,7 @@ DATASET_OVERRIDES = (
 )  # fmt: skip
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
-    "train": {"iterations": 1_000, "cap_max": 40_000},
+    "train": {"iterations": 1_000, "cap_max": 40_000, "checkpoint_apart_s": 10.0},
     "render": {"fps": 15, "width": 800, "height": 450},
     "device": {"min_free_gb": 1.0},
 }
@@ -260,6 +260,11 @@ class Config(Settings):
 
 def load(values: Mapping[str, Any]) -> Config:
     """The validated config, overrides included. Raises ConfigError: one line, the key, its value, what is allowed."""
+    if "provenance" in values:
+        raise ConfigError(
+            "a result of this workflow is among the config files, where Snakemake takes what follows --configfile: "
+            "put -- before the targets, as in --configfile mine.yaml -- results/0103/metrics.json"
+        )
     config = validated(Config, dict(values), "")
     variants = {name: variant for name, variant in config.ablation.without.items() if variant is not None}
     for kind, named, allowed in (

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drivesplat.errors import ConfigError
 from drivesplat.settings.report import HELD_OUT_PAIR, LOOKS, ReportJob
 from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.storage import canonical_json
@@ -36,6 +37,17 @@ class ReportPlan:
         if not self._alone:
             return scenes
         return [scene for scene in scenes if Path(self._results, scene, "metrics.json").is_file()]
+
+    def refuse_empty(self) -> None:
+        """Raises ConfigError where the report is asked for by itself and would hold none of the scenes that have been
+        measured, since their datasets do not belong to it."""
+        others = [scene for scene in self._plan.config.scenes if scene not in self._plan.config.batch_scenes]
+        measured = [scene for scene in others if Path(self._results, scene, "metrics.json").is_file()]
+        if self._alone and measured and not self.scenes:
+            raise ConfigError(
+                f"no scene of the report has been measured; {', '.join(measured)} has, and is no part of it "
+                "(datasets.<name>.batch: false): with --configfile presets/demo.yaml -- report it is the demo's report"
+            )
 
     @property
     def metrics(self) -> list[str]:

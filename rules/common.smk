@@ -28,6 +28,7 @@ try:
     if workflow.is_main_process and not asked.lint:
         plan.refuse_unknown(wanted)
         plan.refuse_download(wanted)
+        plan.report(wanted).refuse_empty()
         if wanted != [COSTS]:
             plan.refuse_absent_data(wanted)
 except DriveSplatError as error:

@@ -432,3 +432,16 @@ def test_no_stage_has_another_name():
 def test_settings_cannot_be_changed_after_the_fact():
     with pytest.raises(ValueError, match="frozen"):
         load({}).train.iterations = 5
+
+
+def test_a_result_among_the_config_files_is_named_as_that(defaults):
+    """Snakemake takes a target that is there for one where `--` is missing before it."""
+    with pytest.raises(ConfigError, match=r"a result of this workflow is among the config files.*put -- before"):
+        load({**defaults, "methods": {"vanilla": {"interpolation": {}}}, "provenance": {"stages": {}}})
+
+
+def test_of_a_long_value_the_message_has_the_beginning():
+    with pytest.raises(ConfigError) as error:
+        load({"trian": {"iterations": list(range(1000))}})
+    assert "unknown key 'trian' (value {'iterations': [0, 1, 2, 3" in str(error.value) and "…)" in str(error.value)
+    assert len(str(error.value)) < 200

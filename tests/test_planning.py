@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from drivesplat.config import load
+from drivesplat.errors import ConfigError
 from drivesplat.planning import Plan
 from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
 from drivesplat.stages import ALL_SCENE_STAGES, SCENE_STAGES, refines_poses, stage_settings
@@ -217,3 +218,20 @@ def test_the_reference_is_the_first_method_that_stands_still():
 
     assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}, "b": {}, "c": {}}) == "b"
     assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}}) is None
+
+
+def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_been_measured(tmp_path):
+    """As after the demo: its report would give way to one of nothing."""
+    datasets = {"a": {"scenes": ["a1"]}, "demo": {"scenes": ["demo"], "batch": False}}
+    made = Plan({"datasets": datasets, "results_dir": str(tmp_path)}, str(REPOSITORY))
+    made.report(["report"]).refuse_empty()
+    for scene in ("demo", "a1"):
+        (tmp_path / scene).mkdir()
+    (tmp_path / "demo/metrics.json").touch()
+    for targets in (["report"], [f"{tmp_path}/gap_report.html"]):
+        with pytest.raises(ConfigError, match=r"demo has, .*--configfile presets/demo\.yaml"):
+            made.report(targets).refuse_empty()
+    for others in ([], ["all"], ["report", "metrics"]):
+        made.report(others).refuse_empty()
+    (tmp_path / "a1/metrics.json").touch()
+    made.report(["report"]).refuse_empty()

@@ -26,9 +26,9 @@ NARROW = 0.06
 
 @dataclass(frozen=True)
 class TrackRow:
-    """A track in the table. `seconds`: from its first annotation to its last; `seconds_visible`: in how much of the
-    drive the evaluated camera sees it; speeds in m/s, horizontal; sizes in metres; `key_frame`: where it fills most
-    `pixels` of that camera's images, None and 0 where it is never seen."""
+    """A track in the table. `seconds`: from its first annotation to its last; `seconds_visible`: in how much of that
+    the evaluated camera sees it; speeds in m/s, horizontal; sizes in metres; `key_frame`: where it fills most `pixels`
+    of that camera's images, None and 0 where it is never seen."""
 
     id: str
     category: str
@@ -68,12 +68,13 @@ def _row(track: Track, seen: list[Subject], interval: float) -> TrackRow:
     boxes = (box_at(track, int(time), interval) for time in track.timestamps)
     speeds = [box.speed for box in boxes if box is not None]
     largest = max(seen, key=lambda subject: subject.pixels, default=None)
+    seconds = float(track.timestamps[-1] - track.timestamps[0]) * 1e-6
     return TrackRow(
         id=track.id,
         category=track.category,
         moves=moves_at_all(track),
-        seconds=round(float(track.timestamps[-1] - track.timestamps[0]) * 1e-6, 2),
-        seconds_visible=round(len(seen) * interval * 1e-6, 2),
+        seconds=round(seconds, 2),
+        seconds_visible=round(seconds * min(1.0, len(seen) / len(track.timestamps)), 2),
         speed_mean=round(float(np.mean(speeds)), 2),
         speed_max=round(float(np.max(speeds)), 2),
         **dict(zip(("length", "width", "height"), (round(float(s), 2) for s in track.size), strict=True)),

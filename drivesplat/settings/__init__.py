@@ -11,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from drivesplat.errors import ConfigError
 
 S = TypeVar("S", bound="Settings")
+MOST_QUOTED = 80
+"""Characters of a value in a message."""
 
 
 class Settings(BaseModel):
@@ -43,13 +45,19 @@ def validated(model: type[S], values: dict[str, Any], where: str, document: str 
         raise ConfigError("; ".join(_sentence(item, where, document) for item in error.errors())) from None
 
 
+def _quoted(value: Any) -> str:
+    """A value, or as much of it as a line can hold."""
+    text = repr(value)
+    return text if len(text) <= MOST_QUOTED else f"{text[:MOST_QUOTED]}…"
+
+
 def _sentence(item: dict[str, Any], where: str, document: str) -> str:
     if not item["loc"]:
         return where + item["msg"].removeprefix("Value error, ")
     key = where + ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
-        return f"unknown key '{key}' (value {item['input']!r}): check its spelling against {document}"
+        return f"unknown key '{key}' (value {_quoted(item['input'])}): check its spelling against {document}"
     if item["type"] == "missing":
         return f"'{key}' is missing: {document} says what it is"
     message = item["msg"].removeprefix("Value error, ")
-    return f"'{key}' is {item['input']!r}: {message[:1].lower()}{message[1:]}"
+    return f"'{key}' is {_quoted(item['input'])}: {message[:1].lower()}{message[1:]}"
