@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from drivesplat.comparison import WHERE
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.report.costs import costs_table
 from drivesplat.report.gaps import in_words
-from drivesplat.report.looks import Looks, data_address
+from drivesplat.report.looks import Looks, apart_at, data_address
 from drivesplat.report.page import filled_page
 from drivesplat.report.plot import gap_plot
 from drivesplat.storage import canonical_json
@@ -170,13 +170,15 @@ def _where(shown: dict[str, Any] | None) -> str:
     return f"key frame {shown['key_frame']}, held out {WHERE[shown['group']]}"
 
 
-def _compared(below: Any, above: Any, left: str, right: str, what: str) -> str:
-    """Two pictures of one view with a slider between them."""
+def _compared(below: Path, above: Path, left: str, right: str, what: str) -> str:
+    """Two pictures of one view with a slider between them, which begins where they differ."""
+    begins = f"{100 * apart_at(below, above):.1f}"
     return (
         f'<figure><div class="compare"><img alt="{escape(left)}" src="{data_address(below)}">'
         f'<img class="over" alt="{escape(right)}" src="{data_address(above)}">'
         f'<span class="side left">{escape(left)}</span><span class="side right">{escape(right)}</span>'
-        f'<input type="range" min="0" max="100" step="0.1" value="50" aria-label="{escape(left)} or {escape(right)}">'
+        f'<input type="range" min="0" max="100" step="0.1" value="{begins}" '
+        f'aria-label="{escape(left)} or {escape(right)}">'
         f"</div><figcaption>{escape(what)}</figcaption></figure>"
     )
 
