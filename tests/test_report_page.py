@@ -16,7 +16,7 @@ from drivesplat.errors import ResultError
 from drivesplat.images import write_png
 from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import report_page
-from drivesplat.report.looks import WIDEST, apart_at, data_address, looks_of
+from drivesplat.report.looks import WIDEST, apart_at, data_address, looks_of, picture_of
 from drivesplat.report.plot import gap_plot
 from drivesplat.settings.report import PICTURES
 from drivesplat.storage import write_json
@@ -124,8 +124,9 @@ def test_a_slider_begins_where_its_pictures_differ(tmp_path):
     with_car[20:40, 30:50] = 200
     for name, pixels in (("with", with_car), ("without", without)):
         write_png(tmp_path / f"{name}.png", pixels)
-    assert apart_at(tmp_path / "with.png", tmp_path / "without.png") == pytest.approx(0.2, abs=0.01)
-    assert apart_at(tmp_path / "with.png", tmp_path / "with.png") == 0.5
+    shown, gone = (picture_of(tmp_path / f"{name}.png") for name in ("with", "without"))
+    assert apart_at(shown, gone) == pytest.approx(0.2, abs=0.01)
+    assert apart_at(shown, shown) == 0.5
 
 
 def test_what_there_is_to_see_is_sorted_by_scene_and_method(tmp_path):

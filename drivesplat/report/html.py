@@ -9,7 +9,7 @@ from drivesplat.comparison import WHERE
 from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.report.costs import costs_table
 from drivesplat.report.gaps import in_words
-from drivesplat.report.looks import Looks, apart_at, data_address
+from drivesplat.report.looks import Looks, address_of, apart_at, data_address, picture_of
 from drivesplat.report.page import filled_page
 from drivesplat.report.plot import gap_plot
 from drivesplat.storage import canonical_json
@@ -172,10 +172,11 @@ def _where(shown: dict[str, Any] | None) -> str:
 
 def _compared(below: Path, above: Path, left: str, right: str, what: str) -> str:
     """Two pictures of one view with a slider between them, which begins where they differ."""
-    begins = f"{100 * apart_at(below, above):.1f}"
+    pictures = picture_of(below), picture_of(above)
+    begins, (under, over) = f"{100 * apart_at(*pictures):.1f}", map(address_of, pictures)
     return (
-        f'<figure><div class="compare"><img alt="{escape(left)}" src="{data_address(below)}">'
-        f'<img class="over" alt="{escape(right)}" src="{data_address(above)}">'
+        f'<figure><div class="compare"><img alt="{escape(left)}" src="{under}">'
+        f'<img class="over" alt="{escape(right)}" src="{over}">'
         f'<span class="side left">{escape(left)}</span><span class="side right">{escape(right)}</span>'
         f'<input type="range" min="0" max="100" step="0.1" value="{begins}" '
         f'aria-label="{escape(left)} or {escape(right)}">'

@@ -41,10 +41,19 @@ def looks_of(files: Iterable[str | Path], results: Path) -> dict[tuple[str, str]
     return found
 
 
-def apart_at(first: Path, second: Path) -> float:
+def picture_of(path: Path) -> Image.Image:
+    """A picture in RGB. Raises ResultError naming the path where it cannot be read."""
+    try:
+        with Image.open(path) as image:
+            return image.convert("RGB")
+    except OSError as error:
+        raise ResultError(f"{path} is no readable picture ({error}); delete it, and its rule makes it again") from error
+
+
+def apart_at(first: Image.Image, second: Image.Image) -> float:
     """How far across, of 1, two pictures of one view differ: the mean over what they differ by, squared; 0.5 where they
-    do not. Raises ResultError naming the path where one cannot be read."""
-    a, b = (np.asarray(_picture(path).resize((COMPARED, COMPARED)), dtype=np.float64) for path in (first, second))
+    do not."""
+    a, b = (np.asarray(picture.resize((COMPARED, COMPARED)), dtype=np.float64) for picture in (first, second))
     weights = ((a - b) ** 2).sum(axis=(0, 2))
     places = (np.arange(COMPARED) + 0.5) / COMPARED
     return float(np.average(places, weights=weights)) if weights.any() else 0.5
@@ -52,16 +61,13 @@ def apart_at(first: Path, second: Path) -> float:
 
 def data_address(path: Path) -> str:
     """A picture as an address that holds it, a JPEG. Raises ResultError naming the path where it cannot be read."""
-    picture = _picture(path)
-    picture.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
+    return address_of(picture_of(path))
+
+
+def address_of(picture: Image.Image) -> str:
+    """An RGB picture as an address that holds it, a JPEG."""
+    reduced = picture.copy()
+    reduced.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
     written = io.BytesIO()
-    picture.save(written, format="JPEG", quality=QUALITY)
+    reduced.save(written, format="JPEG", quality=QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(written.getvalue()).decode()
-
-
-def _picture(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            return image.convert("RGB")
-    except OSError as error:
-        raise ResultError(f"{path} is no readable picture ({error}); delete it, and its rule makes it again") from error
