@@ -7,7 +7,7 @@ from them (`python -m drivesplat.config_document`). Importing this module is che
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
@@ -15,6 +15,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings, validated
 from drivesplat.settings.ablation import AblationSettings
 from drivesplat.settings.actor_seed import ActorSeedSettings
+from drivesplat.settings.dataset import DatasetSettings, default_datasets
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.download import NuscenesMiniSettings
 from drivesplat.settings.evaluate import LpipsSettings
@@ -28,96 +29,17 @@ from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.looks import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings
-from drivesplat.settings.names import require_name, require_text
+from drivesplat.settings.names import require_name
 from drivesplat.settings.overrides import merged
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.train import SkyKind, TrainSettings
-from drivesplat.settings.world import WorldSettings
 
-MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
     "lidar_depth", "free_space", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
 )  # fmt: skip
-DEMO_OVERRIDES = {
-    "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
-    "train": {"iterations": 1_000, "cap_max": 40_000, "checkpoint_apart_s": 10.0},
-    "render": {"fps": 15, "width": 800, "height": 450},
-    "device": {"min_free_gb": 1.0},
-}
-"""What makes the demo world train, and its films render, in minutes on a CPU."""
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
-
-
-class DatasetSettings(Settings):
-    reader: Literal["nuscenes"] = "nuscenes"
-    """The format."""
-    dataroot: str = "~/data/nuscenes/v1.0-mini"
-    """The folder that holds the folder of tables (or that folder itself, or its grandparent)."""
-    version: str = "v1.0-mini"
-    """The folder of tables: v1.0-mini, v1.0-trainval, ..."""
-    scenes: tuple[str, ...] = MINI_SCENES
-    """Scene numbers, quoted: bare YAML would read an octal number."""
-    frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
-    """Per scene a range of key frames [first, last + 1) to use, which are then counted from 0.
-
-    Others are used whole.
-    """
-    edits: dict[str, str] = Field(default_factory=dict)
-    """Per scene the file of its edits (docs/editing.md)."""
-    overrides: dict[str, Any] = Field(default_factory=dict)
-    """Settings of this file that differ for this dataset, as a tree: {images: {width: 800}}."""
-    batch: bool = True
-    """Whether its scenes belong to `snakemake` without a target and to the report."""
-    world: WorldSettings | None = None
-    """A synthetic street that is made at dataroot, with one scene. null = a recorded dataset, which is there."""
-
-    @property
-    def world_root(self) -> str:
-        """The folder where `world` is made."""
-        return str(Path(self.dataroot).expanduser())
-
-    @field_validator("scenes", mode="before")
-    @classmethod
-    def _scenes_are_quoted(cls, value: Any) -> Any:
-        for scene in value if isinstance(value, (list, tuple)) else ():
-            require_text(scene)
-        return value
-
-    @model_validator(mode="after")
-    def _a_world_has_one_scene(self) -> "DatasetSettings":
-        if self.world and len(self.scenes) != 1:
-            raise ValueError(f"a dataset with a world has one scene, this one has {len(self.scenes)}")
-        return self
-
-    @model_validator(mode="after")
-    def _frames_are_ranges(self) -> "DatasetSettings":
-        for scene, (first, last) in self.frames.items():
-            if scene not in self.scenes:
-                raise ValueError(f"frames names scene {scene!r}, which is not in scenes")
-            if not 0 <= first < last:
-                raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
-        return self
-
-    @model_validator(mode="after")
-    def _edits_are_of_its_scenes(self) -> "DatasetSettings":
-        for scene in self.edits:
-            if scene not in self.scenes:
-                raise ValueError(f"edits names scene {scene!r}, which is not in scenes")
-        return self
-
-
-def _default_datasets() -> dict[str, DatasetSettings]:
-    demo = DatasetSettings(
-        dataroot="resources/demo",
-        scenes=("demo",),
-        edits={"demo": "presets/edits/demo.yaml"},
-        batch=False,
-        world=WorldSettings(),
-        overrides=DEMO_OVERRIDES,
-    )
-    return {"nuscenes": DatasetSettings(), "demo": demo}
 
 
 def _default_methods() -> dict[str, MethodSettings]:
@@ -126,7 +48,7 @@ def _default_methods() -> dict[str, MethodSettings]:
 
 
 class Config(Settings):
-    datasets: dict[str, DatasetSettings] = Field(default_factory=_default_datasets, min_length=1)
+    datasets: dict[str, DatasetSettings] = Field(default_factory=default_datasets, min_length=1)
     """Recorded drives, each under a name of your choice."""
     accept_nuscenes_terms: bool = False
     """Whether you accept nuScenes' terms, https://www.nuscenes.org/terms-of-use: non-commercial use, unless you have a

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivesplat.config import Config, DatasetSettings, for_scene
+from drivesplat.config import Config, for_scene
 from drivesplat.editing.edits_file import read_edits
 from drivesplat.errors import ConfigError
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob

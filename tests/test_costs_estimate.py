@@ -1,16 +1,19 @@
 """An estimate before a run: by what jobs like it cost here, else by a machine that is known; time, and disk."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 from workflow_copy import WorkflowCopy
 
 from drivesplat.config import load, merged
-from drivesplat.costs.disk import MEGABYTES, Leaves, disk_need
+from drivesplat.costs.disk import Leaves, disk_need
 from drivesplat.costs.estimate import Machine, PlannedJob, estimate, in_full, in_one_line, spelled
 from drivesplat.costs.expected import SECONDS, START_SECONDS, Expectations, Work, wall_seconds
 from drivesplat.costs.measured import Cost, Job
+from drivesplat.costs.of_run import planned_job
+from drivesplat.costs.usual import gaussians_of, usual_bytes
 
 DEFAULTS = yaml.safe_load((Path(__file__).parent.parent / "config.yaml").read_text())
 
@@ -98,14 +101,63 @@ def test_disk_is_what_the_same_jobs_left_for_other_scenes(tmp_path):
         (folder / "checkpoint.pt").write_bytes(bytes(size))
         (folder / "tensorboard/events").write_bytes(bytes(50))
     jobs = [
-        Leaves("train", "0061", (f"{tmp_path}/0061/street/checkpoint.pt", f"{tmp_path}/0061/street/train.json")),
-        Leaves("film", "0061", (f"{tmp_path}/0061/street/original.mp4",)),
-        Leaves("train", "0103", (f"{tmp_path}/0103/street/checkpoint.pt",)),
+        Leaves(
+            Job("train", "0061", "street"),
+            (f"{tmp_path}/0061/street/checkpoint.pt", f"{tmp_path}/0061/street/train.json"),
+        ),
+        Leaves(Job("film", "0061", "street", "original"), (f"{tmp_path}/0061/street/original.mp4",)),
+        Leaves(Job("train", "0103", "street"), (f"{tmp_path}/0103/street/checkpoint.pt",)),
     ]
-    found = disk_need(tmp_path, jobs, lambda scene: ["0103", "0553", "0655"])
-    assert found.needed == 2050 + 1e6 * MEGABYTES["film"], "what is there already is replaced"
+    found = disk_need(tmp_path, jobs, lambda scene: ["0103", "0553", "0655"], lambda job: 7e6)
+    assert found.needed == 2050 + 7e6, "what is there already is replaced"
     assert found.rough == 1 and found.free > 0
-    assert disk_need(tmp_path / "not/there/yet", [], lambda scene: []).free > 0
+    assert disk_need(tmp_path / "not/there/yet", [], lambda scene: [], lambda job: 0.0).free > 0
+
+
+def test_what_nobody_has_measured_goes_with_its_settings():
+    def megabytes(stage: str, scene: str = "0061", film: str = "", **config) -> float:
+        return usual_bytes(load(merged(DEFAULTS, config)), Job(stage, scene, "street", film)) / 1e6
+
+    one_layer = {"train": {"cap_max": 500_000}}
+    for stage, bytes_a_gaussian in (("train", 23 * 4), ("export", 2 * 26 * 4)):
+        more = megabytes(stage) - megabytes(stage, **one_layer)
+        assert more == pytest.approx(bytes_a_gaussian * 1.0), "a million more Gaussians with harmonics of degree 1"
+    degree_3 = {"train": {"gaussians": {"sh_degree": 3}}}
+    assert megabytes("export", **degree_3) == pytest.approx(2 * 62 * 4 * 1.5), "62 numbers, as 3DGS's PLY has them"
+    limits = {"export": {"usd_gaussians": 10_000, "viewer_gaussians": 10_000}}
+    assert megabytes("export_usd", **limits) < 1.0 and megabytes("export_viewer", **limits) < 1.1
+    assert megabytes("film", film="original", render={"fps": 15}) == pytest.approx(megabytes("film") / 2)
+    assert megabytes("edit", film="stop", render={"edited_frames": True}) > 10 * megabytes("edit", film="stop")
+    half = {"datasets": {"nuscenes": {"frames": {"0061": [0, 20]}}}}
+    assert megabytes("film", **half) == pytest.approx(megabytes("film") * 19 / 39)
+    assert megabytes("lidar_seed", lidar_seed={"max_points": 100_000, "far_points": 0}) == pytest.approx(2.0)
+
+
+def test_gaussians_are_no_more_than_pixels_of_training_images_allow():
+    narrow = load(merged(DEFAULTS, {"images": {"width": 640}}))
+    assert gaussians_of(narrow, "0061", "vanilla") == 40 * 640 * 360 // 20
+    assert gaussians_of(load(DEFAULTS), "0061", "vanilla") == 1_500_000
+    assert gaussians_of(load(merged(DEFAULTS, {"train": {"pixels_per_gaussian": 0}})), "0061", "street") == 1_500_000
+    assert gaussians_of(load(DEFAULTS), "demo", "street") == 40_000
+
+
+def test_the_demo_is_foretold_as_what_its_run_left():
+    """Megabytes of the files of a run of the demo."""
+    left = {
+        "demo_world": 24.0, "train": 5.5, "export": 8.5, "export_usd": 3.9, "export_viewer": 2.1, "film": 1.4,
+        "edit": 1.45, "lidar_seed": 0.5, "parser": 0.5,
+    }  # fmt: skip
+    config = load(DEFAULTS)
+    for stage, megabytes in left.items():
+        job = Job(stage, film="demo") if stage == "demo_world" else Job(stage, "demo", "street", "original")
+        assert 0.5 * megabytes < usual_bytes(config, job) / 1e6 < 2 * megabytes, stage
+
+
+@pytest.mark.parametrize(("gpu", "on_gpu"), [(1, True), (0, False), (None, False)])
+def test_on_processors_no_job_waits_for_a_card(gpu, on_gpu):
+    resources = {} if gpu is None else {"gpu": gpu}
+    job = SimpleNamespace(threads=2, resources=resources, output=["a.mp4"])
+    assert planned_job(Job("film", "demo"), job) == PlannedJob(Job("film", "demo"), 2, on_gpu, ("a.mp4",))
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(45.2, "45 s"), (700.0, "12 min"), (11100.0, "3 h 5 min")])

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from drivesplat.costs.disk import DiskNeed, Leaves, disk_need
 from drivesplat.costs.expected import KNOWN_MACHINE, Expectations, Work, wall_seconds
 from drivesplat.costs.measured import Job
+from drivesplat.costs.usual import usual_bytes
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,10 @@ def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine:
         by_stage=dict(sorted(stages.items(), key=lambda item: -item[1][1])),
         machine=machine,
         disk=disk_need(
-            results, [Leaves(one.job.stage, one.job.scene, one.outputs) for one in planned], expectations.peers
+            results,
+            [Leaves(one.job, one.outputs) for one in planned],
+            expectations.peers,
+            partial(usual_bytes, expectations.config),
         ),
     )
 

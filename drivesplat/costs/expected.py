@@ -9,20 +9,21 @@ from drivesplat.costs.measured import TRAIN, WORLD, Cost, Job
 from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.settings.world import WorldSettings
 
-KNOWN_MACHINE = "two processor cores and the demo drive; trainings on one NVIDIA H200 at 640x360"
+KNOWN_MACHINE = "two processor cores, films as the demo's; trainings on one NVIDIA H200 at 640x360"
 SECONDS = {
-    "demo_world": 37.0, "lpips_backbone": 2.0, "extract": 3.0, "own_car": 5.0, "refine_poses": 60.0, "lidar_seed": 10.0,
-    "parser": 1.0, "masks": 6.0, "actors": 5.0, "lidar_depth": 5.0, "free_space": 10.0, "evaluate": 6.5, "tracks": 4.0,
-    "scene_metrics": 1.0, "film": 13.5, "film_parts": 9.0, "edit": 12.0, "ghost_panel": 5.0, "remove_actor": 6.0,
-    "export": 3.0, "export_usd": 4.0, "export_viewer": 3.0, "ablation": 1.0, "gap_report": 2.0,
+    "demo_world": 36.0, "lpips_backbone": 1.0, "extract": 1.5, "own_car": 1.0, "refine_poses": 62.0, "lidar_seed": 3.0,
+    "parser": 0.5, "masks": 6.0, "actors": 3.0, "lidar_depth": 3.0, "free_space": 3.0, "evaluate": 5.5, "tracks": 2.0,
+    "scene_metrics": 0.5, "film": 12.5, "film_parts": 9.0, "edit": 11.0, "ghost_panel": 3.5, "remove_actor": 2.5,
+    "export": 2.0, "export_usd": 2.0, "export_viewer": 2.0, "ablation": 1.0, "gap_report": 1.0,
 }  # fmt: skip
-"""Seconds of stages on KNOWN_MACHINE."""
+"""Seconds of stages on KNOWN_MACHINE: of a scene's own with one camera of nuScenes' size, of what a model is rendered
+for with the demo's."""
 OTHERS = 10.0
 """Seconds of a stage that is not among them."""
-START_SECONDS = 8.0
+START_SECONDS = 4.0
 """Of every training: images are read, the model is made, files are written."""
 ITERATIONS_PER_SECOND = {
-    ("gpu", False): 730.0, ("gpu", True): 400.0, ("cpu", False): 17.5, ("cpu", True): 13.2
+    ("gpu", False): 730.0, ("gpu", True): 400.0, ("cpu", False): 18.5, ("cpu", True): 14.0
 }  # fmt: skip
 """By device, and by whether a method has parts that move; on CPUs those of the demo."""
 
@@ -39,7 +40,7 @@ class Expectations:
     """What jobs of a `config` may cost where others have cost `costs`."""
 
     def __init__(self, config: Config, costs: Sequence[Cost]):
-        self._config = config
+        self.config = config
         self._costs: dict[tuple[str, str], list[Cost]] = {}
         for cost in costs:
             self._costs.setdefault((cost.job.stage, self.dataset(cost.job.scene)), []).append(cost)
@@ -62,11 +63,11 @@ class Expectations:
 
     def peers(self, scene: str) -> list[str]:
         """The other scenes of a scene's dataset."""
-        return [other for other in self._config.scenes if other != scene and self.dataset(other) == self.dataset(scene)]
+        return [other for other in self.config.scenes if other != scene and self.dataset(other) == self.dataset(scene)]
 
     def dataset(self, scene: str) -> str:
         """The dataset of a scene, empty for jobs of no scene; a scene that is not configured any more has its own."""
-        return self._config.dataset_of(scene) if scene in self._config.scenes else f"?{scene}" if scene else ""
+        return self.config.dataset_of(scene) if scene in self.config.scenes else f"?{scene}" if scene else ""
 
     def _scaled(self, cost: Cost, job: Job) -> float | None:
         if job.stage == WORLD and cost.job != job:
@@ -81,24 +82,24 @@ class Expectations:
             return SECONDS[WORLD] * rays_of(self._world(job) or WorldSettings()) / rays_of(WorldSettings())
         if job.stage != TRAIN:
             return SECONDS.get(job.stage, OTHERS)
-        kind = for_scene(self._config, job.scene).device.kind
-        synthetic = self._config.datasets[self._config.dataset_of(job.scene)].world is not None
+        kind = for_scene(self.config, job.scene).device.kind
+        synthetic = self.config.datasets[self.config.dataset_of(job.scene)].world is not None
         where = "cpu" if kind == "cpu" or (kind == "auto" and synthetic) else "gpu"
         return START_SECONDS + self._planned_iterations(job) / ITERATIONS_PER_SECOND[where, self._moves(job.method)]
 
     def _world(self, job: Job) -> WorldSettings | None:
         """The synthetic world that a job makes; None where it is not configured any more."""
-        dataset = self._config.datasets.get(job.film)
+        dataset = self.config.datasets.get(job.film)
         return dataset.world if dataset is not None else None
 
     def _planned_iterations(self, job: Job) -> int:
         key = job.scene, job.method
         if key not in self._iterations:
-            self._iterations[key] = for_scene(self._config, *key).train.iterations
+            self._iterations[key] = for_scene(self.config, *key).train.iterations
         return self._iterations[key]
 
     def _moves(self, method: str) -> bool:
-        known = self._config.all_methods
+        known = self.config.all_methods
         return method in known and bool(set(known[method].parts) & MOVING_PARTS)
 
 

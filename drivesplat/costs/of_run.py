@@ -81,10 +81,7 @@ class RunCosts:
 
     @property
     def _planned(self) -> list[PlannedJob]:
-        return [
-            PlannedJob(name, int(job.threads), "gpu" in job.rule.resources, tuple(map(str, job.output)))
-            for name, job in self._jobs.items()
-        ]
+        return [planned_job(name, job) for name, job in self._jobs.items()]
 
     @property
     def _machine(self) -> Machine:
@@ -99,6 +96,11 @@ class RunCosts:
 
     def _finished(self) -> set[Job]:
         return {name for name, job in self._jobs.items() if self._workflow.dag.finished(job)}
+
+
+def planned_job(name: Job, job: Any) -> PlannedJob:
+    """One of Snakemake's jobs. It takes a GPU where it asks for one: on processors its rule asks for none."""
+    return PlannedJob(name, int(job.threads), bool(job.resources.get("gpu")), tuple(map(str, job.output)))
 
 
 def _say(line: str) -> None:

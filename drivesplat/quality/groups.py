@@ -8,10 +8,11 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from drivesplat.config import DATASET_OVERRIDES, DatasetSettings, load, require_known
+from drivesplat.config import DATASET_OVERRIDES, load, require_known
 from drivesplat.errors import ConfigError
 from drivesplat.planning import Plan
 from drivesplat.settings import validated
+from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, with_seed, with_seeds
 from drivesplat.settings.names import require_name
 from drivesplat.settings.overrides import merged

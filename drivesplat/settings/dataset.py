@@ -1,0 +1,90 @@
+"""What a recorded or synthetic drive may be told: where it lies, its scenes, and what differs for it."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from drivesplat.settings import Settings
+from drivesplat.settings.names import require_text
+from drivesplat.settings.world import WorldSettings
+
+MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
+DEMO_OVERRIDES = {
+    "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
+    "train": {"iterations": 1_000, "cap_max": 40_000, "checkpoint_apart_s": 10.0},
+    "render": {"fps": 15, "width": 800, "height": 450},
+    "device": {"min_free_gb": 1.0},
+}
+"""What makes the demo world train, and its films render, in minutes on a CPU."""
+
+
+class DatasetSettings(Settings):
+    reader: Literal["nuscenes"] = "nuscenes"
+    """The format."""
+    dataroot: str = "~/data/nuscenes/v1.0-mini"
+    """The folder that holds the folder of tables (or that folder itself, or its grandparent)."""
+    version: str = "v1.0-mini"
+    """The folder of tables: v1.0-mini, v1.0-trainval, ..."""
+    scenes: tuple[str, ...] = MINI_SCENES
+    """Scene numbers, quoted: bare YAML would read an octal number."""
+    frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
+    """Per scene a range of key frames [first, last + 1) to use, which are then counted from 0.
+
+    Others are used whole.
+    """
+    edits: dict[str, str] = Field(default_factory=dict)
+    """Per scene the file of its edits (docs/editing.md)."""
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    """Settings of this file that differ for this dataset, as a tree: {images: {width: 800}}."""
+    batch: bool = True
+    """Whether its scenes belong to `snakemake` without a target and to the report."""
+    world: WorldSettings | None = None
+    """A synthetic street that is made at dataroot, with one scene. null = a recorded dataset, which is there."""
+
+    @property
+    def world_root(self) -> str:
+        """The folder where `world` is made."""
+        return str(Path(self.dataroot).expanduser())
+
+    @field_validator("scenes", mode="before")
+    @classmethod
+    def _scenes_are_quoted(cls, value: Any) -> Any:
+        for scene in value if isinstance(value, (list, tuple)) else ():
+            require_text(scene)
+        return value
+
+    @model_validator(mode="after")
+    def _a_world_has_one_scene(self) -> "DatasetSettings":
+        if self.world and len(self.scenes) != 1:
+            raise ValueError(f"a dataset with a world has one scene, this one has {len(self.scenes)}")
+        return self
+
+    @model_validator(mode="after")
+    def _frames_are_ranges(self) -> "DatasetSettings":
+        for scene, (first, last) in self.frames.items():
+            if scene not in self.scenes:
+                raise ValueError(f"frames names scene {scene!r}, which is not in scenes")
+            if not 0 <= first < last:
+                raise ValueError(f"frames of scene {scene!r} must be [first, last + 1) with 0 <= first < last + 1")
+        return self
+
+    @model_validator(mode="after")
+    def _edits_are_of_its_scenes(self) -> "DatasetSettings":
+        for scene in self.edits:
+            if scene not in self.scenes:
+                raise ValueError(f"edits names scene {scene!r}, which is not in scenes")
+        return self
+
+
+def default_datasets() -> dict[str, DatasetSettings]:
+    """nuScenes mini, and the demo world."""
+    demo = DatasetSettings(
+        dataroot="resources/demo",
+        scenes=("demo",),
+        edits={"demo": "presets/edits/demo.yaml"},
+        batch=False,
+        world=WorldSettings(),
+        overrides=DEMO_OVERRIDES,
+    )
+    return {"nuscenes": DatasetSettings(), "demo": demo}
