@@ -13,6 +13,7 @@ from drivesplat.costs.measured import BENCHMARKS, Job, read_costs
 from drivesplat.costs.progress import Progress, Watch
 from drivesplat.costs.table import FILES, costs_in_words, finding, write_costs
 from drivesplat.errors import DriveSplatError
+from drivesplat.overridden import without_effect
 from drivesplat.planning import Plan
 
 COSTS, ESTIMATE = "costs", "estimate"
@@ -29,8 +30,11 @@ class RunCosts:
         self._watch: Watch | None = None
 
     def tell_estimate(self) -> bool:
-        """Prints what is to be expected, in full, where that is all that is asked for; whether it is."""
+        """Prints which settings will not hold, and what is to be expected, in full, where that is all that is asked
+        for; whether it is."""
         self._jobs = self._needed()
+        for sentence in without_effect(self._plan.config, {(job.scene, job.method) for job in self._jobs}):
+            _say(sentence)
         if ESTIMATE in self._targets:
             print(in_full(self.estimate()), flush=True)
         return ESTIMATE in self._targets
