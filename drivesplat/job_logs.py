@@ -17,6 +17,11 @@ def failures(text: str) -> dict[str, str]:
     return found
 
 
+def has_begun(text: str) -> bool:
+    """Whether a job's log has a beginning."""
+    return bool(_BEGINS.search(text))
+
+
 def is_cut_short(text: str) -> bool:
     """Whether a job's log has a beginning and no end: the job was killed, or is at work."""
-    return bool(_BEGINS.search(text)) and not _ENDS.search(text) and not failures(text)
+    return has_begun(text) and not _ENDS.search(text) and not failures(text)

@@ -18,6 +18,7 @@ CONFIG = load(yaml.safe_load((Path(__file__).parent.parent / "config.yaml").read
 MASKS, TRAIN, FILM = Job("masks", "0103"), Job("train", "0103", "street"), Job("film", "0103", "street", "original")
 COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=15000), Cost(FILM, 100.0, "")]
 BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.job: street/train 0103 begins\n"
+ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.job: street/train 0103 ends\n"
 TOLD = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
 
 
@@ -58,6 +59,17 @@ def test_a_job_that_says_nothing_is_taken_to_be_as_far_as_expected(tmp_path):
     assert looked.line(1000.0).startswith("90 % of the work")
     assert looked.line(1060.0) == "96 % of the work, 2 of 3 jobs, about 40 s left; at work: 0103 street film original"
     assert "about 0 s left" in looked.line(2000.0)
+
+
+def test_a_job_that_has_ended_is_done_before_it_is_counted(tmp_path):
+    """Snakemake looks for outputs, and at other jobs, before it counts one."""
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("99 %, 18.8 it/s, 8 s left") + ENDS)
+    assert progress(tmp_path, {MASKS}).line(0.0) == "90 % of the work, 1 of 3 jobs, about 2 min left"
+
+
+def test_a_log_without_a_beginning_tells_nothing(tmp_path):
+    (tmp_path / "train.log").write_text("")
+    assert progress(tmp_path, {MASKS}).line(0.0).startswith("10 % of the work, 1 of 3 jobs, about 15 min left")
 
 
 def test_logs_of_earlier_runs_are_nobody_at_work(tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 from drivesplat.costs.estimate import Machine, PlannedJob, spelled
 from drivesplat.costs.expected import Expectations, Work, wall_seconds
 from drivesplat.costs.measured import TRAIN, Job
-from drivesplat.job_logs import is_cut_short
+from drivesplat.job_logs import has_begun, is_cut_short
 
 EVERY_S = 30.0
 SHOWN = 4
@@ -45,8 +45,9 @@ class Progress:
         done, left, at_work = 0.0, [], []
         for one in self._planned:
             seconds = expectations.of(one.job).seconds
-            remaining = 0.0 if one.job in finished else seconds
-            if one.job not in finished and self._is_at_work(one.job):
+            begun = self._is_cut_short(one.job) if one.job not in finished else False
+            remaining = seconds if begun is None else 0.0
+            if begun:
                 part, remaining = self._of_running(one.job, seconds, now)
                 at_work.append(f"{one.job.name} ({part:.0f} %)" if part is not None else one.job.name)
                 seconds = max(seconds, remaining) if part is None else remaining / (1.0 - min(part, 99.0) / 100.0)
@@ -59,12 +60,15 @@ class Progress:
         time_left = spelled(wall_seconds(left, self._machine.cores, self._machine.gpus))
         return f"{share:.0f} % of the work, {len(finished)} of {len(self._planned)} jobs, about {time_left} left{named}"
 
-    def _is_at_work(self, job: Job) -> bool:
+    def _is_cut_short(self, job: Job) -> bool | None:
+        """Whether a job's log of this run has no end, as while the job is at work; None where it has not begun. One
+        that has ended may wait for seconds until Snakemake counts it."""
         log = self._logs.get(job)
         try:
-            return log is not None and log.stat().st_mtime >= self._began and is_cut_short(log.read_text("utf-8"))
+            text = log.read_text("utf-8") if log and log.stat().st_mtime >= self._began else ""
         except (OSError, UnicodeDecodeError):
-            return False
+            return None
+        return is_cut_short(text) if has_begun(text) else None
 
     def _of_running(self, job: Job, expected: float, now: float) -> tuple[float | None, float]:
         """How far a job at work is, in percent, where it says so, and the seconds it still needs."""
