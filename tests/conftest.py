@@ -20,12 +20,14 @@ install_import_hook("drivesplat", "beartype.beartype")
 REPOSITORY = Path(__file__).parent.parent
 
 
+@pytest.hookimpl(trylast=True)  # when it is known which tests are left out: workers' shares are cut by their number
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Has each of pytest's workers, who begin with equal shares, start with what runs Snakemake: modules that take long
-    and make what their tests share. What one worker takes from another at the end is then short."""
+    """Has each of pytest's workers, who begin with equal shares, start with what runs Snakemake, the largest modules
+    first: they take long and make what their tests share. What one worker takes from another at the end is then short.
+    """
     runs = [item for item in items if item.get_closest_marker("workflow")]
     others = [item for item in items if not item.get_closest_marker("workflow")]
-    modules = [list(module) for _, module in groupby(runs, key=lambda item: item.path)]
+    modules = sorted((list(module) for _, module in groupby(runs, key=lambda item: item.path)), key=len, reverse=True)
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     shares = [[item for module in modules[i::workers] for item in module] for i in range(workers)]
     for i, share in enumerate(shares):
