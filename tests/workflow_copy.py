@@ -1,5 +1,6 @@
 """A copy of the workflow in a folder of its own, run as users run it: as a subprocess, with a config file."""
 
+import compileall
 import json
 import os
 import re
@@ -7,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +62,10 @@ class WorkflowCopy:
         """Copies the workflow and writes a tiny world beside it; `config` is laid over the tests' settings. The methods
         that it names are all there are."""
         folder.mkdir(parents=True, exist_ok=True)
+        _compiled()
         for part in PARTS:
             source = REPOSITORY / part
-            ignore = shutil.ignore_patterns("__pycache__")
+            ignore = shutil.ignore_patterns("kernels-*", "*.opt-jaxtyping*.pyc")
             shutil.copytree(source, folder / part, ignore=ignore) if source.is_dir() else shutil.copy2(
                 source, folder / part
             )
@@ -132,6 +135,14 @@ class WorkflowCopy:
 
     def read(self, path: str) -> Any:
         return json.loads((self.folder / path).read_text())
+
+
+@cache
+def _compiled() -> None:
+    """Compiles the library once, for every copy: what is compiled goes along, and is valid where its source is as old.
+    Otherwise each copy's first call, and its first job, would compile a hundred modules of their own."""
+    if not sys.dont_write_bytecode:
+        compileall.compile_dir(REPOSITORY / "drivesplat", quiet=2)
 
 
 def _drop(config: Path, key: str) -> None:
