@@ -118,9 +118,9 @@ def test_what_nobody_has_measured_goes_with_its_settings():
     def megabytes(stage: str, scene: str = "0061", film: str = "", **config) -> float:
         return usual_bytes(load(merged(DEFAULTS, config)), Job(stage, scene, "street", film)) / 1e6
 
-    one_layer = {"train": {"cap_max": 500_000}}
+    fewer = {"train": {"cap_max": 500_000}}
     for stage, bytes_a_gaussian in (("train", 23 * 4), ("export", 2 * 26 * 4)):
-        more = megabytes(stage) - megabytes(stage, **one_layer)
+        more = megabytes(stage) - megabytes(stage, **fewer)
         assert more == pytest.approx(bytes_a_gaussian * 1.0), "a million more Gaussians with harmonics of degree 1"
     degree_3 = {"train": {"gaussians": {"sh_degree": 3}}}
     assert megabytes("export", **degree_3) == pytest.approx(2 * 62 * 4 * 1.5), "62 numbers, as 3DGS's PLY has them"

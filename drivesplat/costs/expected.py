@@ -103,12 +103,16 @@ class Expectations:
         return method in known and bool(set(known[method].parts) & MOVING_PARTS)
 
 
-def rays_of(world: WorldSettings) -> int:
-    """How many rays a synthetic world is cast by, about, in rays of one pixel: six images a key frame, two more of
-    truth, and five between two key frames of each camera that also records there."""
+def images_of(world: WorldSettings) -> int:
+    """How many images a synthetic world has: six a key frame, two more of truth, and five between two key frames of
+    each camera that also records there."""
     between = sum(channel.startswith("CAM") for channel in world.sweeps)
-    images = 8 * world.key_frames + 5 * (world.key_frames - 1) * between
-    return images * world.width**2 * world.samples_per_pixel
+    return 8 * world.key_frames + 5 * (world.key_frames - 1) * between
+
+
+def rays_of(world: WorldSettings) -> int:
+    """How many rays a synthetic world is cast by, about, in rays of one pixel."""
+    return images_of(world) * world.width**2 * world.samples_per_pixel
 
 
 @dataclass(frozen=True)

@@ -45,9 +45,9 @@ class Progress:
         done, left, at_work = 0.0, [], []
         for one in self._planned:
             seconds = expectations.of(one.job).seconds
-            begun = self._is_cut_short(one.job) if one.job not in finished else False
-            remaining = seconds if begun is None else 0.0
-            if begun:
+            working = False if one.job in finished else self._is_at_work(one.job)
+            remaining = seconds if working is None else 0.0
+            if working:
                 part, remaining = self._of_running(one.job, seconds, now)
                 at_work.append(f"{one.job.name} ({part:.0f} %)" if part is not None else one.job.name)
                 seconds = max(seconds, remaining) if part is None else remaining / (1.0 - min(part, 99.0) / 100.0)
@@ -60,9 +60,9 @@ class Progress:
         time_left = spelled(wall_seconds(left, self._machine.cores, self._machine.gpus))
         return f"{share:.0f} % of the work, {len(finished)} of {len(self._planned)} jobs, about {time_left} left{named}"
 
-    def _is_cut_short(self, job: Job) -> bool | None:
-        """Whether a job's log of this run has no end, as while the job is at work; None where it has not begun. One
-        that has ended may wait for seconds until Snakemake counts it."""
+    def _is_at_work(self, job: Job) -> bool | None:
+        """Whether a job is at work, as its log of this run says, and not over, though Snakemake may take seconds to
+        count it; None where it has not begun."""
         log = self._logs.get(job)
         try:
             text = log.read_text("utf-8") if log and log.stat().st_mtime >= self._began else ""

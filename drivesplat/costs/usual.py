@@ -1,6 +1,7 @@
 """Bytes that a job leaves where no other scene's job tells: by its Gaussians, points and pixels, as on the demo."""
 
 from drivesplat.config import Config, for_scene
+from drivesplat.costs.expected import images_of
 from drivesplat.costs.measured import EDIT, FILM, FILM_PARTS, TRAIN, WORLD, Job
 
 KEY_FRAMES, WIDTH, ASPECT = 40, 1600, 9 / 16
@@ -75,11 +76,7 @@ def _film(config: Config, job: Job) -> float:
 def _world(config: Config, dataset: str) -> float:
     known = config.datasets.get(dataset)
     world = known.world if known else None
-    if world is None:
-        return 0.0
-    cameras = sum(channel.startswith("CAM") for channel in world.sweeps)
-    images = 8 * world.key_frames + BETWEEN * (world.key_frames - 1) * cameras
-    return images * (WORLD_IMAGE + WORLD_PIXEL * ASPECT * world.width**2)
+    return images_of(world) * (WORLD_IMAGE + WORLD_PIXEL * ASPECT * world.width**2) if world else 0.0
 
 
 def _key_frames(config: Config, scene: str) -> int:
