@@ -17,7 +17,7 @@ CORES ?= all
 
 demo: setup
 	$(BIN)/snakemake --cores $(CORES) --configfile presets/demo.yaml -- all
-	@$(BIN)/python -m drivesplat.evaluation.in_words results/demo/metrics.json
+	@$(BIN)/python -m drivesplat.evaluation.summary results/demo/metrics.json
 
 setup:
 	@bash scripts/setup.sh
@@ -58,4 +58,4 @@ speed: setup
 	$(BIN)/python -m benchmarks.speed $(FILE) -- --cores $(CORES) $(SNAKEMAKE)
 
 config: setup
-	$(BIN)/python -m drivesplat.config_document
+	$(BIN)/python -m drivesplat.settings.config_document

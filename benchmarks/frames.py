@@ -17,14 +17,14 @@ from typing import Any
 
 import torch
 
-from drivesplat.device import device_name
 from drivesplat.errors import DriveSplatError
-from drivesplat.film import Shot, recorded_shot, render_film
-from drivesplat.scene import Scene, read_scene
+from drivesplat.machine.device import device_name
+from drivesplat.rendering.film import Shot, recorded_shot, render_film
+from drivesplat.rendering.trajectory import film_path
+from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
 from drivesplat.training.run import open_model, read_checkpoint
-from drivesplat.trajectory import film_path
 
 WARM_UP = 0.1
 """The share of the frames that is not timed."""

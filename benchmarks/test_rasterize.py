@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesplat.rasterize import rasterize
+from drivesplat.rasterization import rasterize
 
 COUNT, WIDTH, HEIGHT, FOCAL = 50_000, 400, 225, 315.0
 MOST_MILLISECONDS = 250.0

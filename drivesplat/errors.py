@@ -1,6 +1,6 @@
 """What goes wrong in words a user can act on.
 
-Every message is one sentence or two: what, where, what to do. The script seam (`drivesplat.job`) prints the message
+Every message is one sentence or two: what, where, what to do. The script seam (`drivesplat.workflow.job`) prints the message
 alone; anything else that is raised is a bug and keeps its traceback in the job's log.
 """
 

@@ -10,9 +10,9 @@ from snakemake.utils import validate
 
 sys.path.insert(0, workflow.basedir)
 
-from drivesplat.costs.of_run import COSTS, ESTIMATE, RunCosts
+from drivesplat.workflow.costs.run_costs import COSTS, ESTIMATE, RunCosts
 from drivesplat.errors import DriveSplatError
-from drivesplat.planning import Plan, let_scripts_import
+from drivesplat.workflow.plan import Plan, let_scripts_import
 
 let_scripts_import(workflow.basedir)
 asked = get_argument_parser().parse_known_args()[0]

@@ -84,7 +84,7 @@ disk_needed_mb() { if [ "$1" = cpu ]; then echo 3000; else echo 7000; fi; }
 # Whether the cards of this machine can run the build; one that was asked for by name is made anyway.
 check_build() {
   local status=0
-  "$python" -m drivesplat.doctor.torch_builds "$1" || status=$?
+  "$python" -m drivesplat.machine.doctor.torch_builds "$1" || status=$?
   if [ "$status" = 1 ] && [ -n "${TORCH_CUDA:-}" ]; then
     say "going on, since TORCH_CUDA=$1 was asked for"
     return 0
@@ -124,7 +124,7 @@ compile_ahead() {
   say "compiling what trains on processors; half a minute at most"
   .venv/bin/python -m compileall -q drivesplat workflow_scripts ||
     say "no bytecode could be kept: is the checkout read-only? Every job will compile it anew"
-  if .venv/bin/python -m drivesplat.training.rehearsal; then
+  if .venv/bin/python -m drivesplat.training.warm_up; then
     { : > "$compiled"; } 2>/dev/null || true  # a .venv of somebody else's: the next call does it again
   else
     say "all packages are in place, but a first training on the processors fails (see above); make doctor says more"
@@ -153,7 +153,7 @@ else
 fi
 no_card() { [ -z "${GSPLAT_ARCHS:-}" ] && ! command -v nvidia-smi >/dev/null 2>&1; }
 if [ -z "$quiet" ] || ! no_card; then
-  .venv/bin/python -m drivesplat.gsplat_build $quiet ||
+  .venv/bin/python -m drivesplat.machine.gsplat_build $quiet ||
     fail "everything but gsplat's kernels is in place; GSPLAT_ARCHS=none make setup goes without them (CPU only)"
 fi
 [ -e "$compiled" ] || compile_ahead

@@ -57,7 +57,7 @@ def tiny_root(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def tiny_scene(tiny_root):
     """The tiny drive as a Scene, with the images between key frames."""
-    from drivesplat.extract import extract_scene
+    from drivesplat.preprocess.extract import extract_scene
     from drivesplat.settings.extract import SceneSource
 
     return extract_scene(

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from drivesplat.masks import mask_name
+from drivesplat.io.point_cloud import PointCloud
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
@@ -15,12 +15,12 @@ from drivesplat.model.parameters import SH_C0
 from drivesplat.model.part import Part
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.motion import Motion
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
-from drivesplat.recording import Recording
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene
+from drivesplat.preprocess.masks import mask_name
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.holdout import HoldoutSettings

@@ -6,9 +6,9 @@ from typing import Any
 
 import yaml
 
-from drivesplat.quality.groups import Group, groups_of, read_recipes
+from benchmarks.quality.groups import Group, groups_of, read_recipes
+from benchmarks.quality.recipes import RecipeFile
 from drivesplat.settings.method import with_seed
-from drivesplat.settings.recipes import RecipeFile
 
 REPOSITORY = Path(__file__).parent.parent
 PROTOCOL = {

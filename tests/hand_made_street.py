@@ -17,9 +17,9 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.motion import Motion
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene, Track
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.render import FilmFormat
@@ -132,7 +132,7 @@ def views_of(record: dict[str, Any], scene: Scene) -> list[View]:
 
 
 class Reels(dict[str, np.ndarray]):
-    """In the encoder's place (`drivesplat.film.write_video`): what films were given, (n, h, w, 3), by their names."""
+    """In the encoder's place (`drivesplat.rendering.film.write_video`): what films were given, (n, h, w, 3), by their names."""
 
     def __call__(
         self, path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: int, crf: int, threads: int = 0

@@ -8,11 +8,11 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from drivesplat.images import continuous_intrinsics, project
 from drivesplat.poses.features import image_pairs, write_images
 from drivesplat.poses.rig import RigImages
-from drivesplat.rigid import inverse, rigid
-from drivesplat.scene import Frame, Scene
+from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 
 KEY_FRAME_US = 500_000

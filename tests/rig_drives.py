@@ -11,7 +11,7 @@ from drivesplat.demo.imaging import central_hits
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor
 from drivesplat.demo.street import OWN_CAR
-from drivesplat.scene import Frame, Scene, Sweep
+from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.settings.world import WorldSettings
 
 RIG = {sensor.channel: sensor for sensor in SENSORS}

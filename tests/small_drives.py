@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World, cast, write_world
 
-from drivesplat.extract import extract_scene
-from drivesplat.scene import Frame, Scene
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.extract import SceneSource
 
 HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}

@@ -8,19 +8,19 @@ from typing import Any, TypeVar
 
 from workflow_copy import TINY_TRAINING
 
-from drivesplat.actors.sight import Drive, open_drive
-from drivesplat.config import Config, load
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.evaluation.scene_metrics import side_by_side
-from drivesplat.extract import extract_scene
-from drivesplat.masks import make_masks
-from drivesplat.parser import parser_dict
-from drivesplat.recording import Recording
-from drivesplat.seeding.actor_points import actors_record
-from drivesplat.seeding.depth_points import lidar_depths
-from drivesplat.seeding.seed import seed_points
+from drivesplat.inspection.rendered_view import Drive, open_drive
+from drivesplat.preprocess.actor_seed import actors_record
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.lidar_depth import lidar_depths
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.preprocess.masks import make_masks
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.prepared_drive import Recording
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.config import Config, load
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.extract import SceneSource
@@ -29,8 +29,8 @@ from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob
-from drivesplat.stages import stage_settings
 from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training
+from drivesplat.workflow.stages import stage_settings
 
 S = TypeVar("S", bound=Settings)
 SCENE = "0001"

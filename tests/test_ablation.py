@@ -12,12 +12,12 @@ import pytest
 import yaml
 from workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
 
-from drivesplat.ablation import ablation, markdown, write_csv
-from drivesplat.config import Config, for_scene, load, merged
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.planning import Plan
+from drivesplat.evaluation.ablation import ablation, markdown, write_csv
 from drivesplat.settings.ablation import AblationJob
-from drivesplat.stages import METHOD_STAGES, SCENE_STAGES, TRAINING_INPUTS, stage_settings, training_inputs
+from drivesplat.settings.config import Config, for_scene, load, merged
+from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.stages import METHOD_STAGES, SCENE_STAGES, TRAINING_INPUTS, stage_settings, training_inputs
 
 REPOSITORY = Path(__file__).parent.parent
 VARIANTS = (

@@ -14,8 +14,8 @@ from hand_made import about_z, looking_at, motion_through, track_of
 from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.motion import Motion
-from drivesplat.rasterize import rasterize
+from drivesplat.rasterization import rasterize
+from drivesplat.scene.motion import Motion
 from drivesplat.settings.actors import ActorSettings, TrackSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings

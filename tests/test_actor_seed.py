@@ -23,16 +23,16 @@ from small_drives import (
 from tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 
 from drivesplat.errors import ResultError
-from drivesplat.extract import extract_scene
-from drivesplat.holdout import frame_groups, sweep_groups
-from drivesplat.motion import Motion
-from drivesplat.own_car import NOWHERE, OwnCar
-from drivesplat.scene import Frame, Scene
-from drivesplat.seeding.actor_points import actors_record
-from drivesplat.seeding.actors import motion_of, read_actors
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.preprocess.actor_seed import actors_record
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.actor_record import motion_of, read_actors
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.extract import SceneSource
-from drivesplat.storage import write_plain_pickle
 
 CAR = World().things[0]
 """It drives ahead of the own car: 4 x 2 x 1.6 m, its rear 4.8 m from the camera at first."""

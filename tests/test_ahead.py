@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from drivesplat.ahead import ahead, in_advance
+from drivesplat.io.prefetch import ahead, in_advance
 
 
 def test_results_come_in_order_however_long_each_takes():

@@ -14,7 +14,7 @@ from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.camera_poses import CameraPoses, transform
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings

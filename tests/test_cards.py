@@ -11,9 +11,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivesplat.job import Job
-from drivesplat.cards import visible_cards
+from drivesplat.workflow.job import Job
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.workflow.gpus import visible_cards
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -79,15 +79,13 @@ def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path
 
 def test_counting_cards_does_not_import_torch():
     """Planning takes about a second; torch takes longer."""
-    script = (
-        "import sys; from drivesplat.cards import visible_cards; visible_cards(); assert 'torch' not in sys.modules"
-    )
+    script = "import sys; from drivesplat.workflow.gpus import visible_cards; visible_cards(); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, check=True)
 
 
 HOLD = """
 import logging, os, sys, time
-from drivesplat.cards import hold_card
+from drivesplat.workflow.gpus import hold_card
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
 lock = hold_card(int(sys.argv[1]))
 print("holds", os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)

@@ -10,8 +10,8 @@ from PIL import Image
 from small_drives import scene_at
 from tiny_world import World, write_world
 
-from drivesplat.circumstances import cautions, luminance, moved, seconds_long, standing
-from drivesplat.scene import Scene
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.scene_warnings import cautions, luminance, moved, seconds_long, standing
 
 DAY = 0.4
 
@@ -122,7 +122,7 @@ def test_luminance_is_that_of_the_whole_drive(tiny_scene, tmp_path):
     ids=["ordinary", "stands", "dark", "nothing moves"],
 )
 def test_the_extraction_warns_in_a_line_each(tmp_path, caplog, world, expected):
-    with caplog.at_level(logging.WARNING, logger="drivesplat.extract"):
+    with caplog.at_level(logging.WARNING, logger="drivesplat.preprocess.extract"):
         scene_at(write_world(tmp_path, world))
     messages = [record.getMessage() for record in caplog.records]
     assert [message.startswith(f"scene 0001: {start}") for message, start in zip(messages, expected, strict=True)] == [

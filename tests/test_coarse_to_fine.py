@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from drivesplat.masks import UNLABELLED
 from drivesplat.model.view import View
-from drivesplat.rasterize import rasterize
+from drivesplat.preprocess.masks import UNLABELLED
+from drivesplat.rasterization import rasterize
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced

@@ -1,6 +1,6 @@
 """Figures over several random seeds: means that leave out what is null, differences paired by seed, their spelling."""
 
-from drivesplat.comparison import (
+from drivesplat.evaluation.comparison import (
     PSNRS,
     compared,
     difference,

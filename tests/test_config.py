@@ -9,10 +9,10 @@ import jsonschema
 import pytest
 import yaml
 
-from drivesplat.config import Config, for_scene, load, merged
-from drivesplat.config_document import config_schema, config_yaml
 from drivesplat.errors import ConfigError
-from drivesplat.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
+from drivesplat.settings.config import Config, for_scene, load, merged
+from drivesplat.settings.config_document import config_schema, config_yaml
+from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 LOOKS = ("tracks", "film", "ghost_panel", "remove_actor", "export", "export_usd", "export_viewer")

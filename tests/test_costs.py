@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import yaml
 
-from drivesplat.costs.measured import Job, read_costs
-from drivesplat.costs.of_run import COSTS, RunCosts
-from drivesplat.costs.table import LIMIT_SECONDS, costs_in_words, costs_record, scene_totals, write_costs
-from drivesplat.planning import Plan
+from drivesplat.io.storage import write_json
 from drivesplat.report.costs import costs_table
-from drivesplat.storage import write_json
+from drivesplat.workflow.costs.measured import Job, read_costs
+from drivesplat.workflow.costs.run_costs import COSTS, RunCosts
+from drivesplat.workflow.costs.table import LIMIT_SECONDS, costs_in_words, costs_record, scene_totals, write_costs
+from drivesplat.workflow.plan import Plan
 
 REPOSITORY = Path(__file__).parent.parent
 HEADER = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time"

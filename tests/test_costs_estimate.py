@@ -7,13 +7,13 @@ import pytest
 import yaml
 from workflow_copy import WorkflowCopy
 
-from drivesplat.config import load, merged
-from drivesplat.costs.disk import Leaves, disk_need
-from drivesplat.costs.estimate import Machine, PlannedJob, estimate, in_full, in_one_line, spelled
-from drivesplat.costs.expected import SECONDS, START_SECONDS, Expectations, Work, wall_seconds
-from drivesplat.costs.measured import Cost, Job
-from drivesplat.costs.of_run import planned_job
-from drivesplat.costs.usual import gaussians_of, usual_bytes
+from drivesplat.settings.config import load, merged
+from drivesplat.workflow.costs.disk import Leaves, disk_need
+from drivesplat.workflow.costs.estimate import Machine, PlannedJob, estimate, in_full, in_one_line, spelled
+from drivesplat.workflow.costs.expected import SECONDS, START_SECONDS, Expectations, Work, wall_seconds
+from drivesplat.workflow.costs.measured import Cost, Job
+from drivesplat.workflow.costs.run_costs import planned_job
+from drivesplat.workflow.costs.usual import gaussians_of, usual_bytes
 
 DEFAULTS = yaml.safe_load((Path(__file__).parent.parent / "config.yaml").read_text())
 

@@ -7,18 +7,18 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivesplat.config import load
-from drivesplat.costs.estimate import Machine, PlannedJob
-from drivesplat.costs.expected import Expectations
-from drivesplat.costs.measured import Cost, Job
-from drivesplat.costs.progress import Progress, Watch
+from drivesplat.settings.config import load
 from drivesplat.training import monitor
+from drivesplat.workflow.costs.estimate import Machine, PlannedJob
+from drivesplat.workflow.costs.expected import Expectations
+from drivesplat.workflow.costs.measured import Cost, Job
+from drivesplat.workflow.costs.progress import Progress, Watch
 
 CONFIG = load(yaml.safe_load((Path(__file__).parent.parent / "config.yaml").read_text()))
 MASKS, TRAIN, FILM = Job("masks", "0103"), Job("train", "0103", "street"), Job("film", "0103", "street", "original")
 COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=15000), Cost(FILM, 100.0, "")]
-BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.job: street/train 0103 begins\n"
-ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.job: street/train 0103 ends\n"
+BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
+ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.workflow.job: street/train 0103 ends\n"
 TOLD = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
 
 

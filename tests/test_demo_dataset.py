@@ -5,7 +5,7 @@ import pytest
 from nuscenes.utils.data_classes import LidarPointCloud
 from PIL import Image
 
-from drivesplat.extract import extract_scene
+from drivesplat.preprocess.extract import extract_scene
 from drivesplat.settings.extract import SceneSource
 
 CAMERAS = {"CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT"}

@@ -8,8 +8,8 @@ from drivesplat.demo.imaging import central_hits
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.rig import SENSORS
 from drivesplat.demo.tables import token
-from drivesplat.extract import extract_scene
-from drivesplat.regions import LABELS, LEAST_PIXELS, fill, hulls_in, label_image
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.regions import LABELS, LEAST_PIXELS, fill, hulls_in, label_image
 from drivesplat.settings.extract import SceneSource
 
 SIZE = (400, 225)

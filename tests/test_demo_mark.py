@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from drivesplat.config import load
 from drivesplat.demo.mark import WORLD_MARK, begin, refuse_foreign_data
 from drivesplat.demo.world import make_world
 from drivesplat.errors import ConfigError
-from drivesplat.planning import Plan
+from drivesplat.settings.config import load
 from drivesplat.settings.world import WorldJob, WorldSettings
-from drivesplat.stages import stage_settings
+from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.stages import stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 TINY = WorldJob(

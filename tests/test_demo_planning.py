@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from drivesplat.config import load
-from drivesplat.device import choose_device
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.planning import Plan
-from drivesplat.readers.nuscenes_layout import TABLES
+from drivesplat.machine.device import choose_device
+from drivesplat.readers.nuscenes.layout import TABLES
+from drivesplat.scene.truth import TRUTH_FILE
+from drivesplat.settings.config import load
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.truth import TRUTH_FILE
+from drivesplat.workflow.plan import Plan
 
 REPOSITORY = Path(__file__).parent.parent
 

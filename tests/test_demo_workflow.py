@@ -5,7 +5,7 @@ import json
 import pytest
 from workflow_copy import WorkflowCopy
 
-from drivesplat.config import merged
+from drivesplat.settings.config import merged
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("demo_workflow")]
 

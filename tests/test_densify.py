@@ -10,12 +10,12 @@ from gsplat import MCMCStrategy
 from gsplat.strategy import ops
 from hand_made import actors_of, motion_through, round_gaussians, track_of
 
+from drivesplat.kernels.numba.exploration import explore
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.part import filled
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
-from drivesplat.on_cpu.exploration import explore
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.gaussians import GaussianSettings

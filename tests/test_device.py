@@ -12,9 +12,9 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import torch
 
-from drivesplat.device import choose_device, device_name, telling_out_of_memory
 from drivesplat.errors import DeviceError
-from drivesplat.gsplat_build.installed import RECORD, versions
+from drivesplat.machine.device import choose_device, device_name, telling_out_of_memory
+from drivesplat.machine.gsplat_build.installed import RECORD, versions
 from drivesplat.settings.device import DeviceSettings
 
 REPOSITORY = Path(__file__).parent.parent
@@ -184,7 +184,7 @@ def loadable(monkeypatch):
 def test_a_run_does_not_start_compiling_gsplat(gsplat_package):
     message = refusal()
     assert "not compiled" in message and "make setup" in message and "make doctor" in message
-    assert f"{sys.executable} -m drivesplat.gsplat_build" in message and "device: cpu" in message
+    assert f"{sys.executable} -m drivesplat.machine.gsplat_build" in message and "device: cpu" in message
 
 
 def test_a_prebuilt_gsplat_is_taken_as_it_is(gsplat_package, loadable):
@@ -222,7 +222,7 @@ def test_without_gsplat_the_training_stage_still_comes_to_its_one_sentence():
         "import torch; torch.cuda.is_available = lambda: True\n"
         "torch.cuda.mem_get_info = lambda *_: (10**11, 10**11); torch.cuda.get_device_name = lambda *_: 'card'\n"
         "import drivesplat.training.run\n"
-        "from drivesplat.device import choose_device\n"
+        "from drivesplat.machine.device import choose_device\n"
         "from drivesplat.settings.device import DeviceSettings\n"
         "from drivesplat.errors import DeviceError\n"
         "try: choose_device(DeviceSettings())\n"

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from drivesplat.config import load
-from drivesplat.doctor import facts as facts_module
-from drivesplat.doctor.__main__ import main
-from drivesplat.doctor.checks import examine
-from drivesplat.doctor.facts import Backbone, Dataset, Facts, Gsplat, Torch, gather
-from drivesplat.doctor.torch_builds import Card, advice, at_least, fitting_build, generation, read_cards
+from drivesplat.machine.doctor import facts as facts_module
+from drivesplat.machine.doctor.__main__ import main
+from drivesplat.machine.doctor.checks import examine
+from drivesplat.machine.doctor.facts import Backbone, Dataset, Facts, Gsplat, Torch, gather
+from drivesplat.machine.doctor.torch_builds import Card, advice, at_least, fitting_build, generation, read_cards
+from drivesplat.settings.config import load
 
 REPOSITORY = Path(__file__).parent.parent
 GOOD_CARD = Card("NVIDIA GeForce RTX 4090", "580.65.06", (8, 9), 25.3, 24.0)
@@ -62,7 +62,9 @@ def test_modules_that_every_job_compiles_are_told_where_they_are_many():
 
 
 def test_modules_are_counted_whose_bytecode_is_nowhere(tmp_path):
-    script = "import sys, json, http.server; from drivesplat.doctor.facts import _read_as_source as f; print(f())"
+    script = (
+        "import sys, json, http.server; from drivesplat.machine.doctor.facts import _read_as_source as f; print(f())"
+    )
     counts = []
     for keeps in ({"PYTHONDONTWRITEBYTECODE": "1"}, {}, {"PYTHONDONTWRITEBYTECODE": "1"}):
         clean = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
@@ -302,7 +304,7 @@ def test_the_exit_status_tells_whether_something_is_broken(monkeypatch, capsys, 
 
 
 def test_a_python_without_the_packages_says_what_to_do():
-    code = "import sys; sys.modules['pydantic'] = None; import drivesplat.doctor.__main__ as d; sys.exit(d.main([]))"
+    code = "import sys; sys.modules['pydantic'] = None; import drivesplat.machine.doctor.__main__ as d; sys.exit(d.main([]))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stdout.startswith("fix") and "make setup" in done.stdout
 

@@ -13,17 +13,17 @@ import pytest
 from archive_server import Site, packed, served
 from tiny_world import World, write_world
 
-from drivesplat.config import load
-from drivesplat.download import fetch as fetching
-from drivesplat.download import nuscenes_mini, progress
-from drivesplat.download.destination import download_job, is_there
-from drivesplat.download.fetch import fetch
-from drivesplat.download.nuscenes_mini import download, work_folder
-from drivesplat.download.progress import Progress
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.extract import extract_scene
-from drivesplat.planning import Plan
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.readers.nuscenes.download import fetch as fetching
+from drivesplat.readers.nuscenes.download import nuscenes_mini, progress
+from drivesplat.readers.nuscenes.download.destination import download_job, is_there
+from drivesplat.readers.nuscenes.download.fetch import fetch
+from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
+from drivesplat.readers.nuscenes.download.progress import Progress
+from drivesplat.settings.config import load
 from drivesplat.settings.extract import SceneSource
+from drivesplat.workflow.plan import Plan
 
 REPOSITORY = Path(__file__).parent.parent
 CONTENT = bytes(range(256)) * 4000

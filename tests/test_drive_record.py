@@ -8,13 +8,13 @@ from PIL import Image
 from small_drives import HELD_OUT
 from tiny_world import World
 
-from drivesplat.evaluation.drive import drive_record
+from drivesplat.evaluation.drive_summary import drive_record
 from drivesplat.evaluation.evaluate import measured_images
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
-from drivesplat.recording import Recording
-from drivesplat.regions import LABELS
-from drivesplat.scene import Scene
+from drivesplat.io.point_cloud import PointCloud
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.regions import LABELS
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.parser import ParserJob
 
 

@@ -26,23 +26,23 @@ from hand_made_street import (
 from hand_made_traffic import placed
 from PIL import Image
 
-from drivesplat.ahead import THREADS
 from drivesplat.editing.cast import Actor, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, actors_of, appearances, crashes, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
-from drivesplat.film import render_film
-from drivesplat.frames import film_frame
+from drivesplat.io.prefetch import THREADS
+from drivesplat.io.video import read_footage
 from drivesplat.model.part import Appearance
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.motion import Motion
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene
+from drivesplat.rendering.film import render_film
+from drivesplat.rendering.frames import film_frame
+from drivesplat.rendering.trajectory import CameraPath
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import EditJob, FilmJob, TrajectorySettings
-from drivesplat.trajectory import CameraPath
-from drivesplat.video import read_footage
 
 CPU = DeviceSettings(kind="cpu")
 BUSY = [
@@ -90,7 +90,7 @@ def files_in(folder: Path) -> EditFiles:
 def make(scene: Scene, model: SplatModel, folder: Path, *steps: dict[str, Any], **changes: Any) -> Made:
     with pytest.MonkeyPatch.context() as patch:
         reels = Reels()
-        patch.setattr("drivesplat.film.write_video", reels)
+        patch.setattr("drivesplat.rendering.film.write_video", reels)
         record = render_edit(scene, checkpoint_of(model), a_job(*steps, **changes), CPU, files_in(folder))
     return Made(json.loads(json.dumps(record, allow_nan=False)), reels, folder)
 
@@ -118,7 +118,7 @@ def large(scene, model, tmp_path_factory) -> Made:
 
 def test_the_recorded_drive_is_on_the_left_as_its_own_film_shows_it(scene, model, large, tmp_path, monkeypatch):
     reels = Reels()
-    monkeypatch.setattr("drivesplat.film.write_video", reels)
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", reels)
     job = FilmJob(**a_format(width=64, height=36).model_dump(), trajectory=TrajectorySettings())
     render_film(scene, checkpoint_of(model), job, CPU, tmp_path / "original.mp4")
     np.testing.assert_array_equal(large.halves[0], reels["original"])
@@ -275,7 +275,7 @@ def test_an_encoded_film_has_as_many_frames_and_is_twice_as_wide(scene, model, t
 
 
 def test_an_edit_leaves_the_checkpoint_as_it_is(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr("drivesplat.film.write_video", Reels())
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", Reels())
     checkpoint, before = checkpoint_of(model), checkpoint_of(model)
     render_edit(scene, checkpoint, a_job(*BUSY, width=16, height=16, fps=1), CPU, files_in(tmp_path))
     assert checkpoint["model"].keys() == before["model"].keys()
@@ -296,9 +296,9 @@ def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, model
             assert 2 * taken <= len(rendered) <= 2 * (taken + THREADS + 1)
         path.write_bytes(b"")
 
-    for module in ("drivesplat.editing.film", "drivesplat.film"):
+    for module in ("drivesplat.editing.film", "drivesplat.rendering.film"):
         monkeypatch.setattr(f"{module}.film_frames", counted)
-    monkeypatch.setattr("drivesplat.film.write_video", encoder)
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", encoder)
     render_edit(scene, checkpoint_of(model), a_job(*BUSY), CPU, files_in(tmp_path))
     assert len(rendered) == 2 * 19
 

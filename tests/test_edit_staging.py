@@ -22,16 +22,16 @@ from hand_made_traffic import placed
 from drivesplat.editing.cast import Role, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import actors_of, appearances
-from drivesplat.film import Shot
-from drivesplat.frames import film_frame
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene
+from drivesplat.rendering.film import Shot
+from drivesplat.rendering.frames import film_frame
+from drivesplat.rendering.trajectory import film_path
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.render import FilmFormat, TrajectorySettings
-from drivesplat.trajectory import film_path
 
 LAST = 4.5
 """The tiny drive's first image is at 0, its last at this second."""

@@ -5,7 +5,7 @@ import pytest
 
 from drivesplat.editing.cast import Actor, edited_cast
 from drivesplat.errors import ConfigError
-from drivesplat.motion import Motion
+from drivesplat.scene.motion import Motion
 from drivesplat.settings.edit import Edit
 
 IDS = ("6e5c0000aaaa", "6e7d0000bbbb", "91ab0000cccc")

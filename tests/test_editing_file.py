@@ -13,11 +13,11 @@ from drivesplat.demo.tables import token
 from drivesplat.editing.cast import Actor, edited_cast
 from drivesplat.editing.edits_file import read_edits
 from drivesplat.errors import ConfigError
-from drivesplat.motion import Motion
+from drivesplat.io.storage import canonical_json
+from drivesplat.scene.motion import Motion
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit, Step
 from drivesplat.settings.world import WorldSettings
-from drivesplat.storage import canonical_json
 
 REPOSITORY = Path(__file__).parent.parent
 DEMO = REPOSITORY / "presets" / "edits" / "demo.yaml"

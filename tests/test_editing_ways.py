@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.editing.cast import Actor, Role, edited_cast
 from drivesplat.errors import ConfigError
-from drivesplat.motion import Motion
-from drivesplat.rigid import rigid
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.rigid import rigid
 from drivesplat.settings.edit import Edit
 
 SPEED, RADIUS, END = 10.0, 20.0, 10.0

@@ -8,14 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivesplat.export.cameras_json import cameras_record
-from drivesplat.images import project
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
-from drivesplat.rigid import inverse
+from drivesplat.io.point_cloud import PointCloud
+from drivesplat.io.storage import write_json
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.images import project
+from drivesplat.scene.rigid import inverse
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.parser import ParserJob
-from drivesplat.storage import write_json
 
 SEED = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
 

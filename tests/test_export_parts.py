@@ -20,16 +20,16 @@ from hand_made_traffic import (
 )
 
 from drivesplat.export import splat_asset
+from drivesplat.export.names import distinct
 from drivesplat.export.parts_json import write_parts
 from drivesplat.export.sampled_motion import sampled
-from drivesplat.export.spelling import distinct
 from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.export.trained_parts import SampledPiece, trained_gaussians, trained_pieces
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.motion import Motion
-from drivesplat.rigid import rigid
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.rigid import rigid
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {}}

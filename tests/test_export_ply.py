@@ -12,13 +12,13 @@ from drivesplat.errors import ResultError
 from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.export.trained_parts import trained_gaussians
+from drivesplat.io.point_cloud import PointCloud
 from drivesplat.model.background import Background
 from drivesplat.model.build import definitions
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
-from drivesplat.rasterize import rasterize
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.rasterization import rasterize
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings

@@ -18,7 +18,7 @@ from drivesplat.model.background import Background
 from drivesplat.model.build import definitions
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 from drivesplat.settings.export import UsdJob
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainJob, TrainSettings

@@ -24,8 +24,8 @@ from drivesplat.model.part import Sky
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rigid import rigid
-from drivesplat.scene import Frame
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame
 from drivesplat.settings.export import ViewerJob
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainJob, TrainSettings

@@ -26,24 +26,24 @@ from test_training import (
     untrained,
 )
 
-from drivesplat.config import load
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import parser_dict
-from drivesplat.seeding.seed import seed_points
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.settings.config import load
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
-from drivesplat.stages import stage_settings
 from drivesplat.training.first_exposure import first_gains, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, schedule
 from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
 from drivesplat.training.views import Guides, TrainingView, load_views, view_of
+from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

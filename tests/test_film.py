@@ -18,21 +18,21 @@ import pytest
 import torch
 from hand_made_street import checkpoint_of
 
-from drivesplat import video
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.film import Shot, render_film
-from drivesplat.frames import film_frame
+from drivesplat.io import video
+from drivesplat.io.video import Footage, read_footage, write_video
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.scene import Scene
+from drivesplat.rendering.film import Shot, render_film
+from drivesplat.rendering.frames import film_frame
+from drivesplat.rendering.trajectory import film_path
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.trajectory import film_path
-from drivesplat.video import Footage, read_footage, write_video
 
 WIDTH, HEIGHT, FPS = 160, 120, 30
 SIZE = (WIDTH, HEIGHT)

@@ -8,14 +8,14 @@ import pytest
 import torch
 from hand_made import looking_at, round_gaussians
 
-from drivesplat import on_gpu
 from drivesplat.errors import ResultError
-from drivesplat.frames import _in_a_row
+from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels.cuda_graphs import Graph
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.on_gpu import frames as frames_on_gpu
-from drivesplat.on_gpu import rooms
-from drivesplat.on_gpu.frames import Asked, Frame, FramesOnGpu
-from drivesplat.on_gpu.graphs import Graph
+from drivesplat.rendering import captured_frames as frames_on_gpu
+from drivesplat.rendering.captured_frames import Asked, Frame, FramesOnGpu
+from drivesplat.rendering.frames import _in_a_row
 
 ROOM = 7
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from hand_made_street import Reels, a_format, checkpoint_of, street_actors, street_model, street_scene, views_of
 
-from drivesplat.ahead import THREADS
-from drivesplat.film import BACKDROP, render_film, render_parts
-from drivesplat.frames import film_frame
+from drivesplat.io.prefetch import THREADS
+from drivesplat.io.video import read_footage
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene import Scene
+from drivesplat.rendering.film import BACKDROP, render_film, render_parts
+from drivesplat.rendering.frames import film_frame
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
-from drivesplat.video import read_footage
 
 CPU = DeviceSettings(kind="cpu")
 
@@ -29,7 +29,7 @@ def scene(tiny_scene) -> Scene:
 @pytest.fixture
 def reels(monkeypatch) -> Reels:
     made = Reels()
-    monkeypatch.setattr("drivesplat.film.write_video", made)
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", made)
     return made
 
 
@@ -94,7 +94,9 @@ def test_where_nothing_moves_the_third_picture_is_plain_grey(scene, tmp_path, re
 
 def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, tmp_path, monkeypatch):
     rendered = []
-    monkeypatch.setattr("drivesplat.film.film_frame", lambda *_: rendered.append(1) or np.zeros((10, 20, 3), np.uint8))
+    monkeypatch.setattr(
+        "drivesplat.rendering.film.film_frame", lambda *_: rendered.append(1) or np.zeros((10, 20, 3), np.uint8)
+    )
 
     def encoder(path, frames, size, fps, crf, threads):
         frames = iter(frames)
@@ -104,5 +106,5 @@ def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, tmp_p
         assert len([*frames]) > 2 * THREADS
         path.write_bytes(b"")
 
-    monkeypatch.setattr("drivesplat.film.write_video", encoder)
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", encoder)
     parts_film(scene, tmp_path, checkpoint_of(street_model()))

@@ -13,13 +13,13 @@ from small_drives import HELD_OUT, NOTHING_HELD_OUT, drive, scene_at, seconds_of
 from tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.holdout import frame_groups, sweep_groups
-from drivesplat.scene import Scene
-from drivesplat.seeding.empty_space import Rays, camera_rays, free_space_record, lidar_rays, proven_empty, proving
-from drivesplat.seeding.free_space import read_free_space
-from drivesplat.seeding.traversal import OCCUPIED, count_passing
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.lidar.free_space_record import read_free_space
+from drivesplat.lidar.traversal import OCCUPIED, count_passing
+from drivesplat.preprocess.free_space import Rays, camera_rays, free_space_record, lidar_rays, proven_empty, proving
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.free_space import FreeSpaceJob, FreeSpaceSettings
-from drivesplat.storage import write_plain_pickle
 from drivesplat.training.cells import Cells
 
 SENSOR = np.array([0.0, 0.0, 1.8])

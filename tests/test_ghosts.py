@@ -9,13 +9,13 @@ import torch
 from hand_made import Own, recording_of, round_gaussians
 from scipy.spatial.transform import Rotation
 
-from drivesplat.actors.ghosts import Ghosts, boxes_along, ghosts_of, swept
-from drivesplat.actors.sight import Drive, Sight
+from drivesplat.inspection.ghosts import Ghosts, boxes_along, ghosts_of, swept
+from drivesplat.inspection.rendered_view import Drive, Sight
 from drivesplat.model.part import Part
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene import Scene, Track
-from drivesplat.settings.looks import GhostSettings
-from drivesplat.tracks import box_at
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.tracks import box_at
+from drivesplat.settings.inspection import GhostSettings
 
 START = 1_532_402_927_647_951
 INTERVAL = 500_000.0

@@ -28,19 +28,21 @@ from test_training import (
     untrained_street,
 )
 
-from drivesplat.ahead import in_advance
-from drivesplat.device import choose_device
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
-from drivesplat.frames import film_frame, film_frames
+from drivesplat.io.prefetch import in_advance
+from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels import cuda_graphs as graphs
+from drivesplat.kernels.cuda_graphs import own_stream
+from drivesplat.machine.device import choose_device
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.on_gpu import frames as frames_on_gpu
-from drivesplat.on_gpu import graphs, rooms
-from drivesplat.on_gpu.graphs import own_stream
-from drivesplat.rasterize import gpu, rasterize
+from drivesplat.rasterization import gsplat_backend as gpu
+from drivesplat.rasterization import rasterize
+from drivesplat.rendering import captured_frames as frames_on_gpu
+from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings

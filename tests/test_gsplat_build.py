@@ -10,11 +10,11 @@ from time import monotonic
 import pytest
 
 from drivesplat.errors import DeviceError
-from drivesplat.gsplat_build import __main__ as command
-from drivesplat.gsplat_build import compile as building
-from drivesplat.gsplat_build import diagnose, installed, toolkit
-from drivesplat.gsplat_build.compile_job import sources
-from drivesplat.gsplat_build.toolkit import Toolkit
+from drivesplat.machine.gsplat_build import __main__ as command
+from drivesplat.machine.gsplat_build import compile as building
+from drivesplat.machine.gsplat_build import diagnose, installed, toolkit
+from drivesplat.machine.gsplat_build.compile_job import sources
+from drivesplat.machine.gsplat_build.toolkit import Toolkit
 
 REPOSITORY = Path(__file__).parent.parent
 TOOLKIT = Toolkit(Path("/opt/cuda"), "13.0", "CUDA_HOME")
@@ -85,7 +85,7 @@ def test_machine_code_runs_within_a_major_version_and_ptx_later(archs, capabilit
 
 def test_the_platform_of_torch_is_read_without_importing_it():
     code = (
-        "import sys; from drivesplat.gsplat_build.installed import torch_platform; found = torch_platform(); "
+        "import sys; from drivesplat.machine.gsplat_build.installed import torch_platform; found = torch_platform(); "
         "assert 'torch' not in sys.modules; from torch import version; assert found == (version.cuda, version.hip)"
     )
     subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, check=True)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from drivesplat.holdout import frame_groups, held_out_key_frames, sweep_groups
-from drivesplat.scene import Frame, Scene, Sweep
+from drivesplat.scene.scene import Frame, Scene, Sweep
+from drivesplat.scene.splits import frame_groups, held_out_key_frames, sweep_groups
 from drivesplat.settings.holdout import HoldoutSettings
 
 INTERVAL = 500_000

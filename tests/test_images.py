@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from drivesplat.errors import DatasetError
-from drivesplat.images import continuous_intrinsics, pixel_rays, project, read_image, read_mask, target_size
-from drivesplat.rigid import inverse, rigid
-from drivesplat.scene import Frame
+from drivesplat.scene.images import continuous_intrinsics, pixel_rays, project, read_image, read_mask, target_size
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Frame
 from drivesplat.settings.images import ImageSettings
 
 

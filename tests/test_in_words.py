@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from drivesplat.evaluation.in_words import in_words
+from drivesplat.evaluation.summary import in_words
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -86,7 +86,7 @@ def test_truth_over_too_few_pixels_is_not_spoken_of():
 
 def test_the_command_line_prints_it_and_names_a_missing_file(tmp_path):
     file = tmp_path / "metrics.json"
-    command = [sys.executable, "-m", "drivesplat.evaluation.in_words", str(file)]
+    command = [sys.executable, "-m", "drivesplat.evaluation.summary", str(file)]
     absent = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert absent.returncode and str(file) in absent.stderr and "Traceback" not in absent.stderr
     file.write_text(json.dumps({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}))

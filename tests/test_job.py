@@ -10,7 +10,7 @@ REPOSITORY = Path(__file__).parent.parent
 AS_A_SCRIPT = """
 snakemake = None
 import gc
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 """
 AS_A_LIBRARY = AS_A_SCRIPT.replace("snakemake = None", "")
 IN_A_JOB = """
@@ -45,4 +45,6 @@ def test_every_script_imports_the_job_before_the_rest_of_the_library():
             line.split()[1] for line in script.read_text().splitlines() if line.startswith(("from ", "import "))
         ]
         heavy = [name for name in imported if name.split(".")[0] not in sys.stdlib_module_names]
-        assert heavy[0] == "drivesplat.job", f"{script.name}: garbage is looked for while {heavy[0]} is imported"
+        assert heavy[0] == "drivesplat.workflow.job", (
+            f"{script.name}: garbage is looked for while {heavy[0]} is imported"
+        )

@@ -5,9 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-CALLEE = "from drivesplat.kernels import kernel\n\nSCALE = {scale}\n\n\n@kernel\ndef scaled(x):\n    return SCALE * x\n"
+CALLEE = "from drivesplat.kernels.cache import kernel\n\nSCALE = {scale}\n\n\n@kernel\ndef scaled(x):\n    return SCALE * x\n"
 CALLER = (
-    "from drivesplat.kernels import kernel\nfrom drivesplat.callee import SCALE, scaled\n\n\n"
+    "from drivesplat.kernels.cache import kernel\nfrom drivesplat.callee import SCALE, scaled\n\n\n"
     "@kernel\ndef total(x):\n    return scaled(x) + SCALE\n"
 )
 SHOW = "from drivesplat.caller import total\nprint(total(10.0))\nprint(sum(total.stats.cache_hits.values()))\n"

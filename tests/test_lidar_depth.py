@@ -12,19 +12,19 @@ from small_drives import HELD_OUT, NOTHING_HELD_OUT, Speeding, drive, scene_at, 
 from tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 
 from drivesplat.errors import ResultError
-from drivesplat.extract import extract_scene
-from drivesplat.holdout import frame_groups, sweep_groups
-from drivesplat.own_car import OwnCar
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene
-from drivesplat.seeding.depth_points import Depths, lidar_depths, taken_apart
-from drivesplat.seeding.lidar_depth import read_lidar_depth
-from drivesplat.seeding.movers import Mover, movers
-from drivesplat.seeding.occlusion import patches, unhidden
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.lidar.movers import Mover, movers
+from drivesplat.lidar.occlusion import patches, unhidden
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.lidar_depth import Depths, lidar_depths, taken_apart
+from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
+from drivesplat.scene.truth import read_truth
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
-from drivesplat.storage import write_plain_pickle
-from drivesplat.truth import read_truth
 
 CAR, TRUCK = World().things[:2]
 AHEAD = Thing("vehicle.truck", (4.0, 2.0, 2.6), (8.5, 0.0, 1.3), (4.2, 0.0))

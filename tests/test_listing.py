@@ -8,7 +8,8 @@ import pytest
 from hand_made import recording_of
 from matplotlib.figure import Figure
 
-from drivesplat.actors.listing import (
+from drivesplat.errors import ResultError
+from drivesplat.inspection.track_table import (
     MOST_PICTURES,
     draw_tracks,
     fewest_that_show_all,
@@ -16,10 +17,9 @@ from drivesplat.actors.listing import (
     track_rows,
     write_tracks,
 )
-from drivesplat.errors import ResultError
-from drivesplat.recording import Recording
-from drivesplat.scene import Scene
-from drivesplat.tracks import SHORT, beginnings
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.tracks import SHORT, beginnings
 
 
 @pytest.fixture(scope="module")

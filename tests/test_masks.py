@@ -11,9 +11,9 @@ from PIL import Image
 from tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.extract import extract_scene
-from drivesplat.images import project, read_image
-from drivesplat.masks import (
+from drivesplat.lidar.sweeps import read_sweep
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.masks import (
     NO_SKY,
     UNLABELLED,
     make_masks,
@@ -23,14 +23,14 @@ from drivesplat.masks import (
     read_masks_record,
     read_sky_mask,
 )
-from drivesplat.own_car import OwnCar
-from drivesplat.regions import LABELS, label_image, region_mask
-from drivesplat.rigid import apply, inverse
-from drivesplat.scene import Frame, Scene
-from drivesplat.seeding.sweeps import read_sweep
+from drivesplat.preprocess.sky_mask import sky_mask
+from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.images import project, read_image
+from drivesplat.scene.regions import LABELS, label_image, region_mask
+from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.masks import MaskJob
-from drivesplat.sky_mask import sky_mask
 
 SIZE = (96, 54)
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from drivesplat import meaning as module
-from drivesplat.meaning import Meanings, meaning
+from drivesplat.provenance import syntax_digest as module
+from drivesplat.provenance.syntax_digest import Meanings, meaning
 
 CODE = 'import a.b\nfrom . import c\nfrom ..d import e as f\n\nNAME = "g.h"\nWORDS = "i. j"\n'
 

@@ -11,7 +11,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation.evaluate import findings
 from drivesplat.evaluation.metrics import RegionMetrics, gap_db, psnr, ssim_map, with_gap
-from drivesplat.regions import LABELS, REGIONS, region_masks
+from drivesplat.scene.regions import LABELS, REGIONS, region_masks
 
 HEIGHT, WIDTH = 40, 50
 

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.errors import ResultError
-from drivesplat.images import pixel_rays
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.build import Beginnings, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
@@ -21,6 +20,7 @@ from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
+from drivesplat.scene.images import pixel_rays
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings

@@ -7,10 +7,10 @@ import pytest
 from hand_made import about_z, motion_through
 from scipy.spatial.transform import Rotation
 
-from drivesplat.motion import Motion
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene, Track
-from drivesplat.tracks import box_at
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.tracks import box_at
 
 TIMES = np.array([0.5, 1.0, 1.4, 2.0, 2.5, 3.1])
 """Seconds of annotations, not quite evenly spaced."""

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from test_training import ALL_TERMS, guided_views, settings_of, untrained_street
 from torch import nn
 
-from drivesplat import on_gpu
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.quaternions import left_factor, rotation_matrix
 from drivesplat.model.sky import CubemapSky
@@ -47,7 +47,7 @@ def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tens
     ],
 )
 def test_colours_differ_by_what_torch_says_and_pull_as_it_does(height, width, hidden, moving):
-    from drivesplat.on_gpu.colours import Window, colour_difference
+    from drivesplat.kernels.triton.colours import Window, colour_difference
 
     rng = np.random.default_rng(0)
     image, recorded = (torch.from_numpy(rng.uniform(0, 1, (height, width, 3))).float().to(DEVICE) for _ in range(2))
@@ -70,7 +70,7 @@ def test_colours_differ_by_what_torch_says_and_pull_as_it_does(height, width, hi
 
 
 def test_nothing_that_moves_is_no_difference():
-    from drivesplat.on_gpu.colours import Window, colour_difference
+    from drivesplat.kernels.triton.colours import Window, colour_difference
 
     image = torch.rand(4, 5, 3, device=DEVICE, requires_grad=True)
     window = Window(torch.from_numpy(weights()).float().to(DEVICE), C1, C2)
@@ -82,7 +82,7 @@ def test_nothing_that_moves_is_no_difference():
 
 
 def test_adams_steps_are_torchs():
-    from drivesplat.on_gpu.adam import adam_step
+    from drivesplat.kernels.triton.adam import adam_step
 
     torch.manual_seed(0)
     theirs = torch.randn(700, 3, device=DEVICE)
@@ -102,7 +102,7 @@ def test_adams_steps_are_torchs():
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("coefficients", [1, 4, 9])
 def test_a_camera_sees_the_colours_that_gsplat_says(degree, coefficients):
-    from drivesplat.on_gpu.harmonics import seen_colours
+    from drivesplat.kernels.triton.harmonics import seen_colours
 
     if degree == 1 and coefficients == 1:
         pytest.skip("there are none of that degree")
@@ -126,7 +126,7 @@ def test_a_camera_sees_the_colours_that_gsplat_says(degree, coefficients):
 
 
 def test_regularisers_hold_down_what_torch_says_and_as_much():
-    from drivesplat.on_gpu.regularisers import mean_opacity_and_scale
+    from drivesplat.kernels.triton.regularisers import mean_opacity_and_scale
 
     torch.manual_seed(0)
     opacities, scales = torch.rand(1500, device=DEVICE), 5.0 * torch.rand(1500, 3, device=DEVICE)
@@ -143,7 +143,7 @@ def test_regularisers_hold_down_what_torch_says_and_as_much():
 @pytest.mark.parametrize("seed", range(4))
 def test_the_sky_behind_is_that_of_torch_and_learns_as_much(seed):
     """Cameras that look every way: over edges and corners of the cube, too; a long lens sees few texels."""
-    from drivesplat.on_gpu.cube import Cube, before_cube
+    from drivesplat.kernels.triton.cube import Cube, before_cube
 
     torch.manual_seed(seed)
     sky = CubemapSky(9, torch.tensor([0.3, 0.5, 0.7]), 1e-2).to(DEVICE)
@@ -169,7 +169,7 @@ def test_the_sky_behind_is_that_of_torch_and_learns_as_much(seed):
 def test_exploration_spreads_as_far_as_a_gaussian_reaches_and_less_where_it_is_seen():
     """By the covariance of many draws: strength² times that of the Gaussian, squared, of a faint one; an opaque one
     stays."""
-    from drivesplat.on_gpu.exploration import explore
+    from drivesplat.kernels.triton.exploration import explore
 
     torch.manual_seed(0)
     count, strength, logit = 20_000, 2.0, -6.0
@@ -191,7 +191,7 @@ def test_exploration_spreads_as_far_as_a_gaussian_reaches_and_less_where_it_is_s
 
 
 def test_exploration_is_seeded():
-    from drivesplat.on_gpu.exploration import explore
+    from drivesplat.kernels.triton.exploration import explore
 
     ends = []
     for seed in (1, 1, 2):
@@ -208,7 +208,7 @@ def test_exploration_is_seeded():
 
 def some_objects(requires_grad: bool = True) -> tuple[Any, torch.Tensor, torch.Tensor]:
     """Five objects, one of them absent, two of other sizes; whose 150 Gaussians are, and the matrix of that."""
-    from drivesplat.on_gpu.placing import Objects
+    from drivesplat.kernels.triton.placing import Objects
 
     quats = F.normalize(torch.randn(5, 4, device=DEVICE), dim=1).requires_grad_(requires_grad)
     translations = torch.randn(5, 3, device=DEVICE).requires_grad_(requires_grad)
@@ -218,7 +218,7 @@ def some_objects(requires_grad: bool = True) -> tuple[Any, torch.Tensor, torch.T
 
 
 def test_objects_are_placed_as_by_matrices_and_pull_alike():
-    from drivesplat.on_gpu.placing import Shapes, placed
+    from drivesplat.kernels.triton.placing import Shapes, placed
 
     torch.manual_seed(0)
     shapes = Shapes(*(torch.randn(150, *size, device=DEVICE).requires_grad_() for size in ((3,), (4,), (3,), ())))
@@ -242,7 +242,7 @@ def test_objects_are_placed_as_by_matrices_and_pull_alike():
 
 @pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), (3, 2), (2, 1)])
 def test_colours_in_time_are_summed_and_turned_and_learn_alike(degree, terms):
-    from drivesplat.on_gpu.colours_in_time import turned_colours
+    from drivesplat.kernels.triton.colours_in_time import turned_colours
 
     torch.manual_seed(1)
     objects, owner, _ = some_objects(requires_grad=False)
@@ -303,8 +303,8 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.on_gpu import adam, chunks, colours, colours_in_time, cube, exploration, harmonics, placing
-from drivesplat.on_gpu import regularisers, tiles, trial
+from drivesplat.kernels.triton import adam, chunks, colours, colours_in_time, cube, exploration, harmonics, placing
+from drivesplat.kernels.triton import regularisers, tiles, trial
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "there": "*i1",
@@ -367,7 +367,7 @@ def test_every_kernel_compiles():
 @pytest.mark.parametrize("switch", ["0", "1"])
 def test_what_triton_cannot_do_torch_does(switch, monkeypatch, caplog):
     """The user has switched it off, which needs no word; or it fails, which is told once."""
-    from drivesplat.on_gpu import trial
+    from drivesplat.kernels.triton import trial
 
     def fail() -> None:
         raise RuntimeError("Failed to find C compiler.\nmore")

@@ -11,8 +11,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
-from drivesplat.on_gpu import chunks, rooms
-from drivesplat.on_gpu.tiles import Lists, Projected, lists_of
+from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels.triton import chunks
+from drivesplat.kernels.triton.tiles import Lists, Projected, lists_of
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 TILE = 16

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hand_made import actors_of, motion_through, track_of
 
-from drivesplat import on_gpu
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.background import Background
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel

@@ -8,11 +8,11 @@ from rig_drives import rig_drive
 
 from drivesplat.evaluation.evaluate import evaluate_groups
 from drivesplat.evaluation.overlaps import overlap_masks, seen_by_others
-from drivesplat.images import continuous_intrinsics, project
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.recording import Recording
-from drivesplat.rigid import inverse
+from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.rigid import inverse
 
 GREY = (0.4, 0.5, 0.6)
 FRONT = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT")

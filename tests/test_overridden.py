@@ -6,8 +6,8 @@ import pytest
 import yaml
 from workflow_copy import WorkflowCopy
 
-from drivesplat.config import load, merged
-from drivesplat.overridden import without_effect
+from drivesplat.settings.config import load, merged
+from drivesplat.settings.overridden import without_effect
 
 DEFAULTS = yaml.safe_load((Path(__file__).parent.parent / "config.yaml").read_text())
 DEMO, REAL = [("demo", ""), ("demo", "vanilla"), ("demo", "street")], [("0061", "vanilla"), ("0061", "street")]

@@ -9,19 +9,19 @@ import pytest
 from PIL import Image
 from rig_drives import KEY_FRAMES, rig_drive, true_body
 
-from drivesplat import own_car_search
-from drivesplat.config import load
 from drivesplat.errors import ResultError
-from drivesplat.extract import extract_scene
-from drivesplat.holdout import frame_groups
-from drivesplat.own_car import OwnCar, enclosed, read_own_car
-from drivesplat.own_car_search import Drive, ends, found_in, known, outlines_of, own_car_record
-from drivesplat.scene import Scene
+from drivesplat.io.storage import write_json
+from drivesplat.preprocess import ego_mask as own_car_search
+from drivesplat.preprocess.ego_mask import Drive, ends, found_in, known, outlines_of, own_car_record
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.ego_mask import OwnCar, enclosed, read_own_car
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups
+from drivesplat.settings.config import load
+from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.own_car import OwnCarJob, OwnCarSearch
-from drivesplat.stages import stage_settings
-from drivesplat.storage import write_json
+from drivesplat.workflow.stages import stage_settings
 
 CAMERAS = ("CAM_BACK", "CAM_BACK_RIGHT", "CAM_FRONT")
 SIZE = (160, 90)

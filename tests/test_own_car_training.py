@@ -23,21 +23,21 @@ from test_training import (
     trained,
 )
 
-from drivesplat.masks import make_masks
+from drivesplat.io.storage import write_json, write_plain_pickle
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.own_car import read_own_car
-from drivesplat.own_car_search import own_car_record
-from drivesplat.parser import parser_dict
-from drivesplat.seeding.seed import seed_points
+from drivesplat.preprocess.ego_mask import own_car_record
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.preprocess.masks import make_masks
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.masks import MaskJob, MaskSettings
-from drivesplat.settings.own_car import OwnCarJob, OwnCarSearch
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob
-from drivesplat.storage import write_json, write_plain_pickle
 from drivesplat.training import run
 from drivesplat.training.run import TrainingInputs, read_checkpoint, read_inputs, run_training, trained_model
 from drivesplat.training.views import Guides, TrainingView, load_views, view_of

@@ -13,19 +13,19 @@ from matplotlib.figure import Figure
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
-from drivesplat.actors.drawing import draw_panel, draw_removal
-from drivesplat.actors.panel import Panel, ghost_panel
-from drivesplat.actors.remove import RemovalPair, remove_actor
-from drivesplat.actors.sheet import save_figure
-from drivesplat.actors.sight import Drive, Sight
 from drivesplat.errors import DeviceError, ResultError
+from drivesplat.inspection.drawing import draw_panel, draw_removal
+from drivesplat.inspection.figures import save_figure
+from drivesplat.inspection.ghost_panel import Panel, ghost_panel
+from drivesplat.inspection.removal import RemovalPair, remove_actor
+from drivesplat.inspection.rendered_view import Drive, Sight
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.regions import LABELS
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene, Track
-from drivesplat.settings.looks import GhostSettings, PanelJob, RemovalJob, RemovalSettings, SubjectSettings
+from drivesplat.scene.regions import LABELS
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.settings.inspection import GhostSettings, PanelJob, RemovalJob, RemovalSettings, SubjectSettings
 from drivesplat.training.views import view_of
 
 SIZE = np.array([4.0, 2.0, 1.6])

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.holdout import frame_groups
-from drivesplat.parser import parser_dict, read_parser
-from drivesplat.point_cloud import PointCloud
+from drivesplat.io.point_cloud import PointCloud
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.preprocess.parser import parser_dict, read_parser
+from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.parser import ParserJob
-from drivesplat.storage import write_plain_pickle
 
 HOLDOUT = HoldoutSettings(every_nth=4, offset=2, last_block=2)
 

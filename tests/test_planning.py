@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from drivesplat.config import load
 from drivesplat.errors import ConfigError
-from drivesplat.planning import Plan
+from drivesplat.settings.config import load
 from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
-from drivesplat.stages import ALL_SCENE_STAGES, SCENE_STAGES, refines_poses, stage_settings
+from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, refines_poses, stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 ACTORS = ["background", "actors"]

@@ -5,7 +5,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from drivesplat.errors import ResultError
-from drivesplat.point_cloud import PointCloud, read_ply, read_positions, write_ply
+from drivesplat.io.point_cloud import PointCloud, read_ply, read_positions, write_ply
 
 
 def some_points(count: int = 5) -> PointCloud:

@@ -25,8 +25,8 @@ from drivesplat.poses.adjustment import Priors, adjust, observations, priors_of,
 from drivesplat.poses.refine import poses_of, refined_by_matches
 from drivesplat.poses.refinement import Refinement
 from drivesplat.poses.rig import RigImages, from_pycolmap, sensor, to_pycolmap
-from drivesplat.rigid import inverse, rigid
-from drivesplat.scene import Scene
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import PriorSettings
 
 pytestmark = pytest.mark.usefixtures("quiet")

@@ -7,12 +7,12 @@ import pytest
 from hand_made_views import drive_of, ego_at
 from scipy.spatial.transform import Rotation
 
-from drivesplat.holdout import frame_groups
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import PointCloud
+from drivesplat.io.point_cloud import PointCloud
 from drivesplat.poses.corrections import Corrections, corrected
-from drivesplat.rigid import apply, inverse, rigid
-from drivesplat.scene import Scene, Sweep, Track, read_scene, write_scene
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.scene.scene import Scene, Sweep, Track, read_scene, write_scene
+from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.parser import ParserJob

@@ -12,8 +12,8 @@ from workflow_copy import WorkflowCopy
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.demo.rig import KEY_FRAME_US, SENSORS
 from drivesplat.poses.refine import refine_poses
-from drivesplat.rigid import inverse, rigid
-from drivesplat.scene import Frame, Scene, Track, read_scene
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Frame, Scene, Track, read_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 from drivesplat.settings.world import WorldSettings
 

@@ -8,12 +8,12 @@ from hand_made_views import HEADINGS, SIZE, drive_of, job_of
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.images import continuous_intrinsics, project
-from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.poses.features import find_features, image_pairs, largest, meets_box, shows_what_stands, views_overlap
 from drivesplat.poses.rig import RigImages
-from drivesplat.rigid import inverse, rigid
-from drivesplat.scene import Scene, Track
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.refine_poses import FeatureSettings, RefinePosesJob
 
 CAMERAS = tuple(HEADINGS)

@@ -10,14 +10,14 @@ from hand_made_views import FRONT, HEADINGS, Drive, Seen, drive_of, error_at, vi
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
+from drivesplat.io.storage import canonical_json
 from drivesplat.poses.from_images import aligned
 from drivesplat.poses.refine import made_by_matches
 from drivesplat.poses.refinement import Refinement
 from drivesplat.poses.rig import RigImages
-from drivesplat.rigid import apply, inverse, rigid
-from drivesplat.scene import Scene, Sweep
+from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob
-from drivesplat.storage import canonical_json
 
 pytestmark = pytest.mark.usefixtures("quiet")
 LIDAR = rigid(np.eye(3), np.array([0.9, 0.0, 1.8]))

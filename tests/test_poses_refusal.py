@@ -23,15 +23,15 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError, DriveSplatError
+from drivesplat.io.storage import canonical_json
 from drivesplat.poses import refine
 from drivesplat.poses.adjustment import adjust, priors_of, triangulated
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.refine import Trial, doubt, refine_poses, refined_by_matches
 from drivesplat.poses.refinement import Refinement, refined_or_kept
 from drivesplat.poses.rig import RigImages
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 from drivesplat.settings.refine_poses import LimitSettings
-from drivesplat.storage import canonical_json
 
 GOOD = Trial(points=10, observations=50, before=1.5, after=0.4)
 

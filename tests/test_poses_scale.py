@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.from_images import aligned, in_metres
 from drivesplat.poses.scale import depth_at, drift, strays, told_by_lidar
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 from drivesplat.settings.refine_poses import PriorSettings
 
 

@@ -10,6 +10,7 @@ from small_drives import HELD_OUT, NOTHING_HELD_OUT, TRAINING, scene_at
 from tiny_world import CAMERA_AT, World, cast
 
 from drivesplat.errors import ResultError
+from drivesplat.io.storage import write_plain_pickle
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.triangulated import (
     LEAST_VIEWS,
@@ -20,10 +21,9 @@ from drivesplat.poses.triangulated import (
     seen_in,
     triangulated_record,
 )
-from drivesplat.scene import Scene, read_scene
-from drivesplat.seeding.seed import seed_points, triangulated_points
+from drivesplat.preprocess.lidar_seed import seed_points, triangulated_points
+from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.lidar_seed import SeedJob
-from drivesplat.storage import write_plain_pickle
 
 
 def job(holdout=HELD_OUT, **settings) -> SeedJob:

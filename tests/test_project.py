@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivesplat.config import load, merged
+from drivesplat.settings.config import load, merged
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -36,7 +36,7 @@ def test_every_requirement_is_pinned():
 
 
 def test_planning_imports_nothing_heavy():
-    code = "import sys, drivesplat.planning as _; print(' '.join(sys.modules))"
+    code = "import sys, drivesplat.workflow.plan as _; print(' '.join(sys.modules))"
     modules = subprocess.run(
         [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
     ).stdout

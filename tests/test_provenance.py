@@ -7,7 +7,7 @@ import json
 import pytest
 
 from drivesplat.errors import ResultError
-from drivesplat.provenance import combine, differences, digests_of, provenance
+from drivesplat.provenance.record import combine, differences, digests_of, provenance
 
 
 def extract(settings=None, code="e1", tables="t1") -> dict:

@@ -14,12 +14,12 @@ import yaml
 from hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_evaluation
 from workflow_copy import TINY_TRAINING, WorkflowCopy
 
-from benchmarks.quality import main, measure
+from benchmarks.quality.__main__ import main, measure
+from benchmarks.quality.compare import quality
+from benchmarks.quality.results import Result, results_of
+from benchmarks.quality.runs import Outcome
+from benchmarks.quality.table import markdown
 from drivesplat.errors import ConfigError
-from drivesplat.quality.compare import quality
-from drivesplat.quality.results import Result, results_of
-from drivesplat.quality.runs import Outcome
-from drivesplat.quality.table import markdown
 
 REPOSITORY = Path(__file__).parent.parent
 BAD = {"overrides": {"sky": "none"}}

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import yaml
 
-from drivesplat.config import load, merged
+from benchmarks.quality.groups import Group, groups_of, read_recipes
 from drivesplat.errors import ConfigError
-from drivesplat.quality.groups import Group, groups_of, read_recipes
-from drivesplat.stages import stage_settings
+from drivesplat.settings.config import load, merged
+from drivesplat.workflow.stages import stage_settings
 
 REPOSITORY = Path(__file__).parent.parent
 DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import pytest
 from hand_made_recipes import evaluation, recipe_file, write_evaluation
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
+from benchmarks.quality.results import Result, occupation, results_of
+from benchmarks.quality.runs import Outcome, outcome, passed_on
 from drivesplat.errors import ConfigError
-from drivesplat.quality.results import Result, occupation, results_of
-from drivesplat.quality.runs import Outcome, outcome, passed_on
 from drivesplat.settings.device import DeviceSettings
 
 WELL = Outcome(0, None, {})
@@ -27,14 +27,14 @@ drivesplat: waits for a GPU: jobs hold all there are (1; processes 7)
 drivesplat: b-seed1/train 0061: out of GPU memory with 9,000 Gaussians (peak 7.1 GB): lower train.cap_max
 Logfile out/plain/logs/0061/b-seed1/train.log:
 ================================================================================
-2026-11-21 20:30:20,123 INFO drivesplat.cards: runs on the GPU 0 (GPU-1)
-2026-11-21 20:31:20,123 ERROR drivesplat.job: b-seed1/train 0061: out of GPU memory with 9,000 Gaussians: lower it
+2026-11-21 20:30:20,123 INFO drivesplat.workflow.gpus: runs on the GPU 0 (GPU-1)
+2026-11-21 20:31:20,123 ERROR drivesplat.workflow.job: b-seed1/train 0061: out of GPU memory with 9,000 Gaussians: lower it
 ================================================================================
 """
 OF_THE_SCENE = """\
 localrule extract:
-2026-11-21 20:31:20,123 ERROR drivesplat.job: extract 0061: no such table: samples
-2026-11-21 20:31:22,123 ERROR drivesplat.job: demo_world_demo: KeyError: 'x' (a bug; the traceback is in w.log)
+2026-11-21 20:31:20,123 ERROR drivesplat.workflow.job: extract 0061: no such table: samples
+2026-11-21 20:31:22,123 ERROR drivesplat.workflow.job: demo_world_demo: KeyError: 'x' (a bug; the traceback is in w.log)
 """
 REFUSED = "Using profile profiles/default.\ndrivesplat: dataset nuscenes: there is no folder nowhere\n"
 NO_CORES = "usage: snakemake [-h]\nsnakemake: error: argument --cores: expected one argument\n\n"
@@ -45,7 +45,10 @@ def test_a_failed_job_is_told_of_the_method_it_belongs_to():
     assert ended.why("b-seed1") == "train: out of GPU memory with 9,000 Gaussians: lower it"
     assert ended.why("b-seed0") is ended.why("a-b-seed1") is None
     assert outcome(1, FAILED.replace("b-seed1/", "a-b-seed1/")).why("b-seed1") is None
-    assert outcome(1, FAILED.replace("ERROR drivesplat.job", "INFO drivesplat.job")).why("b-seed1") is None
+    assert (
+        outcome(1, FAILED.replace("ERROR drivesplat.workflow.job", "INFO drivesplat.workflow.job")).why("b-seed1")
+        is None
+    )
 
 
 def test_what_fails_of_the_scene_fails_for_all_methods():
@@ -143,12 +146,12 @@ def write_log(group, recipe: str, seed: int, began: str, finished: str, card: st
     """What a job logs that had its card from `began` on; for a card it has waited since nine."""
     path = group.log(recipe, seed, stage)
     path.parent.mkdir(parents=True, exist_ok=True)
-    took = f"2026-11-21 {began},000 INFO drivesplat.cards: runs on the GPU 0 ({card})\n" if card else ""
+    took = f"2026-11-21 {began},000 INFO drivesplat.workflow.gpus: runs on the GPU 0 ({card})\n" if card else ""
     name = f"{recipe}-seed{seed}/{stage} 0061"
     started = "09:00:00" if card else began
     path.write_text(
-        f"2026-11-21 {started},000 INFO drivesplat.job: {name} begins\n{took}a line of a traceback\n"
-        f"2026-11-21 {finished},000 INFO drivesplat.job: {name} ends\n"
+        f"2026-11-21 {started},000 INFO drivesplat.workflow.job: {name} begins\n{took}a line of a traceback\n"
+        f"2026-11-21 {finished},000 INFO drivesplat.workflow.job: {name} ends\n"
     )
     return path
 

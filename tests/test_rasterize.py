@@ -9,7 +9,7 @@ import torch
 from gsplat import DefaultStrategy
 from scipy.spatial.transform import Rotation
 
-from drivesplat.rasterize import Rendering, rasterize
+from drivesplat.rasterization import Rendering, rasterize
 
 DILATION = 0.3
 """Pixels squared that 3DGS adds to the variance of every projected Gaussian."""

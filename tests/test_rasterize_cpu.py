@@ -15,8 +15,8 @@ import torch
 from gsplat import DefaultStrategy
 from test_rasterize import Scene, random_scene
 
-from drivesplat.rasterize import Rendering, rasterize
-from drivesplat.rasterize.cpu import tiles
+from drivesplat.kernels.numba import tiles
+from drivesplat.rasterization import Rendering, rasterize
 
 AGREEMENT = 1e-5
 """Greatest error allowed in float64, over the tensor's greatest value."""
@@ -334,7 +334,7 @@ def unwritable(self):
 
 for locator in (caching._CacheLocator, *caching._CacheLocator.__subclasses__()):
     locator.ensure_cache_path = unwritable
-from drivesplat.rasterize.cpu.tiles import _sorted_by
+from drivesplat.kernels.numba.tiles import _sorted_by
 print(_sorted_by(np.arange(3, dtype=np.int32), np.array([2, 0, 1], np.uint32)).tolist())
 """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

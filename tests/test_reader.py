@@ -12,10 +12,10 @@ from pyquaternion import Quaternion
 from tiny_world import CAMERA_AT, CAMERA_TO_EGO, KEY_FRAME_US, LIDAR_AT, ORIGIN, START_US, World, write_world
 
 from drivesplat.errors import DatasetError
-from drivesplat.extract import extract_scene
-from drivesplat.readers.nuscenes_layout import TABLES, find_root, table_files
-from drivesplat.scene import Frame, Scene
-from drivesplat.seeding.seed import seed_points
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.readers.nuscenes.layout import TABLES, find_root, table_files
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_seed import SeedJob
 

@@ -11,12 +11,12 @@ from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.evaluate import evaluate_groups
+from drivesplat.io.storage import write_json, write_plain_pickle
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.recording import read_recording
-from drivesplat.regions import LABELS, label_image
-from drivesplat.scene import write_scene
-from drivesplat.storage import write_json, write_plain_pickle
+from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.regions import LABELS, label_image
+from drivesplat.scene.scene import write_scene
 
 GREY = (0.45, 0.5, 0.4)
 

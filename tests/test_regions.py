@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial import ConvexHull
 from tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World, cast, write_world
 
-from drivesplat.extract import extract_scene
-from drivesplat.regions import LABELS, REGIONS, fill, hull_of, is_dynamic, label_image, region_mask
-from drivesplat.rigid import rigid
-from drivesplat.scene import Frame, Scene, Track
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.regions import LABELS, REGIONS, fill, hull_of, is_dynamic, label_image, region_mask
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame, Scene, Track
+from drivesplat.scene.tracks import Box
 from drivesplat.settings.extract import SceneSource
-from drivesplat.tracks import Box
 
 SIZE = (384, 216)
 """Four times the size of the tiny drive's images."""

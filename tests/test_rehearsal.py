@@ -11,8 +11,8 @@ LEFT = """
 import importlib, pathlib, pkgutil, tempfile
 from numba.core.registry import CPUDispatcher
 from drivesplat import on_cpu
-from drivesplat.rasterize import cpu
-from drivesplat.training.rehearsal import rehearse
+from drivesplat.rasterization import cpu
+from drivesplat.training.warm_up import rehearse
 
 with tempfile.TemporaryDirectory() as folder:
     rehearse(pathlib.Path(folder))

@@ -10,17 +10,17 @@ import torch
 from hand_made import Own, recording_of, round_gaussians, write_labels
 from scipy.ndimage import convolve
 
-from drivesplat.actors.remove import RemovalPair, figures, remove_actor
-from drivesplat.actors.sight import Drive
+from drivesplat.inspection.removal import RemovalPair, figures, remove_actor
+from drivesplat.inspection.rendered_view import Drive
 from drivesplat.model.part import Part
 from drivesplat.model.removal import removal_of
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.regions import LABELS, fill
-from drivesplat.rigid import rigid
-from drivesplat.scene import Scene, Track
-from drivesplat.settings.looks import GhostSettings, RemovalJob, RemovalSettings, SubjectSettings
-from drivesplat.tracks import Box
+from drivesplat.scene.regions import LABELS, fill
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.tracks import Box
+from drivesplat.settings.inspection import GhostSettings, RemovalJob, RemovalSettings, SubjectSettings
 
 SIZE = np.array([4.0, 2.0, 1.6])
 SKY = torch.tensor([0.2, 0.4, 0.7])

@@ -7,13 +7,13 @@ import pytest
 import torch
 from test_training import guided_views
 
-from drivesplat import on_gpu
-from drivesplat.on_gpu import rooms
-from drivesplat.on_gpu.graphs import Graph
+from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels.cuda_graphs import Graph
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training import replays
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.replays import Extent, Replays, can_be_replayed
+from drivesplat.training.cuda_graph import replays
+from drivesplat.training.cuda_graph.replays import Extent, Replays, can_be_replayed
 
 CPU = torch.device("cpu")
 HUNDRED = Extent(100, 1.0)

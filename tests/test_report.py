@@ -428,7 +428,7 @@ def log(folder: Path, name: str, *lines: str) -> None:
     path.write_text("".join(f"2026-11-21 23:32:06,793 {line}\n" for line in lines))
 
 
-BEGINS, ENDS = (f"INFO drivesplat.job: extract 0103 {word}" for word in ("begins", "ends"))
+BEGINS, ENDS = (f"INFO drivesplat.workflow.job: extract 0103 {word}" for word in ("begins", "ends"))
 
 
 @pytest.mark.parametrize(
@@ -436,10 +436,10 @@ BEGINS, ENDS = (f"INFO drivesplat.job: extract 0103 {word}" for word in ("begins
     [
         ({}, "not measured"),
         ({"extract": (BEGINS, ENDS)}, "not measured"),
-        ({"extract": (BEGINS, "ERROR drivesplat.job: extract 0103: image n015.jpg is broken")},
+        ({"extract": (BEGINS, "ERROR drivesplat.workflow.job: extract 0103: image n015.jpg is broken")},
          "extract: image n015.jpg is broken"),
         ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS,)}, "vanilla/train was ended in the middle"),
-        ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS, "ERROR drivesplat.job: vanilla/train 0103: no memory")},
+        ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS, "ERROR drivesplat.workflow.job: vanilla/train 0103: no memory")},
          "vanilla/train: no memory"),
     ],
 )  # fmt: skip

@@ -13,13 +13,13 @@ from PIL import Image
 from test_report import NO_LOGS, expecting, group, method, metrics, stages
 
 from drivesplat.errors import ResultError
-from drivesplat.images import write_png
+from drivesplat.io.storage import write_json
 from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import report_page
 from drivesplat.report.looks import WIDEST, apart_at, data_address, looks_of, picture_of
 from drivesplat.report.plot import gap_plot
+from drivesplat.scene.images import write_png
 from drivesplat.settings.report import PICTURES
-from drivesplat.storage import write_json
 
 METHODS = ("vanilla", "street")
 GAPS = {"0061": (7.5, 1.0), "0103": (4.0, 1.5), "0553": (10.5, 2.0), "0655": (None, None)}
@@ -41,7 +41,9 @@ def results(tmp_path_factory) -> Path:
         write_json(folder / scene / "metrics.json", metrics(scene, measured, stages(METHODS)))
     log = folder / "logs/1100/street/train.log"
     log.parent.mkdir(parents=True)
-    log.write_text("2026-11-21 23:32:06,793 ERROR drivesplat.job: street/train 1100: <b>no memory</b> & more\n")
+    log.write_text(
+        "2026-11-21 23:32:06,793 ERROR drivesplat.workflow.job: street/train 1100: <b>no memory</b> & more\n"
+    )
     return folder
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from drivesplat import rerun
-from drivesplat.meaning import meanings
+from drivesplat.provenance import code_digest as rerun
+from drivesplat.provenance.syntax_digest import meanings
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -251,7 +251,7 @@ def test_different_scripts_have_different_digests(toy):
 def test_every_stages_digest_is_the_same_in_every_process():
     """Sets and dicts have no order to rely on: hashes of strings differ from process to process."""
     code = (
-        "from pathlib import Path; from drivesplat.rerun import code_digest\n"
+        "from pathlib import Path; from drivesplat.provenance.code_digest import code_digest\n"
         "print([(p.name, code_digest(p)) for p in sorted(Path('workflow_scripts').glob('*.py'))])"
     )
     printed = set()

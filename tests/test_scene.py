@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivesplat.errors import ResultError
-from drivesplat.scene import Frame, Scene, Sweep, Track, read_scene, write_scene
+from drivesplat.scene.scene import Frame, Scene, Sweep, Track, read_scene, write_scene
 
 
 def pose(seed: int) -> np.ndarray:

@@ -12,23 +12,23 @@ from plyfile import PlyData, PlyElement
 from tiny_world import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar
 
 from drivesplat.errors import DatasetError
-from drivesplat.extract import extract_scene
-from drivesplat.holdout import frame_groups, sweep_groups
-from drivesplat.images import project
-from drivesplat.own_car import OwnCar
-from drivesplat.point_cloud import PointCloud
-from drivesplat.regions import fill, hull_of
-from drivesplat.rigid import inverse, rigid
-from drivesplat.scene import Scene
-from drivesplat.seeding.coloring import ColorView, color_by_visibility
-from drivesplat.seeding.far_points import far_points, uncovered
-from drivesplat.seeding.seed import color_view, lidar_points, seed_points
-from drivesplat.seeding.sweeps import outside_boxes, read_sweep, thin, without_own_car
+from drivesplat.io.point_cloud import PointCloud
+from drivesplat.lidar.coloring import ColorView, color_by_visibility
+from drivesplat.lidar.sweeps import outside_boxes, read_sweep, thin, without_own_car
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.far_points import far_points, uncovered
+from drivesplat.preprocess.lidar_seed import color_view, lidar_points, seed_points
+from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.images import project
+from drivesplat.scene.regions import fill, hull_of
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
+from drivesplat.scene.tracks import Box, box_at, tracks_that_move
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
-from drivesplat.tracks import Box, box_at, tracks_that_move
 
 HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}
 """Of the tiny drive's 10 key frames: 2, 6; 8, 9."""

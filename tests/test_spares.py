@@ -14,10 +14,10 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.road import RoadSettings
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.training import strategies
+from drivesplat.training.cuda_graph.replays import Replays
 from drivesplat.training.densify import Densifier, Optimizers
 from drivesplat.training.losses import loss_terms, mean_opacity_and_scale
 from drivesplat.training.optimizers import make_optimizers
-from drivesplat.training.replays import Replays
 from drivesplat.training.road import driven_road, road_loss
 from drivesplat.training.surfaces import NOTHING_KNOWN, surface_terms
 

@@ -13,19 +13,19 @@ import torch
 import yaml
 from workflow_copy import TINY_TRAINING, WorkflowCopy
 
-from benchmarks import speed as command
-from drivesplat.config import load, merged
+from benchmarks.quality.runs import Outcome
+from benchmarks.speed import __main__ as command
+from benchmarks.speed import runs
+from benchmarks.speed.alone import in_own_process
+from benchmarks.speed.bystanders import Moment, busy_elsewhere
+from benchmarks.speed.compare import speed
+from benchmarks.speed.plan import Task, group_of, read_speed_file, targets_of, tasks_of
+from benchmarks.speed.settings import SpeedFile
+from benchmarks.speed.table import markdown
 from drivesplat.errors import ConfigError, TrainingError
-from drivesplat.quality.runs import Outcome
-from drivesplat.settings.speed import SpeedFile
-from drivesplat.speed import runs
-from drivesplat.speed.alone import in_own_process
-from drivesplat.speed.bystanders import Moment, busy_elsewhere
-from drivesplat.speed.compare import speed
-from drivesplat.speed.plan import Task, group_of, read_speed_file, targets_of, tasks_of
-from drivesplat.speed.table import markdown
-from drivesplat.stages import stage_settings
+from drivesplat.settings.config import load, merged
 from drivesplat.training.run import TrainingFiles, read_checkpoint, read_inputs, run_training
+from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 REPOSITORY = Path(__file__).parent.parent
@@ -240,10 +240,10 @@ def test_ones_own_work_is_not_other_work(tmp_path, monkeypatch):
     assert Moment.now().own - before.own > 0.05
     statistics = tmp_path / "stat"
     statistics.write_text("cpu  200 100 300 5000 700 10 90 0 0 0\ncpu0 1 1 1 1 1 1 1 0 0 0\n")
-    monkeypatch.setattr("drivesplat.speed.bystanders.STATISTICS", statistics)
+    monkeypatch.setattr("benchmarks.speed.bystanders.STATISTICS", statistics)
     monkeypatch.setattr("os.sysconf", lambda name: 100)
     assert Moment.now().busy == 7.0, "neither idle nor waiting for disks"
-    monkeypatch.setattr("drivesplat.speed.bystanders.STATISTICS", tmp_path / "none")
+    monkeypatch.setattr("benchmarks.speed.bystanders.STATISTICS", tmp_path / "none")
     assert Moment.now().busy is None
 
 

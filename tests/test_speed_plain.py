@@ -12,11 +12,11 @@ import torch
 from PIL import Image
 from skimage.metrics import structural_similarity
 
-from drivesplat.rasterize import rasterize
-from drivesplat.speed.plain import PlainRecipe, Schedule, as_model, make_optimizers, scene_scale, started
-from drivesplat.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
-from drivesplat.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
-from drivesplat.speed.plain_training import PlainTraining, fit
+from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, make_optimizers, scene_scale, started
+from benchmarks.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
+from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
+from benchmarks.speed.plain_training import PlainTraining, fit
+from drivesplat.rasterization import rasterize
 from drivesplat.training.checkpoint import load
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -169,7 +169,7 @@ def test_the_fused_ssim_is_taken_on_a_gpu_where_it_is_installed(monkeypatch):
     assert (chosen.name, calls) == ("fused_ssim", ["valid"])
     assert chosen_ssim(CPU).name == "torch"
     monkeypatch.delitem(sys.modules, "fused_ssim")
-    monkeypatch.setattr("drivesplat.speed.plain_ssim.find_spec", lambda name: None)
+    monkeypatch.setattr("benchmarks.speed.plain_ssim.find_spec", lambda name: None)
     assert chosen_ssim(torch.device("cuda")).name == "torch"
 
 
@@ -202,7 +202,7 @@ def test_means_learn_ever_slower_and_the_noise_goes_with_them(parser, monkeypatc
     def noted(self, params, optimizers, state, step, info, lr):
         told.append((step, lr))
 
-    monkeypatch.setattr("drivesplat.speed.plain.MCMCStrategy.step_post_backward", noted)
+    monkeypatch.setattr("benchmarks.speed.plain.MCMCStrategy.step_post_backward", noted)
     training = begun(parser, PlainRecipe(Schedule.of(10), 60, 0))
     data, first = endless(loader_of(images_of(parser), 0, CPU)), 1.6e-4 * 1.1 * 0.4
     for step in range(10):

@@ -9,14 +9,14 @@ from small_runs import Finished, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny_world import World, write_world
 
-from drivesplat.actors.panel import ghost_panel
-from drivesplat.actors.remove import remove_actor
 from drivesplat.editing.film import actors_of
 from drivesplat.errors import ConfigError
-from drivesplat.evaluation.in_words import in_words
-from drivesplat.settings.looks import PanelJob, RemovalJob
+from drivesplat.evaluation.summary import in_words
+from drivesplat.inspection.ghost_panel import ghost_panel
+from drivesplat.inspection.removal import remove_actor
+from drivesplat.rendering.trajectory import film_path
+from drivesplat.settings.inspection import PanelJob, RemovalJob
 from drivesplat.settings.render import FilmJob
-from drivesplat.trajectory import film_path
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivesplat.errors import ResultError
-from drivesplat.storage import (
+from drivesplat.io.storage import (
     ABANDONED_SECONDS,
     atomic_write,
     canonical_json,

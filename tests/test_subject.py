@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from hand_made import recording_of, write_labels
 
-from drivesplat.actors.subject import choose_subject, described
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.recording import Recording
-from drivesplat.regions import LABELS
-from drivesplat.rigid import rigid
-from drivesplat.scene import Frame, Scene, Track
-from drivesplat.settings.looks import SubjectSettings
+from drivesplat.inspection.subject import choose_subject, described
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.regions import LABELS
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame, Scene, Track
+from drivesplat.settings.inspection import SubjectSettings
 
 WIDTH = 192
 """Twice as wide as the tiny drive's images."""

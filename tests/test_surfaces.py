@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 from drivesplat.settings.road import RoadSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.floaters import LARGEST_STEP

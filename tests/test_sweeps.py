@@ -16,24 +16,24 @@ from small_drives import scene_at, seconds_of
 from small_runs import S, settings_of
 from tiny_world import LIDAR_AT, START_US, World, cast_lidar, write_world
 
-from drivesplat.config import load
 from drivesplat.errors import DatasetError
-from drivesplat.holdout import frame_groups, sweep_groups
-from drivesplat.masks import make_masks, read_sky_mask
-from drivesplat.own_car_search import own_car_record
-from drivesplat.parser import parser_dict
-from drivesplat.scene import Scene
-from drivesplat.seeding.actor_points import actors_record
-from drivesplat.seeding.depth_points import lidar_depths
-from drivesplat.seeding.empty_space import free_space_record
-from drivesplat.seeding.seed import lidar_points, seed_points
+from drivesplat.preprocess.actor_seed import actors_record
+from drivesplat.preprocess.ego_mask import own_car_record
+from drivesplat.preprocess.free_space import free_space_record
+from drivesplat.preprocess.lidar_depth import lidar_depths
+from drivesplat.preprocess.lidar_seed import lidar_points, seed_points
+from drivesplat.preprocess.masks import make_masks, read_sky_mask
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.config import load
+from drivesplat.settings.ego_mask import OwnCarJob
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
-from drivesplat.settings.own_car import OwnCarJob
 from drivesplat.settings.parser import ParserJob
 
 HALF_AN_INTERVAL = 250_000
@@ -264,7 +264,7 @@ def test_a_missing_image_between_key_frames_stops_and_says_how_to_do_without(roo
 def test_missing_images_between_key_frames_are_left_out_and_counted_where_told_to_go_on(root, count, caplog):
     """Who has no sweeps/ at all reads ten names, not a thousand."""
     paths = delete(root, "CAM_FRONT", count)
-    with caplog.at_level(logging.WARNING, logger="drivesplat.extract"):
+    with caplog.at_level(logging.WARNING, logger="drivesplat.preprocess.extract"):
         scene = scene_at(root, on_missing="warn")
     assert (scene.missing_images, len(scene.frames)) == (count, IMAGES - count)
     messages = [record.getMessage() for record in caplog.records if "left out" in record.getMessage()]

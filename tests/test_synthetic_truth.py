@@ -18,24 +18,24 @@ from drivesplat.errors import DatasetError, ResultError
 from drivesplat.evaluation.evaluate import EvaluationInputs, against_truth
 from drivesplat.evaluation.metrics import RegionMetrics, measuring_threads
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
-from drivesplat.extract import extract_scene
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
-from drivesplat.regions import LABELS, is_dynamic
-from drivesplat.rigid import rigid
-from drivesplat.scene import Frame
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.regions import LABELS, is_dynamic
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame
+from drivesplat.scene.tracks import Box, box_at, boxes_at
+from drivesplat.scene.truth import Truth, TruthFrame, read_truth, truth_image
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
-from drivesplat.settings.looks import RemovalSettings
-from drivesplat.tracks import Box, box_at, boxes_at
 from drivesplat.training.views import view_of
-from drivesplat.truth import Truth, TruthFrame, read_truth, truth_image
 
 CPU = torch.device("cpu")
 MARGIN = 0.1

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from drivesplat.rigid import apply, interpolate, inverse, rigid
-from drivesplat.scene import Track
-from drivesplat.tracks import Box, box_at, boxes_at, moves_at_all
+from drivesplat.scene.rigid import apply, interpolate, inverse, rigid
+from drivesplat.scene.scene import Track
+from drivesplat.scene.tracks import Box, box_at, boxes_at, moves_at_all
 
 INTERVAL = 500_000.0
 """Microseconds between key frames."""

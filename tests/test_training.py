@@ -24,14 +24,14 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
-from drivesplat.masks import mask_name
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.rasterize import rasterize
-from drivesplat.regions import LABELS
+from drivesplat.preprocess.masks import mask_name
+from drivesplat.rasterization import rasterize
+from drivesplat.scene.regions import LABELS
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings

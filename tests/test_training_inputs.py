@@ -4,9 +4,9 @@ take them."""
 import pytest
 from workflow_copy import WorkflowCopy
 
-from drivesplat.seeding.actors import read_actors
-from drivesplat.seeding.free_space import read_free_space
-from drivesplat.seeding.lidar_depth import read_lidar_depth
+from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.lidar.free_space_record import read_free_space
+from drivesplat.scene.actor_record import read_actors
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("inputs")]
 
@@ -67,9 +67,9 @@ def test_a_changed_setting_reruns_its_stage_and_the_trainings_that_take_it(train
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
     [
-        ("drivesplat/seeding/actor_points.py", "UNSEEN = 127", "UNSEEN = 128", {"actors": 1, "train": 1}),
-        ("drivesplat/seeding/depth_points.py", "< interval", "<= interval", {"lidar_depth": 1, "train": 1}),
-        ("drivesplat/seeding/traversal.py", "OCCUPIED - 1:", "OCCUPIED - 2:", {"free_space": 1, "train": 1}),
+        ("drivesplat/preprocess/actor_seed.py", "UNSEEN = 127", "UNSEEN = 128", {"actors": 1, "train": 1}),
+        ("drivesplat/preprocess/lidar_depth.py", "< interval", "<= interval", {"lidar_depth": 1, "train": 1}),
+        ("drivesplat/lidar/traversal.py", "OCCUPIED - 1:", "OCCUPIED - 2:", {"free_space": 1, "train": 1}),
     ],
 )
 def test_code_that_makes_them_reruns_no_training_that_does_not_take_them(trained, file, old, new, expected):

@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
-from drivesplat.rigid import rigid
-from drivesplat.scene import Frame, Scene
+from drivesplat.rendering.trajectory import CameraPath, film_intrinsics, film_path, smooth_poses
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.render import TrajectorySettings
-from drivesplat.trajectory import CameraPath, film_intrinsics, film_path, smooth_poses
 
 START_US = 1_532_402_927_612_460
 RADIUS, SPEED = 20.0, 8.0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivesplat.config import Config, load
+from drivesplat.settings.config import Config, load
 
 REPOSITORY = Path(__file__).parent.parent
 PAGE = (REPOSITORY / "docs/troubleshooting.md").read_text(encoding="utf-8")

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 from workflow_copy import WorkflowCopy, complaints
 
+from drivesplat.io.video import read_footage
 from drivesplat.settings.report import HELD_OUT_PAIR
-from drivesplat.video import read_footage
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("workflow")]
 
@@ -310,15 +310,15 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/evaluation/metrics.py", "LEAST_FRAME_PIXELS = 100", "LEAST_FRAME_PIXELS = 90",
          {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2, "remove_actor": 2}),
         ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
-        ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71", {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
-        ("drivesplat/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
+        ("drivesplat/preprocess/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71", {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
+        ("drivesplat/preprocess/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
         ("drivesplat/training/floaters.py", "LARGEST_STEP = 15.0", "LARGEST_STEP = 14.0", TRAINING_AND_AFTER),
         ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
-        ("drivesplat/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
+        ("drivesplat/scene/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
         ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
-        ("drivesplat/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
-        ("drivesplat/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
-        ("drivesplat/editing/veering.py", "STANDS, DRIVES = 1.0", "STANDS, DRIVES = 0.5", {"edit": 2}),
+        ("drivesplat/io/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
+        ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
+        ("drivesplat/editing/heading.py", "STANDS, DRIVES = 1.0", "STANDS, DRIVES = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report/gaps.py", "SCHEMA = 2", "SCHEMA = 3", {"gap_report": 1}),
         ("drivesplat/report/page/page.js", "Sliders", "The sliders", {"gap_report": 1}),

@@ -1,10 +1,10 @@
 """The eval.json of a method, whole and without each thing, into ablation.json, ablation.csv and a table."""
 
-from drivesplat.job import job
-from drivesplat.ablation import ablation, markdown, write_csv
+from drivesplat.workflow.job import job
+from drivesplat.evaluation.ablation import ablation, markdown, write_csv
 from drivesplat.evaluation.scene_metrics import read_evaluations
+from drivesplat.io.storage import write_json
 from drivesplat.settings.ablation import AblationJob
-from drivesplat.storage import write_json
 
 with job(snakemake) as current:
     evals = read_evaluations(current.input.evals)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.demo.world import make_world
 from drivesplat.settings.world import WorldJob
 

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.editing.film import EditFiles, render_edit
-from drivesplat.scene import read_scene
+from drivesplat.io.storage import write_json
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.render import EditJob
-from drivesplat.storage import write_json
 from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
-from drivesplat.images import write_image
-from drivesplat.masks import read_masks_record
-from drivesplat.recording import read_recording
+from drivesplat.io.storage import sha256_file, write_json
+from drivesplat.preprocess.masks import read_masks_record
+from drivesplat.scene.images import write_image
+from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.storage import sha256_file, write_json
 from drivesplat.training.run import read_checkpoint, read_summary
 
 with job(snakemake) as current:

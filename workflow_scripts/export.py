@@ -1,9 +1,9 @@
 """checkpoint.pt as splat.ply, in the convention of splat viewers, its parts likewise, cameras.json and parts.json."""
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.export.splat_asset import SplatFiles, export_splat
-from drivesplat.parser import read_parser
-from drivesplat.scene import read_scene
+from drivesplat.preprocess.parser import read_parser
+from drivesplat.scene.scene import read_scene
 from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:

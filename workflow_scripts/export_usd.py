@@ -1,8 +1,8 @@
 """checkpoint.pt as scene.usdz: Gaussians in OpenUSD's schema, what moves among them, and the recording camera."""
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.export.usd_asset import export_usd
-from drivesplat.scene import read_scene
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.export import UsdJob
 from drivesplat.training.run import read_checkpoint
 

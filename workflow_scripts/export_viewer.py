@@ -1,8 +1,8 @@
 """checkpoint.pt as viewer.html: one page that shows the splat under a mouse."""
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.export.viewer import export_viewer
-from drivesplat.scene import read_scene
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.export import ViewerJob
 from drivesplat.training.run import read_checkpoint
 

@@ -3,10 +3,10 @@
 import dataclasses
 from pathlib import Path
 
-from drivesplat.job import job
-from drivesplat.extract import extract_scene
-from drivesplat.provenance import digests_of
-from drivesplat.scene import write_scene
+from drivesplat.workflow.job import job
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.provenance.record import digests_of
+from drivesplat.scene.scene import write_scene
 from drivesplat.settings.extract import SceneSource
 
 with job(snakemake) as current:

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
-from drivesplat.film import render_film
-from drivesplat.scene import read_scene
+from drivesplat.workflow.job import job
+from drivesplat.io.storage import write_json
+from drivesplat.rendering.film import render_film
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.render import FilmJob
-from drivesplat.storage import write_json
 from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:

@@ -1,11 +1,11 @@
 """scene.json, and triangulated.pkl where poses are refined, into free_space.pkl."""
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
+from drivesplat.io.storage import write_plain_pickle
 from drivesplat.poses.triangulated import read_triangulated
-from drivesplat.scene import read_scene
-from drivesplat.seeding.empty_space import free_space_record
+from drivesplat.preprocess.free_space import free_space_record
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.free_space import FreeSpaceJob
-from drivesplat.storage import write_plain_pickle
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.report.files import ReportFiles, write_report
 from drivesplat.settings.report import ReportJob
 

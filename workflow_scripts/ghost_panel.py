@@ -1,13 +1,13 @@
 """checkpoint.pt before a moving vehicle, into ghost_panel.png and ghost_panel.json."""
 
-from drivesplat.job import job
-from drivesplat.actors.drawing import draw_panel
-from drivesplat.actors.panel import ghost_panel
-from drivesplat.actors.sheet import save_figure
-from drivesplat.actors.sight import open_drive
-from drivesplat.recording import read_recording
-from drivesplat.settings.looks import PanelJob
-from drivesplat.storage import write_json
+from drivesplat.workflow.job import job
+from drivesplat.inspection.drawing import draw_panel
+from drivesplat.inspection.figures import save_figure
+from drivesplat.inspection.ghost_panel import ghost_panel
+from drivesplat.inspection.rendered_view import open_drive
+from drivesplat.io.storage import write_json
+from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.settings.inspection import PanelJob
 from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:

@@ -1,11 +1,11 @@
 """scene.json and own_car.json into lidar_depth.pkl."""
 
-from drivesplat.job import job
-from drivesplat.own_car import read_own_car
-from drivesplat.scene import read_scene
-from drivesplat.seeding.depth_points import lidar_depths
+from drivesplat.workflow.job import job
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.preprocess.lidar_depth import lidar_depths
+from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.lidar_depth import LidarDepthJob
-from drivesplat.storage import write_plain_pickle
 
 with job(snakemake) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)

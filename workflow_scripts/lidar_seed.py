@@ -2,13 +2,13 @@
 
 import dataclasses
 
-from drivesplat.job import job
-from drivesplat.own_car import read_own_car
-from drivesplat.point_cloud import write_ply
+from drivesplat.workflow.job import job
+from drivesplat.io.point_cloud import write_ply
 from drivesplat.poses.triangulated import read_triangulated
-from drivesplat.provenance import digests_of
-from drivesplat.scene import read_scene
-from drivesplat.seeding.seed import seed_points
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.provenance.record import digests_of
+from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.lidar_seed import SeedJob
 
 with job(snakemake) as current:

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.evaluation.backbone import provide_backbone
+from drivesplat.io.storage import write_json
 from drivesplat.settings.evaluate import BACKBONE, LpipsSettings
-from drivesplat.storage import write_json
 
 with job(snakemake) as current:
     write_json(current.output.record, provide_backbone(current.settings(LpipsSettings), Path(BACKBONE)))

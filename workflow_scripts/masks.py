@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
-from drivesplat.masks import make_masks
-from drivesplat.own_car import read_own_car
-from drivesplat.scene import read_scene
+from drivesplat.workflow.job import job
+from drivesplat.io.storage import write_json
+from drivesplat.preprocess.masks import make_masks
+from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.masks import MaskJob
-from drivesplat.storage import write_json
 
 with job(snakemake) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)

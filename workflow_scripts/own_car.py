@@ -1,10 +1,10 @@
 """scene.json, its images and its sweeps into own_car.json."""
 
-from drivesplat.job import job
-from drivesplat.own_car_search import own_car_record
-from drivesplat.scene import read_scene
-from drivesplat.settings.own_car import OwnCarJob
-from drivesplat.storage import write_json
+from drivesplat.workflow.job import job
+from drivesplat.io.storage import write_json
+from drivesplat.preprocess.ego_mask import own_car_record
+from drivesplat.scene.scene import read_scene
+from drivesplat.settings.ego_mask import OwnCarJob
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)

@@ -1,11 +1,11 @@
 """scene.json and seed.ply into parser.pkl."""
 
-from drivesplat.job import job
-from drivesplat.parser import parser_dict
-from drivesplat.point_cloud import read_ply
-from drivesplat.scene import read_scene
+from drivesplat.workflow.job import job
+from drivesplat.io.point_cloud import read_ply
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.scene import read_scene
 from drivesplat.settings.parser import ParserJob
-from drivesplat.storage import write_plain_pickle
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)

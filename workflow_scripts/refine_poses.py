@@ -2,12 +2,12 @@
 
 import dataclasses
 
-from drivesplat.job import job
-from drivesplat.own_car import read_own_car
+from drivesplat.workflow.job import job
+from drivesplat.io.storage import write_json, write_plain_pickle
 from drivesplat.poses.refinement import refined_or_kept
-from drivesplat.scene import read_scene, write_scene
+from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.scene import read_scene, write_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
-from drivesplat.storage import write_json, write_plain_pickle
 
 with job(snakemake) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)

@@ -1,14 +1,14 @@
 """checkpoint.pt with and without a vehicle, into with_car.png, without_car.png, removal.png and removal.json."""
 
-from drivesplat.job import job
-from drivesplat.actors.drawing import draw_removal
-from drivesplat.actors.remove import remove_actor
-from drivesplat.actors.sheet import save_figure
-from drivesplat.actors.sight import open_drive
-from drivesplat.images import write_image
-from drivesplat.recording import read_recording
-from drivesplat.settings.looks import RemovalJob
-from drivesplat.storage import write_json
+from drivesplat.workflow.job import job
+from drivesplat.inspection.drawing import draw_removal
+from drivesplat.inspection.figures import save_figure
+from drivesplat.inspection.removal import remove_actor
+from drivesplat.inspection.rendered_view import open_drive
+from drivesplat.io.storage import write_json
+from drivesplat.scene.images import write_image
+from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.settings.inspection import RemovalJob
 from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:

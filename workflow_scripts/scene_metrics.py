@@ -1,8 +1,8 @@
 """The eval.json of every method into metrics.json."""
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.evaluation.scene_metrics import read_evaluations, side_by_side
-from drivesplat.storage import write_json
+from drivesplat.io.storage import write_json
 
 with job(snakemake) as current:
     evals = read_evaluations(current.input.evals)

@@ -1,10 +1,10 @@
 """scene.json as tracks.csv and tracks.png: what moves, and by which id."""
 
-from drivesplat.job import job
-from drivesplat.actors.listing import draw_tracks, sightings_of, track_rows, write_tracks
-from drivesplat.actors.sheet import save_figure
-from drivesplat.recording import read_recording
-from drivesplat.settings.looks import TracksJob
+from drivesplat.workflow.job import job
+from drivesplat.inspection.figures import save_figure
+from drivesplat.inspection.track_table import draw_tracks, sightings_of, track_rows, write_tracks
+from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.settings.inspection import TracksJob
 
 with job(snakemake) as current:
     files, camera = current.input, current.settings(TracksJob).eval_camera

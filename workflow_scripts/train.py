@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.settings.train import TrainJob
 from drivesplat.training.run import TrainingFiles, read_inputs, run_training
 

@@ -7,7 +7,7 @@ import numpy as np
 from drivesplat.demo.lighting import facing_normal, turned
 from drivesplat.demo.materials import compiled, surface
 from drivesplat.demo.raycast import Stage
-from drivesplat.rigid import apply, inverse
+from drivesplat.scene.rigid import apply, inverse
 
 ELEVATIONS = np.radians(np.linspace(-30.67, 10.67, 32))
 COLUMNS = 1085

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.storage import write_json
+from drivesplat.io.storage import write_json
 
 WORLD_MARK = "world.json"
 """Beside the folders of a synthetic world: that it was made here, and from which settings and code."""

@@ -10,7 +10,7 @@ from typing import no_type_check
 import numpy as np
 
 from drivesplat.demo.bodies import Material
-from drivesplat.kernels import kernel
+from drivesplat.kernels.cache import kernel
 
 compiled = kernel(fastmath=True)
 

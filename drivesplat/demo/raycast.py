@@ -9,7 +9,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from drivesplat.demo.bodies import Body
 from drivesplat.demo.street import Thing
-from drivesplat.rigid import apply, inverse
+from drivesplat.scene.rigid import apply, inverse
 
 FAR = 1e9
 

@@ -13,8 +13,8 @@ from drivesplat.demo.lighting import Light, daylight, lamplight
 from drivesplat.demo.raycast import Layer, Stage
 from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor, height_of
 from drivesplat.demo.street import Street, Thing, build_street
-from drivesplat.images import project
-from drivesplat.rigid import apply, inverse, rigid
+from drivesplat.scene.images import project
+from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.settings.world import WorldSettings
 
 STREET_TO_GLOBAL = rigid(Rotation.from_euler("z", 0.62).as_matrix(), np.array([812.4, 1437.9, 0.0]))

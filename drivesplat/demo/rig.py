@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 
 FULL_WIDTH, FULL_HEIGHT = 1600, 900
 KEY_FRAME_US = 500_000

@@ -12,8 +12,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drivesplat.demo.rig import Sensor
-from drivesplat.readers.nuscenes_layout import TABLES
-from drivesplat.storage import write_json
+from drivesplat.io.storage import write_json
+from drivesplat.readers.nuscenes.layout import TABLES
 
 MAP = "maps/empty.png"
 ATTRIBUTES = ("vehicle.moving", "vehicle.parked", "pedestrian.moving")

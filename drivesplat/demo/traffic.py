@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 
 LANE_CENTER = 1.75
 """Traffic drives on the right: at y = -LANE_CENTER along x, at +LANE_CENTER against it."""

@@ -15,9 +15,9 @@ from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor, firing_times, height_of
 from drivesplat.demo.tables import NuScenesTables
 from drivesplat.demo.truth import write_truth, write_truth_frame
+from drivesplat.io.storage import atomic_write, canonical_json, sha256_text
+from drivesplat.scene.truth import TruthFrame
 from drivesplat.settings.world import WorldJob, WorldSettings
-from drivesplat.storage import atomic_write, canonical_json, sha256_text
-from drivesplat.truth import TruthFrame
 
 log = logging.getLogger(__name__)
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from drivesplat.editing.path import Way, recorded_way
 from drivesplat.editing.steps import copied, reversed_way, shifted, sped, stopped
-from drivesplat.editing.way import Way, recorded_way
 from drivesplat.errors import ConfigError
-from drivesplat.motion import Motion
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.tracks import beginnings
 from drivesplat.settings.edit import Duplicate, Edit, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
-from drivesplat.tracks import beginnings
 
 STANDS = 0.5
 """Metres: what comes less far stands; its annotations tremble."""

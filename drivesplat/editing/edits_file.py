@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from drivesplat.errors import ConfigError
 from drivesplat.settings.edit import Edit, Step
 from drivesplat.settings.names import NAME
-from drivesplat.yaml_file import read_yaml
+from drivesplat.settings.yaml_file import read_yaml
 
 RESERVED = ("ego",)
 """Names that no duplicate may have: it is the camera's car."""

@@ -5,13 +5,13 @@ from collections.abc import Callable
 import numpy as np
 
 from drivesplat.editing.easing import Onset
-from drivesplat.editing.veering import beside_the_way
+from drivesplat.editing.heading import beside_the_way
 from drivesplat.errors import ConfigError
-from drivesplat.rigid import inverse
-from drivesplat.scene import Frame, Scene
+from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames, smooth_poses
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.edit import Edit, Ego
 from drivesplat.settings.render import TrajectorySettings
-from drivesplat.trajectory import CameraPath, film_path, recorded_frames, smooth_poses
 
 Seconds = Callable[[np.ndarray], np.ndarray]
 

@@ -12,18 +12,18 @@ from drivesplat.editing.cast import Actor, Role, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.film import Shot, recorded_shot, write_film
-from drivesplat.frames import film_frames
-from drivesplat.images import write_png
 from drivesplat.model.part import Appearance
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rigid import inverse
-from drivesplat.scene import Scene
+from drivesplat.rendering.film import Shot, recorded_shot, write_film
+from drivesplat.rendering.frames import film_frames
+from drivesplat.rendering.trajectory import CameraPath, film_path
+from drivesplat.scene.images import write_png
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob, TrajectorySettings
 from drivesplat.training.run import open_model
-from drivesplat.trajectory import CameraPath, film_path
 
 log = logging.getLogger(__name__)
 

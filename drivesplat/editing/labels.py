@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from drivesplat.editing.cast import Role
-from drivesplat.motion import Motion
-from drivesplat.regions import is_dynamic
-from drivesplat.scene import Scene, Track
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.regions import is_dynamic
+from drivesplat.scene.scene import Scene, Track
 
 DECIMALS = 6
 """Of a pose: micrometres, and ten thousandths of a degree. More would double the file."""

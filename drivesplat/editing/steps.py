@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from drivesplat.editing.easing import Onset
-from drivesplat.editing.way import Offsets, Progress, Way
+from drivesplat.editing.path import Offsets, Progress, Way
 from drivesplat.settings.edit import Duplicate, Reverse, Shift, Speed, Stop
 
 INTEGRATED = 0.005

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import DriveSplatError
+from drivesplat.io.storage import atomic_write, read_record, sha256_file
 from drivesplat.settings.evaluate import LpipsSettings
-from drivesplat.storage import atomic_write, read_record, sha256_file
 
 log = logging.getLogger(__name__)
 

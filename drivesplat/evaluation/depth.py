@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.evaluation.metrics import LEAST_REGION_PIXELS
-from drivesplat.seeding.depth_points import Depths
+from drivesplat.preprocess.lidar_depth import Depths
 
 
 class DepthErrors:

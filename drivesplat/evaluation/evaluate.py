@@ -10,28 +10,28 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.ahead import ahead
-from drivesplat.device import telling_out_of_memory
 from drivesplat.evaluation.depth import DepthErrors
-from drivesplat.evaluation.drive import drive_record
+from drivesplat.evaluation.drive_summary import drive_record
 from drivesplat.evaluation.held_out import held_out_images, measured_images
 from drivesplat.evaluation.lpips_map import unavailable_or_map
 from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
-from drivesplat.evaluation.shown import Shown, held_out_pair
+from drivesplat.evaluation.sample_pair import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
-from drivesplat.holdout import HELD_OUT_GROUPS
+from drivesplat.io.prefetch import ahead
+from drivesplat.machine.device import telling_out_of_memory
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import image_size
-from drivesplat.recording import Recording
-from drivesplat.regions import REGIONS, region_masks
-from drivesplat.seeding.depth_points import Depths, clouds_of, depths_in
+from drivesplat.preprocess.lidar_depth import Depths, clouds_of, depths_in
+from drivesplat.preprocess.parser import image_size
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.regions import REGIONS, region_masks
+from drivesplat.scene.splits import HELD_OUT_GROUPS
+from drivesplat.scene.truth import read_truth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.training.run import open_model
 from drivesplat.training.views import view_of
-from drivesplat.truth import read_truth
 
 STATIC_FINDING_DB = 22.0
 VEHICLE_FINDING_DB = 18.0

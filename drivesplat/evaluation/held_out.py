@@ -3,7 +3,7 @@
 from typing import Any
 
 from drivesplat.errors import DatasetError
-from drivesplat.holdout import HELD_OUT_GROUPS
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 
 def held_out_images(parser: dict[str, Any], group: str, camera: str) -> list[int]:

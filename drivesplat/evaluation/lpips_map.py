@@ -10,7 +10,7 @@ import torch
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.metrics import LpipsMap
-from drivesplat.storage import unreadable
+from drivesplat.io.storage import unreadable
 
 
 def unavailable_or_map(record: dict[str, Any] | None, device: torch.device) -> tuple[str | None, LpipsMap | None]:

@@ -13,7 +13,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from drivesplat.errors import ResultError
-from drivesplat.regions import REGIONS
+from drivesplat.scene.regions import REGIONS
 
 LEAST_REGION_PIXELS = 1000
 """A region with fewer pixels in a group is null."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ResultError
-from drivesplat.storage import read_record
+from drivesplat.io.storage import read_record
 
 SCHEMA = 1
 

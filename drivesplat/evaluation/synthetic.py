@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.ahead import ahead
 from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads
-from drivesplat.images import continuous_intrinsics, read_image
+from drivesplat.io.prefetch import ahead
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.recording import Recording
-from drivesplat.regions import fill, hull_of, label_image, region_masks
-from drivesplat.rigid import inverse
-from drivesplat.scene import Frame
-from drivesplat.tracks import Box, box_at
+from drivesplat.scene.images import continuous_intrinsics, read_image
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Frame
+from drivesplat.scene.tracks import Box, box_at
+from drivesplat.scene.truth import Truth, TruthFrame, truth_image
 from drivesplat.training.views import view_of
-from drivesplat.truth import Truth, TruthFrame, truth_image
 
 LATERAL_REGIONS = ("all", "static")
 REMOVAL_REGIONS = ("box", "outside")

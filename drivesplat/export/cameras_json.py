@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from drivesplat.export.placement import placement
-from drivesplat.parser import image_size
-from drivesplat.scene import Frame, Scene
+from drivesplat.preprocess.parser import image_size
+from drivesplat.scene.scene import Frame, Scene
 
 SCHEMA = 1
 CONVENTIONS = {

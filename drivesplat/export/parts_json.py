@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.export.names import distinct
 from drivesplat.export.placement import placement
 from drivesplat.export.sampled_motion import SampledMotion
-from drivesplat.export.spelling import distinct
 from drivesplat.export.splat_ply import note_of, write_splat_ply
 from drivesplat.export.trained_parts import SampledPiece, digests, middle_timestamp
-from drivesplat.scene import Scene
-from drivesplat.storage import write_json
+from drivesplat.io.storage import write_json
+from drivesplat.scene.scene import Scene
 
 SCHEMA = 1
 CONVENTIONS = {

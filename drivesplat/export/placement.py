@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from drivesplat.scene import Scene
+from drivesplat.scene.scene import Scene
 
 GLOBAL = "A position in the dataset's global frame is its world position plus origin."
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.motion import Motion
+from drivesplat.scene.motion import Motion
 
 SAMPLES_PER_SECOND = 30
 _MICROSECOND = 1e-6

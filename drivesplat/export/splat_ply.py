@@ -18,8 +18,8 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from drivesplat.io.storage import atomic_write, canonical_json, unreadable
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.storage import atomic_write, canonical_json, unreadable
 
 _NOTE = "drivesplat "
 _LONGEST_HEADER = 10_000

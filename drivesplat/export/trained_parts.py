@@ -15,7 +15,7 @@ import torch
 from drivesplat.export.sampled_motion import SampledMotion, sampled
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene import Scene, Track
+from drivesplat.scene.scene import Scene, Track
 
 log = logging.getLogger(__name__)
 

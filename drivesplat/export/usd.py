@@ -20,10 +20,10 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from drivesplat.errors import ResultError
-from drivesplat.export.spelling import distinct
+from drivesplat.export.names import distinct
 from drivesplat.export.trained_parts import SampledPiece
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_piece, usd_matrix
-from drivesplat.storage import atomic_path
+from drivesplat.io.storage import atomic_path
 
 APERTURE_WIDTH = 0.36
 """A sensor 36 mm wide in the unit that UsdGeom.Camera has for lenses: a tenth of the scene's unit, here 10 cm."""

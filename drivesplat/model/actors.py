@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
-from drivesplat import on_gpu
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import learning_rates, optimised, started_at
 from drivesplat.model.part import Appearance, Part, Piece
 from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.timeline import ActorTrack, Moment, Timeline
-from drivesplat.motion import Motion
+from drivesplat.scene.motion import Motion
 from drivesplat.settings.actors import ActorSettings, TrackSettings
 from drivesplat.settings.gaussians import GaussianSettings
 
@@ -165,8 +165,8 @@ class Actors(Part):
 
     def _placed_on_gpu(self, moment: Moment, placements: Placements, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
         """The same by two kernels."""
-        from drivesplat.on_gpu.colours_in_time import turned_colours
-        from drivesplat.on_gpu.placing import Objects, Shapes, placed
+        from drivesplat.kernels.triton.colours_in_time import turned_colours
+        from drivesplat.kernels.triton.placing import Objects, Shapes, placed
 
         p, owner, coefficients = self.params, self.params["owner"], self.params["shN"].shape[2] + 1
         shapes = Shapes(p["means"], p["quats"], p["scales"], p["opacities"])

@@ -15,7 +15,7 @@ from drivesplat.model.part import Part, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
-from drivesplat.seeding.actors import motion_of
+from drivesplat.scene.actor_record import motion_of
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
 EXPOSED = "exposure.first."

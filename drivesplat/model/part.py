@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.view import View
-from drivesplat.motion import Motion
+from drivesplat.scene.motion import Motion
 
 FADED = 1e-4
 """Opacity of a faded Gaussian: under every strategy's threshold, so that the strategy removes or relocates it."""
@@ -131,7 +131,7 @@ class Part(nn.Module, ABC):
 
     @property
     def spare(self) -> int:
-        """So many of the last rows are no Gaussians, but wait to become some (`drivesplat.training.spares`); none
+        """So many of the last rows are no Gaussians, but wait to become some (`drivesplat.training.cuda_graph.preallocation`); none
         outside trainings."""
         return self._spare
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.tracks import Box
+from drivesplat.scene.tracks import Box
 
 
 @dataclass(frozen=True)

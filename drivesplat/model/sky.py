@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat import on_gpu
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.part import Sky
 from drivesplat.model.view import View
 
@@ -62,7 +62,7 @@ class CubemapSky(Sky):
     ) -> Float[Tensor, "h w 3"]:
         if view.camera_to_world.requires_grad or not on_gpu.for_tensor(splats):
             return super().behind(splats, alpha, view, rays)
-        from drivesplat.on_gpu.cube import Cube, before_cube
+        from drivesplat.kernels.triton.cube import Cube, before_cube
 
         return before_cube(splats, alpha, Cube(self.params["texels"], self.index), view.K, view.camera_to_world)
 
@@ -76,7 +76,7 @@ def face_coordinates(rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     Faces 0 to 5 are +x, -x, +y, -y, +z, -z. On a face with axis i, x and y are the coordinates of axes i + 1 and i + 2.
     """
     if rays.device.type == "cpu" and not rays.requires_grad:
-        from drivesplat.on_cpu.cube import face_coordinates_of
+        from drivesplat.kernels.numba.cube import face_coordinates_of
 
         return torch.from_numpy(face_coordinates_of(rays.contiguous().numpy()))
     axis = rays.abs().argmax(dim=-1, keepdim=True)

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from drivesplat import on_gpu
 from drivesplat.errors import ResultError
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Appearance, Part, Piece, Sky
 from drivesplat.model.view import View
-from drivesplat.rasterize import Rendering, rasterize
+from drivesplat.rasterization import Rendering, rasterize
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _colors(gaussians: Gaussians, view: View, sh_degree: int | None) -> tuple[Te
     it, the colours (n, 3) that the view's camera sees, and None."""
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     if on_gpu.for_tensor(gaussians.means) and not view.camera_to_world.requires_grad:
-        from drivesplat.on_gpu import harmonics
+        from drivesplat.kernels.triton import harmonics
 
         if degree in harmonics.DEGREES:
             own = gaussians.means, gaussians.sh0, gaussians.shN

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from drivesplat.motion import Motion
+from drivesplat.scene.motion import Motion
 
 REMEMBERED = 8192
 """Times that are kept: those of a training's images come again and again, 1,440 where six cameras record at 12 Hz for

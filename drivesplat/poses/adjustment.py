@@ -18,7 +18,7 @@ from pycolmap import cost_functions
 
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.rig import RigImages, to_pycolmap
-from drivesplat.rigid import inverse
+from drivesplat.scene.rigid import inverse
 from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob, RefinePosesSettings
 
 WORST_PIXELS = 8.0

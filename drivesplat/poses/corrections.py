@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from drivesplat.rigid import interpolate, inverse
-from drivesplat.scene import Scene, Sweep, Track
+from drivesplat.scene.rigid import interpolate, inverse
+from drivesplat.scene.scene import Scene, Sweep, Track
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ import numpy as np
 import pycolmap
 from numpy.linalg import inv
 
-from drivesplat.images import continuous_intrinsics, read_image
-from drivesplat.own_car import OwnCar
 from drivesplat.poses.rig import RigImages
-from drivesplat.rigid import inverse
-from drivesplat.scene import Frame, Scene
+from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.images import continuous_intrinsics, read_image
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.refine_poses import FeatureSettings, RefinePosesJob
-from drivesplat.tracks import boxes_at
 
 
 def find_features(images: RigImages, job: RefinePosesJob, database: Path, threads: int) -> pycolmap.Reconstruction:

@@ -17,8 +17,8 @@ from drivesplat.poses.corrections import Corrections, corrected
 from drivesplat.poses.mapping import REMEDY, Model, mapped
 from drivesplat.poses.rig import RigImages
 from drivesplat.poses.scale import STRETCHES, by_lidar, by_positions, drift, moves, strays, told_by_lidar
-from drivesplat.rigid import inverse, rigid
-from drivesplat.scene import Scene
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import LimitSettings, PriorSettings, RefinePosesJob
 
 ROUNDS = 2

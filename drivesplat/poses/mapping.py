@@ -14,7 +14,7 @@ import pycolmap
 from drivesplat.errors import DatasetError
 from drivesplat.poses.features import image_name
 from drivesplat.poses.rig import RigImages, from_pycolmap
-from drivesplat.rigid import inverse
+from drivesplat.scene.rigid import inverse
 from drivesplat.settings.refine_poses import RefinePosesJob
 
 REMEDY = "such a drive needs recorded poses (refine_poses.start: recorded)"

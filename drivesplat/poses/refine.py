@@ -15,7 +15,6 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.poses.adjustment import (
     Priors,
     adjust,
@@ -32,8 +31,9 @@ from drivesplat.poses.observations import Observations
 from drivesplat.poses.refinement import Refinement, verdict
 from drivesplat.poses.rig import RigImages, from_pycolmap
 from drivesplat.poses.triangulated import no_points, triangulated_record
-from drivesplat.rigid import inverse
-from drivesplat.scene import Scene
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import LimitSettings, RefinePosesJob
 
 log = logging.getLogger(__name__)

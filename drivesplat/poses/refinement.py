@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import DatasetError, DriveSplatError
-from drivesplat.own_car import NOWHERE, OwnCar
 from drivesplat.poses.triangulated import no_points
-from drivesplat.scene import Scene
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 
 log = logging.getLogger(__name__)

@@ -11,10 +11,10 @@ import numpy as np
 import pycolmap
 
 from drivesplat.errors import DatasetError
-from drivesplat.images import continuous_intrinsics
-from drivesplat.own_car import NOWHERE, OwnCar
-from drivesplat.rigid import inverse
-from drivesplat.scene import Frame, Scene
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.images import continuous_intrinsics
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Frame, Scene
 
 CAR = pycolmap.sensor_t(pycolmap.SensorType.IMU, 1)
 """The rig's own frame: ego."""

@@ -9,14 +9,14 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import median_filter
 from scipy.spatial import QhullError, cKDTree
 
-from drivesplat.images import continuous_intrinsics, project
+from drivesplat.lidar.coloring import visible
+from drivesplat.lidar.nearest_sweep import nearest_returns
+from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.poses.mapping import Model, Sightings
 from drivesplat.poses.rig import RigImages
-from drivesplat.rigid import inverse
-from drivesplat.scene import Frame, Scene
-from drivesplat.seeding.coloring import visible
-from drivesplat.seeding.nearest_sweep import nearest_returns
-from drivesplat.seeding.occlusion import patches, unhidden
+from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.refine_poses import LidarRays
 
 WITHIN_US = 100_000.0

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.io.storage import read_plain_pickle, unreadable
 from drivesplat.poses.observations import Observations
-from drivesplat.storage import read_plain_pickle, unreadable
 
 SHARP_PIXELS = 2.0
 """A point's mean reprojection error is under this."""

@@ -7,8 +7,8 @@ A dataset is two modules here: `{name}_layout` knows its files (`find_root`, `ta
 from importlib import import_module
 from types import ModuleType
 
-LAYOUTS = {"nuscenes": "drivesplat.readers.nuscenes_layout"}
-READERS = {"nuscenes": "drivesplat.readers.nuscenes"}
+LAYOUTS = {"nuscenes": "drivesplat.readers.nuscenes.layout"}
+READERS = {"nuscenes": "drivesplat.readers.nuscenes.reader"}
 
 
 def layout(name: str) -> ModuleType:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
-from drivesplat.rigid import rigid
+from drivesplat.scene.rigid import rigid
 
 
 def checked_pose(translation: Sequence[float], rotation_wxyz: Sequence[float], record: str) -> np.ndarray:

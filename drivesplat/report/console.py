@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from drivesplat.holdout import HELD_OUT_GROUPS
 from drivesplat.report.gaps import in_words
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 SHOWN = ("static", "vehicle", "moving_vehicle", "gap_db")
 

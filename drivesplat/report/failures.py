@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from drivesplat.job_logs import failures, is_cut_short
+from drivesplat.workflow.job_logs import failures, is_cut_short
 
 NOT_MEASURED = "not measured"
 

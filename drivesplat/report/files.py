@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivesplat.costs.measured import read_costs
-from drivesplat.costs.table import scene_totals
+from drivesplat.io.storage import atomic_write, write_json
 from drivesplat.report.console import console_table
 from drivesplat.report.gaps import gap_report, write_csv
 from drivesplat.report.html import report_page
 from drivesplat.report.looks import looks_of
 from drivesplat.settings.report import ReportJob
-from drivesplat.storage import atomic_write, write_json
+from drivesplat.workflow.costs.measured import read_costs
+from drivesplat.workflow.costs.table import scene_totals
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ Means of gaps, and the fraction of them that a method closes, are over scenes in
 from pathlib import Path
 from typing import Any
 
-from drivesplat import storage
-from drivesplat.comparison import WHERE
 from drivesplat.errors import ResultError
-from drivesplat.holdout import HELD_OUT_GROUPS
-from drivesplat.provenance import differences
+from drivesplat.evaluation.comparison import WHERE
+from drivesplat.io import storage
+from drivesplat.io.storage import read_json, unreadable
+from drivesplat.provenance.record import differences
 from drivesplat.report.failures import why_missing
 from drivesplat.report.statistics import gap_closed, mean_over_scenes
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.report import ReportJob
-from drivesplat.storage import read_json, unreadable
 
 SCHEMA = 2
 REGIONS = ("static", "vehicle", "moving_vehicle")

@@ -5,14 +5,14 @@ from html import escape
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from drivesplat.comparison import WHERE
-from drivesplat.holdout import HELD_OUT_GROUPS
+from drivesplat.evaluation.comparison import WHERE
+from drivesplat.io.storage import canonical_json
 from drivesplat.report.costs import costs_table
 from drivesplat.report.gaps import in_words
 from drivesplat.report.looks import Looks, address_of, apart_at, data_address, picture_of
 from drivesplat.report.page import filled_page
 from drivesplat.report.plot import gap_plot
-from drivesplat.storage import canonical_json
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 Seen = Mapping[tuple[str, str], Looks]
 COLUMNS = {

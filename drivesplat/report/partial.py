@@ -4,10 +4,10 @@ import sys
 from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.planning import Plan
 from drivesplat.report.files import ReportFiles, write_report
-from drivesplat.report_plan import REPORT_FILES, REPORT_RULES
 from drivesplat.settings.report import ReportJob
+from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.report_plan import REPORT_FILES, REPORT_RULES
 
 
 def write_partial_report(plan: Plan) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from drivesplat.comparison import WHERE
+from drivesplat.evaluation.comparison import WHERE
 from drivesplat.report.gaps import counted_gap
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")

@@ -1,7 +1,7 @@
 """The base of every settings record, and its errors in one line each.
 
 A stage's settings live beside the stage. Field comments are attribute docstrings, so that a reworded comment is no
-change of the code (see `drivesplat.rerun`).
+change of the code (see `drivesplat.provenance.code_digest`).
 """
 
 from typing import Any, TypeVar, get_args

@@ -4,8 +4,8 @@ from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
-from drivesplat.settings.looks import RemovalSettings
 
 BACKBONE = "resources/lpips/alexnet.pth"
 """Where LPIPS's AlexNet backbone is kept; users without network put it there themselves."""

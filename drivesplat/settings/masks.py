@@ -3,14 +3,14 @@
 from pydantic import Field
 
 from drivesplat.settings import Settings
+from drivesplat.settings.ego_mask import OwnCarKind
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.own_car import OwnCarKind
 
 
 class MaskSettings(Settings):
     regions_folder: str | None = None
-    """Your own label images (labels as in drivesplat/regions.py), named {camera}/{image name}.png. null = from the
+    """Your own label images (labels as in drivesplat/scene/regions.py), named {camera}/{image name}.png. null = from the
     annotated boxes."""
     sky_folder: str | None = None
     """Your own sky masks (255 = sky), named {camera}/{image name}.png. null = a heuristic."""

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from drivesplat.errors import ResultError, TrainingError
+from drivesplat.io.storage import atomic_write, unreadable, unwritable
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.storage import atomic_write, unreadable, unwritable
 from drivesplat.training.densify import Densifier
 from drivesplat.training.optimizers import ModelOptimizers
 

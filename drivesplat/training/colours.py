@@ -9,12 +9,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from drivesplat import on_gpu
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.training.ssim import C1, C2, ssim, weights
 from drivesplat.training.views import TrainingView
 
 if TYPE_CHECKING:
-    from drivesplat.on_gpu.colours import Window
+    from drivesplat.kernels.triton.colours import Window
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def colour_difference(image: Float[Tensor, "h w 3"], view: TrainingView, of_movi
     """
     moving = view.moving if of_moving else None
     if on_gpu.for_tensor(image):
-        from drivesplat.on_gpu import colours
+        from drivesplat.kernels.triton import colours
 
         l1, similarity, moving_l1 = colours.colour_difference(
             image, view.pixels, view.own_car, moving, _window(image.device)
@@ -59,6 +59,6 @@ def masked_l1(
 
 @cache
 def _window(device: torch.device) -> "Window":
-    from drivesplat.on_gpu.colours import Window
+    from drivesplat.kernels.triton.colours import Window
 
     return Window(torch.from_numpy(weights()).float().to(device), C1, C2)

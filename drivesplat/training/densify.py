@@ -67,7 +67,7 @@ class Densifier:
     def end(self, optimizers: Optimizers) -> None:
         """Drops rows that have stayed spare."""
         if self._part.spare:
-            from drivesplat.training import spares
+            from drivesplat.training.cuda_graph import preallocation as spares
 
             spares.release(self._part, optimizers)
 

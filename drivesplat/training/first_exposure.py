@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.seeding.coloring import visible
+from drivesplat.lidar.coloring import visible
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)

@@ -5,11 +5,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from drivesplat import on_gpu
-from drivesplat.masks import UNLABELLED
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import filled
 from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.preprocess.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.colours import colour_difference
 from drivesplat.training.views import LidarDepth, TrainingView
@@ -68,7 +68,7 @@ def mean_opacity_and_scale(shown: Gaussians) -> tuple[Float[Tensor, ""], Float[T
     """The mean opacity, and the mean of all scales in metres, 0 for those of what is not there, of opacity 0; over all
     rows, spare ones, too."""
     if on_gpu.for_tensor(shown.scales) and len(shown):
-        from drivesplat.on_gpu import regularisers
+        from drivesplat.kernels.triton import regularisers
 
         return regularisers.mean_opacity_and_scale(shown.opacities, shown.scales)
     there = shown.opacities.detach() > 0.0

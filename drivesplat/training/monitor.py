@@ -14,8 +14,8 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from drivesplat.errors import ResultError, TrainingError
+from drivesplat.io.storage import unwritable
 from drivesplat.model.splat_model import Picture
-from drivesplat.storage import unwritable
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ class Monitor:
 
     def _tell(self, step: int, now: float) -> None:
         """Logs '43 %, 12.3 it/s, 120 s left' at most every LOGGED_EVERY_S, by the speed since the last time, the first
-        iterations, in which kernels are compiled, left out; `drivesplat.costs.progress` reads it."""
+        iterations, in which kernels are compiled, left out; `drivesplat.workflow.costs.progress` reads it."""
         before, began = self._told = self._told or (step, now)
         if now - began < LOGGED_EVERY_S:
             return

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat import on_gpu
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
@@ -93,7 +93,7 @@ def _adam(
 ) -> None:
     """A step that has been counted."""
     if isinstance(rate, Tensor) and on_gpu.for_tensor(parameter):
-        from drivesplat.on_gpu.adam import adam_step
+        from drivesplat.kernels.triton.adam import adam_step
 
         adam_step(parameter, parameter.grad, state, rate, betas, eps)
         return

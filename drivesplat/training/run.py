@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.ahead import ahead
-from drivesplat.device import choose_device, telling_out_of_memory
-from drivesplat.masks import read_classes, read_labels, read_masks_record, read_sky_mask
+from drivesplat.io.prefetch import ahead
+from drivesplat.io.storage import canonical_json, read_record, sha256_text, unreadable, write_json
+from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.lidar.free_space_record import read_free_space
+from drivesplat.machine.device import choose_device, telling_out_of_memory
 from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.parser import image_size, read_parser
-from drivesplat.regions import LABELS, region_mask
-from drivesplat.seeding.actors import read_actors
-from drivesplat.seeding.free_space import read_free_space
-from drivesplat.seeding.lidar_depth import read_lidar_depth
+from drivesplat.preprocess.masks import read_classes, read_labels, read_masks_record, read_sky_mask
+from drivesplat.preprocess.parser import image_size, read_parser
+from drivesplat.scene.actor_record import read_actors
+from drivesplat.scene.regions import LABELS, region_mask
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
-from drivesplat.storage import canonical_json, read_record, sha256_text, unreadable, write_json
 from drivesplat.training import checkpoint
 from drivesplat.training.first_exposure import first_gains
 from drivesplat.training.surfaces import Surroundings, surroundings_of

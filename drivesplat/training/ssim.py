@@ -16,7 +16,7 @@ def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float
     """The mean of the similarity over pixels and channels, with gradients for `image`; for `target` on a GPU alone."""
     if image.device.type != "cpu":
         return ssim_in_torch(image, target)
-    from drivesplat.on_cpu.similarity import Similarity
+    from drivesplat.kernels.numba.similarity import Similarity
 
     return Similarity.apply(image, target, weights(), C1, C2)
 

@@ -13,10 +13,10 @@ from gsplat.strategy import ops
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat import on_gpu
+from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training import spares
+from drivesplat.training.cuda_graph import preallocation as spares
 from drivesplat.training.optimizers import Optimizers
 
 
@@ -95,13 +95,13 @@ class ExploringStrategy(MCMCStrategy):
 def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
     """Moves positions at random, the farther the fainter and larger a Gaussian is."""
     if on_gpu.for_tensor(params["means"]):
-        from drivesplat.on_gpu.exploration import explore
+        from drivesplat.kernels.triton.exploration import explore
 
         explore(params, strength)
     elif params["means"].is_cuda:
         ops.inject_noise_to_position(params, optimizers, {}, strength)
     else:
-        from drivesplat.on_cpu.exploration import explore
+        from drivesplat.kernels.numba.exploration import explore
 
         explore(params, strength)
 

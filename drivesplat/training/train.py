@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 
-from drivesplat.device import device_name, telling_out_of_memory
 from drivesplat.errors import TrainingError
+from drivesplat.kernels.cuda_graphs import own_stream
+from drivesplat.machine.device import device_name, telling_out_of_memory
 from drivesplat.model.splat_model import Picture, SplatModel
-from drivesplat.on_gpu.graphs import own_stream
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import checkpoint
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock

@@ -10,11 +10,11 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
+from drivesplat.training.cuda_graph.replays import Extent, Replays, Terms, can_be_replayed
 from drivesplat.training.densify import Densifier
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import ModelOptimizers, ToldDevice, make_optimizers, schedule
-from drivesplat.training.replays import Extent, Replays, Terms, can_be_replayed
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
 from drivesplat.training.views import TrainingView
 

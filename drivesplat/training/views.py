@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from drivesplat.ahead import ahead
-from drivesplat.images import read_image
+from drivesplat.io.prefetch import ahead
 from drivesplat.model.view import View
-from drivesplat.parser import image_size
+from drivesplat.preprocess.parser import image_size
+from drivesplat.scene.images import read_image
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from archive_server import Site, packed, served
 from tiny_world import World, write_world
 from workflow_copy import WorkflowCopy, complaints
 
-from drivesplat.download import fetch as fetching
-from drivesplat.download import unpack as unpacking
-from drivesplat.download.nuscenes_mini import download, work_folder
 from drivesplat.errors import DatasetError
+from drivesplat.readers.nuscenes.download import fetch as fetching
+from drivesplat.readers.nuscenes.download import unpack as unpacking
+from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
 from drivesplat.settings.download import DownloadJob
 
 ACCEPTED = ("--config", "accept_nuscenes_terms=True")

@@ -10,7 +10,7 @@ from small_runs import BASE, run
 from tiny_world import Thing, World, write_world
 from workflow_copy import REPOSITORY
 
-from drivesplat.config import load
+from drivesplat.settings.config import load
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -14,19 +14,19 @@ from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.lpips_map import load_alexnet
 from drivesplat.evaluation.scene_metrics import read_evaluations
 from drivesplat.export.splat_ply import read_splat_ply
-from drivesplat.masks import read_masks_record
-from drivesplat.own_car import read_own_car
-from drivesplat.parser import read_parser
-from drivesplat.point_cloud import read_ply
+from drivesplat.io.point_cloud import read_ply
+from drivesplat.io.storage import read_json
+from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.poses.triangulated import read_triangulated
-from drivesplat.scene import read_scene
-from drivesplat.seeding.actors import read_actors
-from drivesplat.seeding.free_space import read_free_space
-from drivesplat.seeding.lidar_depth import read_lidar_depth
-from drivesplat.storage import read_json
+from drivesplat.preprocess.masks import read_masks_record
+from drivesplat.preprocess.parser import read_parser
+from drivesplat.scene.actor_record import read_actors
+from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.scene import read_scene
+from drivesplat.scene.truth import read_truth
 from drivesplat.training.checkpoint import resumable
 from drivesplat.training.run import read_checkpoint, read_summary
-from drivesplat.truth import read_truth
 
 REPOSITORY = Path(__file__).parents[2]
 SOURCES = [
@@ -188,7 +188,7 @@ NO_RESULTS = {
 
 
 def test_results_are_written_whole_or_not_at_all():
-    """Every file that is written goes through `drivesplat.storage`, beside its place and into it once it is on disk."""
+    """Every file that is written goes through `drivesplat.io.storage`, beside its place and into it once it is on disk."""
     found = set()
     for path in (path for path in SOURCES if path.name not in NO_RESULTS):
         for name, call in calls(path):

@@ -384,7 +384,7 @@ def test_without_network_lpips_is_null_with_the_reason_and_nothing_else_is(train
 TRAINING_THAT_SLEEPS = """\
 import json, os, time
 from pathlib import Path
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 
 with job(snakemake) as current:
     current.device()

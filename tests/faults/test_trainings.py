@@ -27,7 +27,7 @@ from test_training import (
     untrained,
 )
 
-from drivesplat.job import job
+from drivesplat.workflow.job import job
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training import checkpoint
@@ -197,7 +197,7 @@ def test_a_disk_that_takes_no_more_is_no_bug(tmp_path, capsys, number):
         f"film 0001: frames/000001.png: cannot be written ({os.strerror(number)}); free space or fix its permissions"
     )
     assert said == f"drivesplat: {expected}\n"
-    assert logged.splitlines()[-1].endswith(f"ERROR drivesplat.job: {expected}") and "Traceback" not in logged
+    assert logged.splitlines()[-1].endswith(f"ERROR drivesplat.workflow.job: {expected}") and "Traceback" not in logged
 
 
 def test_any_other_error_is_one_with_its_traceback_in_the_log(tmp_path, capsys):

@@ -1,0 +1,82 @@
+"""The training images as the plain recipe reads them: files that are decoded whenever they are looked at."""
+
+import warnings
+from collections.abc import Iterator
+from itertools import chain, repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from drivesplat.io.prefetch import ahead
+from drivesplat.preprocess.parser import image_size
+from drivesplat.scene.images import read_image, write_png
+
+MANY_WORKERS = "This DataLoader will create"
+"""How torch warns of more processes than processors, of which gsplat's example has so many nonetheless."""
+
+
+class ImageFiles(Dataset):
+    """The training images of a parser record; `paths` are files of their size."""
+
+    def __init__(self, parser: dict[str, Any], paths: list[str]):
+        self._parser = parser
+        self._images = [int(i) for i in parser["splits"]["train"]]
+        self._paths = paths
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, item: int) -> dict[str, Tensor]:
+        """`K` (3, 3), `camtoworld` (4, 4), and `image` (h, w, 3), floats from 0 to 255."""
+        index = self._images[item]
+        with Image.open(self._paths[item]) as image:
+            pixels = np.array(image.convert("RGB"))
+        return {
+            "K": torch.from_numpy(self._parser["Ks"][index]).float(),
+            "camtoworld": torch.from_numpy(self._parser["camtoworlds"][index]).float(),
+            "image": torch.from_numpy(pixels).float(),
+        }
+
+
+def files_of_size(parser: dict[str, Any], folder: Path) -> list[str]:
+    """Files of the training images at the size they are trained at: the recorded ones where they have it, else PNGs in
+    `folder`, made once, as the example keeps reduced copies of a scene's images."""
+
+    def file_of(index: int) -> str:
+        recorded, size = parser["image_paths"][index], image_size(parser, index)
+        with Image.open(recorded) as image:
+            if image.size == size:
+                return recorded
+        reduced = folder / "{}x{}".format(*size) / f"{Path(recorded).stem}.png"
+        if not reduced.is_file() or reduced.stat().st_mtime < Path(recorded).stat().st_mtime:
+            write_png(reduced, read_image(recorded, size))
+        return str(reduced)
+
+    return list(ahead(file_of, [int(i) for i in parser["splits"]["train"]]))
+
+
+def loader_of(images: Dataset, workers: int, device: torch.device) -> DataLoader:
+    """One image at a time in random order, decoded by `workers` processes (0: by this one)."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", MANY_WORKERS)
+        return DataLoader(
+            images,
+            batch_size=1,
+            shuffle=True,
+            num_workers=workers,
+            multiprocessing_context="fork" if workers else None,  # as users have it, whose program nothing spawned
+            persistent_workers=workers > 0,
+            pin_memory=device.type == "cuda",
+        )
+
+
+def endless(loader: DataLoader) -> Iterator[dict[str, Tensor]]:
+    """Its images, epoch after epoch; the processes that decode them start now."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", MANY_WORKERS)
+        return chain(iter(loader), chain.from_iterable(repeat(loader)))

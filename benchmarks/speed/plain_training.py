@@ -1,0 +1,179 @@
+"""The plain recipe's training: the loop of gsplat's example trainer, with what it does beside learning."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from gsplat import rasterization
+from torch import Tensor
+from torch.utils.data import Dataset
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from benchmarks.speed.plain import (
+    DECAY,
+    LOGGED_EVERY,
+    OPACITY_REG,
+    SAVED_AT,
+    SCALE_REG,
+    SSIM_WEIGHT,
+    Optimizers,
+    PlainRecipe,
+    Splats,
+    make_optimizers,
+)
+from benchmarks.speed.plain_images import endless, loader_of
+from benchmarks.speed.plain_ssim import Ssim, chosen_ssim
+from drivesplat.rasterization import rasterize
+from drivesplat.training.checkpoint import save
+from drivesplat.training.clock import ITERATION, UNTIMED, Clock
+from drivesplat.training.strategies import torch_twins
+
+CHECKPOINT = "ckpt.pt"
+
+
+@dataclass(frozen=True)
+class PlainSummary:
+    """What there is to say of a training that ended: the seconds of its loop, when its files were there (by
+    `time.monotonic`), the Gaussians, what torch held at its peak (GB; None on the CPU), and which SSIM it trained
+    with."""
+
+    seconds: float
+    ended: float
+    gaussians: int
+    peak_gpu_memory_gb: float | None
+    ssim: str
+
+
+def fit(
+    splats: Splats, images: Dataset, scale: float, recipe: PlainRecipe, folder: Path, clock: Clock = UNTIMED
+) -> PlainSummary:
+    """Fits Gaussians, on the device where they lie, to `images`; `scale` is the scene's, `folder` where scalars and
+    checkpoints go. `clock` times the stages of an iteration."""
+    device = splats["means"].device
+    on_gpu = device.type == "cuda"
+    torch.manual_seed(recipe.seed)
+    if on_gpu:
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+    training = PlainTraining(splats, make_optimizers(splats, scale), recipe, device, chosen_ssim(device), clock)
+    data = endless(loader_of(images, recipe.workers, device))
+    with SummaryWriter(str(folder / "tensorboard")) as writer:
+        began = time.monotonic()
+        training.run(data, writer, folder)
+        if on_gpu:
+            torch.cuda.synchronize(device)
+        seconds = time.monotonic() - began
+    save(folder / CHECKPOINT, training.state())
+    ended = time.monotonic()  # the processes that decode images take up to seconds to leave: no part of a training
+    peak = torch.cuda.max_memory_reserved(device) / 1e9 if on_gpu else None
+    return PlainSummary(seconds, ended, len(splats["means"]), peak, training.ssim.name)
+
+
+class PlainTraining:
+    """A training by the plain recipe between two iterations."""
+
+    def __init__(
+        self,
+        splats: Splats,
+        optimizers: Optimizers,
+        recipe: PlainRecipe,
+        device: torch.device,
+        ssim: Ssim,
+        clock: Clock = UNTIMED,
+    ):
+        self.splats, self.optimizers, self.recipe, self.device = splats, optimizers, recipe, device
+        self.ssim, self.clock, self.step = ssim, clock, 0
+        self._strategy = recipe.strategy()
+        self._strategy.check_sanity(splats, optimizers)
+        self._strategy_state = self._strategy.initialize_state()
+        decay = DECAY ** (1.0 / recipe.schedule.iterations)
+        self._schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=decay)
+
+    def run(self, data: Iterator[dict[str, Tensor]], writer: SummaryWriter, folder: Path) -> None:
+        """All iterations."""
+        bar = tqdm(range(self.recipe.schedule.iterations), desc="plain", disable=not sys.stderr.isatty())
+        for _ in bar:
+            with self.clock.stage(ITERATION):
+                terms, info = self.fit_one(data)
+                bar.set_description(f"loss={terms['loss'].item():.3f}")
+                if self.step % LOGGED_EVERY == 0:
+                    self._log(terms, writer)
+                if self.step + 1 in SAVED_AT:
+                    save(folder / CHECKPOINT, self.state())
+                self.learn(info)
+
+    def fit_one(self, data: Iterator[dict[str, Tensor]]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The first half of an iteration: the next image, rendered, compared, and the gradients of that. Returns the
+        terms of the loss, and what the rasterizer tells densification."""
+        with self.clock.stage("data"):
+            batch = next(data)
+            camtoworlds, intrinsics = batch["camtoworld"].to(self.device), batch["K"].to(self.device)
+            pixels = batch["image"].to(self.device) / 255.0
+        with self.clock.stage("render"):
+            colors, info = self._render(camtoworlds, intrinsics, pixels.shape[2], pixels.shape[1])
+        with self.clock.stage("loss"):
+            terms = self._loss(colors, pixels)
+        with self.clock.stage("backward"):
+            terms["loss"].backward()
+        return terms, info
+
+    def learn(self, info: dict[str, Any]) -> None:
+        """The second half: the optimizers step, and Gaussians are moved and added."""
+        with self.clock.stage("optimizer"):
+            for optimizer in self.optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            self._schedule.step()
+        with self.clock.stage("densification"), self._kernels():
+            rate = self._schedule.get_last_lr()[0]
+            self._strategy.step_post_backward(
+                self.splats, self.optimizers, self._strategy_state, self.step, info, lr=rate
+            )
+        self.step += 1
+
+    def state(self) -> dict[str, Any]:
+        """The content of a checkpoint."""
+        return {"step": self.step, "splats": {name: value.detach() for name, value in self.splats.items()}}
+
+    def _render(self, camtoworlds: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, dict[str, Any]]:
+        """The image (1, h, w, 3) before black, and what densification reads."""
+        gaussians = (
+            self.splats["means"],
+            self.splats["quats"],
+            torch.exp(self.splats["scales"]),
+            torch.sigmoid(self.splats["opacities"]),
+            torch.cat([self.splats["sh0"], self.splats["shN"]], dim=1),
+        )
+        cameras, degree = (torch.linalg.inv(camtoworlds), Ks, width, height), self.recipe.schedule.sh_degree(self.step)
+        if self.device.type == "cuda":
+            colors, _, info = rasterization(*gaussians, *cameras, sh_degree=degree, packed=False)
+            return colors, info
+        rendering = rasterize(*gaussians, *cameras, sh_degree=degree)
+        return rendering.image, rendering.info
+
+    def _loss(self, colors: Tensor, pixels: Tensor) -> dict[str, Tensor]:
+        l1 = F.l1_loss(colors, pixels)
+        ssim = 1.0 - self.ssim.of(colors.permute(0, 3, 1, 2), pixels.permute(0, 3, 1, 2))
+        loss = l1 * (1.0 - SSIM_WEIGHT) + ssim * SSIM_WEIGHT
+        loss = loss + OPACITY_REG * torch.sigmoid(self.splats["opacities"]).mean()
+        loss = loss + SCALE_REG * torch.exp(self.splats["scales"]).mean()
+        return {"loss": loss, "l1loss": l1, "ssimloss": ssim}
+
+    def _log(self, terms: dict[str, Tensor], writer: SummaryWriter) -> None:
+        for name, value in terms.items():
+            writer.add_scalar(f"train/{name}", value.item(), self.step)
+        writer.add_scalar("train/num_GS", len(self.splats["means"]), self.step)
+        if self.device.type == "cuda":
+            writer.add_scalar("train/mem", torch.cuda.max_memory_allocated() / 1024**3, self.step)
+        writer.flush()
+
+    def _kernels(self) -> AbstractContextManager[None]:
+        """What gsplat's strategies compute with: on a CPU, torch's twins of the two CUDA kernels they call."""
+        return nullcontext() if self.device.type == "cuda" else torch_twins()

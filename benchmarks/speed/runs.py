@@ -1,0 +1,187 @@
+"""One training, timed and measured: by the plain recipe, or as the rule `train` does it."""
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.speed.bystanders import Moment, busy_elsewhere
+from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, as_splats, scene_scale, started
+from benchmarks.speed.plain_images import ImageFiles, files_of_size
+from benchmarks.speed.plain_training import CHECKPOINT, fit
+from benchmarks.speed.plan import Task
+from drivesplat.evaluation.evaluate import evaluate_groups, protocol
+from drivesplat.io.storage import read_json
+from drivesplat.machine.device import choose_device, device_name
+from drivesplat.model.build import gaussian_cap, some_of
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.preprocess.masks import read_masks_record
+from drivesplat.preprocess.parser import read_parser
+from drivesplat.provenance.record import provenance
+from drivesplat.rasterization import rasterize
+from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.training.checkpoint import load
+from drivesplat.training.clock import UNTIMED, Clock, StageClock
+from drivesplat.training.run import (
+    TrainingFiles,
+    TrainingInputs,
+    prepare,
+    read_checkpoint,
+    read_inputs,
+    run_training,
+    trained_model,
+)
+from drivesplat.training.train import Workspace, train
+from drivesplat.workflow.gpus import hold_card
+
+Times = dict[str, Any]
+WHOLE_IMAGES = CoarseToFineSettings(quarter_until=0.0, half_until=0.0)
+WARM_UP = 20
+"""So many iterations pass before stages are timed."""
+
+
+def run(task: Task) -> dict[str, Any]:
+    """Trains and measures. `loop` are the seconds of the training's loop, `whole` those from reading parser.pkl to the
+    files it leaves; `busy_elsewhere` says how many of the `processors` on average had other work meanwhile (None where
+    that is not known); `result` are the metrics per group of held-out frames, measured as `protocol` says.
+
+    What both recipes need once, the rasterizer's kernels and a copy of the images at their size, is there beforehand.
+    """
+    shutil.rmtree(task.folder, ignore_errors=True)
+    with held_device(task.device) as device:
+        parser = read_parser(task.files.parser)
+        paths = files_of_size(parser, task.images)
+        before = Moment.now()
+        times, model = plain(task, device, paths) if task.recipe == "plain" else ours(task, device)
+        elsewhere = busy_elsewhere(before, Moment.now())
+        recording, _ = read_recording(task.files.scene, task.files.parser, task.files.masks)
+        masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
+        groups = evaluate_groups(model.to(device).requires_grad_(False), recording, camera, None, device)
+        return {
+            "recipe": task.recipe,
+            "iterations": task.iterations,
+            "seed": task.seed,
+            "device": device_name(device),
+            "processors": os.cpu_count(),
+            "busy_elsewhere": elsewhere,
+            "cap_max": gaussian_cap(parser, task.train.train),
+            **times,
+            "dataset": parser["scene"]["dataset"],
+            "protocol": protocol(parser, masks, task.evaluate),
+            "result": groups,
+        }
+
+
+def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, SplatModel]:
+    """A training by the plain recipe, and its model."""
+    began = time.monotonic()
+    parser = read_parser(task.files.parser)
+    cap = gaussian_cap(parser, task.train.train)
+    kept = some_of(len(parser["points"]), cap)
+    splats = started(parser["points"][kept], parser["points_rgb"][kept], task.seed).to(device)
+    recipe = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers)
+    summary = fit(splats, ImageFiles(parser, paths), scene_scale(parser), recipe, task.folder)
+    costs = {key: getattr(summary, key) for key in ("gaussians", "peak_gpu_memory_gb", "ssim")}
+    times = {"loop": summary.seconds, "whole": summary.ended - began, **costs}
+    return times, as_model({name: value.detach() for name, value in splats.items()}, parser)
+
+
+def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
+    """A training by what the rule `train` calls, and its model. Its kernels are loaded by two iterations before it."""
+    _go_on(task, device, 2)
+    began = time.monotonic()
+    inputs, upstream = _inputs(task)
+    settings = json.loads(task.train.model_dump_json())
+    made = provenance(task.stage, settings, task.code, upstream, {})
+    files = training_files(task)
+    run_training(inputs, task.train, task.device, files, made, task.label)
+    whole, summary = time.monotonic() - began, read_json(files.summary, rule="train")
+    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    costs = {key: summary[key] for key in ("gaussians", "peak_gpu_memory_gb")}
+    return {"loop": summary["seconds"], "whole": whole, **costs}, model
+
+
+def training_files(task: Task) -> TrainingFiles:
+    """What a training of ours writes."""
+    return TrainingFiles(task.folder / "checkpoint.pt", task.folder / "train.json")
+
+
+def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:
+    """Milliseconds an iteration by stage, over so many iterations that go on from where a task's training ended:
+    per stage `device_ms` and `host_ms` (`drivesplat.training.clock`). What is trained here is thrown away."""
+    profiled = _profile_plain if task.recipe == "plain" else _profile_ours
+    with held_device(task.device) as device:
+        clock = StageClock(device, WARM_UP)
+        profiled(task, device, WARM_UP + iterations, clock)
+        return {name: asdict(share) for name, share in clock.shares().items()}
+
+
+def _profile_plain(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
+    parser = read_parser(task.files.parser)
+    splats = as_splats(load(task.folder / CHECKPOINT, rule="train")["splats"]).to(device)
+    cap = gaussian_cap(parser, task.train.train)
+    recipe = PlainRecipe(Schedule.of_trained(iterations), cap, task.seed, task.workers)
+    images = ImageFiles(parser, files_of_size(parser, task.images))
+    fit(splats, images, scene_scale(parser), recipe, _aside(task), clock)
+    shutil.rmtree(_aside(task))
+
+
+def _profile_ours(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
+    model, _ = trained_model(read_checkpoint(training_files(task).checkpoint))
+    _go_on(task, device, iterations, model, clock)
+
+
+def _go_on(
+    task: Task, device: torch.device, iterations: int, model: SplatModel | None = None, clock: Clock = UNTIMED
+) -> None:
+    """Iterations with all degrees of harmonics of a model (None: a new one), whole images and densification."""
+    inputs, _ = _inputs(task)
+    begun = prepare(inputs, task.train, device)
+    goes_on = {"iterations": iterations, "sh_every": 0.0, "refine_start": 0.0, "refine_stop": 1.0}
+    settings = begun.settings.model_copy(update={**goes_on, "coarse_to_fine": WHOLE_IMAGES})
+    workspace = Workspace(_aside(task) / "resume", _aside(task) / "tensorboard", "", task.label)
+    trained = begun.model if model is None else model
+    train(trained, begun.views, settings, task.seed, device, workspace, begun.surroundings, clock)
+    shutil.rmtree(_aside(task))
+
+
+def _inputs(task: Task) -> tuple[TrainingInputs, list[dict[str, Any]]]:
+    files = task.files
+    return read_inputs(files.parser, files.masks, files.actors, files.lidar_depth, files.free_space)
+
+
+def _aside(task: Task) -> Path:
+    return task.folder / "profile"
+
+
+@contextmanager
+def held_device(settings: DeviceSettings) -> Iterator[torch.device]:
+    """The device that the settings choose, with no other job of this workflow on it, and awake."""
+    card = hold_card(1) if settings.kind != "cpu" else None
+    try:
+        device = choose_device(settings)
+        wake(device)
+        yield device
+    finally:
+        if card is not None:
+            card.close()
+
+
+def wake(device: torch.device) -> None:
+    """Loads the rasterizer's kernels and, on a GPU, what torch starts with: neither recipe pays for it."""
+    means = torch.tensor([[0.0, 0.0, 2.0]] * 8, device=device, requires_grad=True)
+    quats, scales = torch.ones(8, 4, device=device), torch.full((8, 3), 0.1, device=device)
+    opacities, coefficients = torch.full((8,), 0.5, device=device), torch.zeros(8, 16, 3, device=device)
+    intrinsics = torch.tensor([[[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]]], device=device)
+    cameras = torch.eye(4, device=device)[None], intrinsics, 32, 32
+    rendering = rasterize(means, quats, scales, opacities, coefficients, *cameras, sh_degree=3)
+    rendering.image.sum().backward()

@@ -1,0 +1,82 @@
+"""What a metrics.json says, in sentences: `python -m drivesplat.evaluation.summary results/demo/metrics.json`."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from drivesplat.errors import DriveSplatError
+from drivesplat.evaluation.comparison import WHERE
+from drivesplat.io.storage import read_json
+from drivesplat.scene.scene_warnings import DARK
+
+LOOKS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
+SAME_PLACE = 0.1
+"""Metres. A point 10 m away is then seen, at nuScenes' focal length, within a dozen pixels of where it was."""
+
+
+def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
+    """A sentence per method and group of held-out frames, more where there is truth, and where to look."""
+    lines = _circumstances(metrics["drive"]) if "drive" in metrics else []
+    for name, method in metrics["methods"].items():
+        for group, where in WHERE.items():
+            gap = method[group].get("gap_db")
+            if (static := _psnr(method[group], "static")) is not None:
+                lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_movers(method[group], gap)}")
+        for metres, regions in method.get("lateral", {}).items():
+            if (static := _psnr(regions, "static")) is not None:
+                lines.append(f"{name}, from {float(metres):g} m to the left, against truth: static {static:.1f} dB")
+        removal = method.get("removal", {})
+        removed, before = (_psnr(regions, "box") for regions in (removal, removal.get("not_removed", {})))
+        if removed is not None and before is not None:
+            lines.append(
+                f"{name}, the car ahead removed, against the empty street: {removed:.1f} dB in its box "
+                f"({before:.1f} dB before)"
+            )
+        seconds, device = method["train_seconds"], method["device"]
+        lines.append(f"{name}: {method['gaussians']:,} Gaussians, trained in {seconds:.0f} s on {device}")
+    folder = Path(path).parent
+    lines.append(f"All figures: {path}; training curves and pictures: tensorboard --logdir {folder}")
+    for name in metrics["methods"]:
+        there = [look for look in LOOKS if (folder / name / look).is_file()]
+        there += ["edits/"] if (folder / name / "edits").is_dir() else []
+        if there:
+            lines.append(f"To look at, in {folder / name}: {', '.join(there)}")
+    return lines
+
+
+def _circumstances(drive: dict[str, Any]) -> list[str]:
+    """What makes the figures say less than they seem to, a sentence each."""
+    lines = []
+    for group, where in WHERE.items():
+        held_out = drive[group] or {}
+        distance, flat = held_out.get("from_training_m"), held_out.get("flat_psnr")
+        if distance is not None and distance < SAME_PLACE:
+            lines.append(
+                f"Frames {where} were taken {distance:.2f} m from training frames: a PSNR there tells what was "
+                "remembered, not what can be seen from elsewhere"
+            )
+        if flat is not None and held_out["luminance"] < DARK:
+            lines.append(
+                f"Frames {where} are dark (mean luminance {held_out['luminance']:.2f}): their mean colour alone has "
+                f"{flat:.1f} dB static; read the figures against that"
+            )
+    return lines
+
+
+def _psnr(regions: dict[str, Any], region: str) -> float | None:
+    """The PSNR of a region, None where that is null or missing."""
+    return (regions.get(region) or {}).get("psnr")
+
+
+def _movers(group: dict[str, Any], gap: float | None) -> str:
+    moving = _psnr(group, "moving_vehicle")
+    if gap is None or moving is None:
+        return "no moving vehicle to compare with"
+    return f"moving vehicles {moving:.1f} dB: a gap of {gap:.1f} dB"
+
+
+if __name__ == "__main__":
+    try:
+        print("\n".join(in_words(read_json(sys.argv[1], rule="scene_metrics"), sys.argv[1])))
+    except DriveSplatError as error:
+        sys.exit(f"drivesplat: {error}")

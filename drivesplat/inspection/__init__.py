@@ -1,0 +1,1 @@
+"""Looking at a trained model: ghost panel, removal of a vehicle, track table."""

@@ -1,0 +1,88 @@
+"""The ghost panel and the removal as pictures."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from drivesplat.inspection.figures import draw_outline, sheet, show
+from drivesplat.inspection.ghost_panel import Panel
+from drivesplat.inspection.removal import RemovalPair
+
+LARGEST_ERROR = 0.5
+WAY = "#4cc9f0"
+
+
+def draw_panel(panel: Panel, record: dict[str, Any], method: str) -> Figure:
+    """ground truth | render over absolute error | ghosts."""
+    title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
+    subject = record["subject"]
+    if subject is None:
+        title += f"\n{record['why_null']}"
+    else:
+        seen = "training image" if subject["split"] == "train" else f"held out: {subject['split']}"
+        title += f" ({seen})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m away"
+    figure, axes = sheet(panel.truth.shape, rows=2, columns=2, title=title)
+    show(axes[0], panel.truth, "Ground truth")
+    show(axes[1], panel.render, f"Render: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}")
+    _show_error(axes[2], panel.render, panel.truth, "Absolute error, mean over the channels")
+    show(axes[3], panel.haunted, _ghosts_in_words(record["ghosts"]))
+    if len(panel.way) > 1:
+        axes[3].plot(*_clipped(panel.way, panel.truth.shape).T, color=WAY, linewidth=2.0, alpha=0.9)
+    _outline(axes, panel.outline)
+    return figure
+
+
+def _ghosts_in_words(ghosts: dict[str, Any] | None) -> str:
+    if ghosts is None:
+        return "Ghosts: none, nothing moves"
+    if not ghosts["gaussians"]:
+        return "Ghosts: none on the vehicle's way (blue)"
+    count, mean = ghosts["gaussians"], ghosts["opacity_mean"]
+    drawn = f" (drawn {ghosts['drawn_times']:.1f}x)" if ghosts["drawn_times"] > 1.0 else ""
+    return f"Ghosts{drawn} along its way (blue): {count:,}, mean opacity {mean:.2f}"
+
+
+def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figure:
+    """with | without | difference."""
+    title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
+    without = "Without its Gaussians" if record["removed_by"] == "actor" else "Without the Gaussians in its box"
+    if record["subject"] is None:
+        title += f"\n{record['why_null']}"
+    else:
+        changed = record["box"]["changed_share"] or 0.0
+        title += f"\n{record['gaussians_removed']:,} Gaussians removed, which changes {changed:.0%} of its box's pixels"
+    figure, axes = sheet(pair.with_car.shape, rows=1, columns=3, title=title)
+    show(axes[0], pair.with_car, "Render")
+    show(axes[1], pair.without_car, without)
+    _show_error(axes[2], pair.without_car, pair.with_car, "Difference, mean over the channels")
+    _outline(axes, pair.outline)
+    return figure
+
+
+def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) -> None:
+    error = axis.imshow(np.abs(image - truth).mean(axis=2), cmap="inferno", vmin=0.0, vmax=LARGEST_ERROR)
+    axis.set_autoscale_on(False)
+    axis.set_title(title, loc="left", fontsize=15)
+    bar = axis.inset_axes((0.7, 0.12, 0.26, 0.03))
+    axis.figure.colorbar(error, cax=bar, orientation="horizontal", ticks=[0.0, LARGEST_ERROR])
+    bar.tick_params(colors="white", labelsize=11)
+
+
+def _outline(axes: list[Axes], outline: np.ndarray) -> None:
+    """Draws the box (n, 2) in continuous pixels into every picture, where there is one."""
+    for axis in axes if len(outline) else ():
+        draw_outline(axis, outline)
+
+
+def _clipped(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A line (m, 2) of continuous pixels in an image's coordinates, NaN (a gap) outside of it."""
+    inside = ((pixels >= 0) & (pixels <= [shape[1], shape[0]])).all(axis=1)
+    return np.where(inside[:, None], pixels - 0.5, np.nan)
+
+
+def _decibels(record: dict[str, Any] | None) -> str:
+    if record is None:
+        return "none"
+    return "identical" if record["psnr"] is None else f"{record['psnr']:.1f} dB"

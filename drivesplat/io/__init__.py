@@ -1,0 +1,1 @@
+"""Files: atomic storage, PLY, video, HTML templates; prefetching."""

@@ -1,0 +1,61 @@
+"""Coloured points as PLY files, with a JSON note in the header that says where they come from."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from drivesplat.io.storage import atomic_write, canonical_json, unreadable
+
+_NOTE = "drivesplat "
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """`positions` (n, 3) float32 metres; `colors` (n, 3) uint8 RGB; `note`: plain data about them."""
+
+    positions: np.ndarray
+    colors: np.ndarray
+    note: dict[str, Any] = field(default_factory=dict)
+
+
+def write_ply(path: str | Path, points: PointCloud) -> None:
+    vertices = np.empty(
+        len(points.positions),
+        dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")],
+    )
+    for i, name in enumerate("xyz"):
+        vertices[name] = points.positions[:, i]
+    for i, name in enumerate(("red", "green", "blue")):
+        vertices[name] = points.colors[:, i]
+    element = PlyElement.describe(vertices, "vertex")
+    with atomic_write(path) as file:
+        PlyData([element], byte_order="<", comments=[_NOTE + canonical_json(points.note)]).write(file)
+
+
+def read_ply(path: str | Path, rule: str) -> PointCloud:
+    """Reads what `write_ply` wrote. Raises ResultError naming the file and the `rule` that makes it."""
+    try:
+        data = PlyData.read(str(path))
+        note = next(json.loads(c.removeprefix(_NOTE)) for c in data.comments if c.startswith(_NOTE))
+        vertices = data["vertex"]
+        return PointCloud(
+            _columns(vertices, ("x", "y", "z"), "f4"), _columns(vertices, ("red", "green", "blue"), "u1"), note
+        )
+    except (OSError, PlyParseError, KeyError, ValueError, StopIteration) as error:
+        raise unreadable(path, rule, f"not a seed of this workflow ({error or type(error).__name__})") from error
+
+
+def read_positions(path: str | Path) -> np.ndarray:
+    """The vertex positions (n, 3) float64 of any PLY file.
+
+    Raises OSError, PlyParseError, KeyError or ValueError where it is none.
+    """
+    return _columns(PlyData.read(str(path))["vertex"], ("x", "y", "z"), "f8")
+
+
+def _columns(vertices: PlyElement, names: tuple[str, ...], dtype: str) -> np.ndarray:
+    return np.stack([np.asarray(vertices[name]) for name in names], axis=1).astype(dtype)

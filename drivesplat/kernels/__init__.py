@@ -1,0 +1,1 @@
+"""Compiled kernels: Triton on GPUs, numba on CPUs."""

@@ -1,0 +1,97 @@
+"""Alpha compositing of projected Gaussians, with gradients (Kerbl et al. 2023)."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from drivesplat.kernels.numba.gradients import MOMENTS, gather_gradients
+from drivesplat.kernels.numba.pixels import composite_tiles, composite_tiles_backward
+from drivesplat.kernels.numba.projection import arrays
+from drivesplat.kernels.numba.threads import parallel_for
+from drivesplat.kernels.numba.tiles import Splats, TileLists, front_to_back, grid, tile_lists
+
+TILES = 8
+"""Tiles a piece: few enough that threads end together."""
+
+
+class Compositing(torch.autograd.Function):
+    """Image (c, h, w, channels), premultiplied, and alpha (c, h, w, 1) of projected Gaussians.
+
+    With `absgrad` the backward pass leaves the sums over pixels of the absolute gradients of `means2d` in
+    `means2d.absgrad` (c, n, 2), as gsplat does.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means2d: Float[Tensor, "c n 2"],
+        depths: Float[Tensor, "c n"],
+        conics: Float[Tensor, "c n 3"],
+        radii: Int[Tensor, "c n 2"],
+        opacities: Float[Tensor, "c n"],
+        values: Float[Tensor, "c n channels"],
+        width: int,
+        height: int,
+        absgrad: bool,
+    ) -> tuple[Float[Tensor, "c h w channels"], Float[Tensor, "c h w 1"]]:
+        cameras, channels = values.shape[0], values.shape[-1]
+        image = means2d.new_empty((cameras, height, width, channels))
+        alpha = means2d.new_empty((cameras, height, width, 1))
+        ctx.cameras = []
+        for c in range(cameras):
+            splats = front_to_back(*arrays(means2d[c], depths[c], conics[c], opacities[c], radii[c], values[c]))
+            ctx.cameras.append(_composite(splats, *arrays(image[c], alpha[c])))
+        ctx.save_for_backward(means2d, image, alpha)
+        ctx.absgrad = absgrad
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor, v_alpha: Tensor) -> tuple[Tensor | None, ...]:
+        means2d, image, alpha = ctx.saved_tensors
+        cameras, n = means2d.shape[:2]
+        absolute = means2d.new_zeros((cameras, n if ctx.absgrad else 0, 2))
+        v_inputs = [means2d.new_zeros((cameras, n, *size)) for size in ((2,), (3,), (), (image.shape[-1],))]
+        for c in range(cameras):
+            pictures = arrays(image[c], alpha[c], v_image[c], v_alpha[c])
+            _composite_backward(*ctx.cameras[c], pictures, arrays(*(v[c] for v in (*v_inputs, absolute))), ctx.absgrad)
+        if ctx.absgrad:
+            means2d.absgrad = absolute
+        v_means2d, v_conics, v_opacities, v_values = v_inputs
+        return v_means2d, None, v_conics, None, v_opacities, v_values, None, None, None
+
+
+def _composite(splats: Splats, image: np.ndarray, alpha: np.ndarray) -> tuple[Splats, TileLists | None]:
+    """Renders one camera. Returns what its backward pass needs; the lists only if they are one window's."""
+    columns, rows = grid(image.shape[1], image.shape[0])
+    lists = None
+    for lists in tile_lists(splats, columns, rows):
+        parallel_for(
+            composite_tiles, lists.last - lists.first, TILES,
+            lists.first, lists.offsets, lists.ranks, splats.shapes, splats.values, columns, image, alpha,
+        )  # fmt: skip
+    whole = lists is not None and lists.first == 0
+    return splats, lists if whole else None
+
+
+def _composite_backward(
+    splats: Splats, lists: TileLists | None, pictures: list[np.ndarray], v_inputs: list[np.ndarray], absolute: bool
+) -> None:
+    """Adds one camera's gradients to `v_inputs`; `pictures` are image, alpha and their gradients."""
+    columns, rows = grid(pictures[0].shape[1], pictures[0].shape[0])
+    for window in [lists] if lists is not None else tile_lists(splats, columns, rows):
+        width = MOMENTS + splats.values.shape[1] + 2 * absolute
+        parts = np.zeros((len(window.ranks), width), splats.shapes.dtype)
+        parallel_for(
+            composite_tiles_backward, window.last - window.first, TILES,
+            window.first, window.offsets, window.ranks, window.slots, splats.shapes, splats.values, columns,
+            *pictures, absolute, parts,
+        )  # fmt: skip
+        parallel_for(
+            gather_gradients, len(splats.order), 4096,
+            splats.order, splats.shapes, window.slot_offsets, parts, *v_inputs,
+        )  # fmt: skip

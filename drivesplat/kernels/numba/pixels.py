@@ -1,0 +1,294 @@
+"""Compositing within tiles, and its gradients: the inner loops, written to be vectorised.
+
+A tile's pixels are planes of one scratch array: pixel p of plane k stands at k * PIXELS + p, so that the compiler sees
+loads and stores at constant distances and needs no checks for overlap. A Gaussian is composited on whole rows of the
+tile, without branches. Constants are cast to the pixels' type, or arithmetic would be in float64.
+
+The backward pass runs front to back like the forward pass and repeats its decisions exactly. With the loss's gradients
+g of a pixel's channels (alpha is one more, of value 1), weights w = T alpha and what is yet to come
+R_i = sum over j > i of w_j (g · value_j), the gradient of alpha_i is T_i (g · value_i) - R_i / (1 - alpha_i); the sum
+over all j is known from the rendered image (Kerbl et al. 2023 run back to front instead).
+"""
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from numba import njit, types
+from numba.extending import overload
+
+from drivesplat.kernels.cache import OPTIONS, callee, kernel
+from drivesplat.kernels.numba import tiles
+from drivesplat.kernels.numba.gradients import MOMENTS
+
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+PIXELS = tiles.TILE_WIDTH * tiles.TILE_HEIGHT
+ROWS = 2
+"""Rows of a tile that are composited together at least: 32 pixels, for loops without a remainder."""
+PATIENCE = 16
+"""Gaussians after which a tile is asked whether all its rays have ended."""
+X, Y, TRANSMITTANCE, WEIGHT = range(4)
+OUT = 4
+"""Plane of alpha in the forward pass, which the channels follow."""
+RAW, VALUE, REST, GRADIENT = range(4, 8)
+"""Planes of the backward pass; GRADIENT is alpha's, which the channels' follow."""
+fast_callee = njit(**OPTIONS, fastmath={"reassoc", "contract", "nsz", "arcp"})
+
+
+def _exp(x):
+    """exp(x) for -25 <= x <= 0, in kernels alone."""
+
+
+@overload(_exp)
+@no_type_check
+def _exp_overload(x):
+    if x != types.float32:
+        return lambda x: math.exp(x)
+
+    def single(x):
+        # 2^n 2^f with n whole and |f| <= 1/2, by a Taylor polynomial; relative error 2e-7
+        exponent = x * np.float32(1.4426950408889634)
+        n = np.int32(exponent - np.float32(0.5))
+        f = exponent - np.float32(n)
+        power = np.float32(1.5403530e-4)
+        power = power * f + np.float32(1.3333558e-3)
+        power = power * f + np.float32(9.6181291e-3)
+        power = power * f + np.float32(5.5504109e-2)
+        power = power * f + np.float32(2.4022651e-1)
+        power = power * f + np.float32(6.9314718e-1)
+        power = power * f + np.float32(1.0)
+        return power * np.int32((n + np.int32(127)) << np.int32(23)).view(np.float32)
+
+    return single
+
+
+@njit(nogil=True)
+@no_type_check
+def _at(plane):
+    """Where a plane begins; unsigned, for signed indices could be negative and would be checked."""
+    return np.uint64(plane * PIXELS)
+
+
+@callee
+@no_type_check
+def _rows(shape, x0, y0):
+    """First and last pixel (excluded) of a tile's rows that a Gaussian reaches; the tile's corner is `x0`, `y0`."""
+    a, b, c = float(shape[tiles.CONIC_XX]), float(shape[tiles.CONIC_XY]), float(shape[tiles.CONIC_YY])
+    reach = float(shape[tiles.RADIUS_Y])
+    low, high = -reach, reach
+    determinant = a * c - b * b
+    if determinant > 0.0 and a > 0.0 and c > 0.0:
+        quadratic = float(shape[tiles.REACH])
+        x_max = math.sqrt(quadratic * c / determinant) + tiles.SLACK
+        left = max(x0 + 0.5 - shape[tiles.MEAN_X], -x_max)
+        right = min(x0 + tiles.TILE_WIDTH - 0.5 - shape[tiles.MEAN_X], x_max)
+        turn = b * math.sqrt(quadratic * a / determinant) / a
+        x = min(max(-turn, left), right)
+        high = (math.sqrt(max(c * quadratic - determinant * x * x, 0.0)) - b * x) / c + tiles.SLACK
+        x = min(max(turn, left), right)
+        low = (-math.sqrt(max(c * quadratic - determinant * x * x, 0.0)) - b * x) / c - tiles.SLACK
+    top = shape[tiles.MEAN_Y] - 0.5 - y0
+    begin = max(math.ceil((top + low) / ROWS - (ROWS - 1) / ROWS), 0.0)
+    end = min(math.floor((top + high) / ROWS) + 1.0, float(tiles.TILE_HEIGHT // ROWS))
+    if not begin < end:
+        return np.uint64(0), np.uint64(0)
+    return np.uint64(int(begin) * (ROWS * tiles.TILE_WIDTH)), np.uint64(int(end) * (ROWS * tiles.TILE_WIDTH))
+
+
+@callee
+@no_type_check
+def _begin_tile(s, x0, y0, width, height):
+    """Coordinates of the pixels' centres, and transmittance: 1, and 0 beyond the image."""
+    for p in range(PIXELS):
+        x, y = x0 + p % tiles.TILE_WIDTH, y0 + p // tiles.TILE_WIDTH
+        s[X * PIXELS + p], s[Y * PIXELS + p] = x + 0.5, y + 0.5
+        s[TRANSMITTANCE * PIXELS + p] = 1.0 if x < width and y < height else 0.0
+
+
+@callee
+@no_type_check
+def _ended(s):
+    """Whether no ray of the tile is left."""
+    total = s[0] * 0
+    for p in range(np.uint64(0), np.uint64(PIXELS)):
+        total += s[_at(TRANSMITTANCE) + p]
+    return total == 0
+
+
+@fast_callee
+@no_type_check
+def _alpha(dx, dy, a, b, c, opacity):
+    """The opacity that a Gaussian has at an offset from its centre, before it is held at 0.999; 0 below 1/255."""
+    real = type(dx)
+    half, zero, far = real(0.5), real(0.0), real(-25.0)
+    exponent = -(half * a * dx + b * dy) * dx - half * c * dy * dy
+    held = exponent if exponent > far else far
+    held = held if held < zero else zero
+    alpha = opacity * _exp(held)
+    return alpha if (exponent <= zero) & (alpha >= real(tiles.MIN_ALPHA)) else zero
+
+
+@fast_callee
+@no_type_check
+def _weigh(s, begin, end, shape):
+    """Advances the transmittance of pixels `begin` to `end` by one Gaussian, and writes its weights.
+
+    A ray that has ended has transmittance 0.
+    """
+    real = s.dtype.type
+    mean_x, mean_y, opacity = shape[tiles.MEAN_X], shape[tiles.MEAN_Y], shape[tiles.OPACITY]
+    a, b, c = shape[tiles.CONIC_XX], shape[tiles.CONIC_XY], shape[tiles.CONIC_YY]
+    zero, one, max_alpha, min_transmittance = real(0.0), real(1.0), real(MAX_ALPHA), real(MIN_TRANSMITTANCE)
+    for p in range(begin, end):
+        alpha = _alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
+        alpha = alpha if alpha < max_alpha else max_alpha
+        before = s[_at(TRANSMITTANCE) + p]
+        after = before * (one - alpha)
+        s[_at(WEIGHT) + p] = alpha * before if after > min_transmittance else zero
+        s[_at(TRANSMITTANCE) + p] = after if after > min_transmittance else zero
+
+
+@fast_callee
+@no_type_check
+def _add(s, begin, end, target, source, factor):
+    """Adds `factor` times plane `source` to plane `target`."""
+    for p in range(begin, end):
+        s[_at(target) + p] += factor * s[_at(source) + p]
+
+
+@kernel
+@no_type_check
+def composite_tiles(start, stop, first, offsets, ranks, shapes, values, columns, image, alpha):
+    """Renders tiles first + start to first + stop into `image` (h, w, channels) and `alpha` (h, w, 1)."""
+    height, width, channels = image.shape
+    s = np.empty((OUT + 1 + channels) * PIXELS, image.dtype)
+    for tile in range(start, stop):
+        x0, y0 = (first + tile) % columns * tiles.TILE_WIDTH, (first + tile) // columns * tiles.TILE_HEIGHT
+        _begin_tile(s, x0, y0, width, height)
+        s[OUT * PIXELS :] = 0.0
+        for i in range(offsets[tile], offsets[tile + 1]):
+            if (i - offsets[tile]) % PATIENCE == PATIENCE - 1 and _ended(s):
+                break
+            r = ranks[i]
+            begin, end = _rows(shapes[r], x0, y0)
+            _weigh(s, begin, end, shapes[r])
+            _add(s, begin, end, OUT, WEIGHT, image.dtype.type(1.0))
+            for k in range(channels):
+                _add(s, begin, end, OUT + 1 + k, WEIGHT, values[r, k])
+        for y in range(y0, min(y0 + tiles.TILE_HEIGHT, height)):
+            for x in range(x0, min(x0 + tiles.TILE_WIDTH, width)):
+                p = (y - y0) * tiles.TILE_WIDTH + x - x0
+                alpha[y, x, 0] = s[OUT * PIXELS + p]
+                for k in range(channels):
+                    image[y, x, k] = s[(OUT + 1 + k) * PIXELS + p]
+
+
+@callee
+@no_type_check
+def _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha):
+    """Loads the gradients of a tile's pixels, and what its rays have to come at their beginning."""
+    height, width, channels = image.shape
+    s[REST * PIXELS :] = 0.0
+    for y in range(y0, min(y0 + tiles.TILE_HEIGHT, height)):
+        for x in range(x0, min(x0 + tiles.TILE_WIDTH, width)):
+            p = (y - y0) * tiles.TILE_WIDTH + x - x0
+            s[GRADIENT * PIXELS + p] = v_alpha[y, x, 0]
+            rest = alpha[y, x, 0] * v_alpha[y, x, 0]
+            for k in range(channels):
+                s[(GRADIENT + 1 + k) * PIXELS + p] = v_image[y, x, k]
+                rest += image[y, x, k] * v_image[y, x, k]
+            s[REST * PIXELS + p] = rest
+
+
+@fast_callee
+@no_type_check
+def _weigh_again(s, begin, end, shape):
+    """As _weigh; RAW gets alpha before it is held at 0.999, and VALUE the gradient of alpha as a channel."""
+    mean_x, mean_y, opacity = shape[tiles.MEAN_X], shape[tiles.MEAN_Y], shape[tiles.OPACITY]
+    a, b, c = shape[tiles.CONIC_XX], shape[tiles.CONIC_XY], shape[tiles.CONIC_YY]
+    for p in range(begin, end):
+        s[_at(RAW) + p] = _alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
+        s[_at(VALUE) + p] = s[_at(GRADIENT) + p]
+
+
+@fast_callee
+@no_type_check
+def _moments(s, begin, end, shape, out):
+    """Advances transmittance and REST, and writes weights, gradients of exponents (to RAW) and their moments."""
+    real = s.dtype.type
+    mean_x, mean_y = shape[tiles.MEAN_X], shape[tiles.MEAN_Y]
+    zero, one = real(0.0), real(1.0)
+    max_alpha, min_transmittance = real(MAX_ALPHA), real(MIN_TRANSMITTANCE)
+    m = m_x = m_y = m_xx = m_xy = m_yy = zero
+    for p in range(begin, end):
+        dx, dy = s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y
+        raw, before, value = s[_at(RAW) + p], s[_at(TRANSMITTANCE) + p], s[_at(VALUE) + p]
+        alpha = raw if raw < max_alpha else max_alpha
+        after = before * (one - alpha)
+        lit = after > min_transmittance
+        weight = alpha * before if lit else zero
+        rest = s[_at(REST) + p] - weight * value
+        s[_at(REST) + p] = rest
+        s[_at(WEIGHT) + p] = weight
+        s[_at(TRANSMITTANCE) + p] = after if lit else zero
+        v = raw * (before * value - rest / (one - alpha))
+        v = v if lit & (raw <= max_alpha) else zero
+        s[_at(RAW) + p] = v
+        m += v
+        m_x, m_y = m_x + v * dx, m_y + v * dy
+        m_xx, m_xy, m_yy = m_xx + v * dx * dx, m_xy + v * dx * dy, m_yy + v * dy * dy
+    out[0], out[1], out[2], out[3], out[4], out[5] = m, m_x, m_y, m_xx, m_xy, m_yy
+
+
+@fast_callee
+@no_type_check
+def _weighted_sum(s, begin, end, plane):
+    """The sum of a plane times the weights."""
+    total = s.dtype.type(0.0)
+    for p in range(begin, end):
+        total += s[_at(WEIGHT) + p] * s[_at(plane) + p]
+    return total
+
+
+@fast_callee
+@no_type_check
+def _absolute_sums(s, begin, end, shape):
+    """The sums over pixels of the absolute gradients of the Gaussian's centre."""
+    mean_x, mean_y = shape[tiles.MEAN_X], shape[tiles.MEAN_Y]
+    a, b, c = shape[tiles.CONIC_XX], shape[tiles.CONIC_XY], shape[tiles.CONIC_YY]
+    total_x = total_y = s.dtype.type(0.0)
+    for p in range(begin, end):
+        dx, dy = s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y
+        total_x += abs(s[_at(RAW) + p] * (a * dx + b * dy))
+        total_y += abs(s[_at(RAW) + p] * (b * dx + c * dy))
+    return total_x, total_y
+
+
+@kernel
+@no_type_check
+def composite_tiles_backward(
+    start, stop, first, offsets, ranks, slots, shapes, values, columns, image, alpha, v_image, v_alpha, absolute, parts
+):
+    """Writes each list entry's part of its Gaussian's gradients into its row of `parts`: moments, channels and, where
+    `absolute`, the sums of absolute gradients of the centre. Rows of Gaussians behind all rays' ends stay as they are.
+    """
+    height, width, channels = image.shape
+    s = np.empty((GRADIENT + 1 + channels) * PIXELS, image.dtype)
+    for tile in range(start, stop):
+        x0, y0 = (first + tile) % columns * tiles.TILE_WIDTH, (first + tile) // columns * tiles.TILE_HEIGHT
+        _begin_tile(s, x0, y0, width, height)
+        _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha)
+        for i in range(offsets[tile], offsets[tile + 1]):
+            if (i - offsets[tile]) % PATIENCE == PATIENCE - 1 and _ended(s):
+                break
+            r, out = ranks[i], parts[slots[i]]
+            begin, end = _rows(shapes[r], x0, y0)
+            _weigh_again(s, begin, end, shapes[r])
+            for k in range(channels):
+                _add(s, begin, end, VALUE, GRADIENT + 1 + k, values[r, k])
+            _moments(s, begin, end, shapes[r], out)
+            for k in range(channels):
+                out[MOMENTS + k] = _weighted_sum(s, begin, end, GRADIENT + 1 + k)
+            if absolute:
+                out[MOMENTS + channels], out[MOMENTS + channels + 1] = _absolute_sums(s, begin, end, shapes[r])

@@ -1,0 +1,1 @@
+"""LiDAR sweeps as rays and points."""

@@ -1,0 +1,24 @@
+"""What LiDAR met about the time of an image."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.lidar.sweeps import read_sweep, without_own_car
+from drivesplat.scene.rigid import apply
+from drivesplat.scene.scene import Sweep
+
+
+def nearest_returns(
+    sweeps: Iterable[Sweep], timestamp: int, interval: float, own_car_radius: float = 0.0
+) -> np.ndarray | None:
+    """World points (n, 3) of the readable sweep nearest to `timestamp`, those within `own_car_radius` metres of the
+    sensor left out; None where none is within `interval`, microseconds as the timestamp."""
+    for sweep in sorted(sweeps, key=lambda sweep: abs(sweep.timestamp - timestamp)):
+        if abs(sweep.timestamp - timestamp) >= interval:
+            break
+        with suppress(DatasetError):  # the stage lidar_seed is the one that complains
+            return apply(sweep.sensor_to_world, without_own_car(read_sweep(sweep), own_car_radius))
+    return None

@@ -1,0 +1,97 @@
+"""LiDAR sweeps in world coordinates, without the own car and without what moves."""
+
+import logging
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.scene.rigid import apply
+from drivesplat.scene.scene import Scene, Sweep, place_of
+from drivesplat.scene.splits import Group, sweep_groups
+from drivesplat.scene.tracks import Box
+from drivesplat.settings.holdout import HoldoutSettings
+
+log = logging.getLogger(__name__)
+
+_RECORD = 5
+"""nuScenes' .pcd.bin: x, y, z (metres, sensor frame), intensity, ring; five float32 a return."""
+
+
+def read_sweep(sweep: Sweep) -> np.ndarray:
+    """The returns (n, 3) of a sweep in its sensor's frame, metres, non-finite ones left out.
+
+    Raises DatasetError naming the sample_data token and the path where the file is missing, truncated or empty.
+    """
+    fault = sweep_fault(sweep)
+    if fault:
+        leave_out = "" if sweep.is_key_frame else "lidar_seed.sweeps: false to do without all between key frames, or "
+        raise DatasetError(f"{fault}; restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it")
+    points = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
+    return points[np.isfinite(points).all(axis=1)].astype(np.float64)
+
+
+def sweep_fault(sweep: Sweep) -> str | None:
+    """What is wrong with a sweep's file, beside its sample_data token and path, or None."""
+    path = Path(sweep.path)
+    where = f"{place_of(sweep)}: LiDAR file {path}"
+    if not path.is_file():
+        return f"{where} is missing"
+    size = path.stat().st_size
+    if size == 0 or size % (4 * _RECORD):
+        return f"{where} is corrupt ({size} bytes are no whole number of returns)"
+    return None
+
+
+def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:
+    """The sweeps that a training may see, of key frames and, where the scene holds any, between them."""
+    return sweeps_of(scene, holdout, ("train",))
+
+
+def sweeps_of(scene: Scene, holdout: HoldoutSettings, groups: tuple[Group, ...]) -> list[Sweep]:
+    """The sweeps of some groups, of key frames and, where the scene holds any, between them."""
+    owners = sweep_groups(scene, holdout)
+    return [sweep for sweep, group in zip(scene.sweeps, owners, strict=True) if group in groups]
+
+
+def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
+    """The sweeps that a training may see, as `returns_of` gives them."""
+    return returns_of(scene, holdout, own_car_radius, ("train",))
+
+
+def returns_of(
+    scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...]
+) -> list[tuple[Sweep, np.ndarray]]:
+    """The sweeps of some groups, each with its returns (n, 3) in world coordinates, the own car's left out. A sweep
+    whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
+    found = []
+    for sweep in sweeps_of(scene, holdout, groups):
+        with suppress(DatasetError):
+            points = without_own_car(read_sweep(sweep), own_car_radius)
+            found.append((sweep, apply(sweep.sensor_to_world, points)))
+    return found
+
+
+def without_own_car(points: np.ndarray, radius: float) -> np.ndarray:
+    """Sensor-frame returns (n, 3) farther than `radius` metres (horizontally) from the sensor."""
+    return points[np.hypot(points[:, 0], points[:, 1]) > radius]
+
+
+def outside_boxes(points: np.ndarray, boxes: list[Box], margin: float) -> np.ndarray:
+    """Which world points (n, 3) lie outside all boxes grown by `margin` metres on every side: (n,) bool."""
+    outside = np.ones(len(points), dtype=bool)
+    for box in boxes:
+        outside &= ~box.holds(points, margin, floor=-margin)
+    return outside
+
+
+def thin(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Indices (m,) of one point for every occupied voxel of edge `voxel` metres, in order; all for voxel 0."""
+    if voxel == 0 or len(points) == 0:
+        return np.arange(len(points))
+    cells = np.floor(points / voxel).astype(np.int64)
+    cells -= cells.min(axis=0)
+    spans = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
+    return np.sort(np.unique(keys, return_index=True)[1])

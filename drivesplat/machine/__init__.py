@@ -1,0 +1,1 @@
+"""The machine: compute device, doctor, building gsplat."""

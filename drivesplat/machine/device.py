@@ -1,0 +1,118 @@
+"""The compute device, probed through torch alone, so that AMD's builds of torch are treated alike."""
+
+import logging
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+
+import torch
+
+from drivesplat.errors import DeviceError
+from drivesplat.machine.gsplat_build.installed import build_record, compiled_extension, covers, package_folder
+from drivesplat.settings.device import DeviceSettings
+
+log = logging.getLogger(__name__)
+
+COMPILE = f"run `make setup` (with a Python of your own: `{sys.executable} -m drivesplat.machine.gsplat_build`)"
+REBUILD = "`rm -r .venv; make setup`"
+
+
+def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) -> torch.device:
+    """The torch device to train or render on; `min_free_gb` stands in for the setting of that name where given.
+
+    Raises DeviceError, saying what to do, where there is no usable GPU (unless `cpu` or `any` was written), gsplat is
+    not importable or cannot run on it, or too little memory is free.
+    """
+    if settings.kind == "cpu" or (settings.kind == "any" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    try:
+        _require_gpu(settings.min_free_gb if min_free_gb is None else min_free_gb)
+    except DeviceError as error:
+        if settings.kind != "any":
+            raise
+        log.warning("going on with the CPU: %s", error)
+        return torch.device("cpu")
+    if settings.max_gb is not None:
+        total_gb = torch.cuda.get_device_properties().total_memory / 1e9
+        torch.cuda.set_per_process_memory_fraction(min(1.0, settings.max_gb / total_gb))
+    return torch.device("cuda")
+
+
+def _require_gpu(needed_gb: float) -> None:
+    if not torch.cuda.is_available():
+        build = (
+            "is built without GPU support"
+            if not (torch.version.cuda or torch.version.hip)
+            else "sees no GPU (driver missing or too old?)"
+        )
+        raise DeviceError(
+            f"no usable GPU: torch {torch.__version__} {build}; "
+            "`make doctor` says what to do, or write device: cpu (very slow on real scenes)"
+        )
+    free_gb = torch.cuda.mem_get_info()[0] / 1e9
+    name = torch.cuda.get_device_name()
+    if free_gb < needed_gb:
+        raise DeviceError(
+            f"{name} has {free_gb:.1f} GB of free memory, device.min_free_gb asks for {needed_gb:g}; "
+            "end other programs on it, or lower train.cap_max, images.width and device.min_free_gb"
+        )
+    _require_gsplat()
+
+
+def _require_gsplat() -> None:
+    """Loads gsplat's kernels. Never compiles: left alone, gsplat would, silently and for minutes."""
+    if torch.version.cuda and not {"gsplat.csrc", "gsplat.cuda._backend"} & sys.modules.keys():
+        _refuse_uncompiled()
+    try:
+        if torch.version.cuda and "gsplat.cuda._backend" not in sys.modules:
+            import_module("gsplat.csrc")  # what does not load would be compiled anew
+        from gsplat.cuda._backend import _C
+    except Exception as error:  # compiled code can fail to load in any way
+        raise DeviceError(
+            f"gsplat cannot be loaded ({type(error).__name__}: {error}); "
+            f"`make doctor` says why, {REBUILD} reinstalls it for this torch and CUDA; or write device: cpu"
+        ) from error
+    if _C is None:
+        raise DeviceError(
+            "gsplat is not compiled and there is no CUDA toolkit (nvcc) to compile it with; "
+            f"{COMPILE}, `make doctor` says what that needs; or write device: cpu"
+        )
+
+
+def _refuse_uncompiled() -> None:
+    if package_folder() is None:
+        return  # the import says so
+    if compiled_extension() is None:
+        raise DeviceError(
+            "gsplat is installed, but its CUDA kernels are not compiled for this torch, and a run does not start that: "
+            f"{COMPILE} (minutes, once; it brings nvcc along), `make doctor` says what it needs; or write device: cpu"
+        )
+    archs = build_record().get("archs")
+    if archs and not covers(archs, torch.cuda.get_device_capability()):
+        major, minor = torch.cuda.get_device_capability()
+        raise DeviceError(
+            f"gsplat has been compiled for compute capability {', '.join(archs)}, and "
+            f"{torch.cuda.get_device_name()} has {major}.{minor}: "
+            f'run `GSPLAT_ARCHS="{";".join([*archs, f"{major}.{minor}"])}" make setup`, '
+            "or write device: cpu"
+        )
+
+
+def device_name(device: torch.device) -> str:
+    """What `train.json` calls the device."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({platform.machine()})"
+
+
+@contextmanager
+def telling_out_of_memory(gaussians: Callable[[], int]) -> Iterator[None]:
+    """Turns an exhausted GPU into a DeviceError with what lowers the need; `gaussians` counts them when it happens."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError:
+        peak = torch.cuda.max_memory_allocated() / 1e9
+        raise DeviceError(
+            f"out of GPU memory with {gaussians():,} Gaussians (peak {peak:.1f} GB): lower train.cap_max, then "
+            "images.width, then the number of cameras or sweeps"
+        ) from None

@@ -1,0 +1,160 @@
+"""The stage `actors`: which vehicles become actors, and where their Gaussians start.
+
+LiDAR of the training sweeps that lies in an actor's box, gathered over the drive in the actor's own frame; random
+points in the box where that is little (Street Gaussians, Yan et al. 2024, arXiv 2401.01339). Colours are those of
+training images in whose pixels the actor is seen. Held-out images and sweeps contribute nothing.
+"""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivesplat.io.prefetch import ahead
+from drivesplat.lidar.coloring import in_image
+from drivesplat.lidar.movers import Mover, movers
+from drivesplat.lidar.sweeps import training_returns
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
+from drivesplat.scene.regions import LEAST_PIXELS, hulls_in, owner_image
+from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.scene import Frame, Scene, Sweep, Track
+from drivesplat.scene.splits import training_images
+from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
+
+log = logging.getLogger(__name__)
+
+CYCLES = ("vehicle.bicycle", "vehicle.motorcycle")
+UNSEEN = 127
+"""Grey of an actor that no pixel shows."""
+
+
+def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
+    """The record of `drivesplat.scene.actor_record`, provenance aside. A mover that no training image sees is left out."""
+    sweeps = training_returns(scene, job.holdout, job.own_car_radius)
+    order = {track.id: i for i, track in enumerate(scene.tracks)}
+    seeds = []
+    for mover in sorted(movers(scene), key=lambda mover: mover.track.id):
+        if may_be_actor(mover.track, job.actors):
+            random = np.random.default_rng((job.random_seed, order[mover.track.id]))
+            seeds.append(Seed(mover, *gathered_points(scene, mover, sweeps, job.actors, random)))
+    for sight in training_sights(scene, job, own_car):
+        for seed in seeds:
+            seed.look(sight)
+    unseen = [seed.mover.track.id for seed in seeds if not seed.seen]
+    if unseen:
+        log.info("%d tracks that move are left out, no training image sees them: %s", len(unseen), ", ".join(unseen))
+    actors = [seed.record() for seed in seeds if seed.seen]
+    for actor in actors:
+        log.info("%s: %d points, %d of them LiDAR's", actor["id"], len(actor["points"]), actor["lidar_points"])
+    return {"actors": actors}
+
+
+def may_be_actor(track: Track, settings: ActorSeedSettings) -> bool:
+    """Whether objects of its class become actors."""
+    if track.category in CYCLES:
+        return settings.cycles
+    return track.category.startswith("vehicle.") or (settings.humans and track.category.startswith("human."))
+
+
+def gathered_points(
+    scene: Scene,
+    mover: Mover,
+    sweeps: list[tuple[Sweep, np.ndarray]],
+    settings: ActorSeedSettings,
+    random: np.random.Generator,
+) -> tuple[np.ndarray, int]:
+    """Points (n, 3) in an object's frame: LiDAR's first, then random ones in its box; and how many are LiDAR's.
+
+    `sweeps` with their returns (m, 3) in world coordinates.
+    """
+    gathered = (mover.own(points, scene.seconds(sweep.timestamp), settings.box_margin) for sweep, points in sweeps)
+    lidar = np.concatenate([np.empty((0, 3)), *gathered])
+    wanted = min(settings.random_points, settings.max_points) if len(lidar) < settings.min_points else 0
+    if len(lidar) > settings.max_points:
+        lidar = lidar[np.sort(random.choice(len(lidar), settings.max_points, replace=False))]
+    filling = random.uniform(-0.5, 0.5, (max(0, wanted - len(lidar)), 3)) * mover.track.size
+    return np.concatenate([lidar, filling]), len(lidar)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A training image: `pixels` (h, w, 3) uint8; `owners` (h, w), whose every pixel is, as a number of `tracks`, which
+    tells it by id, -1 where it is nobody's; `seen`, the tracks that are seen there."""
+
+    frame: Frame
+    seconds: float
+    intrinsics: np.ndarray
+    pixels: np.ndarray
+    owners: np.ndarray
+    tracks: dict[str, int]
+    seen: set[str]
+
+
+def training_sights(scene: Scene, job: ActorSeedJob, own_car: OwnCar) -> Iterator[Sight]:
+    """The training images, one by one."""
+    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
+    return ahead(lambda frame: sight_of(scene, frame, job, own_car), frames)
+
+
+def sight_of(scene: Scene, frame: Frame, job: ActorSeedJob, own_car: OwnCar) -> Sight:
+    """A frame, with what is seen in it: of LEAST_PIXELS pixels and not hidden by nearer boxes and the own car."""
+    size = target_size(frame, job.images)
+    hulls = hulls_in(scene, frame, size)
+    owners, covered = owner_image(hulls, size)
+    owners[own_car.pixels(frame.camera, size)] = -1
+    tracks = {hull.box.track_id: number for number, hull in enumerate(hulls)}
+    shown = np.bincount(owners[owners >= 0], minlength=len(hulls))
+    seen = {track for track, number in tracks.items() if shown[number] and covered[number] >= LEAST_PIXELS}
+    pixels, intrinsics = read_image(frame.image_path, size), continuous_intrinsics(frame, size)
+    return Sight(frame, scene.seconds(frame.timestamp), intrinsics, pixels, owners, tracks, seen)
+
+
+class Seed:
+    """An actor in the making: its points, and what the images that it has been looked at in show of them.
+
+    A point has the colour of the image whose camera was nearest to it, of those in which its pixel is the actor's.
+    """
+
+    def __init__(self, mover: Mover, points: np.ndarray, lidar: int):
+        self.mover = mover
+        self.seen, self.pixels = False, 0
+        self._points, self._lidar = points, lidar
+        self._colors = np.zeros((len(points), 3), dtype=np.uint8)
+        self._distances = np.full(len(points), np.inf)
+
+    def look(self, sight: Sight) -> None:
+        """Takes the colours that an image shows better than those before it."""
+        self.seen |= self.mover.track.id in sight.seen
+        number, pose = sight.tracks.get(self.mover.track.id), self.mover.pose(sight.seconds)
+        if number is None or pose is None:
+            return
+        self.pixels += int((sight.owners == number).sum())
+        points = apply(pose, self._points)
+        camera = inverse(sight.frame.camera_to_world), sight.intrinsics
+        index, rows, columns, _ = in_image(points, *camera, sight.owners.shape)
+        distances = np.linalg.norm(points[index] - sight.frame.camera_to_world[:3, 3], axis=1)
+        better = (sight.owners[rows, columns] == number) & (distances < self._distances[index])
+        self._distances[index[better]] = distances[better]
+        self._colors[index[better]] = sight.pixels[rows[better], columns[better]]
+
+    def record(self) -> dict[str, Any]:
+        """The actor as `drivesplat.scene.actor_record` describes it. Points that no image shows have the others' mean
+        colour."""
+        track, motion, shown = self.mover.track, self.mover.motion, np.isfinite(self._distances)
+        mean = self._colors[shown].mean(axis=0).round() if shown.any() else UNSEEN
+        return {
+            "id": track.id,
+            "category": track.category,
+            "size": track.size,
+            "times": motion.times,
+            "object_to_world": motion.object_to_world,
+            "runs": [list(run) for run in motion.runs],
+            "reach": motion.reach,
+            "points": self._points.astype(np.float32),
+            "points_rgb": np.where(shown[:, None], self._colors, mean).astype(np.uint8),
+            "lidar_points": self._lidar,
+            "pixels": self.pixels,
+        }

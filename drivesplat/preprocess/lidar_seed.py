@@ -1,0 +1,181 @@
+"""The stage `lidar_seed`: where the Gaussians start.
+
+LiDAR of the training sweeps in world coordinates, without the own car and without what moves, thinned, coloured
+from training images; points that the refinement of poses triangulated, if two training images see them; points of a
+file, if given; then far points along pixels that none of these cover. Held-out images and sweeps contribute nothing,
+neither position (of LiDAR) nor colour, and a point that no training image sees is left out.
+"""
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyParseError
+
+from drivesplat.errors import DatasetError
+from drivesplat.io.point_cloud import PointCloud, read_positions
+from drivesplat.io.prefetch import ahead
+from drivesplat.lidar.coloring import ColorView, color_by_visibility
+from drivesplat.lidar.sweeps import outside_boxes, read_sweep, sweep_fault, thin, without_own_car
+from drivesplat.poses.triangulated import mean_over_views, seen_in
+from drivesplat.preprocess.far_points import far_points, uncovered
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
+from drivesplat.scene.regions import fill, hulls_in
+from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.splits import sweep_groups, training_images
+from drivesplat.scene.tracks import boxes_of, tracks_that_move
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_seed import SeedJob
+
+log = logging.getLogger(__name__)
+
+
+def seed_points(
+    scene: Scene, job: SeedJob, own_car: OwnCar = NOWHERE, triangulated: dict[str, Any] | None = None
+) -> PointCloud:
+    """The seed of a scene, to which the own car's body lends nothing; `triangulated` is the content of its
+    triangulated.pkl. Its note counts points by source, missing sweeps, and names the points file.
+
+    Raises DatasetError where a LiDAR file is missing (unless told to go on) or nothing is left to start from.
+    """
+    random = np.random.default_rng(job.random_seed)
+    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
+    if not frames:
+        raise DatasetError(
+            f"scene {scene.name}: the hold-out leaves none of its {len(scene.key_frame_timestamps)} key frames to "
+            "train on; lower holdout.last_block, or set holdout.every_nth: 0"
+        )
+    lidar, times, missing = lidar_points(scene, job)
+    middle = float(np.median(scene.key_frame_timestamps))
+    extra = extra_points(scene, job.lidar_seed.points_file)
+    sources = {
+        "lidar": (lidar, times),
+        "triangulated": triangulated_points(scene, job, triangulated) if triangulated else (np.empty((0, 3)), []),
+        "points_file": (extra, np.full(len(extra), middle)),
+    }
+    positions, times = (np.concatenate(columns) for columns in zip(*sources.values(), strict=True))
+    source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
+    colors, seen = color_by_visibility(positions, times, color_views(scene, frames, job.images, own_car))
+    kept = np.flatnonzero(seen)
+    if len(kept) > job.lidar_seed.max_points:
+        kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
+    positions, colors, source = positions[kept], colors[kept], source[kept]
+    far, far_colors = _far_points(scene, frames, positions, job, own_car, random)
+    note = {
+        **{name: int((source == i).sum()) for i, name in enumerate(sources)},
+        "far": len(far),
+        "lidar_missing": missing,
+        "extra_points": Path(job.lidar_seed.points_file).name if job.lidar_seed.points_file else None,
+    }
+    if len(positions) + len(far) == 0:
+        raise DatasetError(
+            f"scene {scene.name}: no seed points: "
+            "no LiDAR return is seen by a training image, and there are no far points (lidar_seed.far_points)"
+        )
+    log.info("%d seed points: %s", len(positions) + len(far), note)
+    return PointCloud(np.concatenate([positions, far]).astype(np.float32), np.concatenate([colors, far_colors]), note)
+
+
+def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, int]:
+    """Static LiDAR points (n, 3) of the training sweeps in world coordinates, their times (n,), and the sweeps missing.
+
+    Raises DatasetError where the scene has no LiDAR at all and on_missing is 'stop'.
+    """
+    settings = job.lidar_seed
+    if not scene.sweeps and settings.on_missing == "stop":
+        raise DatasetError(
+            f"scene {scene.name} has no LiDAR sweeps; set lidar_seed.on_missing: warn to seed from images alone"
+        )
+    positions, times, missing = [np.empty((0, 3))], [np.empty(0)], 0
+    moving = tracks_that_move(scene)
+    for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
+        try:
+            points = read_sweep(sweep)
+        except DatasetError:
+            if settings.on_missing == "stop":
+                raise
+            missing += 1
+            log.log(logging.WARNING if missing == 1 else logging.DEBUG, "%s; left out", sweep_fault(sweep))
+            continue
+        if group != "train":
+            continue
+        points = apply(sweep.sensor_to_world, without_own_car(points, settings.own_car_radius))
+        boxes = boxes_of(moving, sweep.timestamp, scene.key_frame_interval)
+        points = points[outside_boxes(points, boxes, settings.box_margin)]
+        positions.append(points)
+        times.append(np.full(len(points), sweep.timestamp, dtype=np.float64))
+    if missing:
+        log.warning("%d of %d LiDAR sweeps are missing; seeding without them", missing, len(scene.sweeps))
+    merged, merged_times = np.concatenate(positions), np.concatenate(times)
+    kept = thin(merged, settings.voxel_size)
+    return merged[kept], merged_times[kept], missing
+
+
+def extra_points(scene: Scene, path: str | None) -> np.ndarray:
+    """The points (n, 3) of a PLY in the dataset's global frame, in world coordinates; none without a path."""
+    if path is None:
+        return np.empty((0, 3))
+    try:
+        return read_positions(Path(path).expanduser()) - scene.origin
+    except (OSError, PlyParseError, KeyError, ValueError) as error:
+        raise DatasetError(f"lidar_seed.points_file {path} is no readable PLY of points ({error})") from error
+
+
+def triangulated_points(scene: Scene, job: SeedJob, record: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The triangulated points (n, 3) that enough training images see, in world coordinates, and the times (n,) at which
+    they do, on average."""
+    training = training_images(scene, job.holdout)
+    times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
+    chosen = seen_in(record, training)
+    return record["points"][chosen], mean_over_views(record, training, times)[chosen]
+
+
+def color_views(
+    scene: Scene, frames: list[Frame], images: ImageSettings, own_car: OwnCar = NOWHERE
+) -> Iterator[ColorView]:
+    """The frames one by one as sources of colour: at 12 Hz all of them would not fit into memory."""
+    return ahead(lambda frame: color_view(scene, frame, images, own_car), frames)
+
+
+def color_view(scene: Scene, frame: Frame, images: ImageSettings, own_car: OwnCar = NOWHERE) -> ColorView:
+    """A frame as a source of colour; pixels of moving boxes and of the own car are not usable."""
+    size = target_size(frame, images)
+    usable = ~own_car.pixels(frame.camera, size)
+    for hull in hulls_in(scene, frame, size):
+        if hull.box.moves:
+            usable[fill(hull.polygon, size)] = False
+    return ColorView(
+        read_image(frame.image_path, size),
+        continuous_intrinsics(frame, size),
+        inverse(frame.camera_to_world),
+        frame.timestamp,
+        usable,
+    )
+
+
+def _far_points(
+    scene: Scene,
+    frames: list[Frame],
+    covered: np.ndarray,
+    job: SeedJob,
+    own_car: OwnCar,
+    random: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+
+    def view_of(frame: Frame) -> tuple[ColorView, np.ndarray]:
+        view = color_view(scene, frame, job.images, own_car)
+        return view, uncovered(view, covered)
+
+    settings = job.lidar_seed
+    positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
+    shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
+    for frame, (view, candidates), count in zip(frames, ahead(view_of, frames), shares, strict=True):
+        ground_z = float(frame.ego_to_world[2, 3])
+        p, c = far_points(view, ground_z, candidates, count, settings.far_depths, random)
+        positions.append(p)
+        colors.append(c)
+    return np.concatenate(positions), np.concatenate(colors)

@@ -1,0 +1,155 @@
+"""The stage `masks`: what is static, moving or sky in every image, as PNGs that a person can look at.
+
+- masks/masks.json: what was made, from what, and which cameras see the own car
+- masks/regions/{camera}/{timestamp}.png: labels of `drivesplat.scene.regions.LABELS`
+- masks/sky/{camera}/{timestamp}.png: 255 where the sky is
+- masks/semantic/{camera}/{timestamp}.png: the user's classes, where there are any
+"""
+
+import logging
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.io.storage import read_record, unreadable
+from drivesplat.lidar.nearest_sweep import nearest_returns
+from drivesplat.lidar.sweeps import training_sweeps
+from drivesplat.preprocess.sky_mask import sky_mask
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
+from drivesplat.scene.regions import LABELS, label_image
+from drivesplat.scene.scene import Frame, Scene, Sweep
+from drivesplat.scene.splits import Group, frame_groups
+from drivesplat.settings.masks import MaskJob
+
+log = logging.getLogger(__name__)
+
+UNLABELLED = 255
+"""The value of pixels that a user's map of classes says nothing of."""
+LEAST_SKY = 0.005
+"""Where the heuristic finds less sky than this share of all pixels, it has found none: it looks for what is bright."""
+NO_SKY = (
+    "scene %s: no sky was found, as by night or in a tunnel: losses about the sky are left out; "
+    "masks.sky_folder takes masks of your own"
+)
+
+
+def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
+    """Writes the masks of every image below `folder`; returns the record for masks.json. The own car's body is a region
+    of its own, no sky, and of no class. The sky of a training image is told by sweeps that a training may see alone.
+
+    Raises DatasetError naming the file where a user's mask is missing or unreadable.
+    """
+    groups, training = frame_groups(scene, job.holdout), training_sweeps(scene, job.holdout)
+
+    def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
+        size = target_size(frame, job.images)
+        labels = _regions(scene, frame, job, size)
+        labels[own_car.pixels(frame.camera, size)] = LABELS["own_car"]
+        body = labels == LABELS["own_car"]
+        sweeps = training if group == "train" else scene.sweeps
+        sky = _sky(sweeps, frame, job, size, scene.key_frame_interval) & ~body
+        write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
+        write_png(folder / mask_name("regions", frame.camera, frame.timestamp), labels)
+        return float(sky.mean()), _semantic(frame, job, body, folder), bool(body.any())
+
+    with ThreadPoolExecutor() as pool:
+        sky_shares, classes, bodies = zip(*pool.map(one, scene.frames, groups), strict=True)
+    seeing = {frame.camera for frame, body in zip(scene.frames, bodies, strict=True) if body}
+    sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= LEAST_SKY
+    if not sky_known:
+        log.warning(NO_SKY, scene.name)
+    return {
+        "labels": LABELS,
+        "images": len(scene.frames),
+        "regions": "masks" if job.masks.regions_folder else "boxes",
+        "sky": "masks" if job.masks.sky_folder else "heuristic",
+        "sky_share": float(np.mean(sky_shares)),
+        "sky_known": sky_known,
+        "semantic_classes": max(classes),
+        "own_car": {camera: own_car.source.get(camera, "masks") for camera in sorted(seeing)},
+    }
+
+
+def mask_name(kind: str, camera: str, timestamp: int) -> str:
+    """The path of a mask below the masks folder; `kind` is 'regions', 'sky' or 'semantic'."""
+    return f"{kind}/{camera}/{timestamp}.png"
+
+
+def read_masks_record(folder: Path) -> dict[str, Any]:
+    """Reads `masks.json`. Raises ResultError where it is not one."""
+    return read_record(folder / "masks.json", "masks", "regions", "sky_known", "semantic_classes", "own_car")
+
+
+def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    """The sky (h, w) bool of an image at `size` (width, height).
+
+    Raises ResultError where the mask is missing or unreadable.
+    """
+    return _made_mask(folder, "sky", camera, timestamp, size) > 127
+
+
+def read_labels(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    """The label image (h, w) of an image at `size` (width, height).
+
+    Raises ResultError where it is missing or unreadable.
+    """
+    return _made_mask(folder, "regions", camera, timestamp, size)
+
+
+def read_classes(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    """The user's classes (h, w) of an image at `size` (width, height), UNLABELLED where there is none.
+
+    Raises ResultError where they are missing or unreadable.
+    """
+    return _made_mask(folder, "semantic", camera, timestamp, size)
+
+
+def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int:
+    """Writes the user's classes of an image, where there are any, none of them for the own car's `body` (h, w) bool;
+    returns how many there are at least."""
+    if not job.masks.semantic_folder:
+        return 0
+    classes = _users_mask(job.masks.semantic_folder, frame, (body.shape[1], body.shape[0])).copy()
+    classes[body] = UNLABELLED
+    write_png(folder / mask_name("semantic", frame.camera, frame.timestamp), classes)
+    labelled = classes[classes != UNLABELLED]
+    return int(labelled.max()) + 1 if len(labelled) else 0
+
+
+def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
+    path = folder / mask_name(kind, camera, timestamp)
+    try:
+        return read_mask(path, size)
+    except DatasetError as error:
+        raise unreadable(path, "masks", str(error)) from error
+
+
+def _sky(sweeps: Sequence[Sweep], frame: Frame, job: MaskJob, size: tuple[int, int], interval: float) -> np.ndarray:
+    """The sky (h, w) bool of a frame; the one of `sweeps` that is nearest, within `interval` microseconds, helps."""
+    if job.masks.sky_folder:
+        return _users_mask(job.masks.sky_folder, frame, size) > 127
+    lidar = nearest_returns(sweeps, frame.timestamp, interval)
+    return sky_mask(
+        read_image(frame.image_path, size), continuous_intrinsics(frame, size), frame.camera_to_world, lidar
+    )
+
+
+def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) -> np.ndarray:
+    if not job.masks.regions_folder:
+        return label_image(scene, frame, size)
+    labels = _users_mask(job.masks.regions_folder, frame, size).copy()
+    if labels.max() > max(LABELS.values()):
+        raise DatasetError(
+            f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; "
+            f"they end at {max(LABELS.values())}"
+        )
+    return labels
+
+
+def _users_mask(folder: str, frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    return read_mask(Path(folder).expanduser() / frame.camera / f"{Path(frame.image_path).stem}.png", size)

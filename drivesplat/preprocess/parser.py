@@ -1,0 +1,87 @@
+"""The stage `parser`: what a trainer needs of a scene, in one pickle of plain containers and arrays.
+
+The dict has the keys that users of gsplat's example trainer will recognise. Frames: world (metres, z up), OpenCV
+cameras; `Ks` in the continuous pixel convention at `image_sizes`, the size at which images are trained and measured.
+"""
+
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.io.point_cloud import PointCloud
+from drivesplat.io.storage import read_plain_pickle, unreadable
+from drivesplat.scene.images import continuous_intrinsics, target_size
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames
+from drivesplat.settings.parser import ParserJob
+
+_KEYS = {
+    "Ks", "camtoworlds", "ego_to_world", "image_paths", "image_names", "image_sizes", "camera_names", "camera_indices",
+    "timestamps", "sample_indices", "is_key_frame", "points", "points_rgb", "scene_scale", "splits",
+    "held_out_frames", "scene", "seed",
+}  # fmt: skip
+
+
+def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any]:
+    """The training record of a scene with N images and P seed points.
+
+    `Ks` (N, 3, 3), `camtoworlds` and `ego_to_world` (N, 4, 4), `image_sizes` (N, 2) width and height, `camera_indices`
+    (N,) of cameras, `timestamps` (N,) microseconds, `points` (P, 3), `points_rgb` (P, 3) uint8, `scene_scale` metres
+    (the farthest training camera from their mean), `splits`: indices of images by group. Raises DatasetError where no
+    training image is left.
+    """
+    frames = scene.frames
+    sizes = [target_size(frame, job.images) for frame in frames]
+    cameras = list(dict.fromkeys(frame.camera for frame in frames))
+    groups = np.array(frame_groups(scene, job.holdout))
+    splits = {group: np.flatnonzero(groups == group) for group in get_args(Group)}
+    if len(splits["train"]) == 0:
+        raise DatasetError(
+            f"scene {scene.name}: no training image is left; "
+            "hold out fewer key frames (holdout.every_nth, holdout.last_block)"
+        )
+    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
+    centers = camera_to_world[splits["train"], :3, 3]
+    return {
+        "Ks": np.stack([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)]),
+        "camtoworlds": camera_to_world,
+        "ego_to_world": np.stack([frame.ego_to_world for frame in frames]),
+        "image_paths": [frame.image_path for frame in frames],
+        "image_names": [Path(frame.image_path).name for frame in frames],
+        "image_sizes": np.array(sizes, dtype=np.int64),
+        "camera_names": cameras,
+        "camera_indices": np.array([cameras.index(frame.camera) for frame in frames], dtype=np.int64),
+        "timestamps": np.array([frame.timestamp for frame in frames], dtype=np.int64),
+        "sample_indices": np.array([frame.sample_index for frame in frames], dtype=np.int64),
+        "is_key_frame": np.array([frame.is_key_frame for frame in frames], dtype=bool),
+        "points": seed.positions,
+        "points_rgb": seed.colors,
+        "scene_scale": max(1.0, float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())),
+        "splits": splits,
+        "held_out_frames": held_out_key_frames(len(scene.key_frame_timestamps), job.holdout),
+        "scene": {
+            "name": scene.name,
+            "dataset": scene.dataset,
+            "version": scene.version,
+            "poses": scene.poses,
+            "key_frame_range": scene.key_frame_range,
+            "missing_images": scene.missing_images,
+        },
+        "seed": {key: value for key, value in seed.note.items() if key != "provenance"},
+    }
+
+
+def image_size(parser: dict[str, Any], index: int | np.integer) -> tuple[int, int]:
+    """Width and height in pixels at which image `index` of a parser record is trained and measured."""
+    width, height = parser["image_sizes"][index].tolist()
+    return width, height
+
+
+def read_parser(path: str | Path) -> dict[str, Any]:
+    """Reads `parser.pkl`. Raises ResultError where it is not one, or holds anything but plain data and arrays."""
+    content = read_plain_pickle(path, rule="parser")
+    if not isinstance(content, dict) or not content.keys() >= _KEYS:
+        raise unreadable(path, "parser", "it lacks the keys of a parser record")
+    return content

@@ -1,0 +1,88 @@
+"""Where a result comes from: settings, code and inputs of every stage behind it, carried from stage to stage."""
+
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from drivesplat.errors import ResultError
+from drivesplat.io.storage import canonical_json, sha256_file, sha256_text
+
+VERSIONS_OF = ("torch", "gsplat", "numpy", "nuscenes-devkit", "lpips", "pycolmap")
+
+
+def provenance(
+    stage: str, settings: dict[str, Any], code: str, upstream: Iterable[dict[str, Any]], inputs: dict[str, str]
+) -> dict[str, Any]:
+    """The provenance of a result of `stage`, given those of the results it was made from.
+
+    `inputs` are digests of files that no stage made (tables, a user's points file), by name. Raises ResultError where
+    two results behind it were made by the same stage in different ways.
+    """
+    merged = combine(upstream)
+    merged["stages"][stage] = {"settings": settings, "code": code}
+    merged["inputs"].update(inputs)
+    return sealed(merged["stages"], merged["inputs"])
+
+
+def combine(records: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Several provenances as one. Raises ResultError naming the stage and the difference where they contradict."""
+    stages: dict[str, Any] = {}
+    inputs: dict[str, str] = {}
+    for record in records:
+        contradictions = differences(stages, record["stages"], shared_only=True)
+        changed = [name for name, digest in record["inputs"].items() if inputs.get(name, digest) != digest]
+        if contradictions or changed:
+            what = "; ".join(contradictions) or f"other inputs: {', '.join(changed)}"
+            raise ResultError(
+                f"results that belong together were made differently ({what}); delete the older and rerun"
+            )
+        stages |= record["stages"]
+        inputs |= record["inputs"]
+    return sealed(stages, inputs)
+
+
+def sealed(stages: dict[str, Any], inputs: dict[str, str]) -> dict[str, Any]:
+    """The record with the digests that `metrics.json` promises."""
+    return {
+        "settings_sha256": sha256_text(canonical_json({name: stage["settings"] for name, stage in stages.items()})),
+        "code_sha256": sha256_text(canonical_json({name: stage["code"] for name, stage in stages.items()})),
+        "inputs_sha256": sha256_text(canonical_json(inputs)),
+        "versions": {name: _version(name) for name in VERSIONS_OF},
+        "stages": stages,
+        "inputs": inputs,
+    }
+
+
+def differences(expected: dict[str, Any], found: dict[str, Any], shared_only: bool = False) -> list[str]:
+    """How the stages of two provenances differ, in words; stages that only one has count unless `shared_only`."""
+    lines = []
+    for stage in sorted(expected.keys() | found.keys()):
+        if stage not in expected or stage not in found:
+            if not shared_only:
+                lines.append(f"{stage}: {'not in this result' if stage in expected else 'no longer in the config'}")
+            continue
+        a, b = (_flat(side[stage]["settings"]) for side in (expected, found))
+        for key in sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key)):
+            lines.append(f"{stage}: {key} is {b.get(key)!r} in the result, {a.get(key)!r} now")
+        if expected[stage]["code"] != found[stage]["code"]:
+            lines.append(f"{stage}: other code")
+    return lines
+
+
+def digests_of(files: Iterable[str | Path]) -> str:
+    """One digest for a set of files, by name and content."""
+    return sha256_text(canonical_json({Path(file).name: sha256_file(file) for file in files}))
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {prefix.rstrip("."): value}
+    return {key: item for name, child in value.items() for key, item in _flat(child, f"{prefix}{name}.").items()}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

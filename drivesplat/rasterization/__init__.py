@@ -1,0 +1,6 @@
+"""One door to the rasterizers: 3D Gaussians in, image, alpha and depth out."""
+
+from drivesplat.rasterization.rasterization import rasterize
+from drivesplat.rasterization.rendering import Rendering
+
+__all__ = ["Rendering", "rasterize"]

@@ -1,0 +1,1 @@
+"""nuScenes: tables into a Scene, and the download of nuScenes mini."""

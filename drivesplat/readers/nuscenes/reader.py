@@ -1,0 +1,202 @@
+"""nuScenes tables into a `Scene`, through nuscenes-devkit, every value checked on the way in.
+
+nuScenes fires its cameras and its LiDAR at different times, so every image and sweep takes the ego pose of its own
+record, never the key frame's. The tables' quaternions are w, x, y, z; box sizes are width, length, height.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.readers.checks import checked_intrinsics, checked_pose, checked_size, require_increasing
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame, Scene, Sweep, Track
+from drivesplat.settings.extract import SceneSource
+
+LIDAR = "LIDAR_TOP"
+
+
+def read(root: Path, source: SceneSource) -> Scene:
+    """The scene that `source` names, its dataset's name aside; `root` holds the folder of tables.
+
+    `source.sweeps` adds the images between key frames, `source.lidar_sweeps` the LiDAR sweeps there. `source.frames` =
+    (first, last + 1) keeps some key frames, which are then counted from 0, and what lies between them. Image files are
+    not opened. Raises DatasetError naming the offending token.
+    """
+    version, name, cameras, frames = source.version, source.scene, source.cameras, source.frames
+    tables = _load(root, version)
+    record = next((s for s in tables.scene if s["name"] == f"scene-{name}"), None)
+    if record is None:
+        there = ", ".join(s["name"].removeprefix("scene-") for s in tables.scene)
+        raise DatasetError(f"scene {name} is not in nuScenes {version} at {root}; there are: {there}")
+    samples = _samples(tables, record)
+    if frames and frames[1] > len(samples):
+        raise DatasetError(f"scene {name}: the frame range {frames} ends beyond its {len(samples)} key frames")
+    samples = samples[slice(*(frames or (None, None)))]
+    times = require_increasing([s["timestamp"] for s in samples], [s["token"] for s in samples], "sample")
+    origin = _origin(tables, samples[0], cameras)
+    scene = Scene(
+        name,
+        "",
+        version,
+        record.get("description", ""),
+        origin,
+        times,
+        (),
+        (),
+        (),
+        "nuscenes",
+        list(frames) if frames else None,
+    )
+    return Scene(
+        **{
+            **vars(scene),
+            "frames": tuple(
+                f for camera in cameras for f in _frames(tables, root, samples, camera, source.sweeps, scene)
+            ),
+            "sweeps": tuple(_sweeps(tables, root, samples, source.lidar_sweeps, scene)),
+            "tracks": tuple(_tracks(tables, samples, origin)),
+        }
+    )
+
+
+def _load(root: Path, version: str) -> Any:
+    from nuscenes.nuscenes import NuScenes
+
+    try:
+        return NuScenes(version, str(root), verbose=False)
+    except (AssertionError, KeyError, ValueError, OSError) as error:
+        raise DatasetError(
+            f"nuScenes {version} in {root} cannot be read ({type(error).__name__}: {error}); unpack it again"
+        ) from error
+
+
+def _samples(tables: Any, scene: dict) -> list[dict]:
+    samples, token = [], scene["first_sample_token"]
+    while token:
+        samples.append(_get(tables, "sample", token))
+        token = samples[-1]["next"]
+    return samples
+
+
+def _get(tables: Any, table: str, token: str) -> dict:
+    try:
+        return tables.get(table, token)
+    except KeyError:
+        raise DatasetError(f"{table} {token} is referred to but not in the tables") from None
+
+
+def _ego_pose(tables: Any, data: dict) -> np.ndarray:
+    pose = _get(tables, "ego_pose", data["ego_pose_token"])
+    return checked_pose(pose["translation"], pose["rotation"], f"ego_pose {pose['token']}")
+
+
+def _origin(tables: Any, sample: dict, cameras: tuple[str, ...]) -> np.ndarray:
+    channel = LIDAR if LIDAR in sample["data"] else cameras[0]
+    return _ego_pose(tables, _key_data(tables, sample, channel))[:3, 3].copy()
+
+
+def _key_data(tables: Any, sample: dict, channel: str) -> dict:
+    if channel not in sample["data"]:
+        raise DatasetError(
+            f"sample {sample['token']} has no {channel}; it has {', '.join(sorted(sample['data'])) or 'nothing'}"
+        )
+    return _get(tables, "sample_data", sample["data"][channel])
+
+
+def _records(tables: Any, samples: list[dict], channel: str, sweeps: bool) -> Iterator[dict]:
+    """The sample_data of a channel, key frames first to last, with those between where asked for."""
+    key = [_key_data(tables, sample, channel) for sample in samples]
+    require_increasing([d["timestamp"] for d in key], [d["token"] for d in key], "sample_data")
+    if not sweeps:
+        yield from key
+        return
+    data = key[0]
+    while True:
+        yield data
+        if data["token"] == key[-1]["token"]:
+            return
+        if not data["next"]:
+            raise DatasetError(f"sample_data {data['token']}: the chain of {channel} ends before the scene does")
+        following = _get(tables, "sample_data", data["next"])
+        require_increasing(
+            [data["timestamp"], following["timestamp"]], [data["token"], following["token"]], "sample_data"
+        )
+        data = following
+
+
+def _place(tables: Any, data: dict, scene: Scene) -> tuple[np.ndarray, np.ndarray, dict]:
+    """Ego and sensor poses in world coordinates, and the calibration record."""
+    sensor = _get(tables, "calibrated_sensor", data["calibrated_sensor_token"])
+    ego_to_world = _ego_pose(tables, data)
+    ego_to_world[:3, 3] -= scene.origin
+    sensor_to_ego = checked_pose(sensor["translation"], sensor["rotation"], f"calibrated_sensor {sensor['token']}")
+    return ego_to_world, ego_to_world @ sensor_to_ego, sensor
+
+
+def _index(data: dict, index_of_sample: dict[str, int], scene: Scene) -> int:
+    return index_of_sample[data["sample_token"]] if data["is_key_frame"] else scene.nearest_key_frame(data["timestamp"])
+
+
+def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: bool, scene: Scene) -> Iterator[Frame]:
+    index_of_sample = {sample["token"]: i for i, sample in enumerate(samples)}
+    for data in _records(tables, samples, camera, sweeps):
+        ego_to_world, camera_to_world, sensor = _place(tables, data, scene)
+        width, height = checked_size(data["width"], data["height"], data["token"])
+        yield Frame(
+            camera=camera,
+            timestamp=data["timestamp"],
+            image_path=str(root / data["filename"]),
+            width=width,
+            height=height,
+            intrinsics=checked_intrinsics(sensor["camera_intrinsic"], sensor["token"]),
+            camera_to_world=camera_to_world,
+            ego_to_world=ego_to_world,
+            is_key_frame=data["is_key_frame"],
+            sample_index=_index(data, index_of_sample, scene),
+            token=data["token"],
+        )
+
+
+def _sweeps(tables: Any, root: Path, samples: list[dict], sweeps: bool, scene: Scene) -> Iterator[Sweep]:
+    if not any(LIDAR in sample["data"] for sample in samples):
+        return
+    index_of_sample = {sample["token"]: i for i, sample in enumerate(samples)}
+    for data in _records(tables, samples, LIDAR, sweeps):
+        _, sensor_to_world, _ = _place(tables, data, scene)
+        index = _index(data, index_of_sample, scene)
+        yield Sweep(
+            str(root / data["filename"]), data["timestamp"], sensor_to_world, data["is_key_frame"], index, data["token"]
+        )
+
+
+def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Track]:
+    """One track per instance, its annotations in time order."""
+    by_instance: dict[str, list[tuple[int, int, dict]]] = {}
+    for i, sample in enumerate(samples):
+        for token in sample["anns"]:
+            annotation = _get(tables, "sample_annotation", token)
+            by_instance.setdefault(annotation["instance_token"], []).append((i, sample["timestamp"], annotation))
+    for instance, entries in by_instance.items():
+        annotations = [annotation for _, _, annotation in entries]
+        width, length, height = np.median([a["size"] for a in annotations], axis=0)
+        poses = [checked_pose(a["translation"], a["rotation"], f"sample_annotation {a['token']}") for a in annotations]
+        if not (np.isfinite([length, width, height]).all() and min(length, width, height) > 0):
+            raise DatasetError(f"instance {instance}: its boxes have no finite, positive size")
+        yield Track(
+            id=instance,
+            category=annotations[0]["category_name"],
+            size=np.array([length, width, height]),
+            timestamps=np.array([time for _, time, _ in entries], dtype=np.int64),
+            sample_indices=np.array([i for i, _, _ in entries], dtype=np.int64),
+            object_to_world=np.stack([rigid(pose[:3, :3], pose[:3, 3] - origin) for pose in poses]),
+            visibility=np.array([_visibility(a) for a in annotations], dtype=np.int64),
+        )
+
+
+def _visibility(annotation: dict) -> int:
+    token = annotation.get("visibility_token", "")
+    return int(token) if token in ("1", "2", "3", "4") else 0

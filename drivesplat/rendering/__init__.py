@@ -1,0 +1,1 @@
+"""Films and frames from trained models, along trajectories."""

@@ -1,0 +1,112 @@
+"""Paths of a film's camera: the recorded one made smooth, and others beside it; and what such a camera sees.
+
+Frames as in `drivesplat.scene.scene`: world metres, OpenCV cameras, ego x forward, y left, z up. Timestamps: microseconds.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from drivesplat.errors import DatasetError
+from drivesplat.scene.images import continuous_intrinsics
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.settings.render import TrajectorySettings
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """A camera over time: `timestamps` (n,) int64, `camera_to_world` (n, 4, 4)."""
+
+    timestamps: np.ndarray
+    camera_to_world: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, chosen: slice) -> "CameraPath":
+        """A stretch of it."""
+        return CameraPath(self.timestamps[chosen], self.camera_to_world[chosen])
+
+
+def film_path(scene: Scene, camera: str, fps: int, offset: TrajectorySettings) -> CameraPath:
+    """Where a film of the drive, `fps` frames a second at the drive's own speed, is looked at from.
+
+    It runs from the camera's first image to its last. Raises DatasetError where the scene does not hold that camera.
+    """
+    frames = recorded_frames(scene, camera)
+    recorded = np.array([frame.timestamp for frame in frames], dtype=np.int64)
+    timestamps = film_timestamps(frames[0].timestamp, frames[-1].timestamp, fps)
+    camera_to_world = smooth_poses(recorded, np.stack([frame.camera_to_world for frame in frames]), timestamps)
+    ego_to_world = smooth_poses(recorded, np.stack([frame.ego_to_world for frame in frames]), timestamps)
+    return CameraPath(timestamps, beside(camera_to_world, ego_to_world, offset))
+
+
+def recorded_frames(scene: Scene, camera: str) -> list[Frame]:
+    """A camera's images, key frames and those between, at increasing times; the first where several share one.
+
+    Raises DatasetError where there are none.
+    """
+    by_time: dict[int, Frame] = {}
+    for frame in scene.frames:
+        if frame.camera == camera:
+            by_time.setdefault(frame.timestamp, frame)
+    if not by_time:
+        cameras = ", ".join(dict.fromkeys(frame.camera for frame in scene.frames))
+        raise DatasetError(
+            f"scene {scene.name} has no image of camera {camera}; its cameras are {cameras or 'none'}: "
+            "choose eval_camera among them, or add it to cameras"
+        )
+    return [by_time[timestamp] for timestamp in sorted(by_time)]
+
+
+def film_timestamps(first: int, last: int, fps: int) -> np.ndarray:
+    """The times (n,) int64 of a film's frames: first + k / fps while within [first, last], each rounded by itself."""
+    count = (last - first) * fps // 1_000_000 + 1
+    elapsed = (2_000_000 * np.arange(count, dtype=np.int64) + fps) // (2 * fps)
+    return first + elapsed
+
+
+def smooth_poses(timestamps: np.ndarray, poses: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Poses (n, 4, 4) at the times `wanted` (n,) of a motion through `poses` (m, 4, 4) at increasing `timestamps` (m,).
+
+    Position and rotation are twice continuously differentiable, so that neither speed nor turn rate jumps.
+    """
+    # seconds since the first pose: a polynomial in microseconds since 1970 has no digits left
+    known, at = (timestamps - timestamps[0]) * 1e-6, (wanted - timestamps[0]) * 1e-6
+    smooth = np.tile(np.eye(4), (len(wanted), 1, 1))
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    if len(poses) == 1:
+        smooth[:, :3, :3], smooth[:, :3, 3] = rotations.as_matrix(), poses[:, :3, 3]
+    else:
+        smooth[:, :3, :3] = RotationSpline(known, rotations)(at).as_matrix()
+        smooth[:, :3, 3] = CubicSpline(known, poses[:, :3, 3])(at)
+    return smooth
+
+
+def beside(camera_to_world: np.ndarray, ego_to_world: np.ndarray, offset: TrajectorySettings) -> np.ndarray:
+    """Cameras (n, 4, 4) moved by `offset` along and about the axes of the car (n, 4, 4) that carries them."""
+    left, up = ego_to_world[:, :3, 1], ego_to_world[:, :3, 2]
+    yaw = Rotation.from_rotvec(math.radians(offset.yaw) * up).as_matrix()
+    moved = camera_to_world.copy()
+    moved[:, :3, :3] = yaw @ camera_to_world[:, :3, :3]
+    moved[:, :3, 3] += offset.lateral * left + offset.vertical * up
+    return moved
+
+
+def film_intrinsics(frame: Frame, width: int, height: int, horizontal_fov: float | None) -> np.ndarray:
+    """K (3, 3), continuous pixels, of a film of `width` x `height` pixels by the camera of `frame`.
+
+    The recorded image, enlarged alike in both directions about its middle until it is as wide as the film, or until the
+    horizontal field of view is `horizontal_fov` degrees. A film of another aspect gains or loses above and below.
+    """
+    k = continuous_intrinsics(frame, (frame.width, frame.height))
+    scale = width / frame.width
+    if horizontal_fov is not None:
+        scale = width / 2 / math.tan(math.radians(horizontal_fov) / 2) / k[0, 0]
+    k[:2, 2] -= np.array([frame.width, frame.height]) / 2
+    k[:2] *= scale
+    k[:2, 2] += np.array([width, height]) / 2
+    return k

@@ -1,0 +1,1 @@
+"""The record of a drive: sensors, frames, tracks, splits, regions."""

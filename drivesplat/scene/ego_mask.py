@@ -1,0 +1,65 @@
+"""What own_car.json holds: where the recording car's own body is seen.
+
+    cameras         by name, all of the scene's
+        source      'polygons' (outlines that the user gave), 'images' (found in them), null: it is not known to be seen
+        outlines    lists of corners x, y in fractions of the image's width and height, as masks.own_car_polygons has
+                    one a camera
+        share       how much of the image they enclose
+        why_null    where the source is null, why
+    provenance
+
+The stage `own_car` makes it (`drivesplat.preprocess.ego_mask`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from drivesplat.io.storage import read_json, unreadable
+
+RULE = "own_car"
+Outline = tuple[tuple[float, float], ...]
+"""Corners x, y."""
+
+
+@dataclass(frozen=True)
+class OwnCar:
+    """The own car's body in the images of the cameras that see it: `outlines` in fractions of width and height, and
+    their `source`, 'polygons' or 'images', by camera."""
+
+    outlines: Mapping[str, tuple[Outline, ...]] = field(default_factory=dict)
+    source: Mapping[str, str] = field(default_factory=dict)
+
+    def pixels(self, camera: str, size: tuple[int, int]) -> np.ndarray:
+        """The pixels (h, w) bool of the body in an image of `camera` at `size` (width, height)."""
+        return enclosed(self.outlines.get(camera, ()), size)
+
+
+NOWHERE = OwnCar()
+
+
+def enclosed(outlines: tuple[Outline, ...], size: tuple[int, int]) -> np.ndarray:
+    """The pixels (h, w) bool within any of the outlines, which are in fractions of `size` (width, height)."""
+    pixels = np.zeros((size[1], size[0]), dtype=np.uint8)
+    for outline in outlines:
+        cv2.fillPoly(pixels, [np.round(np.array(outline) * size).astype(np.int32)], 1)
+    return pixels.astype(bool)
+
+
+def read_own_car(path: str | Path) -> tuple[OwnCar, dict[str, Any]]:
+    """Reads own_car.json, and the provenance in it. Raises ResultError where the file is not one, naming it and the
+    rule that makes it."""
+    content = read_json(path, RULE)
+    try:
+        known = {name: camera for name, camera in content["cameras"].items() if camera["source"]}
+        outlines = {
+            name: tuple(tuple((float(x), float(y)) for x, y in outline) for outline in camera["outlines"])
+            for name, camera in known.items()
+        }
+        return OwnCar(outlines, {name: camera["source"] for name, camera in known.items()}), content["provenance"]
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise unreadable(path, RULE, f"not a record of the own car ({error})") from error

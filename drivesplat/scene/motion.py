@@ -1,0 +1,119 @@
+"""The smooth motion of an annotated object: where it is at any time, without the jolts of straight lines between key
+frames.
+
+Seconds count from the scene's first image. Frames as in `drivesplat.scene.scene`: object x forward, y left, z up, at the box
+centre; world metres.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.scene.tracks import runs
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion through the poses `object_to_world` (k, 4, 4) at increasing `times` (k,) in seconds.
+
+    Within each of `runs` (first and last index of consecutive annotations) position and rotation are twice continuously
+    differentiable; up to `reach` seconds beyond a run's ends its velocity there continues; elsewhere the object is
+    absent. `turns` (k,) are corrections of the heading: radians about the object's vertical axis, interpolated as
+    positions are.
+    """
+
+    times: np.ndarray
+    object_to_world: np.ndarray
+    runs: tuple[tuple[int, int], ...]
+    reach: float
+    turns: np.ndarray | None = None
+
+    @classmethod
+    def of_track(cls, scene: Scene, track: Track) -> "Motion":
+        """The motion through a track's annotations; it reaches as far beyond them as the measuring protocol says."""
+        times = np.array([scene.seconds(timestamp) for timestamp in track.timestamps])
+        reach = scene.key_frame_interval * 0.5e-6
+        return cls(times, track.object_to_world, tuple(runs(track.sample_indices)), reach)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and the last second at which the object is there."""
+        return float(self.times[0] - self.reach), float(self.times[-1] + self.reach)
+
+    def present(self, at: np.ndarray) -> np.ndarray:
+        """Whether the object is there at the seconds `at` (n,): (n,) bool."""
+        spans = (self.times[[first, last]] + [-self.reach, self.reach] for first, last in self.runs)
+        return np.any([(low <= at) & (at <= high) for low, high in spans], axis=0)
+
+    def poses(self, at: np.ndarray) -> np.ndarray:
+        """The poses (n, 4, 4) at the seconds `at` (n,); where the object is absent, those of its nearest run."""
+        at = np.asarray(at, dtype=np.float64)
+        poses, weights = np.tile(np.eye(4), (len(at), 1, 1)), self.weights(at)
+        poses[:, :3, 3] = weights @ self.object_to_world[:, :3, 3]
+        for run, chosen in self._chosen(at):
+            poses[chosen, :3, :3] = self._rotations(run, at[chosen])
+        if self.turns is not None:
+            about_vertical = Rotation.from_rotvec((weights @ self.turns)[:, None] * [0.0, 0.0, 1.0])
+            poses[:, :3, :3] = poses[:, :3, :3] @ about_vertical.as_matrix()
+        return poses
+
+    def weights(self, at: np.ndarray) -> np.ndarray:
+        """How much (n, k) each annotation has in the position at the seconds `at` (n,): position = weights @ positions.
+
+        A natural cubic spline is linear in what it goes through: whatever else is given at the annotations (a learned
+        correction) is interpolated by the same weights.
+        """
+        at = np.asarray(at, dtype=np.float64)
+        weights = np.zeros((len(at), len(self.times)))
+        for (first, last), chosen in self._chosen(at):
+            weights[chosen, first : last + 1] = self._run_weights((first, last), at[chosen])
+        return weights
+
+    def _chosen(self, at: np.ndarray) -> list[tuple[tuple[int, int], np.ndarray]]:
+        """For each run the positions (m,) in `at` that are nearest to it."""
+        ends = self.times[np.array(self.runs)]
+        outside = np.maximum(ends[:, :1] - at, at - ends[:, 1:])
+        nearest = outside.argmin(axis=0)
+        return [(run, np.flatnonzero(nearest == i)) for i, run in enumerate(self.runs)]
+
+    def _rotations(self, run: tuple[int, int], at: np.ndarray) -> np.ndarray:
+        """Rotation matrices (n, 3, 3) along a run; beyond its ends it turns on as fast as there."""
+        first, last = run
+        if first == last:
+            return np.tile(self.object_to_world[first, :3, :3], (len(at), 1, 1))
+        spline = self._turns[run]
+        within = at.clip(self.times[first], self.times[last])
+        turning = spline(within, order=1) * (at - within)[:, None]
+        return (spline(within) * Rotation.from_rotvec(turning)).as_matrix()
+
+    @cached_property
+    def _turns(self) -> dict[tuple[int, int], RotationSpline]:
+        return {
+            (first, last): RotationSpline(
+                self.times[first : last + 1], Rotation.from_matrix(self.object_to_world[first : last + 1, :3, :3])
+            )
+            for first, last in self.runs
+            if first < last
+        }
+
+    def _run_weights(self, run: tuple[int, int], at: np.ndarray) -> np.ndarray:
+        """The weights (n, k) of a run's k annotations in a natural cubic spline, straight on beyond its ends."""
+        first, last = run
+        if first == last:
+            return np.ones((len(at), 1))
+        spline = self._bases[run]
+        within = at.clip(self.times[first], self.times[last])
+        return spline(within) + (at - within)[:, None] * spline(within, 1)
+
+    @cached_property
+    def _bases(self) -> dict[tuple[int, int], CubicSpline]:
+        """Per run the splines that are 1 at one annotation and 0 at the others."""
+        lengths = {(first, last): last + 1 - first for first, last in self.runs if first < last}
+        return {
+            (first, last): CubicSpline(self.times[first : last + 1], np.eye(length), bc_type="natural")
+            for (first, last), length in lengths.items()
+        }

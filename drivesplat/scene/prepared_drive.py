@@ -1,0 +1,56 @@
+"""A recorded drive, prepared: what every look at a trained model is held against."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.preprocess.masks import read_labels, read_masks_record
+from drivesplat.preprocess.parser import image_size, read_parser
+from drivesplat.scene.images import read_image
+from drivesplat.scene.regions import LABELS, label_image
+from drivesplat.scene.scene import Frame, Scene, read_scene
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A `scene`, the `parser` record made of it, whose images are the scene's frames in their order, and the folder
+    `masks` of the stage of that name; without it the labels are those of the scene's boxes."""
+
+    scene: Scene
+    parser: dict[str, Any]
+    masks: Path | None = None
+
+    def frame(self, index: int) -> Frame:
+        return self.scene.frames[index]
+
+    def size(self, index: int) -> tuple[int, int]:
+        """Width and height in pixels at which an image is trained and measured."""
+        return image_size(self.parser, index)
+
+    def image(self, index: int) -> np.ndarray:
+        """A recorded image (h, w, 3) in [0, 1]."""
+        return read_image(self.frame(index).image_path, self.size(index)) / 255.0
+
+    def labels(self, index: int) -> np.ndarray:
+        """The label image (h, w) of an image."""
+        frame, size = self.frame(index), self.size(index)
+        if self.masks is None:
+            return label_image(self.scene, frame, size)
+        return read_labels(self.masks, frame.camera, frame.timestamp, size)
+
+    def own_car(self, index: int) -> np.ndarray:
+        """The pixels (h, w) bool of an image in which the recording car's own body is seen."""
+        return self.labels(index) == LABELS["own_car"]
+
+    def split(self, index: int) -> str | None:
+        """What an image is used for: 'train', a held-out group or 'excluded'."""
+        return next((name for name, images in self.parser["splits"].items() if index in images), None)
+
+
+def read_recording(scene: str | Path, parser: str | Path, masks: str | Path) -> tuple[Recording, list[dict[str, Any]]]:
+    """The recording of scene.json, parser.pkl and masks.json, and the provenances of these files."""
+    recording = Recording(read_scene(scene), read_parser(parser), Path(masks).parent)
+    record = read_masks_record(recording.masks)
+    return recording, [recording.scene.provenance, recording.parser["provenance"], record["provenance"]]

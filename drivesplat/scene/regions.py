@@ -1,0 +1,153 @@
+"""Static and moving pixels: boxes in images, as the measuring protocol defines them.
+
+A label image gives each pixel one label; a region is a set of labels. Users may supply label images of their own.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.tracks import Box, boxes_at
+
+NEAR_PLANE = 0.1
+FARTHEST = 80.0
+LEAST_PIXELS = 100
+LEAST_VISIBILITY = 2
+
+LABELS = {
+    "static": 0,
+    "left_out": 1,
+    "other": 2,
+    "parked_car": 3,
+    "moving_car": 4,
+    "parked_other_vehicle": 5,
+    "moving_other_vehicle": 6,
+    "still_human": 7,
+    "moving_human": 8,
+    "own_car": 9,
+}
+"""The value of a pixel in a label image. 'other' is an animal; 'own_car' the recording car's own body."""
+
+REGIONS = {
+    "all": tuple(name for name in LABELS if name != "own_car"),
+    "static": ("static",),
+    "vehicle": ("parked_car", "moving_car", "parked_other_vehicle", "moving_other_vehicle"),
+    "car": ("parked_car", "moving_car"),
+    "moving_vehicle": ("moving_car", "moving_other_vehicle"),
+    "parked_vehicle": ("parked_car", "parked_other_vehicle"),
+    "moving_human": ("moving_human",),
+}
+"""The regions of the measuring protocol, as sets of labels."""
+
+
+@dataclass(frozen=True)
+class Hull:
+    """A box seen in an image: `polygon` (n, 2) continuous pixels, `distance` camera to box centre in metres."""
+
+    box: Box
+    polygon: np.ndarray
+    distance: float
+
+
+def region_mask(labels: np.ndarray, region: str) -> np.ndarray:
+    """The pixels (h, w) bool of `region` in a label image (h, w)."""
+    return np.isin(labels, [LABELS[name] for name in REGIONS[region]])
+
+
+def region_masks(labels: np.ndarray) -> dict[str, np.ndarray]:
+    """The pixels (h, w) bool of every region in a label image (h, w)."""
+    return {region: region_mask(labels, region) for region in REGIONS}
+
+
+def is_dynamic(category: str) -> bool:
+    """Whether a class can move at all; cones, barriers and the like count as static."""
+    return category.startswith(("vehicle.", "human.")) or category == "animal"
+
+
+def hull_of(box: Box, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray | None:
+    """The convex hull (n, 2), continuous pixels, of a box clipped at the near plane; None where it is behind.
+
+    `world_to_camera` (4, 4), `intrinsics` (3, 3) in the continuous convention.
+    """
+    in_camera = box.corners @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    edges = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
+    ahead = in_camera[:, 2] >= NEAR_PLANE
+    points = list(in_camera[ahead])
+    for a, b in edges:
+        if ahead[a] != ahead[b]:
+            fraction = (NEAR_PLANE - in_camera[a, 2]) / (in_camera[b, 2] - in_camera[a, 2])
+            points.append(in_camera[a] + fraction * (in_camera[b] - in_camera[a]))
+    if len(points) < 3:
+        return None
+    pixels, _ = project(np.array(points), np.eye(4), intrinsics)
+    return cv2.convexHull(pixels.astype(np.float32))[:, 0, :]
+
+
+def hulls_in(scene: Scene, frame: Frame, size: tuple[int, int]) -> list[Hull]:
+    """The boxes of classes that can move, as seen in a frame at `size` (width, height), farthest first."""
+    world_to_camera = inverse(frame.camera_to_world)
+    intrinsics = continuous_intrinsics(frame, size)
+    hulls = []
+    for box in boxes_at(scene, frame.timestamp):
+        polygon = hull_of(box, world_to_camera, intrinsics) if is_dynamic(box.category) else None
+        if polygon is not None:
+            distance = float(np.linalg.norm(box.object_to_world[:3, 3] - frame.camera_to_world[:3, 3]))
+            hulls.append(Hull(box, polygon, distance))
+    return sorted(hulls, key=lambda hull: -hull.distance)
+
+
+def fill(polygon: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """The pixels (h, w) bool whose centres lie in a convex polygon (n, 2) of continuous pixels."""
+    width, height = size
+    x0, y0 = np.floor(np.clip(polygon.min(axis=0), 0, [width, height])).astype(int)
+    x1, y1 = np.ceil(np.clip(polygon.max(axis=0), 0, [width, height])).astype(int)
+    mask = np.zeros((height, width), dtype=bool)
+    x, y = np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5)
+    following = np.roll(polygon, -1, axis=0).astype(np.float64)
+    sides = [
+        (bx - ax) * (y - ay) - (by - ay) * (x - ax)
+        for (ax, ay), (bx, by) in zip(polygon.astype(np.float64), following, strict=True)
+    ]
+    if sides:
+        mask[y0:y1, x0:x1] = np.all(np.array(sides) >= 0, axis=0) | np.all(np.array(sides) <= 0, axis=0)
+    return mask
+
+
+def owner_image(hulls: list[Hull], size: tuple[int, int]) -> tuple[np.ndarray, list[int]]:
+    """Whose every pixel is, as a position in `hulls` (farthest first), -1 where it is nobody's: (h, w); and how many
+    pixels each hull covers, hidden ones included. Where hulls overlap the nearer box wins."""
+    owners, covered = np.full((size[1], size[0]), -1), []
+    for position, hull in enumerate(hulls):
+        mask = fill(hull.polygon, size)
+        owners[mask] = position
+        covered.append(int(mask.sum()))
+    return owners, covered
+
+
+def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """The label (h, w) uint8 of every pixel of a frame at `size` (width, height), from the scene's boxes.
+
+    Where hulls overlap the nearer box wins, whether it is measured or left out.
+    """
+    hulls = hulls_in(scene, frame, size)
+    owners, covered = owner_image(hulls, size)
+    names = [*(label_of(hull, pixels) for hull, pixels in zip(hulls, covered, strict=True)), "static"]
+    return np.array([LABELS[name] for name in names], dtype=np.uint8)[owners]
+
+
+def label_of(hull: Hull, pixels: int) -> str:
+    """The label of a hull that covers so many pixels."""
+    box = hull.box
+    hidden = 0 < box.visibility < LEAST_VISIBILITY
+    if hidden or hull.distance > FARTHEST or pixels < LEAST_PIXELS:
+        return "left_out"
+    if box.category.startswith("vehicle."):
+        kind = "car" if box.category == "vehicle.car" else "other_vehicle"
+        return f"moving_{kind}" if box.moves else f"parked_{kind}"
+    if box.category.startswith("human."):
+        return "moving_human" if box.moves else "still_human"
+    return "other"

@@ -1,0 +1,64 @@
+"""Which images are held out: whole key-frame timestamps, and the sweeps around them."""
+
+from typing import Literal
+
+import numpy as np
+
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.holdout import HoldoutSettings
+
+Group = Literal["train", "interpolation", "extrapolation", "excluded"]
+HELD_OUT_GROUPS: tuple[Group, Group] = ("interpolation", "extrapolation")
+
+
+def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[int]]:
+    """The held-out key frames of a scene with `count` of them, by group. A frame in both belongs to the block."""
+    block = list(range(max(0, count - holdout.last_block), count))
+    nth = range(holdout.offset, count, holdout.every_nth) if holdout.every_nth else range(0)
+    return {"interpolation": [i for i in nth if i not in block], "extrapolation": block}
+
+
+def group_of_times(
+    scene: Scene, timestamps: np.ndarray, sample_indices: np.ndarray, is_key_frame: np.ndarray, holdout: HoldoutSettings
+) -> list[Group]:
+    """The group of each image or sweep: a key frame goes with its index; what lies between key frames is
+    'excluded' where it is nearer than half a key-frame interval to a held-out one, else 'train'.
+
+    `timestamps` (n,) microseconds, `sample_indices` (n,), `is_key_frame` (n,).
+    """
+    held_out = held_out_key_frames(len(scene.key_frame_timestamps), holdout)
+    group_of_key_frame = {i: group for group, indices in held_out.items() for i in indices}
+    held_out_times = scene.key_frame_timestamps[sorted(group_of_key_frame)]
+    groups: list[Group] = []
+    for time, index, key in zip(timestamps, sample_indices, is_key_frame, strict=True):
+        if key:
+            groups.append(group_of_key_frame.get(int(index), "train"))
+        else:
+            near = np.any(np.abs(held_out_times - time) < scene.key_frame_interval / 2.0)
+            groups.append("excluded" if near else "train")
+    return groups
+
+
+def frame_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
+    """The group of every image of the scene, in the order of `scene.frames`."""
+    return _groups(scene, scene.frames, holdout)
+
+
+def training_images(scene: Scene, holdout: HoldoutSettings) -> np.ndarray:
+    """The numbers (n,) of the images, among `scene.frames`, that a training may see."""
+    return np.flatnonzero([group == "train" for group in frame_groups(scene, holdout)])
+
+
+def sweep_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
+    """The group of every LiDAR sweep of the scene, in the order of `scene.sweeps`."""
+    return _groups(scene, scene.sweeps, holdout)
+
+
+def _groups(scene: Scene, records: tuple, holdout: HoldoutSettings) -> list[Group]:
+    return group_of_times(
+        scene,
+        np.array([r.timestamp for r in records], dtype=np.int64),
+        np.array([r.sample_index for r in records], dtype=np.int64),
+        np.array([r.is_key_frame for r in records], dtype=bool),
+        holdout,
+    )

@@ -1,0 +1,126 @@
+"""Where an annotated object is at a time between its annotations."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivesplat.scene.rigid import apply, interpolate, inverse
+from drivesplat.scene.scene import Scene, Track
+
+MOVING_VEHICLE = 1.0
+"""Horizontal speed in m/s above which a vehicle counts as moving."""
+MOVING_HUMAN = 0.3
+"""Horizontal speed in m/s above which a person counts as moving."""
+SHORT = 8
+"""At least so many characters of an id are shown to people."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A track at one time: `size` (3,) length, width, height in metres, `speed` horizontal in m/s."""
+
+    track_id: str
+    category: str
+    size: np.ndarray
+    object_to_world: np.ndarray
+    speed: float
+    visibility: int
+
+    @property
+    def corners(self) -> np.ndarray:
+        """The eight corners (8, 3) in world coordinates; index bits 2, 1, 0 are the signs of x, y, z."""
+        signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        return (signs * self.size) @ self.object_to_world[:3, :3].T + self.object_to_world[:3, 3]
+
+    def holds(self, points: np.ndarray, margin: float = 0.0, floor: float = 0.0) -> np.ndarray:
+        """Which world points (n, 3) lie in the box grown by `margin` metres at its sides and roof, its floor raised by
+        `floor` metres: (n,) bool."""
+        return in_box(points, self.object_to_world, self.size, margin, floor)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves now, by the measuring protocol's threshold for its class (nothing else moves)."""
+        if self.category.startswith("vehicle."):
+            return self.speed > MOVING_VEHICLE
+        if self.category.startswith("human."):
+            return self.speed > MOVING_HUMAN
+        return False
+
+
+def in_box(
+    points: np.ndarray, object_to_world: np.ndarray, size: np.ndarray, margin: float = 0.0, floor: float = 0.0
+) -> np.ndarray:
+    """Which world points (n, 3) lie in a box of `size` (3,) at a pose (4, 4), grown by `margin` metres at its sides and
+    roof, its floor raised by `floor` metres: (n,) bool."""
+    inside = np.zeros(len(points), dtype=bool)
+    reach = np.linalg.norm(size) / 2 + 2 * max(margin, -floor, 0.0)
+    near = np.flatnonzero(np.linalg.norm(points - object_to_world[:3, 3], axis=1) < reach)
+    in_object = apply(inverse(object_to_world), points[near])
+    inside[near] = (np.abs(in_object[:, :2]) < size[:2] / 2 + margin).all(axis=1)
+    inside[near] &= (in_object[:, 2] > floor - size[2] / 2) & (in_object[:, 2] < size[2] / 2 + margin)
+    return inside
+
+
+def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
+    """The box of `track` at `timestamp` (microseconds), or None where it is absent.
+
+    Between consecutive key frames that both hold the track the position is linear and the rotation slerps. Up to half
+    an `interval` (microseconds, the scene's key-frame interval) beyond an end, the end segment's motion continues; a
+    single box holds still. Where the annotation has a gap, the track ends before it and begins anew after it.
+    """
+    for first, last in runs(track.sample_indices):
+        times = track.timestamps[first : last + 1]
+        reach = interval / 2.0
+        if not times[0] - reach <= timestamp <= times[-1] + reach:
+            continue
+        nearest = first + int(np.argmin(np.abs(times - timestamp)))
+        visibility = int(track.visibility[nearest])
+        if first == last:
+            return Box(track.id, track.category, track.size, track.object_to_world[first], 0.0, visibility)
+        segment = first + int(np.clip(np.searchsorted(times, timestamp, side="right") - 1, 0, last - first - 1))
+        start, end = track.object_to_world[segment], track.object_to_world[segment + 1]
+        duration = float(track.timestamps[segment + 1] - track.timestamps[segment])
+        pose = interpolate(start, end, (timestamp - track.timestamps[segment]) / duration)
+        speed = float(np.linalg.norm((end - start)[:2, 3])) / duration * 1e6
+        return Box(track.id, track.category, track.size, pose, speed, visibility)
+    return None
+
+
+def boxes_of(tracks: Iterable[Track], timestamp: int, interval: float) -> list[Box]:
+    """The boxes of some tracks that are there at `timestamp`; `interval` between key frames, both in microseconds."""
+    boxes = (box_at(track, timestamp, interval) for track in tracks)
+    return [box for box in boxes if box is not None]
+
+
+def boxes_at(scene: Scene, timestamp: int) -> list[Box]:
+    """All boxes that are there at `timestamp` (microseconds)."""
+    return boxes_of(scene.tracks, timestamp, scene.key_frame_interval)
+
+
+def moves_at_all(track: Track) -> bool:
+    """Whether a vehicle or person ever moves in this scene, by the same thresholds."""
+    times = track.timestamps
+    for first, last in runs(track.sample_indices):
+        if any(box_at(track, int(time), 0.0).moves for time in times[first:last]):
+            return True
+    return False
+
+
+def tracks_that_move(scene: Scene) -> list[Track]:
+    """The tracks that ever move in a scene: they leave nothing behind that stands still."""
+    return [track for track in scene.tracks if moves_at_all(track)]
+
+
+def runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
+    """First and last position of every run of consecutive key frames."""
+    breaks = np.flatnonzero(np.diff(sample_indices) != 1).tolist()
+    return list(zip([0, *(i + 1 for i in breaks)], [*breaks, len(sample_indices) - 1], strict=True))
+
+
+def beginnings(ids: Sequence[str]) -> dict[str, str]:
+    """For each id its beginning: SHORT characters, or as many more as tell all of them apart."""
+    longest = max(map(len, ids), default=0)
+    told_apart = (n for n in range(SHORT, longest) if len({name[:n] for name in ids}) == len(ids))
+    length = next(told_apart, longest)
+    return {name: name[:length] for name in ids}

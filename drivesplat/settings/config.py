@@ -1,0 +1,224 @@
+"""The configuration: every stage's settings in one record, and what each stage of each scene and method gets of it.
+
+Defaults, ranges and comments stand in `drivesplat.settings` alone; config.yaml and config.schema.json are generated
+from them (`python -m drivesplat.settings.config_document`). Importing this module is cheap: the Snakefile does.
+"""
+
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, field_validator, model_validator
+
+from drivesplat.errors import ConfigError
+from drivesplat.settings import Settings, validated
+from drivesplat.settings.ablation import AblationSettings
+from drivesplat.settings.actor_seed import ActorSeedSettings
+from drivesplat.settings.dataset import DatasetSettings, default_datasets
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.download import NuscenesMiniSettings
+from drivesplat.settings.evaluate import LpipsSettings
+from drivesplat.settings.export import ExportSettings
+from drivesplat.settings.extract import ExtractSettings
+from drivesplat.settings.free_space import FreeSpaceSettings
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.inspection import GhostSettings, RemovalSettings, SubjectSettings
+from drivesplat.settings.lidar_depth import LidarDepthSettings
+from drivesplat.settings.lidar_seed import LidarSeedSettings
+from drivesplat.settings.masks import MaskSettings
+from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings
+from drivesplat.settings.names import require_name
+from drivesplat.settings.overrides import merged
+from drivesplat.settings.refine_poses import RefinePosesSettings
+from drivesplat.settings.render import RenderSettings
+from drivesplat.settings.train import SkyKind, TrainSettings
+
+DATASET_OVERRIDES = (
+    "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
+    "lidar_depth", "free_space", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
+)  # fmt: skip
+METHOD_OVERRIDES = ("sky", "train", "random_seed")
+
+
+def _default_methods() -> dict[str, MethodSettings]:
+    held = {"train": {"sky_bce_weight": 0.05, "depth_weight": 0.01, "semantic_weight": 0.1}}
+    return {"vanilla": MethodSettings(), "street": MethodSettings(parts=("background", "actors"), overrides=held)}
+
+
+class Config(Settings):
+    datasets: dict[str, DatasetSettings] = Field(default_factory=default_datasets, min_length=1)
+    """Recorded drives, each under a name of your choice."""
+    accept_nuscenes_terms: bool = False
+    """Whether you accept nuScenes' terms, https://www.nuscenes.org/terms-of-use: non-commercial use, unless you have a
+    licence. Without it `snakemake download_nuscenes_mini` fetches nothing."""
+    nuscenes_mini: NuscenesMiniSettings = NuscenesMiniSettings()
+    methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
+    """Methods to train and compare, each under a name of your choice; a result folder each. null = no such method: a
+    file laid over this one drops `street` by {street: null}."""
+    ablation: AblationSettings = AblationSettings()
+    """What each thing in a method is worth; trained for `snakemake results/{scene}/ablation.csv` alone."""
+    cameras: tuple[str, ...] = Field(("CAM_FRONT",), min_length=1)
+    """Cameras to train on."""
+    eval_camera: str = "CAM_FRONT"
+    """The camera whose held-out images are measured; one of cameras."""
+    sweeps: bool = False
+    """Train on the 12 Hz images between key frames, too, but for those nearer than half a key-frame interval to a
+    held-out one. LiDAR between key frames: lidar_seed.sweeps. docs/real_logs.md"""
+    images: ImageSettings = ImageSettings()
+    holdout: HoldoutSettings = HoldoutSettings()
+    extract: ExtractSettings = ExtractSettings()
+    refine_poses: RefinePosesSettings = RefinePosesSettings()
+    lidar_seed: LidarSeedSettings = LidarSeedSettings()
+    actors: ActorSeedSettings = ActorSeedSettings()
+    lidar_depth: LidarDepthSettings = LidarDepthSettings()
+    free_space: FreeSpaceSettings = FreeSpaceSettings()
+    masks: MaskSettings = MaskSettings()
+    sky: SkyKind = "cubemap"
+    """Behind the Gaussians: 'cubemap' (learned, by direction), 'mask' (one learned colour, Gaussians kept out of sky
+    pixels) or 'none' (black). The cube map does best on nuScenes: without one, Gaussians fill the sky."""
+    train: TrainSettings = TrainSettings()
+    render: RenderSettings = RenderSettings()
+    subjects: dict[str, SubjectSettings] = Field(default_factory=dict)
+    """Per scene the vehicle to look at, as {"0061": {track: 6e5c..., key_frame: 12}}; elsewhere it is chosen."""
+    ghosts: GhostSettings = GhostSettings()
+    removal: RemovalSettings = RemovalSettings()
+    export: ExportSettings = ExportSettings()
+    lpips: LpipsSettings = LpipsSettings()
+    device: DeviceSettings = DeviceSettings()
+    random_seed: int = Field(0, ge=0, lt=2**31)
+    """Seeds every random choice."""
+    results_dir: str = Field("results", min_length=1)
+    """The folder of all output; keep experiments apart by giving each its own."""
+
+    @field_validator("accept_nuscenes_terms", mode="before")
+    @classmethod
+    def _text_on_the_command_line(cls, value: Any) -> Any:
+        if value in ("true", "false"):
+            raise ValueError(f"write {value.capitalize()}: Snakemake's --config takes {value} for text")
+        return value
+
+    @field_validator("methods")
+    @classmethod
+    def _none_is_no_method(cls, value: dict[str, MethodSettings | None]) -> dict[str, MethodSettings | None]:
+        wanted = {name: method for name, method in value.items() if method is not None}
+        if not wanted:
+            raise ValueError("no method is left; keep one")
+        return wanted
+
+    @model_validator(mode="after")
+    def _names_fit_together(self) -> "Config":
+        owners: dict[str, str] = {}
+        for name, dataset in self.datasets.items():
+            for scene in dataset.scenes:
+                require_name(scene, "scene")
+                if owners.setdefault(scene, name) != name:
+                    raise ValueError(
+                        f"scene {scene!r} is in two datasets, {owners[scene]} and {name}; rename or drop one"
+                    )
+            if len(set(dataset.scenes)) != len(dataset.scenes):
+                raise ValueError(f"datasets.{name}.scenes names a scene twice")
+        made = [Path(dataset.world_root).resolve() for dataset in self.datasets.values() if dataset.world]
+        if len(set(made)) != len(made):
+            raise ValueError("two datasets make their world in the same dataroot; give each its own")
+        for kind, names in (("method", self.methods), ("trajectory", self.render.trajectories)):
+            for name in names:
+                require_name(name, kind)
+        if "parts" in self.render.trajectories:
+            raise ValueError("a trajectory cannot be called 'parts': the name is kept for the film of a method's parts")
+        for scene in self.subjects:
+            if scene not in owners:
+                raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")
+        if self.eval_camera not in self.cameras:
+            raise ValueError(f"eval_camera {self.eval_camera} is not among cameras ({', '.join(self.cameras)})")
+        return self
+
+    @model_validator(mode="after")
+    def _variants_have_names_of_their_own(self) -> "Config":
+        for name in self.ablation.without:
+            require_name(name, "variant")
+        for name in self.ablated:
+            if name in self.methods:
+                raise ValueError(f"method {name!r} is called like a variant of the ablation; rename it")
+        return self
+
+    @cached_property
+    def places(self) -> dict[tuple[str, str | None], "Config"]:
+        """What `for_scene` has found, by dataset and method: rules ask for it hundreds of times."""
+        return {}
+
+    @cached_property
+    def ablated(self) -> dict[str, MethodSettings]:
+        """The methods of the ablation, by name; none where the method that it takes apart is not configured."""
+        whole = self.methods.get(self.ablation.of)
+        return self.ablation.methods(whole) if whole else {}
+
+    @property
+    def all_methods(self) -> dict[str, MethodSettings]:
+        """The methods to compare, and those of the ablation."""
+        return {**self.methods, **self.ablated}
+
+    @property
+    def scenes(self) -> list[str]:
+        """All configured scenes, in order."""
+        return [scene for dataset in self.datasets.values() for scene in dataset.scenes]
+
+    @property
+    def batch_scenes(self) -> list[str]:
+        """The scenes of `snakemake` without a target, and of the report."""
+        return [scene for dataset in self.datasets.values() if dataset.batch for scene in dataset.scenes]
+
+    def dataset_of(self, scene: str) -> str:
+        """The name of the dataset a scene belongs to. Raises ConfigError listing the scenes there are."""
+        for name, dataset in self.datasets.items():
+            if scene in dataset.scenes:
+                return name
+        raise ConfigError(
+            f"scene {scene!r} is not in the config; "
+            f"there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
+        )
+
+
+def load(values: Mapping[str, Any]) -> Config:
+    """The validated config, overrides included. Raises ConfigError: one line, the key, its value, what is allowed."""
+    if "provenance" in values:
+        raise ConfigError(
+            "a result of this workflow is among the config files, where Snakemake takes what follows --configfile: "
+            "put -- before the targets, as in --configfile mine.yaml -- results/0103/metrics.json"
+        )
+    config = validated(Config, dict(values), "")
+    variants = {name: variant for name, variant in config.ablation.without.items() if variant is not None}
+    for kind, named, allowed in (
+        ("datasets", config.datasets, DATASET_OVERRIDES),
+        ("methods", config.methods, METHOD_OVERRIDES),
+        ("ablation.without", variants, VARIATION_OVERRIDES),
+    ):
+        for name, item in named.items():
+            require_known(item.overrides, allowed, f"{kind}.{name}.overrides")
+            _overridden(config, item.overrides, f"{kind}.{name}.overrides")
+    return config
+
+
+def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
+    """The config as it holds for one scene, and one method where given. Raises ConfigError for an unknown scene."""
+    dataset, known = config.dataset_of(scene), config.places
+    if (dataset, None) not in known:
+        known[dataset, None] = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
+    if (dataset, method) not in known:
+        there = known[dataset, None]
+        known[dataset, method] = _overridden(there, there.all_methods[method].overrides, f"the overrides of {method}")
+    return known[dataset, method]
+
+
+def _overridden(config: Config, overrides: Mapping[str, Any], where: str) -> Config:
+    if not overrides:
+        return config
+    return validated(Config, merged(config.model_dump(), overrides), f"(with {where}) ")
+
+
+def require_known(overrides: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
+    """Raises ConfigError where the tree of overrides at `where` sets what it may not."""
+    for key in overrides:
+        if key not in allowed:
+            raise ConfigError(f"'{where}.{key}' cannot be set there; what can: {', '.join(allowed)}")

@@ -1,0 +1,1 @@
+"""Training iterations as CUDA graphs: replays, and the rows preallocated for them."""

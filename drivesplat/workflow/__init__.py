@@ -1,0 +1,1 @@
+"""What the rules ask: plan, stages, inputs, jobs, GPUs and measured costs."""

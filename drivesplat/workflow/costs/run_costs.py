@@ -1,0 +1,111 @@
+"""What Snakemake's hooks say of costs: an estimate when a run starts, its progress, and costs.csv when it ends."""
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from drivesplat.errors import DriveSplatError
+from drivesplat.settings.overridden import without_effect
+from drivesplat.workflow.costs.estimate import Estimate, Machine, PlannedJob, estimate, in_full, in_one_line
+from drivesplat.workflow.costs.expected import Expectations
+from drivesplat.workflow.costs.measured import BENCHMARKS, Job, read_costs
+from drivesplat.workflow.costs.progress import Progress, Watch
+from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
+from drivesplat.workflow.plan import Plan
+
+COSTS, ESTIMATE = "costs", "estimate"
+"""Targets that make nothing: the first has costs.csv brought up to date, with the second only the estimate is told."""
+
+
+class RunCosts:
+    """The costs of a run of Snakemake's `workflow` that is asked for `targets`; of what it plans once it has begun."""
+
+    def __init__(self, plan: Plan, workflow: Any, targets: Sequence[str]):
+        self._plan, self._workflow, self._targets = plan, workflow, targets
+        self._results = Path(plan.config.results_dir)
+        self._jobs: dict[Job, Any] = {}
+        self._watch: Watch | None = None
+
+    def tell_estimate(self) -> bool:
+        """Prints which settings will not hold, and what is to be expected, in full, where that is all that is asked
+        for; whether it is."""
+        self._jobs = self._needed()
+        for sentence in without_effect(self._plan.config, {(job.scene, job.method) for job in self._jobs}):
+            _say(sentence)
+        if ESTIMATE in self._targets:
+            print(in_full(self.estimate()), flush=True)
+        return ESTIMATE in self._targets
+
+    def begin(self) -> None:
+        """Prints the estimate in a line, and from then on how far the run is; a failure is told and ends nothing."""
+        try:
+            self._jobs = self._needed()
+            if self._jobs:
+                _say(in_one_line(self.estimate()))
+                self._watch_jobs()
+        except Exception as error:  # a run must not end for what is told of it
+            _say(f"what the run will take cannot be told ({type(error).__name__}: {error})")
+
+    def _watch_jobs(self) -> None:
+        logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
+        args = self._planned, logs, self._expectations, self._finished, self._machine, time.time()
+        self._watch = Watch(Progress(*args))
+        self._watch.start()
+
+    def estimate(self) -> Estimate:
+        """What is to be expected of the run."""
+        return estimate(self._planned, self._expectations(), self._machine, self._results)
+
+    def end(self) -> None:
+        """Writes costs.csv and costs.json, and says which scenes of this run took 90 minutes or more. A failure is told
+        and ends nothing."""
+        if self._watch is not None:
+            self._watch.stop()
+        try:
+            record = write_costs(self._results, list(self._plan.config.methods))
+        except (DriveSplatError, OSError) as error:
+            _say(f"costs are not written: {error}")
+            return
+        if COSTS in self._targets:
+            print(costs_in_words(record), flush=True)
+            return
+        here = {job.scene for job in self._jobs}
+        for total in record["scenes"]:
+            if total["scene"] in here and not total["under_90_minutes"]:
+                _say(f"scene {total['scene']}: {finding(total)}; {self._results / FILES[0]} says where it went")
+
+    def _needed(self) -> dict[Job, Any]:
+        """Snakemake's jobs that are to run, by what they are; those that only gather others are none."""
+        jobs = (job for job in self._workflow.dag.needrun_jobs() if job.benchmark)
+        folder = self._results / BENCHMARKS
+        return {Job.of(Path(os.path.relpath(job.benchmark, folder))): job for job in jobs}
+
+    @property
+    def _planned(self) -> list[PlannedJob]:
+        return [planned_job(name, job) for name, job in self._jobs.items()]
+
+    @property
+    def _machine(self) -> Machine:
+        """Where cores are not counted, as on a cluster, as many as its jobs may take at a time."""
+        resources = self._workflow.global_resources
+        cores, nodes, gpus = (resources[n].value if n in resources else None for n in ("_cores", "_nodes", "gpu"))
+        widest = max((one.threads for one in self._planned), default=1)
+        return Machine(cores or (nodes or 1) * widest, gpus if isinstance(gpus, int) and gpus > 0 else 1)
+
+    def _expectations(self) -> Expectations:
+        return Expectations(self._plan.config, read_costs(self._results)[0])
+
+    def _finished(self) -> set[Job]:
+        return {name for name, job in self._jobs.items() if self._workflow.dag.finished(job)}
+
+
+def planned_job(name: Job, job: Any) -> PlannedJob:
+    """One of Snakemake's jobs. It takes a GPU where it asks for one: on processors its rule asks for none."""
+    return PlannedJob(name, int(job.threads), bool(job.resources.get("gpu")), tuple(map(str, job.output)))
+
+
+def _say(line: str) -> None:
+    print(f"drivesplat: {line}", file=sys.stderr, flush=True)

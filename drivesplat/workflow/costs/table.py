@@ -1,0 +1,94 @@
+"""costs.csv and costs.json: a row per job that has run, and what each scene comes to."""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+from drivesplat.io.storage import write_csv, write_json
+from drivesplat.workflow.costs.measured import TRAIN, Cost, by_scene, read_costs
+
+FILES = ("costs.csv", "costs.json")
+LIMIT_SECONDS = 90 * 60.0
+"""What the project that this one follows wanted a scene to take at most; a finding, never a gate."""
+ABLATION = "ablation"
+COLUMNS = (
+    "scene", "method", "stage", "film", "seconds", "seconds_from", "max_rss_mb", "cpu_seconds", "mean_load",
+    "gpu_memory_gb", "device", "scene_under_90_minutes",
+)  # fmt: skip
+
+
+def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[str, Any]]:
+    """What each scene's jobs come to, one after another, and whether that is under 90 minutes. The variants of an
+    ablation are no part of it, but `methods`; `complete`: whether all of these have been trained."""
+    totals = []
+    for scene, own in by_scene(costs):
+        counted = [c for c in own if c.job.method in methods or (not c.job.method and c.job.stage != ABLATION)]
+        if not counted:
+            continue
+        seconds = sum(c.seconds for c in counted)
+        by_part = dict.fromkeys(("scene", *methods), 0.0)
+        for c in counted:
+            by_part[c.job.method or "scene"] += c.seconds
+        memory = {name: [v for c in counted if (v := getattr(c, name)) is not None] for name in _PEAKS}
+        trained = {c.job.method for c in counted if c.job.stage == TRAIN}
+        totals.append(
+            {
+                "scene": scene,
+                "jobs": len(counted),
+                "seconds": seconds,
+                "training_seconds": sum((c.seconds for c in counted if c.job.stage == TRAIN), 0.0),
+                "seconds_by_method": {part: value for part, value in by_part.items() if part != "scene"},
+                "scene_seconds": by_part["scene"],
+                **{name: max(values, default=None) for name, values in memory.items()},
+                "under_90_minutes": seconds < LIMIT_SECONDS,
+                "complete": trained == set(methods),
+            }
+        )
+    return totals
+
+
+_PEAKS = ("max_rss_mb", "gpu_memory_gb")
+
+
+def costs_record(results: Path, methods: Collection[str]) -> dict[str, Any]:
+    """The content of costs.json: `rows` as in costs.csv, totals of `scenes`, and what could not be `read`."""
+    costs, complaints = read_costs(results)
+    scenes = scene_totals(costs, methods)
+    under = {total["scene"]: total["under_90_minutes"] for total in scenes}
+    rows = [
+        {
+            **{name: getattr(cost.job, name) for name in ("scene", "method", "stage", "film")},
+            **{name: getattr(cost, name) for name in COLUMNS[4:-1]},
+            "scene_under_90_minutes": under.get(cost.job.scene),
+        }
+        for cost in costs
+    ]
+    return {"rows": rows, "scenes": scenes, "unreadable": complaints}
+
+
+def write_costs(results: Path, methods: Collection[str]) -> dict[str, Any]:
+    """Writes costs.csv and costs.json of what there is; returns the latter's content.
+
+    Raises ResultError where they cannot be written.
+    """
+    record = costs_record(results, methods)
+    csv_rows = [{**row, "scene_under_90_minutes": _spelled(row["scene_under_90_minutes"])} for row in record["rows"]]
+    write_csv(results / FILES[0], COLUMNS, csv_rows)
+    write_json(results / FILES[1], record)
+    return record
+
+
+def _spelled(value: bool | None) -> str | None:
+    return None if value is None else str(value).lower()
+
+
+def finding(total: dict[str, Any]) -> str:
+    """What a scene's total says: '87 min, under 90'."""
+    so_far = "" if total["complete"] else " so far"
+    return f"{total['seconds'] / 60:.1f} min{so_far}, {'under' if total['under_90_minutes'] else 'not under'} 90"
+
+
+def costs_in_words(record: dict[str, Any]) -> str:
+    """A line per scene, and one per file that could not be read."""
+    lines = [f"{total['scene']}: {finding(total)} ({total['jobs']} jobs)" for total in record["scenes"]]
+    return "\n".join([*(lines or ["no job of a scene has been measured yet"]), *record["unreadable"]])

@@ -1,0 +1,125 @@
+"""The seam between Snakemake's scripts and the library: settings in, errors out in one line."""
+
+import errno
+import gc
+import json
+import logging
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+from drivesplat.errors import DriveSplatError
+from drivesplat.io.storage import unwritable
+from drivesplat.provenance.record import provenance
+from drivesplat.settings import Settings
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.workflow.gpus import hold_card
+
+S = TypeVar("S", bound=Settings)
+
+REFUSED_BY_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""What is wrong with the disk and not with the workflow."""
+
+if hasattr(sys.modules["__main__"], "snakemake"):  # in a rule's script, which imports this before all else
+    gc.disable()  # until the job begins: what is imported stays, and looking for waste in it takes half a second
+
+
+class Job:
+    """What a rule's script may know: its files, its settings and its digest of code; never the whole config."""
+
+    def __init__(self, snakemake: Any):
+        self.input = snakemake.input
+        self.output = snakemake.output
+        self.wildcards = snakemake.wildcards
+        self.log = snakemake.log
+        self.threads: int = snakemake.threads
+        self._rule: str = snakemake.rule
+        self._params = snakemake.params
+        self._resources = snakemake.resources
+        self._card: BinaryIO | None = None
+
+    @property
+    def stage(self) -> str:
+        """The name under which results remember this stage; a method's stages carry its name."""
+        method = getattr(self.wildcards, "method", None)
+        return f"{method}/{self._rule}" if method else self._rule
+
+    @property
+    def name(self) -> str:
+        """Stage and scene, for messages."""
+        return " ".join([self.stage, *([self.wildcards.scene] if hasattr(self.wildcards, "scene") else [])])
+
+    def settings(self, model: type[S]) -> S:
+        """The rule's settings as the record it expects."""
+        return model.model_validate_json(self._params.settings)
+
+    def device(self) -> DeviceSettings:
+        """Where to run; not one of the settings, since it decides no result. From now on until it ends, the job has a
+        GPU, where there is one to have, and sees no other."""
+        settings = DeviceSettings.model_validate_json(self._resources.device)
+        if settings.kind != "cpu" and self._card is None:  # a second lock would wait for the first
+            self._card = hold_card(settings.jobs_per_card)
+        return settings
+
+    def provenance(self, *upstream: dict[str, Any], inputs: dict[str, str] | None = None) -> dict[str, Any]:
+        """The provenance of this rule's result, made from results with the provenances `upstream`."""
+        return provenance(self.stage, json.loads(self._params.settings), self._params.code, upstream, inputs or {})
+
+
+@contextmanager
+def job(snakemake: Any) -> Iterator[Job]:
+    """A rule's script as a context: logs into the rule's log, and ends a failure in one line on the console.
+
+    A DriveSplatError is told as its sentence, a disk that takes no more as what it says; anything else is a bug, told
+    with the place of its traceback in the log.
+    """
+    gc.freeze()  # nor is it looked through again; when the script ends, that is what most of the time goes to
+    gc.enable()
+    log_path = Path(snakemake.log[0])
+    _log_into(log_path)
+    threading_hook, threading.excepthook = threading.excepthook, _log_thread
+    current = Job(snakemake)
+    log = logging.getLogger(__name__)
+    log.info("%s begins", current.name)
+    try:
+        yield current
+        log.info("%s ends", current.name)
+    except DriveSplatError as error:
+        log.error("%s: %s", current.name, error)
+        sys.exit(1)
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in REFUSED_BY_DISK:
+            log.error("%s: %s", current.name, unwritable(error.filename or "a file", error))
+        else:
+            log.info("%s ends with this:", current.name, exc_info=True)
+            message = "%s: %s: %s (a bug; the traceback is in %s)"
+            log.error(message, current.name, type(error).__name__, error, log_path)
+        sys.exit(1)
+    finally:
+        threading.excepthook = threading_hook
+        logging.shutdown()
+        gc.freeze()
+
+
+def _log_into(path: Path) -> None:
+    """Sends what is logged into the file at `path`, warnings and errors to the console as well."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    except OSError as error:
+        sys.exit(f"drivesplat: {unwritable(path, error)}")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    console = logging.StreamHandler(sys.stderr)
+    console.setLevel(logging.WARNING)
+    console.setFormatter(logging.Formatter("drivesplat: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler, console], force=True)
+    logging.captureWarnings(True)
+    logging.raiseExceptions = False  # where the disk has no room for a log, what the job was to write says so, once
+
+
+def _log_thread(failed: threading.ExceptHookArgs) -> None:
+    """What a thread fails with is the log's; who waits for the thread tells the user."""
+    logging.getLogger(__name__).info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)

@@ -1,0 +1,258 @@
+"""What the Snakefile needs to know before anything runs: settings and code digests for its rules, and early refusals.
+
+Everything here is cheap to import and to compute; it runs once in the main process and once in every job.
+"""
+
+import fcntl
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from drivesplat.demo.mark import refuse_foreign_data
+from drivesplat.errors import ConfigError, DriveSplatError
+from drivesplat.io.storage import canonical_json
+from drivesplat.provenance.code_digest import code_digest
+from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
+from drivesplat.readers.nuscenes.download.destination import download_job, refuse
+from drivesplat.settings.config import for_scene, load
+from drivesplat.settings.train import MOVING_PARTS
+from drivesplat.workflow.gpus import any_card
+from drivesplat.workflow.inputs import Inputs
+from drivesplat.workflow.report_plan import ReportPlan
+from drivesplat.workflow.stages import (
+    METHOD_STAGES,
+    SIDE_BY_SIDE,
+    idle_variants,
+    no_such_edit,
+    no_such_film,
+    scene_edits,
+    scene_stages,
+    stage_settings,
+    training_inputs,
+)
+
+SCRIPTS = "workflow_scripts"
+PARTS_FILM = "parts"
+"""The film of a method's parts."""
+ABLATION_FILES = ("ablation.json", "ablation.csv")
+
+
+def let_scripts_import(folder: str) -> None:
+    """Makes the package at `folder` importable for the scripts of all rules, in whatever environment they run."""
+    inherited = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([folder, *([inherited] if inherited else [])])
+
+
+class Plan(Inputs):
+    """The validated config as the rules ask for it; `basedir` is the Snakefile's folder."""
+
+    def __init__(self, values: Mapping[str, Any], basedir: str):
+        super().__init__(load(values))
+        self._scripts = Path(basedir) / SCRIPTS
+        self._held_lock: Any = None
+
+    def settings(self, stage: str) -> Callable[[Any], str]:
+        """The function of wildcards that gives a stage's settings as canonical JSON."""
+
+        def settings_of(wildcards: Any) -> str:
+            method, trajectory, edit = (getattr(wildcards, name, None) for name in ("method", "trajectory", "edit"))
+            return stage_settings(self.config, stage, wildcards.scene, method, trajectory or edit)
+
+        return settings_of
+
+    def code(self, stage: str) -> str:
+        """The digest of all code a stage runs."""
+        return code_digest(self._scripts / f"{stage}.py")
+
+    def world_settings(self, dataset: str) -> str:
+        """The settings of a dataset's synthetic world."""
+        return stage_settings(self.config, "demo_world", self.worlds[dataset])
+
+    def download_settings(self, _: Any) -> str:
+        """The settings of the download of nuScenes mini. Raises ConfigError where no dataset takes it."""
+        return canonical_json(download_job(self.config).model_dump(mode="json"))
+
+    def device(self, wildcards: Any) -> str:
+        """Where a scene's jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
+        device = for_scene(self.config, wildcards.scene).device.model_dump(mode="json")
+        synthetic = self.config.datasets[self.config.dataset_of(wildcards.scene)].world is not None
+        return canonical_json({**device, "kind": "any"} if synthetic and device["kind"] == "auto" else device)
+
+    def cards(self, wildcards: Any) -> int:
+        """How many GPUs a scene's trainings and renderings take each: one, or none where they run on the CPU; by what
+        can be told on this machine, whose GPUs are those of the jobs."""
+        kind = json.loads(self.device(wildcards))["kind"]
+        return int(kind != "cpu" and (kind != "any" or any_card()))
+
+    def threads(self, on_gpu: int) -> Callable[[Any], int]:
+        """The threads of such a job, `on_gpu` where it has one. On the CPU half of the processors: two jobs beside one
+        another are done sooner than one after the other on all of them."""
+        on_cpu = max(1, len(os.sched_getaffinity(0)) // 2)
+        return lambda wildcards: on_gpu if self.cards(wildcards) else on_cpu
+
+    def known(self, names: Any) -> str:
+        """A wildcard constraint that admits these names only."""
+        return "|".join(re.escape(name) for name in names) or "(?!)"
+
+    def report(self, targets: list[str]) -> ReportPlan:
+        """What the rule of the report across scenes asks, where `targets` are wanted."""
+        return ReportPlan(self, targets)
+
+    @property
+    def all_trajectories(self) -> list[str]:
+        """The names of all films of any scene."""
+        films = (for_scene(self.config, scene).render.trajectories for scene in self.config.scenes)
+        return list(dict.fromkeys(name for trajectories in films for name in trajectories))
+
+    @property
+    def methods_with_actors(self) -> list[str]:
+        """The methods whose models know objects that move: those that can be taken apart and edited."""
+        return [name for name, method in self.config.all_methods.items() if set(method.parts) & MOVING_PARTS]
+
+    def films(self, scenes: list[str]) -> list[str]:
+        """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
+        return self._films(scenes, self._films_of)
+
+    def edits(self, scenes: list[str]) -> list[str]:
+        """The films of every edit of `scenes`, by every method that can be edited."""
+        return self._films(scenes, self._edits_of)
+
+    def _films(self, scenes: list[str], names_of: Callable[[str, str], list[str]]) -> list[str]:
+        return [
+            f"{self.config.results_dir}/{scene}/{method}/{name}.mp4"
+            for scene in scenes
+            for method in self.config.methods
+            for name in names_of(scene, method)
+        ]
+
+    def _films_of(self, scene: str, method: str) -> list[str]:
+        parts = [PARTS_FILM] if method in self.methods_with_actors else []
+        return [*for_scene(self.config, scene).render.trajectories, *parts]
+
+    def _edits_of(self, scene: str, method: str) -> list[str]:
+        edits = scene_edits(self.config, scene) if method in self.methods_with_actors else {}
+        return [f"edits/{edit}" for edit in edits]
+
+    def metrics_stages(self, scene: str) -> dict[str, Any]:
+        """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
+        methods = self.evaluation_stages(scene, self.config.methods)
+        return {**methods, SIDE_BY_SIDE: self._stage(SIDE_BY_SIDE, scene)}
+
+    def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
+        """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
+        taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
+        made = (*scene_stages(self.config, scene), *sorted(taken))
+        stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
+        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in METHOD_STAGES}
+        return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
+
+    def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:
+        return {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": self.code(stage)}
+
+    def refuse_unknown(self, targets: list[str]) -> None:
+        """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know, or
+        an ablation that would train one thing twice."""
+        for target in targets:
+            scene, *rest = self._inside_results(target)
+            if not rest:
+                continue
+            self.config.dataset_of(scene)
+            self._refuse_unknown_method(rest)
+            if rest[0] in ABLATION_FILES:
+                self._refuse_idle_variants(scene)
+            if len(rest) > 1:
+                self._refuse_unknown_film(scene, rest[0], rest[1:])
+
+    def _refuse_unknown_method(self, path: list[str]) -> None:
+        """Raises ConfigError where `path` below a scene's folder is about a method that there is none of."""
+        ablation, known = self.config.ablation, ", ".join(self.config.methods)
+        if path[0] in ABLATION_FILES and not self.config.ablated:
+            raise ConfigError(
+                f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: {known}"
+            )
+        if len(path) > 1 and path[0] not in (*self.config.all_methods, "masks"):
+            more = f"; for the ablation: {ablation.job.spelled}" if self.config.ablated else ""
+            raise ConfigError(f"method {path[0]!r} is not in the config; there are: {known}{more}")
+
+    def _refuse_idle_variants(self, scene: str) -> None:
+        """Raises ConfigError where a variant of the ablation would be the whole method, trained again."""
+        idle = idle_variants(self.config, scene)
+        if idle:
+            drop = ", ".join(f"{name}: null" for name in idle)
+            raise ConfigError(
+                f"on scene {scene} these variants take nothing out of {self.config.ablation.of!r} and would train it "
+                f"again as it is: {', '.join(idle)}; drop them with ablation: {{without: {{{drop}}}}}"
+            )
+
+    def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
+        """Raises ConfigError where `path` below a method's folder is a film or an edit that there is none of."""
+        edit = Path(path[-1]).stem if len(path) == 2 and path[0] == "edits" else None
+        film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
+        if (edit is not None or film == PARTS_FILM) and method not in self.methods_with_actors:
+            able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
+            raise ConfigError(
+                f"method {method!r} knows no actors that could be edited or shown apart; those do: {able}"
+            )
+        if edit is not None and edit not in scene_edits(self.config, scene):
+            raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
+        if film not in (path[-1], *self._films_of(scene, method)):
+            raise ConfigError(no_such_film(for_scene(self.config, scene), scene, film))
+
+    def refuse_download(self, targets: list[str]) -> None:
+        """Raises ConfigError where nuScenes mini is asked for and may not be fetched."""
+        if DOWNLOAD in targets:
+            refuse(download_job(self.config))
+
+    def refuse_absent_data(self, targets: list[str]) -> None:
+        """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""
+        needing = [target for target in targets if target != DOWNLOAD]
+        for scene in self._scenes_of(needing) if needing or not targets else ():
+            tables = self.tables(SimpleNamespace(scene=scene))
+            if self.config.datasets[self.config.dataset_of(scene)].world:
+                refuse_foreign_data(Path(tables[0]).parents[1])
+
+    def _scenes_of(self, targets: list[str]) -> list[str]:
+        """The scenes that targets need; those of the batch where a target does not say."""
+        scenes = [self._scene_of(target) for target in targets]
+        if not scenes or any(scene is not None and scene not in self.config.scenes for scene in scenes):
+            return self.report(targets).scenes
+        return [scene for scene in scenes if scene is not None]
+
+    def _scene_of(self, target: str) -> str | None:
+        """The scene whose file a target is: empty for a rule's name, None for a file that is no scene's result, of
+        which Snakemake knows whether it can be made."""
+        for dataset, scene in self.worlds.items():
+            made = (*self.world_tables(dataset), self.truth_file(dataset))
+            if os.path.normpath(target) in map(os.path.normpath, made):
+                return scene
+        return self._inside_results(target)[0] or (None if os.sep in target else "")
+
+    def _inside_results(self, target: str) -> list[str]:
+        """The parts of a target's path below the results folder; an empty one where it lies elsewhere."""
+        path, results = (Path(os.path.normpath(name)) for name in (target, self.config.results_dir))
+        return list(path.relative_to(results).parts) or [""] if path.is_relative_to(results) else [""]
+
+    def hold_results(self) -> None:
+        """Keeps a second run out of the results folder until this process ends, however it ends.
+
+        Raises DriveSplatError.
+        """
+        folder = Path(self.config.results_dir)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
+        except OSError as error:
+            raise DriveSplatError(
+                f"{folder}/: cannot be written ({error.strerror or error}); "
+                "fix its permissions, or give this run another folder (results_dir)"
+            ) from error
+        try:
+            fcntl.flock(self._held_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise DriveSplatError(
+                f"another run is working in {folder}/; wait for it, or give this one its own folder (results_dir)"
+            ) from None

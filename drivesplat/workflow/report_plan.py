@@ -1,0 +1,91 @@
+"""What the report across scenes is made of, and from what."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivesplat.errors import ConfigError
+from drivesplat.io.storage import canonical_json
+from drivesplat.settings.report import HELD_OUT_PAIR, LOOKS, ReportJob
+from drivesplat.settings.train import MOVING_PARTS
+
+if TYPE_CHECKING:
+    from drivesplat.workflow.plan import Plan
+
+EVERYTHING = "all"
+REPORT_RULES = ("gap_report", "report")
+REPORT_FILES = ("gap_report.html", "gap_report.json", "gap_report.csv")
+
+
+class ReportPlan:
+    """The report of a `plan` where `targets` are asked for: of all scenes, or, where nothing but the report is asked
+    for, of those that have been measured. It shows what there is to see, and waits for it where everything is asked
+    for."""
+
+    def __init__(self, plan: "Plan", targets: list[str]):
+        self._plan = plan
+        self._results = plan.config.results_dir
+        names = {*REPORT_RULES, *(f"{self._results}/{name}" for name in REPORT_FILES)}
+        self._alone = bool(targets) and set(targets) <= names
+        self._everything = not targets or EVERYTHING in targets
+        self.wanted = self._everything or bool(set(targets) & names)
+
+    @property
+    def scenes(self) -> list[str]:
+        """Its scenes."""
+        scenes = self._plan.config.batch_scenes
+        if not self._alone:
+            return scenes
+        return [scene for scene in scenes if Path(self._results, scene, "metrics.json").is_file()]
+
+    def refuse_empty(self) -> None:
+        """Raises ConfigError where the report is asked for by itself and would hold none of the scenes that have been
+        measured, since their datasets do not belong to it."""
+        others = [scene for scene in self._plan.config.scenes if scene not in self._plan.config.batch_scenes]
+        measured = [scene for scene in others if Path(self._results, scene, "metrics.json").is_file()]
+        if self._alone and measured and not self.scenes:
+            raise ConfigError(
+                f"no scene of the report has been measured; {', '.join(measured)} has, and is no part of it "
+                "(datasets.<name>.batch: false): with --configfile presets/demo.yaml -- report it is the demo's report"
+            )
+
+    @property
+    def metrics(self) -> list[str]:
+        """The metrics.json of its scenes."""
+        return [f"{self._results}/{scene}/metrics.json" for scene in self.scenes]
+
+    @property
+    def pictures(self) -> list[str]:
+        """The pictures that its page shows. Those that come with the figures are there when the figures are."""
+        with_figures = self._of_methods(HELD_OUT_PAIR.values())
+        return [*(_there(with_figures) if self._alone else with_figures), *self._seen(self._of_methods(LOOKS.values()))]
+
+    @property
+    def links(self) -> list[str]:
+        """What its page links to: films, edits, and what opens in a browser."""
+        films, edits = self._plan.films(self.scenes), self._plan.edits(self.scenes)
+        return self._seen([*films, *edits, *self._of_methods(["viewer.html"])])
+
+    @property
+    def settings(self) -> str:
+        """What its job is told, as canonical JSON."""
+        config = self._plan.config
+        standing = (name for name, method in config.methods.items() if not set(method.parts) & MOVING_PARTS)
+        job = ReportJob(
+            expected={scene: self._plan.metrics_stages(scene) for scene in config.batch_scenes},
+            reference=next(standing, None),
+            random_seed=config.random_seed,
+        )
+        return canonical_json(job.model_dump(mode="json"))
+
+    def _of_methods(self, names: Iterable[str]) -> list[str]:
+        """The files of these names in the folders of all methods of its scenes."""
+        methods, wanted = self._plan.config.methods, tuple(names)
+        return [f"{self._results}/{s}/{m}/{name}" for s in self.scenes for m in methods for name in wanted]
+
+    def _seen(self, files: list[str]) -> list[str]:
+        return files if self._everything else _there(files)
+
+
+def _there(files: list[str]) -> list[str]:
+    return [file for file in files if Path(file).is_file()]
