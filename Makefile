@@ -37,13 +37,13 @@ lint: setup
 # Uses the Python at hand where there is no .venv: GPU machines often bring their own torch.
 test-gpu:
 	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -m gpu -rs -v
-	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -rs -v tests/test_on_gpu.py tests/test_on_gpu_tiles.py
+	$(if $(wildcard $(BIN)/python),$(BIN)/python,python3) -m pytest -rs -v tests/kernels/test_triton.py tests/kernels/test_triton_tiles.py
 
 test-slurm: setup
-	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/test_slurm.py
+	bash scripts/with_slurm.sh $(BIN)/python -m pytest -m slurm -rs -v tests/workflow/test_slurm.py
 
 test-batch: setup
-	DRIVESPLAT_BATCH=1 $(BIN)/python -m pytest -m batch -rs -v tests/test_batch.py
+	DRIVESPLAT_BATCH=1 $(BIN)/python -m pytest -m batch -rs -v tests/workflow/test_batch.py
 
 bench: setup
 	$(BIN)/python -m pytest benchmarks -q

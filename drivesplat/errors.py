@@ -1,7 +1,7 @@
 """What goes wrong in words a user can act on.
 
-Every message is one sentence or two: what, where, what to do. The script seam (`drivesplat.workflow.job`) prints the message
-alone; anything else that is raised is a bug and keeps its traceback in the job's log.
+Every message is one sentence or two: what, where, what to do. The script seam (`drivesplat.workflow.job`) prints the
+message alone; anything else that is raised is a bug and keeps its traceback in the job's log.
 """
 
 

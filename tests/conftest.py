@@ -49,7 +49,7 @@ def one_thread():
 @pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory) -> Path:
     """A tiny drive in nuScenes format: scene 0001, read only."""
-    from tiny_world import World, write_world
+    from helpers.tiny_world import World, write_world
 
     return write_world(tmp_path_factory.mktemp("tiny"), World())
 

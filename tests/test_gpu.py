@@ -13,8 +13,7 @@ import pytest
 import torch
 from gsplat import MCMCStrategy
 from gsplat.relocation import compute_relocation
-from scipy.spatial.transform import Rotation
-from test_training import (
+from helpers.trainings import (
     ALL_TERMS,
     EndedError,
     EndingViews,
@@ -27,6 +26,7 @@ from test_training import (
     untrained,
     untrained_street,
 )
+from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
 from drivesplat.io.prefetch import in_advance

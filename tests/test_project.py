@@ -2,14 +2,12 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
+from helpers import REPOSITORY
 
 from drivesplat.settings.config import load, merged
-
-REPOSITORY = Path(__file__).parent.parent
 
 
 def pins(lines: list[str]) -> dict[str, str]:

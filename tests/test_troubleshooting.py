@@ -3,14 +3,13 @@
 import ast
 import re
 import textwrap
-from pathlib import Path
 
 import pytest
 import yaml
+from helpers import REPOSITORY
 
 from drivesplat.settings.config import Config, load
 
-REPOSITORY = Path(__file__).parent.parent
 PAGE = (REPOSITORY / "docs/troubleshooting.md").read_text(encoding="utf-8")
 HEADINGS = re.findall(r"^### (.+)$", PAGE, re.M)
 MESSAGES = [span for heading in HEADINGS for span in re.findall(r"`([^`]+)`", heading) if "…" in span or " " in span]

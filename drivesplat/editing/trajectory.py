@@ -32,8 +32,8 @@ class Course:
     """The path that a motion leads along.
 
     Metres count horizontally along the path from the first annotation; they never decrease, and do not grow while the
-    object stands. Past its ends the path leads straight on, as `drivesplat.editing.extrapolation` says, and over a gap of the
-    track smoothly.
+    object stands. Past its ends the path leads straight on, as `drivesplat.editing.extrapolation` says, and over a gap
+    of the track smoothly.
     """
 
     motion: Motion

@@ -131,8 +131,8 @@ class Part(nn.Module, ABC):
 
     @property
     def spare(self) -> int:
-        """So many of the last rows are no Gaussians, but wait to become some (`drivesplat.training.cuda_graph.preallocation`); none
-        outside trainings."""
+        """So many of the last rows are no Gaussians, but wait to become some
+        (`drivesplat.training.cuda_graph.preallocation`); none outside trainings."""
         return self._spare
 
     @spare.setter

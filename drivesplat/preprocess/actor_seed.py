@@ -32,7 +32,8 @@ UNSEEN = 127
 
 
 def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
-    """The record of `drivesplat.scene.actor_record`, provenance aside. A mover that no training image sees is left out."""
+    """The record of `drivesplat.scene.actor_record`, provenance aside. A mover that no training image sees is left
+    out."""
     sweeps = training_returns(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []

@@ -62,7 +62,8 @@ MARGIN = 2
 
 
 def own_car_record(scene: Scene, job: OwnCarJob) -> dict[str, Any]:
-    """The record of `drivesplat.scene.ego_mask`, provenance aside. Raises DatasetError naming an image that is unreadable."""
+    """The record of `drivesplat.scene.ego_mask`, provenance aside. Raises DatasetError naming an image that is
+    unreadable."""
     cameras = {}
     for camera in dict.fromkeys(frame.camera for frame in scene.frames):
         outlines, source, why = known(scene, camera, job)

@@ -58,8 +58,8 @@ _PLACES = ("origins", "ends")
 def free_space_record(
     scene: Scene, job: FreeSpaceJob, triangulated: dict[str, np.ndarray] | None = None
 ) -> dict[str, Any]:
-    """The record of `drivesplat.lidar.free_space_record`, provenance aside, from the LiDAR of a scene, and from the content
-    of its triangulated.pkl where it has one."""
+    """The record of `drivesplat.lidar.free_space_record`, provenance aside, from the LiDAR of a scene, and from the
+    content of its triangulated.pkl where it has one."""
     rays = Rays.joined([lidar_rays(scene, job), *([camera_rays(scene, job, triangulated)] if triangulated else [])])
     record = proven_empty(rays, job.free_space)
     log.info("%d rays prove %.0f cubic metres empty", len(rays.ends), len(record["keys"]) * record["voxel"] ** 3)

@@ -1,6 +1,7 @@
 """Paths of a film's camera: the recorded one made smooth, and others beside it; and what such a camera sees.
 
-Frames as in `drivesplat.scene.scene`: world metres, OpenCV cameras, ego x forward, y left, z up. Timestamps: microseconds.
+Frames as in `drivesplat.scene.scene`: world metres, OpenCV cameras, ego x forward, y left, z up. Timestamps:
+microseconds.
 """
 
 import math

@@ -1,8 +1,8 @@
 """The smooth motion of an annotated object: where it is at any time, without the jolts of straight lines between key
 frames.
 
-Seconds count from the scene's first image. Frames as in `drivesplat.scene.scene`: object x forward, y left, z up, at the box
-centre; world metres.
+Seconds count from the scene's first image. Frames as in `drivesplat.scene.scene`: object x forward, y left, z up, at
+the box centre; world metres.
 """
 
 from dataclasses import dataclass

@@ -10,8 +10,8 @@ from drivesplat.settings.images import ImageSettings
 
 class MaskSettings(Settings):
     regions_folder: str | None = None
-    """Your own label images (labels as in drivesplat/scene/regions.py), named {camera}/{image name}.png. null = from the
-    annotated boxes."""
+    """Your own label images (labels as in drivesplat/scene/regions.py), named {camera}/{image name}.png. null = from
+    the annotated boxes."""
     sky_folder: str | None = None
     """Your own sky masks (255 = sky), named {camera}/{image name}.png. null = a heuristic."""
     semantic_folder: str | None = None

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from archive_server import Site, packed, served
-from tiny_world import World, write_world
-from workflow_copy import WorkflowCopy, complaints
+from helpers.archive_server import Site, packed, served
+from helpers.tiny_world import World, write_world
+from helpers.workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.nuscenes.download import fetch as fetching

@@ -6,9 +6,9 @@ import shutil
 
 import pytest
 import yaml
-from small_runs import BASE, run
-from tiny_world import Thing, World, write_world
-from workflow_copy import REPOSITORY
+from helpers.small_runs import BASE, run
+from helpers.tiny_world import Thing, World, write_world
+from helpers.workflow_copy import REPOSITORY
 
 from drivesplat.settings.config import load
 
@@ -30,7 +30,7 @@ def test_a_track_with_one_box_stands_where_it_was_seen_and_is_there_at_that_time
 
 
 def test_a_drive_whose_lidar_is_gone_is_measured_with_the_count_beside_it(tmp_path):
-    """Where `lidar_seed.on_missing` says to go on; where not, tests/test_reader.py holds that it stops."""
+    """Where `lidar_seed.on_missing` says to go on; where not, tests/readers/test_nuscenes.py holds that it stops."""
     root = write_world(tmp_path / "data", World(key_frames=8))
     shutil.rmtree(root / "samples/LIDAR_TOP")
     made = run(root, tmp_path, lidar_seed={**BASE["lidar_seed"], "on_missing": "warn"})

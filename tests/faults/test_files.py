@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import REPOSITORY
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.backbone import read_backbone
@@ -28,7 +29,6 @@ from drivesplat.scene.truth import read_truth
 from drivesplat.training.checkpoint import resumable
 from drivesplat.training.run import read_checkpoint, read_summary
 
-REPOSITORY = Path(__file__).parents[2]
 SOURCES = [
     path for folder in ("drivesplat", "workflow_scripts", "benchmarks") for path in (REPOSITORY / folder).rglob("*.py")
 ]
@@ -93,7 +93,7 @@ def write(path: Path, kind: str) -> None:
 BROKEN = ["empty", "truncated", "a web page", "bytes", "a malicious pickle", "a malicious checkpoint"]
 FOREIGN = ["a pickle of another record", "a list", "another record"]
 LEFT_OUT = ("metrics.json", True)
-"""The report leaves a foreign one out and names it: tests/test_report.py."""
+"""The report leaves a foreign one out and names it: tests/report/test_report.py."""
 
 
 CASES = [(name, kind) for name in READERS for kind in (*BROKEN, *FOREIGN) if (name, kind in FOREIGN) != LEFT_OUT]
@@ -188,7 +188,8 @@ NO_RESULTS = {
 
 
 def test_results_are_written_whole_or_not_at_all():
-    """Every file that is written goes through `drivesplat.io.storage`, beside its place and into it once it is on disk."""
+    """Every file that is written goes through `drivesplat.io.storage`, beside its place and into it once it is on
+    disk."""
     found = set()
     for path in (path for path in SOURCES if path.name not in NO_RESULTS):
         for name, call in calls(path):

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from test_runs import VANILLA, told, training_process
-from workflow_copy import TINY_TRAINING, WorkflowCopy
+from helpers.killed_runs import VANILLA, told, training_process
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("killed")]
 

@@ -11,32 +11,17 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
-from tiny_world import World
-from workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
+from helpers.killed_runs import VANILLA, told, training_process
+from helpers.tiny_world import World
+from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
 
 
-def told(done: subprocess.CompletedProcess) -> str:
-    """The one line that a failed run says, checked to be one line and no traceback."""
-    assert done.returncode != 0, done.stdout
-    assert "Traceback" not in done.stdout, done.stdout
-    lines = complaints(done.stdout)
-    assert len(lines) == 1, done.stdout
-    return lines.pop()
-
-
-VANILLA = {"vanilla": {}}
 TWO_METHODS = {**VANILLA, "street": {"parts": ["background", "actors"]}}
-
-
-@pytest.fixture
-def copy(tmp_path) -> WorkflowCopy:
-    return WorkflowCopy.make(tmp_path / "workflow", methods=VANILLA)
 
 
 def with_edits(copy: WorkflowCopy, text: str) -> WorkflowCopy:
@@ -421,24 +406,6 @@ def test_a_second_run_in_one_folder_is_refused(copy):
         line = told(copy.run("results/0001/scene.json"))
     assert "another run" in line
     assert copy.run("results/0001/scene.json").returncode == 0
-
-
-def training_process(copy: WorkflowCopy) -> int | None:
-    """The process id of the running train.py of this copy."""
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                arguments = (entry / "cmdline").read_bytes().split(b"\0")
-                where = str((entry / "cwd").readlink())
-            except OSError:
-                continue
-            if (
-                where == str(copy.folder)
-                and any(a.endswith(b".train.py") for a in arguments)
-                and b"python" in arguments[0]
-            ):
-                return int(entry.name)
-    return None
 
 
 def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from tiny_world import World
-from workflow_copy import TINY_TRAINING, WorkflowCopy
+from helpers.tiny_world import World
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("scenes")]
 

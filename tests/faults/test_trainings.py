@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_training import (
+from helpers.trainings import (
     PROVENANCE,
     EndedError,
     files_in,

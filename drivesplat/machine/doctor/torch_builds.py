@@ -1,6 +1,7 @@
 """Which build of torch an NVIDIA card and its driver can run; asked by the set-up before anything is installed.
 
-    python -m drivesplat.machine.doctor.torch_builds [BUILD]     exit status 0: the build fits, 1: it does not (says which does)
+    python -m drivesplat.machine.doctor.torch_builds [BUILD]     exit status 0: the build fits, 1: it does not (says
+    which does)
 
 torch 2.11 comes for CUDA 13.0 (the wheel on PyPI), 12.8, 12.6 and for the CPU alone. What each can run on stands in
 PyTorch's release matrix (pytorch/pytorch, RELEASE.md) and in NVIDIA's table of minimum drivers ("CUDA Compatibility",

@@ -1,4 +1,5 @@
-"""`python -m drivesplat.machine.gsplat_build`: compiles gsplat for the cards of this machine, or for those GSPLAT_ARCHS names.
+"""`python -m drivesplat.machine.gsplat_build`: compiles gsplat for the cards of this machine, or for those GSPLAT_ARCHS
+names.
 
 Does nothing where that has been done, and where there is no CUDA build of torch or no card; with `--if-needed` it does
 not even say so.

@@ -1,4 +1,5 @@
-"""Compiles gsplat's kernels as the module `csrc` into a folder: `python -m drivesplat.machine.gsplat_build.compile_job FOLDER`.
+"""Compiles gsplat's kernels as the module `csrc` into a folder: `python -m drivesplat.machine.gsplat_build.compile_job
+FOLDER`.
 
 A process of its own: torch reads CUDA_HOME, TORCH_CUDA_ARCH_LIST and MAX_JOBS once, and ninja writes to its output.
 """

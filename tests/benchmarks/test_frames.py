@@ -1,0 +1,61 @@
+"""How many frames a second there are, and how long a film takes: what the benchmark counts."""
+
+import json
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made_street import checkpoint_of, street_model, street_scene
+
+import benchmarks.frames as command
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.render import FilmJob, TrajectorySettings
+
+JOB = FilmJob(
+    camera="CAM_FRONT", fps=10, width=32, height=18, horizontal_fov=None, crf=30, trajectory=TrajectorySettings()
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene):
+    return street_scene(tiny_scene)
+
+
+def test_frames_are_counted_after_the_first_and_the_film_with_all_it_takes(scene, monkeypatch):
+    """By a clock that only rendering moves: by a second a frame, 0.1 s once a tenth of them are rendered."""
+    now, rendered = {"s": 0.0}, []
+
+    def rendering(model, shot, device):
+        for seconds in shot.seconds:
+            rendered.append(seconds)
+            now["s"] += 1.0 if len(rendered) <= frames // 10 else 0.1
+            yield np.zeros((18, 32, 3), np.uint8)
+
+    def film(*_) -> None:
+        now["s"] += 7.0
+
+    frames = len(command.film_path(scene, "CAM_FRONT", 10, TrajectorySettings()).timestamps)
+    assert frames >= 20
+    monkeypatch.setattr(command, "recorded_shot", rendering)
+    monkeypatch.setattr(command, "render_film", film)
+    monkeypatch.setattr(command, "time", SimpleNamespace(perf_counter=lambda: now["s"]))
+    found = command.measure(scene, checkpoint_of(street_model()), JOB, DeviceSettings(kind="cpu"))
+    assert len(rendered) == found["frames"] == frames and rendered == sorted(rendered)
+    assert found["frames_per_second"] == pytest.approx(10.0) and found["film_seconds"] == pytest.approx(7.0)
+    assert found["film_of_seconds"] == pytest.approx(frames / 10)
+    assert (found["width"], found["height"], found["gaussians"]) == (32, 18, len(street_model()))
+
+
+def test_the_command_measures_a_trained_scene(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "read_scene", lambda path: scene)
+    torch.save(checkpoint_of(street_model()), tmp_path / "checkpoint.pt")
+    threads, began = torch.get_num_threads(), time.monotonic()
+    words = [str(tmp_path / "checkpoint.pt"), "scene.json", "--width", "32", "--height", "18", "--fps", "4"]
+    try:
+        assert command.main([*words, "--threads", "1"]) == 0
+    finally:
+        torch.set_num_threads(threads)
+    found = json.loads(capsys.readouterr().out)
+    assert 0.0 < found["film_seconds"] < time.monotonic() - began and found["frames_per_second"] > 0.0

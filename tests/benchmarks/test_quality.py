@@ -1,0 +1,332 @@
+"""The table of recipes: what stands side by side, what it must be read with, and the command from end to end."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from helpers import REPOSITORY
+from helpers.hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_evaluation
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
+
+from benchmarks.quality.__main__ import main, measure
+from benchmarks.quality.compare import quality
+from benchmarks.quality.results import Result, results_of
+from benchmarks.quality.runs import Outcome
+from benchmarks.quality.table import markdown
+from drivesplat.errors import ConfigError
+
+BAD = {"overrides": {"sky": "none"}}
+
+
+@pytest.fixture
+def compared(tmp_path):
+    """Makes a record of recipes whose eval.json files hold what is given by name and seed; the rest has failed."""
+
+    def compare(evals: dict[str, list[dict[str, Any] | None]], recipes: dict[str, Any]) -> dict[str, Any]:
+        file, groups = recipe_file(tmp_path, recipes=recipes)
+        for group in groups:
+            for recipe in group.recipes:
+                for seed, content in enumerate(evals[recipe]):
+                    if content:
+                        write_evaluation(group, recipe, seed, content)
+        lacking = [f"{name}-seed{seed}" for name, found in evals.items() for seed in (0, 1) if not found[seed]]
+        failures = {f"{method}/train": "a loss | no number" for method in lacking}
+        return quality(file, results_of([(group, Outcome(int(bool(failures)), None, failures)) for group in groups]))
+
+    return compare
+
+
+def rows(text: str) -> list[list[list[str]]]:
+    """The Markdown tables of a page: lines of cells."""
+    blocks = [block for block in text.split("\n\n") if block.startswith("|")]
+    return [
+        [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in block.splitlines()]
+        for block in blocks
+    ]
+
+
+TWO = {"plain": {}, "street": {"of": "street"}}
+EVALS = {
+    "plain": [evaluation(24.0, 18.0, ssim=0.7), evaluation(25.0, 17.0, ssim=0.8)],
+    "street": [
+        evaluation(25.0, 22.0, gaussians=3000, train_seconds=90.0),
+        evaluation(27.0, 21.0, gaussians=2000, train_seconds=130.0, peak_gpu_memory_gb=3.5),
+    ],
+}
+
+
+def test_recipes_stand_side_by_side_with_differences_to_the_first(compared):
+    """Static: 24 and 25 against 25 and 27: +1 and +2, so 1.5 with a standard error of 0.5."""
+    record = compared(EVALS, TWO)
+    (table,) = record["tables"]
+    plain, street = table["rows"]
+    assert (table["reference"], [row["recipe"] for row in table["rows"]]) == ("plain", ["plain", "street"])
+    assert plain["interpolation"]["difference"]["static"] is None
+    off = street["interpolation"]["difference"]["static"]
+    assert (off["mean"], off["by_seed"]) == (1.5, [1.0, 2.0])
+    assert off["standard_error"] == pytest.approx(sqrt(0.5) / sqrt(2.0))
+    assert street["interpolation"]["gap_db"]["by_seed"] == [3.0, 6.0]
+    assert street["extrapolation"]["static"]["by_seed"] == [20.0, 22.0]
+    assert (street["peak_gpu_memory_gb"]["mean"], street["train_seconds"]["max"]) == (3.0, 130.0)
+    assert record["failed"] == []
+
+
+def test_the_page_has_a_table_for_each_group_and_one_of_costs(compared):
+    between, beyond, costs = rows(markdown(compared(EVALS, TWO)))
+    assert between[0] == ["recipe", "static", "difference", "moving vehicles", "difference", "gap", "SSIM"]
+    assert between[2] == ["`plain`", "24.5 (24.0 to 25.0)", "-", "17.5 (17.0 to 18.0)", "-", "7.0", "0.750"]
+    assert between[3] == [
+        "`street`", "26.0 (25.0 to 27.0)", "+1.50 ± 0.50", "21.5 (21.0 to 22.0)", "+4.00 ± 0.00", "4.5", "0.500",
+    ]  # fmt: skip
+    assert beyond[3] == ["`street`", "21.0 (20.0 to 22.0)", "+1.50 ± 0.50", "-", "-", "-"]
+    assert costs[3] == [
+        "`street`", "0, 1", "31", "no", "nuscenes", "15,000", "2,500", "110 s", "3.0 GB", "NVIDIA H200",
+    ]  # fmt: skip
+
+
+def test_the_page_says_how_it_was_measured_and_what_the_recipes_are(compared):
+    text = markdown(compared(EVALS, {**TWO, "street": {"of": "street", "overrides": {"train": {"depth_weight": 0.5}}}}))
+    (line,) = (line for line in text.splitlines() if line.startswith("Scene 0061"))
+    for words in (
+        "of nuscenes (v1.0-mini)", "CAM_FRONT at 640x360", "key frames 4, 12, 20, 28 between training frames",
+        "35 to 38 beyond the last training frame", "poses: nuscenes", "15,000 iterations", "NVIDIA H200",
+        "random seeds 0, 1.",
+    ):  # fmt: skip
+        assert words in line, words
+    assert "- `street`: of `street`, overrides `{train: {depth_weight: 0.5}}`" in text
+    assert "Shared" not in text and "failed" not in text and "depth error" not in text
+
+
+def test_depth_error_and_lpips_have_columns_where_they_were_measured(compared):
+    evals = json.loads(json.dumps(EVALS))
+    for content, error in zip(evals["street"], (0.02, 0.04), strict=True):
+        content["result"]["interpolation"] |= {"depth": {"median_relative_error": error, "pixels": 9}}
+        content["result"]["interpolation"]["all"]["lpips"] = 0.25
+    between, beyond, _ = rows(markdown(compared(evals, TWO)))
+    assert between[0][-3:] == ["SSIM", "LPIPS", "depth error"]
+    assert [line[-2:] for line in between[2:]] == [["-", "-"], ["0.250", "3.0%"]]
+    assert beyond[0][-1] == "gap"
+
+
+OTHERWISE = {
+    "width": {"width": 320},
+    "holdout": {"holdout": {"every_nth": 4, "offset": 4, "last_block": 4}, "held_out_frames": {"interpolation": [4, 8],
+                "extrapolation": [35, 36]}},
+    "eval_camera": {"eval_camera": "CAM_BACK"},
+    "regions": {"regions": "masks"},
+    "own_car": {"own_car": "outline"},
+    "version": {"version": "v1.0-trainval"},
+    "key_frame_range": {"key_frame_range": [0, 20]},
+}  # fmt: skip
+
+
+def spelled(value: Any) -> str:
+    """A value as YAML spells it in a line."""
+    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False).split("\n")[0]
+
+
+@pytest.mark.parametrize("key", OTHERWISE)
+def test_what_was_measured_otherwise_stands_in_a_table_of_its_own(compared, key):
+    evals = {**EVALS, "other": [evaluation(30.0, protocol=OTHERWISE[key])] * 2}
+    record = compared(evals, {"plain": TWO["plain"], "other": BAD, "street": TWO["street"]})
+    assert [[row["recipe"] for row in table["rows"]] for table in record["tables"]] == [["plain", "street"], ["other"]]
+    assert record["tables"][1]["rows"][0]["interpolation"]["difference"]["static"] is None, "to itself alone"
+    text = markdown(record)
+    (note,) = (line for line in text.splitlines() if line.startswith("Measured otherwise than the first table"))
+    assert f"{key} " in note and spelled(PROTOCOL[key]) in note
+    assert len(re.findall("^Difference|Difference from `other`", text)) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "cells"),
+    [
+        ({"sweeps": True, "train_images": 186}, ["186", "yes", "nuscenes"]),
+        ({"poses": "refined"}, ["31", "no", "refined"]),
+        ({"cameras": ["CAM_FRONT", "CAM_BACK"], "train_images": 62}, ["62", "no", "nuscenes"]),
+    ],
+)
+def test_what_recipes_are_trained_on_belongs_to_their_rows(compared, change, cells):
+    evals = {**EVALS, "street": [evaluation(26.0, 21.0, protocol=change)] * 2}
+    record = compared(evals, TWO)
+    (table,) = record["tables"]
+    assert table["rows"][1]["trained_on"].items() >= change.items()
+    text = markdown(record)
+    assert rows(text)[-1][3][2:5] == cells and rows(text)[-1][2][2:5] == ["31", "no", "nuscenes"]
+    assert ("poses: nuscenes, refined" in text) == ("poses" in change)
+
+
+def test_seconds_of_trainings_that_shared_a_card_say_so(tmp_path):
+    file, _ = recipe_file(tmp_path, recipes=TWO)
+    results = [
+        Result(recipe, seed, tmp_path, {**content, "provenance": {}}, shared=(recipe, seed) == ("street", 1))
+        for recipe in TWO
+        for seed, content in enumerate(EVALS[recipe])
+    ]
+    text = markdown(quality(file, results))
+    assert [line[7] for line in rows(text)[2][2:]] == ["60 s", "110 s, shared"]
+    assert "\n\nShared: while it was trained another job ran on the same card" in text
+
+
+def test_a_recipe_that_failed_is_named_with_its_reason_and_the_others_stand(compared):
+    record = compared({**EVALS, "bad": [None, None]}, {**TWO, "bad": BAD})
+    assert [(item["recipe"], item["seed"]) for item in record["failed"]] == [("bad", 0), ("bad", 1)]
+    between, beyond, costs = rows(markdown(record))
+    assert between[4] == ["`bad`", r"failed: train: a loss \| no number", "", "", "", "", ""] and len(beyond) == 5
+    assert [line[0] for line in costs[2:]] == ["`plain`", "`street`"]
+    assert "- `bad`, seed 1: train: a loss | no number" in markdown(record)
+
+
+def test_a_seed_that_failed_leaves_the_recipes_other_seeds(compared):
+    evals = {"plain": EVALS["plain"], "street": [None, EVALS["street"][1]]}
+    record = compared(evals, TWO)
+    street = record["tables"][0]["rows"][1]
+    assert (street["seeds"], street["interpolation"]["static"]["by_seed"]) == ([1], [None, 27.0])
+    assert street["interpolation"]["difference"]["static"] == {
+        "mean": 2.0, "standard_error": None, "by_seed": [None, 2.0]
+    }  # fmt: skip
+    text = markdown(record)
+    assert rows(text)[2][3][:2] == ["`street`", "1"] and "- `street`, seed 0: " in text
+    assert "failed:" not in text, "it has a row of figures"
+
+
+def test_where_the_first_recipe_failed_differences_say_what_they_are_to(compared):
+    record = compared({"bad": [None, None], **EVALS}, {"bad": BAD, **TWO})
+    assert record["tables"][0]["reference"] == "plain" and "Difference from `plain`" in markdown(record)
+
+
+def test_where_all_failed_the_page_says_why(compared):
+    text = markdown(compared({"plain": [None, None], "street": [None, None]}, TWO))
+    assert "Nothing was measured." in text and text.count("a loss | no number") == 4 and "| ---" not in text
+
+
+def test_the_record_holds_every_seeds_figures_and_where_they_came_from(compared):
+    record = compared({**EVALS, "bad": [None, None]}, {**TWO, "bad": BAD})
+    assert json.loads(json.dumps(record, allow_nan=False)) == record
+    assert [(name, [run["seed"] for run in runs]) for name, runs in record["runs"].items()] == [
+        ("plain", [0, 1]), ("street", [0, 1]), ("bad", [0, 1]),
+    ]  # fmt: skip
+    run = record["runs"]["street"][1]
+    assert run["result"] == EVALS["street"][1]["result"] and run["protocol"] == PROTOCOL
+    assert "street-seed1/train" in run["provenance"]["stages"]
+    assert record["runs"]["bad"][0]["result"] is None
+    assert (record["scene"], record["seeds"], record["recipes"]["bad"]["overrides"]) == (
+        "0061",
+        [0, 1],
+        {"sky": "none"},
+    )
+
+
+@pytest.fixture
+def called(tmp_path, monkeypatch):
+    """Calls the command with these words for Snakemake, whose run leaves the results of these recipes; returns the exit
+    status, and what Snakemake was told."""
+
+    def call(words: list[str], done: tuple[str, ...] = ("plain", "street"), status: int = 0) -> tuple[int, list[str]]:
+        recipe_file(tmp_path, recipes=TWO)
+        told: list[str] = []
+
+        def run(group, arguments, workflow) -> Outcome:
+            told.extend(arguments)
+            for recipe in done:
+                for seed, content in enumerate(EVALS[recipe]):
+                    write_evaluation(group, recipe, seed, content)
+            return Outcome(status, None, {})
+
+        monkeypatch.setattr("benchmarks.quality.run", run)
+        monkeypatch.chdir(REPOSITORY)
+        return main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), *words]), told
+
+    return call
+
+
+def test_the_command_hands_on_what_is_snakemakes_and_writes_page_and_record(called, tmp_path, capsys):
+    assert called(["--", "--cores", "4", "--resources", "gpu=2"]) == (0, ["--cores", "4", "--resources", "gpu=2"])
+    page = (tmp_path / "out/quality.md").read_text(encoding="utf-8")
+    record = json.loads((tmp_path / "out/quality.json").read_text())
+    assert page == markdown(record) and page in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("done", "status", "expected"), [(("plain",), 0, 1), (("plain", "street"), 7, 7)])
+def test_the_exit_status_says_whether_all_is_there(called, done, status, expected):
+    assert called(["--", "--cores", "4"], done, status)[0] == expected
+
+
+def test_a_dry_run_writes_nothing(called, tmp_path):
+    assert called(["--", "-n"], done=())[0] == 0
+    assert not list((tmp_path / "out").glob("quality.*"))
+
+
+def test_results_lie_by_the_files_name_unless_told_otherwise(monkeypatch, capsys):
+    places = []
+    monkeypatch.setattr("benchmarks.quality.measure", lambda file, out, words, workflow: places.append(out) or 0)
+    assert main(["a/mine.yaml"]) == main(["a/mine.yaml", "--out", "there", "--", "-n"]) == 0
+    assert places == [Path("results/quality/mine"), Path("there")]
+
+
+def test_it_is_called_where_snakemake_is(tmp_path):
+    with pytest.raises(ConfigError, match="no Snakefile"):
+        measure(tmp_path / "recipes.yaml", tmp_path, [], tmp_path)
+
+
+# --- from end to end ---
+
+RECIPES = {
+    "base": ["mine.yaml"],
+    "scene": "0001",
+    "seeds": [4],
+    "config": {"train": {**TINY_TRAINING, "iterations": 3, "log_every": 1}},
+    "recipes": {
+        "elsewhere": {"config": {"datasets": {"nuscenes": {"dataroot": "nowhere"}}}},
+        "vanilla": {"of": "vanilla"},
+        "broken": {"overrides": {"train": {"opacity_reg": 1.0e300}}},
+    },
+}
+
+
+@pytest.mark.workflow
+@pytest.mark.xdist_group("quality")
+def test_recipes_run_to_a_table_that_names_what_failed_and_what_is_measured_stays(tmp_path):
+    """One recipe's data is not there, one diverges; the third is measured, and only that which failed is run again."""
+    copy = WorkflowCopy.make(tmp_path / "copy")
+    (copy.folder / "recipes.yaml").write_text(yaml.safe_dump(RECIPES, sort_keys=False))
+    done = command(copy)
+    assert done.returncode == 1, done.stdout
+    record = copy.read("results/quality/recipes/quality.json")
+    whys = {item["recipe"]: item["why"] for item in record["failed"]}
+    assert set(whys) == {"elsewhere", "broken"} and "nowhere" in whys["elsewhere"], whys
+    assert whys["broken"].startswith("train: ") and "iteration" in whys["broken"]
+    (row,) = record["tables"][0]["rows"]
+    measured = copy.read("results/quality/recipes/plain/0001/vanilla-seed4/eval.json")["result"]
+    assert (row["recipe"], row["train_iterations"], measured["random_seed"]) == ("vanilla", 3, 4)
+    assert row["extrapolation"]["static"]["by_seed"] == [measured["extrapolation"]["static"]["psnr"]]
+    page = (copy.folder / "results/quality/recipes/quality.md").read_text(encoding="utf-8")
+    assert page in done.stdout and "| `vanilla` |" in page and "| `broken` | failed: train: " in page
+    assert {"extract", "lidar_seed", "parser", "masks", "train", "evaluate"} <= ran(done.stdout)
+
+    again = command(copy)
+    assert again.returncode == 1 and ran(again.stdout) == {"train"}, again.stdout
+    assert copy.read("results/quality/recipes/quality.json")["tables"] == record["tables"]
+
+
+def command(copy: WorkflowCopy) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "benchmarks.quality", "recipes.yaml", "--", "--cores", "2"],
+        cwd=copy.folder,
+        env={**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=600,
+    )
+
+
+def ran(output: str) -> set[str]:
+    """The rules of which Snakemake started a job."""
+    return set(re.findall(r"^(?:local)?rule (\w+):$", output, re.M))

@@ -1,0 +1,364 @@
+"""Timed trainings: what is trained for a file, the tables, and the command from end to end."""
+
+import json
+import os
+import re
+from pathlib import Path
+from threading import Barrier
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from helpers import REPOSITORY
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
+
+from benchmarks.quality.runs import Outcome
+from benchmarks.speed import __main__ as command
+from benchmarks.speed import runs
+from benchmarks.speed.alone import in_own_process
+from benchmarks.speed.bystanders import Moment, busy_elsewhere
+from benchmarks.speed.compare import speed
+from benchmarks.speed.plan import Task, group_of, read_speed_file, targets_of, tasks_of
+from benchmarks.speed.settings import SpeedFile
+from benchmarks.speed.table import markdown
+from drivesplat.errors import ConfigError, TrainingError
+from drivesplat.settings.config import load, merged
+from drivesplat.training.run import TrainingFiles, read_checkpoint, read_inputs, run_training
+from drivesplat.workflow.stages import stage_settings
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
+
+
+def planned(tmp_path: Path, **content: Any) -> tuple[SpeedFile, list[Task]]:
+    file = SpeedFile.model_validate({"scene": "0061", **content})
+    return file, list(tasks_of(file, group_of(file, tmp_path, REPOSITORY), tmp_path))
+
+
+# --- files ---
+
+
+def test_both_recipes_are_trained_with_every_seed_and_length_and_begin_by_turns(tmp_path):
+    _, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
+    order = [(task.iterations, task.seed, task.recipe) for task in tasks]
+    assert order[:4] == [(30, 4, "plain"), (30, 4, "ours"), (30, 5, "ours"), (30, 5, "plain")]
+    assert order[4:] == [(7, *rest) for _, *rest in order[:4]]
+    assert len({task.folder for task in tasks}) == 8
+
+
+def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path):
+    """`street`: with what only that method reads."""
+    file, tasks = planned(tmp_path, method="street", iterations=[77], seeds=[5])
+    group, config = group_of(file, tmp_path, REPOSITORY), load(DEFAULTS)
+    expected = json.loads(stage_settings(config, "train", "0061", "street"))
+    task = tasks[1]
+    assert task.train.model_dump(mode="json") == merged(expected, {"random_seed": 5, "train": {"iterations": 77}})
+    at = SimpleNamespace(scene="0061", method="street-77-seed5")
+    assert json.loads(group.plan.settings("train")(at)) == task.train.model_dump(mode="json")
+    assert (task.code, task.stage) == (group.plan.code("train"), "street-77-seed5/train")
+    assert [[*paths] for paths in (task.files.actors, task.files.lidar_depth, task.files.free_space)] == [
+        group.plan.actors(at), group.plan.lidar_depth(at), group.plan.free_space(at)
+    ]  # fmt: skip
+    assert {Path(path).name for path in targets_of(group)} == {
+        "scene_refined.json", "parser.pkl", "masks.json", "actors.pkl", "lidar_depth.pkl"
+    }  # fmt: skip
+
+
+def test_the_files_config_holds_over_what_the_dataset_sets_for_itself(tmp_path):
+    """The demo has a cap of 40,000 Gaussians and 1,000 iterations of its own."""
+    _, (task, _) = planned(tmp_path, scene="demo", iterations=[9], seeds=[0], config={"train": {"cap_max": 123}})
+    assert (task.train.train.cap_max, task.iterations) == (123, 9)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[]", ["mine.yaml", "docs/speed.md"]),
+        ("seeds: [0]", ["mine.yaml", "'scene' is missing"]),
+        ({"scene": 61}, ["mine.yaml", "scene", "in quotes"]),
+        ({"iterations": [7, 7]}, ["mine.yaml", "iterations", "twice"]),
+        ({"iterations": []}, ["mine.yaml", "iterations", "at least 1"]),
+        ({"seeds": [1, 1]}, ["mine.yaml", "seeds", "twice"]),
+        ({"iteration": [7]}, ["mine.yaml", "unknown key 'iteration'", "docs/speed.md"]),
+        ({"config": {"results_dir": "x"}}, ["mine.yaml", "config.results_dir"]),
+        ({"config": {"train": {"iteration": 3}}}, ["base and config: ", "train.iteration"]),
+        ({"scene": "9999"}, ["scene '9999' is not in the config"]),
+        ({"method": "vanila"}, ["method 'vanila'", "vanilla, street"]),
+    ],
+    ids=str,
+)
+def test_what_is_wrong_is_told_in_one_line(tmp_path, content, words):
+    path = tmp_path / "mine.yaml"
+    text = content if isinstance(content, str) else yaml.safe_dump({"scene": "0061", **content})
+    path.write_text(text)
+    with pytest.raises(ConfigError) as failure:
+        group_of(read_speed_file(path, {}), tmp_path / "out", REPOSITORY)
+    message = str(failure.value)
+    assert "\n" not in message and all(word in message for word in words), message
+
+
+def test_what_the_command_is_told_stands_in_place_of_the_file(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(command, "measure", lambda *told: seen.append(told) or 0)
+    path = str(REPOSITORY / "benchmarks/speed/demo_1600.yaml")
+    assert command.main([path, "--iterations", "5", "6", "--seeds", "9", "--", "--cores", "3"]) == 0
+    assert command.main([path, "--out", "there"]) == 0
+    (short, out, words, *_), (whole, there, none, *_) = seen
+    assert (short.iterations, short.seeds, out, words) == (
+        (5, 6), (9,), Path("results/speed/demo_1600"), ["--cores", "3"]
+    )  # fmt: skip
+    assert (whole.iterations, whole.seeds, there, none) == ((30_000, 7_000), (0, 1, 2), Path("there"), [])
+
+
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks/speed").glob("*.yaml")), ids=lambda path: path.name)
+def test_the_files_that_come_along_are_valid(path, tmp_path):
+    file = read_speed_file(path, {})
+    assert list(tasks_of(file, group_of(file, tmp_path, REPOSITORY), tmp_path))
+
+
+# --- tables ---
+
+PROTOCOL = {
+    "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "width": 640, "height": 360, "train_images": 31,
+}  # fmt: skip
+
+
+def ended(recipe: str, seed: int, loop: float, static: float, **more: Any) -> dict[str, Any]:
+    """A run with such figures between training frames, and static ones 5 dB lower beyond them."""
+    between = {"static": {"psnr": static}, "all": {"psnr": static - 1.0, "ssim": 0.5}, "moving_vehicle": None}
+    result = {"interpolation": between, "extrapolation": {"static": {"psnr": static - 5.0}, "all": None}}
+    costs = {"gaussians": 1000 + seed, "peak_gpu_memory_gb": 2.5, "loop": loop, "whole": 2.0 * loop}
+    return {
+        "recipe": recipe, "iterations": 300, "seed": seed, "device": "NVIDIA H200", "processors": 16, "cap_max": 5000,
+        "busy_elsewhere": 0.5, "dataset": "nuscenes", "protocol": PROTOCOL, "result": result, **costs,
+        **({"ssim": "fused_ssim"} if recipe == "plain" else {}), **more,
+    }  # fmt: skip
+
+
+RUNS = [ended("plain", 0, 60.0, 20.0), ended("ours", 0, 30.0, 22.0), ended("ours", 1, 20.0, 25.0)]
+RUNS += [ended("plain", 1, 50.0, 22.0)]
+TWO = SpeedFile(scene="0061", seeds=(0, 1), iterations=(300, 700), profiled=10)
+
+
+def rows(text: str) -> list[list[list[str]]]:
+    """The Markdown tables of a page: lines of cells."""
+    blocks = [block for block in text.split("\n\n") if block.startswith("|")]
+    return [[[c.strip() for c in line.split("|")[1:-1]] for line in block.splitlines()] for block in blocks]
+
+
+def test_times_stand_beside_what_they_buy():
+    """Loops of 60 and 50 s against 30 and 20: twice and 2.5 times as fast. Static: +2 and +3."""
+    record = speed(TWO, RUNS, [])
+    (table,) = record["tables"]
+    assert (table["iterations"], table["seeds"]) == (300, [0, 1]), "no table of what has not been run"
+    assert table["times_as_fast"]["loop"]["by_seed"] == [2.0, 2.5] == table["times_as_fast"]["whole"]["by_seed"]
+    assert table["rows"][1]["iterations_per_second"]["by_seed"] == [10.0, 15.0]
+    assert table["rows"][1]["interpolation"]["difference"]["static"]["by_seed"] == [2.0, 3.0]
+    between, beyond = rows(markdown(record))
+    assert between[0] == [
+        "recipe", "loop", "whole", "iterations/s", "times as fast", "Gaussians", "GPU memory", "static", "difference",
+        "all", "difference",
+    ]  # fmt: skip
+    assert between[2] == [
+        "`plain`", "55.0 (50.0 to 60.0) s", "110 (100 to 120) s", "5.5", "-", "1,000", "2.5 GB",
+        "21.0 (20.0 to 22.0)", "-", "20.0 (19.0 to 21.0)", "-",
+    ]  # fmt: skip
+    assert between[3] == [
+        "`vanilla`", "25.0 (20.0 to 30.0) s", "50.0 (40.0 to 60.0) s", "12.5", "2.25 (2.00 to 2.50)", "1,000", "2.5 GB",
+        "23.5 (22.0 to 25.0)", "+2.50 ± 0.50", "22.5 (21.0 to 24.0)", "+2.50 ± 0.50",
+    ]  # fmt: skip
+    assert beyond[3] == ["`vanilla`", "18.5 (17.0 to 20.0)", "+2.50 ± 0.50", "-", "-"]
+    assert json.loads(json.dumps(record, allow_nan=False)) == record and record["runs"] == RUNS
+
+
+def test_only_seeds_that_both_recipes_were_run_with_count():
+    (table,) = speed(TWO, RUNS[:3], [])["tables"]
+    assert table["seeds"] == [0] and table["rows"][1]["loop"]["by_seed"] == [30.0]
+    assert speed(TWO, RUNS[:1], [])["tables"] == []
+    assert "Nothing was measured." in markdown(speed(TWO, RUNS[:1], []))
+
+
+def test_the_page_says_how_it_was_measured():
+    text = markdown(speed(TWO, RUNS, []))
+    (line,) = (line for line in text.splitlines() if line.startswith("Scene 0061"))
+    for words in (
+        "of nuscenes (v1.0-mini)", "CAM_FRONT at 640x360", "31 training images", "at most 5,000 Gaussians",
+        "NVIDIA H200, 16 processors", "SSIM of `plain`: fused_ssim", "random seeds 0, 1.",
+    ):  # fmt: skip
+        assert words in line, words
+    assert "other work" not in text and "Milliseconds" not in text
+
+
+def test_other_work_on_the_processors_is_told():
+    text = markdown(speed(TWO, [*RUNS[:3], ended("plain", 1, 50.0, 22.0, busy_elsewhere=4.04)], []))
+    assert "up to 4.0 of the 16 processors had other work" in text
+    unknown = [{**run, "busy_elsewhere": None} for run in RUNS]
+    assert "other work" not in markdown(speed(TWO, unknown, []))
+
+
+def shares(**of: tuple[float, float]) -> dict[str, dict[str, float]]:
+    return {name: {"device_ms": device, "host_ms": host} for name, (device, host) in of.items()}
+
+
+def test_stages_stand_side_by_side_with_their_share_of_the_iteration():
+    plain = shares(data=(1.0, 1.0), render=(2.0, 2.0), other=(1.0, 1.0), iteration=(4.0, 4.0))
+    ours = shares(render=(1.0, 1.0), checks=(0.5, 0.5), other=(0.5, 0.5), iteration=(2.0, 2.0))
+    profiles = [{"recipe": "plain", "iterations": 300, "stages": plain}]
+    profiles += [{"recipe": "ours", "iterations": 300, "stages": ours}]
+    text = markdown(speed(TWO, RUNS, profiles))
+    assert "over 10 iterations that go on from the trained models of seed 0" in text
+    assert rows(text)[2][0] == ["stage", "`plain`", "`vanilla`"]
+    assert rows(text)[2][2:] == [
+        ["render", "2.00 (50%)", "1.00 (50%)"], ["checks", "-", "0.50 (25%)"], ["data", "1.00 (25%)", "-"],
+        ["other", "1.00 (25%)", "0.50 (25%)"], ["iteration", "4.00", "2.00"],
+    ]  # fmt: skip
+
+
+def test_on_a_gpu_the_table_also_says_when_python_went_on():
+    ours = shares(render=(4.0, 1.0), other=(1.0, 0.5), iteration=(5.0, 1.5))
+    text = markdown(speed(TWO, RUNS, [{"recipe": "ours", "iterations": 300, "stages": ours}]))
+    assert rows(text)[2][0] == ["stage", "`vanilla`", "`vanilla`, Python"]
+    assert rows(text)[2][2] == ["render", "4.00 (80%)", "1.00 (67%)"]
+
+
+# --- runs ---
+
+
+def test_how_busy_processors_are_with_other_work():
+    """In 10 s two processors had 18 s of work, 6 s of it one's own; the rest is 1.2 processors' work."""
+    assert busy_elsewhere(Moment(5.0, 100.0, 2.0), Moment(15.0, 118.0, 8.0)) == pytest.approx(1.2)
+    assert busy_elsewhere(Moment(5.0, None, 2.0), Moment(15.0, None, 8.0)) is None
+    assert busy_elsewhere(Moment(5.0, 100.0, 2.0), Moment(15.0, 101.0, 8.0)) == 0.0, "its own, counted twice"
+
+
+def test_ones_own_work_is_not_other_work(tmp_path, monkeypatch):
+    """Work of this process shows in its own seconds; what the kernel says is read as processors' ticks."""
+    before = Moment.now()
+    sum(i * i for i in range(3_000_000))
+    assert Moment.now().own - before.own > 0.05
+    statistics = tmp_path / "stat"
+    statistics.write_text("cpu  200 100 300 5000 700 10 90 0 0 0\ncpu0 1 1 1 1 1 1 1 0 0 0\n")
+    monkeypatch.setattr("benchmarks.speed.bystanders.STATISTICS", statistics)
+    monkeypatch.setattr("os.sysconf", lambda name: 100)
+    assert Moment.now().busy == 7.0, "neither idle nor waiting for disks"
+    monkeypatch.setattr("benchmarks.speed.bystanders.STATISTICS", tmp_path / "none")
+    assert Moment.now().busy is None
+
+
+def test_work_in_a_process_of_its_own_returns_and_raises():
+    assert in_own_process(divmod, 7, 2) == (3, 1)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        in_own_process(read_speed_file, "nowhere.yaml", {})
+
+
+def test_a_training_that_is_killed_is_told_in_a_line():
+    with pytest.raises(TrainingError, match=r"was killed, .* lower train\.cap_max"):
+        in_own_process(os._exit, 1)
+
+
+TINY = {
+    "base": ["mine.yaml"],
+    "scene": "0001",
+    "iterations": [12],
+    "seeds": [4],
+    "profiled": 6,
+    "workers": 0,
+    "config": {"train": {**TINY_TRAINING, "gaussians": {"sh_degree": 3}}},
+}
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """A tiny drive, timed: the folder of the workflow, and what was printed."""
+    copy = WorkflowCopy.make(tmp_path_factory.mktemp("speed") / "copy")
+    (copy.folder / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(copy.folder)
+        patch.setattr(command, "in_own_process", lambda function, *told: function(*told))
+        status = command.main(["tiny.yaml", "--", "--cores", "2"])
+    assert status == 0
+    return copy
+
+
+@pytest.mark.workflow
+@pytest.mark.xdist_group("speed")
+def test_the_command_trains_both_measures_both_and_writes_page_and_record(measured):
+    record = measured.read("results/speed/tiny/speed.json")
+    (table,) = record["tables"]
+    plain, ours = table["rows"]
+    for row in (plain, ours):
+        assert row["extrapolation"]["static"]["mean"] > 5.0, "it was measured"
+        assert 0.0 < row["loop"]["mean"] <= row["whole"]["mean"]
+        assert row["gaussians"]["mean"] > 0 and row["peak_gpu_memory_gb"] is None
+    assert plain["gaussians"] == ours["gaussians"], "the same seed points, the same cap, no growth in 12 iterations"
+    assert plain["extrapolation"]["static"]["mean"] != ours["extrapolation"]["static"]["mean"]
+    fast = plain["loop"]["mean"] / ours["loop"]["mean"]
+    assert table["times_as_fast"]["loop"]["mean"] == pytest.approx(fast)
+    assert list(table["stages"]) == ["plain", "ours"]
+    for stages in table["stages"].values():
+        assert {"data", "render", "loss", "backward", "optimizer", "densification", "other"} < set(stages)
+        assert stages["backward"]["device_ms"] > stages["data"]["device_ms"] > 0
+    page = (measured.folder / "results/speed/tiny/speed.md").read_text(encoding="utf-8")
+    assert page == markdown(record) and "| `plain` |" in page and "| `vanilla` |" in page
+
+
+@pytest.mark.workflow
+@pytest.mark.xdist_group("speed")
+def test_what_is_timed_is_what_the_rule_trains(measured, tmp_path, monkeypatch):
+    """The same function, and with the same settings and files the same model."""
+    script = (REPOSITORY / "workflow_scripts/train.py").read_text()
+    assert re.search(r"^from drivesplat\.training\.run import .*\brun_training$", script, re.MULTILINE)
+    assert runs.run_training is run_training and runs.read_inputs is read_inputs
+    monkeypatch.chdir(measured.folder)
+    file = read_speed_file("tiny.yaml", {})
+    out = Path("results/speed/tiny")
+    _, task = tasks_of(file, group_of(file, out, Path()), out)
+    timed = read_checkpoint(task.folder / "checkpoint.pt")
+    inputs, _ = read_inputs(task.files.parser, task.files.masks, (), (), ())
+    files = TrainingFiles(tmp_path / "again/checkpoint.pt", tmp_path / "again/train.json")
+    run_training(inputs, task.train, task.device, files, timed["provenance"], "again")
+    again = read_checkpoint(files.checkpoint)
+    assert again["job"] == timed["job"] and all(
+        torch.equal(value, again["model"][name]) for name, value in timed["model"].items()
+    )
+
+
+def test_where_snakemake_only_plans_or_fails_nothing_is_trained(tmp_path, monkeypatch):
+    monkeypatch.chdir(REPOSITORY)
+    file = SpeedFile(scene="demo", iterations=(3,), seeds=(0,))
+    for arguments, status in ((["-n"], 0), (["--cores", "1"], 7)):
+        monkeypatch.setattr(command, "run", lambda *told, status=status: Outcome(status, None, {}))
+        assert command.measure(file, tmp_path / "out", arguments, Path()) == status
+    assert not (tmp_path / "out").exists()
+
+
+def test_seeds_are_trained_side_by_side_where_there_are_cards(tmp_path, monkeypatch):
+    file, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
+    assert command.in_series(tasks, 1) == [tasks]
+    assert [{task.seed for task in series} for series in command.in_series(tasks, 2)] == [{4}, {5}]
+    monkeypatch.setattr(command, "visible_cards", lambda: 2)
+    monkeypatch.setattr(command, "run", lambda *_: Outcome(0, None, {}))
+    monkeypatch.setattr(command, "write", lambda record, _: record["runs"])
+    monkeypatch.setattr(command, "speed", lambda _, measured, profiles: {"runs": list(measured)})
+    both, trained = Barrier(2, timeout=60), []
+
+    def in_turn(function, task, *_):
+        if task.seed not in [seed for seed, *_ in trained]:
+            both.wait()
+        trained.append((task.seed, task.iterations, task.recipe))
+        return {"loop": 1.0} if function is runs.run else {}
+
+    monkeypatch.setattr(command, "in_own_process", in_turn)
+    assert command.measure(file, tmp_path, (), REPOSITORY, cards=2) == 0
+    order = [(task.seed, task.iterations, task.recipe) for task in tasks]
+    assert [it for it in trained[:8] if it[0] == 5] == [it for it in order if it[0] == 5]
+    assert sorted(trained[:8]) == sorted(order)
+    with pytest.raises(ConfigError, match="--cards 3: there are 2 GPUs"):
+        command.measure(file, tmp_path, (), REPOSITORY, cards=3)
+
+
+def test_it_is_called_where_snakemake_is(tmp_path):
+    with pytest.raises(ConfigError, match="no Snakefile"):
+        command.measure(SpeedFile(scene="demo"), tmp_path, [], tmp_path)

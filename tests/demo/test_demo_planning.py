@@ -1,0 +1,181 @@
+"""What the workflow knows of a synthetic world: its tables are made, it stays out of the batch, a CPU will do."""
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from helpers import REPOSITORY
+
+from drivesplat.errors import ConfigError, DatasetError
+from drivesplat.machine.device import choose_device
+from drivesplat.readers.nuscenes.layout import TABLES
+from drivesplat.scene.truth import TRUTH_FILE
+from drivesplat.settings.config import load
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.workflow.plan import Plan
+
+
+def plan(**config) -> Plan:
+    return Plan(config, str(REPOSITORY))
+
+
+def scene(name: str) -> SimpleNamespace:
+    return SimpleNamespace(scene=name)
+
+
+@pytest.mark.parametrize(
+    ("written", "synthetic", "recorded"),
+    [("auto", "any", "auto"), ("any", "any", "any"), ("cuda", "cuda", "cuda"), ("cpu", "cpu", "cpu")],
+)
+def test_auto_makes_do_with_the_cpu_for_synthetic_worlds_alone(written, synthetic, recorded):
+    made = plan(device=written)
+    assert json.loads(made.device(scene("demo")))["kind"] == synthetic
+    assert json.loads(made.device(scene("0103")))["kind"] == recorded
+
+
+def test_without_a_word_about_the_device_the_demo_makes_do_with_the_cpu():
+    assert json.loads(plan().device(scene("demo")))["kind"] == "any"
+    assert json.loads(plan().device(scene("0103")))["kind"] == "auto"
+
+
+def test_the_demo_asks_for_little_gpu_memory_and_keeps_the_rest_of_the_device():
+    told = json.loads(
+        plan(device={"kind": "cuda", "min_free_gb": 6, "max_gb": 10, "jobs_per_card": 2}).device(scene("demo"))
+    )
+    assert told == {"kind": "cuda", "min_free_gb": 1.0, "max_gb": 10.0, "jobs_per_card": 2}
+
+
+@pytest.mark.parametrize(
+    ("device", "visible", "demo", "recorded"),
+    [
+        ("auto", "", 0, 1),
+        ("auto", "0", 1, 1),
+        ("any", "", 0, 0),
+        ("any", "0,1", 1, 1),
+        ("cuda", "", 1, 1),
+        ("cpu", "0", 0, 0),
+    ],
+)
+def test_trainings_take_a_card_where_they_run_on_one_and_half_the_processors_elsewhere(
+    monkeypatch, device, visible, demo, recorded
+):
+    """A recorded drive is trained on a GPU or not at all, unless told otherwise."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(12)))
+    made = plan(device=device)
+    assert [made.cards(scene(name)) for name in ("demo", "0103")] == [demo, recorded]
+    threads = made.threads(on_gpu=3)
+    assert [threads(scene(name)) for name in ("demo", "0103")] == [3 if demo else 6, 3 if recorded else 6]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {5})
+    assert plan(device="cpu").threads(on_gpu=3)(scene("demo")) == 1
+
+
+def test_any_device_without_a_gpu_is_the_cpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device(DeviceSettings(kind="any")) == torch.device("cpu")
+
+
+def test_the_demo_is_there_by_default_and_out_of_the_batch():
+    config = load({})
+    assert "demo" in config.scenes and "demo" not in config.batch_scenes
+    assert config.batch_scenes == [s for s in config.scenes if s != "demo"]
+    assert plan().report([]).scenes == config.batch_scenes
+
+
+def test_a_world_can_be_part_of_the_batch():
+    datasets = {"made": {"dataroot": "resources/made", "scenes": ["made"], "world": {}}}
+    assert load({"datasets": datasets}).batch_scenes == ["made"]
+
+
+def test_a_world_is_known_by_its_dataset(tmp_path):
+    datasets = {
+        "a": {"dataroot": str(tmp_path / "a"), "scenes": ["a"], "world": {"random_seed": 5}},
+        "b": {"dataroot": str(tmp_path / "b"), "version": "v1.0-trainval", "scenes": ["b"], "world": {}},
+        "real": {"dataroot": str(tmp_path / "real"), "scenes": ["0001"]},
+    }
+    made = plan(datasets=datasets)
+    assert made.worlds == {"a": "a", "b": "b"}
+    assert {str(Path(table).parent) for table in made.world_tables("b")} == {f"{tmp_path}/b/v1.0-trainval"}
+    told = json.loads(made.world_settings("a"))
+    assert (told["scene"], told["world"]["random_seed"]) == ("a", 5)
+
+
+def test_the_tables_a_scene_of_a_world_needs_are_those_that_the_world_makes(tmp_path):
+    datasets = {"a": {"dataroot": str(tmp_path / "a"), "scenes": ["a"], "world": {}}}
+    made = plan(datasets=datasets)
+    assert made.tables(scene("a")) == made.world_tables("a")
+    assert made.world_tables("a") == [f"{tmp_path}/a/v1.0-mini/{table}.json" for table in TABLES] and len(TABLES) == 13
+
+
+@pytest.mark.parametrize(
+    "target", ["results/demo/metrics.json", "./results/demo//metrics.json", "resources/x/scene.json"]
+)
+def test_a_target_that_needs_no_recorded_drive_is_not_refused_for_want_of_one(target, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    demo = {"dataroot": "resources/demo", "scenes": ["demo"], "world": {}, "batch": False}
+    made = plan(datasets={"nuscenes": {"dataroot": str(tmp_path / "nowhere")}, "demo": demo})
+    made.refuse_absent_data([target])
+    with pytest.raises(DatasetError, match="nowhere"):
+        made.refuse_absent_data(["./results/0103/metrics.json"])
+    with pytest.raises(DatasetError, match="nowhere"):
+        made.refuse_absent_data(["metrics"])
+
+
+def test_only_a_synthetic_world_has_a_truth_whatever_lies_beside_recorded_tables(tmp_path):
+    datasets = {
+        "made": {"dataroot": str(tmp_path / "made"), "scenes": ["made"], "world": {}},
+        "real": {"dataroot": str(tmp_path / "real"), "scenes": ["real"]},
+    }
+    for table in TABLES:
+        path = tmp_path / "real" / "v1.0-mini" / f"{table}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("[]")
+    (tmp_path / "real" / "truth").mkdir()
+    (tmp_path / "real" / TRUTH_FILE).write_text("{}")
+    made = plan(datasets=datasets)
+    assert made.truth(scene("made")) == [f"{tmp_path}/made/{TRUTH_FILE}"]
+    assert made.truth(scene("real")) == []
+
+
+def films() -> Plan:
+    """Scenes a and b, of which a alone has a film called aside."""
+    aside = {"render": {"trajectories": {"aside": {"lateral": 1.0}}}}
+    return plan(datasets={"a": {"scenes": ["a"], "overrides": aside}, "b": {"scenes": ["b"]}})
+
+
+@pytest.mark.parametrize("kind", ["mp4", "cameras.json"])
+@pytest.mark.parametrize(
+    ("target", "known"),
+    [
+        pytest.param("a/vanilla/nowhere", ["original", "lateral_2m", "aside"], id="of no scene"),
+        pytest.param("b/vanilla/aside", ["original", "lateral_2m"], id="of another scene"),
+        pytest.param("./b//vanilla/../vanilla/aside", ["original", "lateral_2m"], id="spelled otherwise"),
+    ],
+)
+def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has(target, known, kind):
+    with pytest.raises(ConfigError) as refusal:
+        films().refuse_unknown([f"results/{target}.{kind}"])
+    message, name = str(refusal.value), Path(target).name
+    assert f"has no film called '{name}'; there are: {', '.join(known)} (" in message
+    assert "render.trajectories" in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "results/a/vanilla/aside.mp4", "results/b/vanilla/original.cameras.json", "results/b/vanilla/cameras.json",
+        "results/b/vanilla/ghost_panel.png", "results/b/vanilla/checkpoint.pt", "results/b/masks/masks.json",
+        "results/b/metrics.json", "results/b/vanilla/tensorboard/nowhere.mp4", "elsewhere/b/vanilla/nowhere.mp4",
+        "films",
+    ],
+)  # fmt: skip
+def test_films_that_there_are_and_what_is_no_film_are_not_refused(target):
+    films().refuse_unknown([target])
+
+
+def test_an_unknown_scene_is_refused_however_its_path_is_spelled():
+    with pytest.raises(ConfigError, match="9999"):
+        plan().refuse_unknown(["./results/9999/metrics.json"])

@@ -1,0 +1,373 @@
+"""What an edit leaves: its film beside the recorded one, a still, labels that belong to its frames, and refusals."""
+
+import json
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.hand_made_street import (
+    AHEAD,
+    DRIVERS,
+    GONE,
+    SPEED,
+    TURNING,
+    Reels,
+    a_format,
+    checkpoint_of,
+    straight,
+    street_model,
+    street_scene,
+    views_of,
+)
+from helpers.hand_made_traffic import placed
+from PIL import Image
+
+from drivesplat.editing.cast import Actor, edited_cast
+from drivesplat.editing.ego import edited_camera_path
+from drivesplat.editing.film import EditFiles, Still, actors_of, appearances, crashes, render_edit
+from drivesplat.errors import ConfigError, DriveSplatError, ResultError
+from drivesplat.io.prefetch import THREADS
+from drivesplat.io.video import read_footage
+from drivesplat.model.part import Appearance
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.rendering.film import render_film
+from drivesplat.rendering.frames import film_frame
+from drivesplat.rendering.trajectory import CameraPath
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.edit import Edit
+from drivesplat.settings.render import EditJob, FilmJob, TrajectorySettings
+
+CPU = DeviceSettings(kind="cpu")
+BUSY = [
+    {"shift": {"track": AHEAD, "lateral": 2.0}},
+    {"duplicate": {"track": "6e5c", "as": "twin", "longitudinal": -6.0}},
+    {"remove": {"track": TURNING}},
+    {"rescale": {"track": GONE, "factor": 1.3}},
+]
+
+
+@dataclass(frozen=True)
+class Made:
+    """An edit called `it`: its record as another program reads it, its film's frames, and its folder."""
+
+    record: dict[str, Any]
+    reels: Reels
+    folder: Path
+
+    def pictures(self) -> np.ndarray:
+        """The PNGs that the record names, (n, h, w, 3)."""
+        return np.stack([np.asarray(Image.open(self.folder / name)) for name in self.record["images"]])
+
+    def track(self, name: str) -> dict[str, Any]:
+        return next(track for track in self.record["tracks"] if track["id"] == name)
+
+    @property
+    def halves(self) -> tuple[np.ndarray, np.ndarray]:
+        """The recorded and the edited drive in the film."""
+        left, right = np.split(self.reels["it"], 2, axis=2)
+        return left, right
+
+
+def a_job(*steps: dict[str, Any], frames: bool = False, **changes: Any) -> EditJob:
+    return EditJob(edit=edit_of(*steps), frames=frames, **a_format(**changes).model_dump())
+
+
+def edit_of(*steps: dict[str, Any]) -> Edit:
+    return Edit.model_validate({"steps": steps})
+
+
+def files_in(folder: Path) -> EditFiles:
+    return EditFiles(folder / "it.mp4", folder / "it.png")
+
+
+def make(scene: Scene, model: SplatModel, folder: Path, *steps: dict[str, Any], **changes: Any) -> Made:
+    with pytest.MonkeyPatch.context() as patch:
+        reels = Reels()
+        patch.setattr("drivesplat.rendering.film.write_video", reels)
+        record = render_edit(scene, checkpoint_of(model), a_job(*steps, **changes), CPU, files_in(folder))
+    return Made(json.loads(json.dumps(record, allow_nan=False)), reels, folder)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene) -> Scene:
+    return street_scene(tiny_scene)
+
+
+@pytest.fixture(scope="module")
+def model() -> SplatModel:
+    return street_model()
+
+
+@pytest.fixture(scope="module")
+def busy(scene, model, tmp_path_factory) -> Made:
+    """All frames written, at the size of half of the film of `large`."""
+    return make(scene, model, tmp_path_factory.mktemp("busy"), *BUSY, frames=True)
+
+
+@pytest.fixture(scope="module")
+def large(scene, model, tmp_path_factory) -> Made:
+    return make(scene, model, tmp_path_factory.mktemp("large"), *BUSY, width=128, height=72)
+
+
+def test_the_recorded_drive_is_on_the_left_as_its_own_film_shows_it(scene, model, large, tmp_path, monkeypatch):
+    reels = Reels()
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", reels)
+    job = FilmJob(**a_format(width=64, height=36).model_dump(), trajectory=TrajectorySettings())
+    render_film(scene, checkpoint_of(model), job, CPU, tmp_path / "original.mp4")
+    np.testing.assert_array_equal(large.halves[0], reels["original"])
+
+
+def test_the_edited_drive_is_on_the_right_as_its_frames_show_it(busy, large):
+    np.testing.assert_array_equal(large.halves[1], busy.pictures())
+    assert (large.halves[0] != large.halves[1]).any(axis=(1, 2, 3)).all()
+
+
+def test_labels_and_cameras_alone_give_the_frames_again(scene, model, busy):
+    """Everything that the model knows stands where the labels have it; by a rounding of float32, of one in a byte."""
+    seen = {track["source"] for track in busy.record["tracks"] if track["editable"]}
+    assert seen == {AHEAD, GONE}
+    for number, (view, picture) in enumerate(zip(views_of(busy.record, scene), busy.pictures(), strict=True)):
+        shown = [
+            Appearance(track["source"], np.array(track["object_to_world"][number]), track["scale"])
+            for track in busy.record["tracks"]
+            if track["editable"] and track["object_to_world"][number] is not None
+        ]
+        again = film_frame(model, view, model.staged_at(view.time, shown)).astype(int)
+        assert np.abs(again - picture).max() <= 1
+
+
+def seconds_of(made: Made, scene: Scene) -> np.ndarray:
+    return np.array([scene.seconds(timestamp) for timestamp in made.record["timestamps"]])
+
+
+def test_labels_say_where_everyone_is_in_every_frame(scene, busy):
+    times = seconds_of(busy, scene)
+    np.testing.assert_allclose(times, 0.25 * np.arange(19), atol=1e-6)
+    ahead, twin = ([*map(np.array, busy.track(name)["object_to_world"])] for name in (AHEAD, "twin"))
+    aside = rigid(np.eye(3), np.array([0.0, 2.0, 0.0]))
+    np.testing.assert_allclose(ahead, [straight(t) @ aside for t in times], atol=1e-6)
+    np.testing.assert_allclose(twin, [straight(t - 6.0 / SPEED) @ aside for t in times], atol=1e-6)
+    there = [pose is not None for pose in busy.track(GONE)["object_to_world"]]
+    assert there == [0.285 <= t <= 1.785 or 2.785 <= t <= 4.285 for t in times]
+    assert 0 < sum(there) < len(times)
+
+
+def test_labels_say_who_everyone_is(busy):
+    known = {
+        track["id"]: [track[key] for key in ("source", "category", "scale", "edited", "editable")]
+        for track in busy.record["tracks"]
+    }
+    assert known == {
+        AHEAD: [AHEAD, "vehicle.car", 1.0, True, True],
+        "twin": [AHEAD, "vehicle.car", 1.0, True, True],
+        GONE: [GONE, "vehicle.truck", 1.3, True, True],
+        "0001 instance 1": ["0001 instance 1", "vehicle.truck", 1.0, False, False],
+        "0001 instance 2": ["0001 instance 2", "human.pedestrian.adult", 1.0, False, False],
+    }
+    np.testing.assert_allclose(busy.track(GONE)["size"], 1.3 * np.array(DRIVERS[GONE].size))
+    np.testing.assert_allclose(busy.track("twin")["size"], DRIVERS[AHEAD].size)
+
+
+def test_what_cannot_be_edited_is_listed_where_it_was_recorded(scene, busy):
+    """A parked truck, and a pedestrian who walks at 1.2 m/s; the tiny world's key frames begin at second 0.035."""
+    parked, walker = (busy.track(f"0001 instance {i}")["object_to_world"] for i in (1, 2))
+    np.testing.assert_allclose(parked, [rigid(np.eye(3), np.array([16.0, -4.5, 1.3]))] * 19, atol=1e-6)
+    expected = [[12.0 + 1.2 * (t - 0.035), 4.0, 0.9] for t in seconds_of(busy, scene)]
+    np.testing.assert_allclose(np.array(walker)[:, :3, 3], expected, atol=1e-6)
+
+
+def test_who_is_as_recorded_is_labelled_as_the_model_has_come_to_know_it(scene, model, tmp_path):
+    made = make(scene, model, tmp_path, {"remove": {"track": AHEAD}})
+    track, motion = made.track(TURNING), model.pieces(0.0)[TURNING].motion
+    assert (track["edited"], track["scale"]) == (False, 1.0)
+    np.testing.assert_allclose(track["object_to_world"], motion.poses(seconds_of(made, scene)), atol=1e-6, rtol=0)
+
+
+def test_the_record_counts_what_was_made_and_holds_the_edit(busy):
+    record = busy.record
+    assert (record["frames"], record["width"], record["height"], record["fps"]) == (19, 64, 36, 4)
+    assert len(record["camera_to_world"]) == len(record["timestamps"]) == len(busy.reels["it"]) == 19
+    assert all(len(track["object_to_world"]) == 19 for track in record["tracks"])
+    assert record["images"] == [f"it/{number:06d}.png" for number in range(19)]
+    assert Edit.model_validate(record["edit"]) == edit_of(*BUSY)
+
+
+def test_the_still_is_the_pair_that_differs_most(large):
+    left, right = (half.astype(float) for half in large.halves)
+    difference = np.abs(left - right).mean(axis=(1, 2, 3))
+    number = int(difference.argmax())
+    assert large.record["still_frame"] == number and 0 < number < len(left) - 1
+    np.testing.assert_array_equal(np.asarray(Image.open(large.folder / "it.png")), large.reels["it"][number])
+
+
+def test_a_later_run_without_frames_removes_them_and_nothing_else(scene, model, tmp_path):
+    kept = {"it/mine.png", "it/12345.png", "it/1234567.png", "it/000001.txt", "other/000001.png"}
+    for name in kept | {"it/000700.png"}:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"mine")
+    step, small = {"remove": {"track": AHEAD}}, {"width": 16, "height": 16, "fps": 1}
+
+    def left() -> set[str]:
+        return {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+
+    made = make(scene, model, tmp_path, step, frames=True, **small)
+    assert len(made.record["images"]) == 5
+    assert left() == {*kept, *made.record["images"], "it.mp4", "it.png"}
+    made = make(scene, model, tmp_path, step, **small)
+    assert left() == kept | {"it.mp4", "it.png"} and made.record["images"] == []
+
+
+def test_a_folder_that_held_frames_alone_goes_with_them(scene, model, tmp_path):
+    step, small = {"remove": {"track": AHEAD}}, {"width": 16, "height": 16, "fps": 1}
+    make(scene, model, tmp_path, step, frames=True, **small)
+    assert (tmp_path / "it").is_dir()
+    make(scene, model, tmp_path, step, **small)
+    assert {path.name for path in tmp_path.iterdir()} == {"it.mp4", "it.png"}
+
+
+def test_a_faster_camera_shortens_both_halves(scene, model, tmp_path):
+    """The recorded drive goes on beside it at its own speed until the edited film ends."""
+    small = {"width": 32, "height": 18}
+    made, slow = (make(scene, model, tmp_path, {"ego": {"speed": speed}}, **small) for speed in (1.5, 0.5))
+    path = edited_camera_path(scene, "CAM_FRONT", 4, edit_of({"ego": {"speed": 1.5}}), "")
+    assert len(made.reels["it"]) == made.record["frames"] == len(path) == 13 and slow.record["frames"] == 19
+    np.testing.assert_allclose(made.record["camera_to_world"], path.camera_to_world)
+    ways = [np.array(record["camera_to_world"])[:, 0, 3] for record in (made.record, slow.record)]
+    np.testing.assert_allclose(ways[0] - ways[0][0], 4.0 * 1.5 * 0.25 * np.arange(13), atol=1e-3)
+    np.testing.assert_allclose(ways[1] - ways[1][0], 4.0 * 0.5 * 0.25 * np.arange(19), atol=1e-3)
+    np.testing.assert_array_equal(made.halves[0], slow.halves[0][:13])
+    frames = make(scene, model, tmp_path, {"ego": {"speed": 1.5}}, width=16, height=8, frames=True).pictures()
+    np.testing.assert_array_equal(made.halves[1], frames)
+    assert (frames[-1] != made.halves[0][-1]).mean() > 0.5
+
+
+def test_at_60_frames_a_second_there_are_twice_as_many_and_actors_move_between(scene, model):
+    step = {"shift": {"track": AHEAD, "lateral": 2.0}}
+    slow, fast = (edited_camera_path(scene, "CAM_FRONT", fps, edit_of(step), "") for fps in (30, 60))
+    assert (len(slow), len(fast)) == (136, 271)
+    assert np.abs(fast.timestamps[::2] - slow.timestamps).max() <= 1
+    seconds = np.array([scene.seconds(timestamp) for timestamp in fast.timestamps])
+    np.testing.assert_allclose(seconds, np.arange(271) / 60, atol=1e-6)
+    present = appearances(edited_cast(actors_of(model, scene, "here"), edit_of(step), "here"), seconds)
+    aside, motion = rigid(np.eye(3), np.array([0.0, 2.0, 0.0])), model.pieces(0.0)[TURNING].motion
+    for number in (1, 77, 270):
+        shown = model.staged_at(float(seconds[number]), present[number])
+        pieces = model.pieces(float(seconds[number]))
+        poses = {AHEAD: straight(number / 60) @ aside, TURNING: motion.poses(np.array([number / 60]))[0]}
+        for name, pose in poses.items():
+            expected = placed(pieces[name].gaussians, pose).means
+            np.testing.assert_allclose(shown.means[model.of_track(name)], expected, atol=2e-4)
+
+
+def test_an_encoded_film_has_as_many_frames_and_is_twice_as_wide(scene, model, tmp_path):
+    job = a_job({"remove": {"track": AHEAD}}, width=38, height=24, fps=6)
+    record = render_edit(scene, checkpoint_of(model), job, CPU, files_in(tmp_path))
+    footage = read_footage(tmp_path / "it.mp4")
+    assert (footage.frames, footage.fps) == (record["frames"], 6.0) == (28, 6.0)
+    assert (footage.width, footage.height) == (36, 10) == Image.open(tmp_path / "it.png").size
+
+
+def test_an_edit_leaves_the_checkpoint_as_it_is(scene, model, tmp_path, monkeypatch):
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", Reels())
+    checkpoint, before = checkpoint_of(model), checkpoint_of(model)
+    render_edit(scene, checkpoint, a_job(*BUSY, width=16, height=16, fps=1), CPU, files_in(tmp_path))
+    assert checkpoint["model"].keys() == before["model"].keys()
+    assert all(bool((value == checkpoint["model"][key]).all()) for key, value in before["model"].items())
+
+
+def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, model, tmp_path, monkeypatch):
+    rendered = []
+
+    def counted(_: SplatModel, shown: Iterable[Any]) -> Iterator[np.ndarray]:
+        for _ in shown:
+            rendered.append(1)
+            yield np.zeros((18, 32, 3), np.uint8)
+
+    def encoder(path, frames, size, fps, crf, threads):
+        for taken, _ in enumerate(frames, start=1):
+            time.sleep(0.01)
+            assert 2 * taken <= len(rendered) <= 2 * (taken + THREADS + 1)
+        path.write_bytes(b"")
+
+    for module in ("drivesplat.editing.film", "drivesplat.rendering.film"):
+        monkeypatch.setattr(f"{module}.film_frames", counted)
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", encoder)
+    render_edit(scene, checkpoint_of(model), a_job(*BUSY), CPU, files_in(tmp_path))
+    assert len(rendered) == 2 * 19
+
+
+def refusal(scene: Scene, model: SplatModel, folder: Path, *steps: dict[str, Any], kind: type[DriveSplatError]) -> str:
+    """What is said of an edit that cannot be made, of which nothing is left."""
+    with pytest.raises(kind) as caught:
+        render_edit(scene, checkpoint_of(model), a_job(*steps, frames=True), CPU, files_in(folder))
+    message = str(caught.value)
+    assert message.startswith("scene 0001, edit 'it'") and "\n" not in message and not list(folder.iterdir())
+    return message
+
+
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [
+        ([{"reverse": {"track": "ffff"}}], ["step 1 (reverse)", "'ffff'", f"there are: {AHEAD}, {TURNING}, {GONE}"]),
+        ([{"stop": {"track": "0001 instance 1", "at": 1.0}}], ["no track that can be edited", "'0001 instance 1'"]),
+        ([{"remove": {"track": AHEAD}}, {"reverse": {"track": AHEAD}}], ["step 2 (reverse)", "removed by step 1"]),
+        ([{"stop": {"track": GONE, "at": 0.1}}], ["step 1 (stop)", "begins after 'at' (0.1 s)", "from 0.29 to 4.29 s"]),
+    ],
+    ids=["unknown", "parked", "contradiction", "too early"],
+)  # fmt: skip
+def test_an_edit_that_does_not_fit_is_refused_before_anything_is_written(scene, model, tmp_path, steps, words):
+    message = refusal(scene, model, tmp_path, *steps, kind=ConfigError)
+    assert all(word in message for word in words), message
+
+
+def test_a_model_without_actors_cannot_be_edited(scene, model, tmp_path):
+    still = street_model(model.parts[0])
+    message = refusal(scene, still, tmp_path, *BUSY, kind=ConfigError)
+    assert "knows no actors" in message and "the method 'street'" in message
+
+
+def test_actors_that_the_scene_does_not_hold_are_refused(scene, model, tmp_path):
+    """Left out, they would vanish from the film without a word."""
+    other = replace(scene, tracks=tuple(track for track in scene.tracks if track.id != TURNING))
+    message = refusal(other, model, tmp_path, {"remove": {"track": AHEAD}}, kind=ResultError)
+    assert TURNING in message and "checkpoint.pt" in message
+
+
+def test_a_still_is_not_taken_from_inside_a_vehicle_unless_there_is_no_other():
+    recorded = [np.zeros((2, 2, 3), np.uint8)] * 3
+    edited = [np.full((2, 2, 3), value, np.uint8) for value in (10, 200, 90)]
+    for spoilt, number in (([False, True, False], 2), ([True, True, True], 1)):
+        still = Still(np.array(spoilt))
+        assert len(list(still.side_by_side(recorded, edited))) == 3
+        assert still.number == number
+
+
+BESIDE = Edit.model_validate({"steps": [{"ego": {"lateral": 1.0}}]})
+"""Of the camera alone."""
+
+
+def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
+    """A car 4 m long and 2 m wide stands across the world's axes at x = 10, from second 1 on."""
+    places = [
+        (10.0, 0.0, 0.0),
+        (10.0, 0.0, 0.0),
+        (10.0, 2.4, 0.0),
+        (10.0, 2.6, 0.0),
+        (11.4, 0.0, 0.0),
+        (11.6, 0.0, 0.0),
+    ]
+    cameras = np.tile(np.eye(4), (6, 1, 1))
+    cameras[:, :3, 3] = places
+    seconds = np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
+    across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
+    car = Actor("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
+    found = crashes(edited_cast([car], BESIDE, ""), CameraPath(np.arange(6), cameras), seconds)
+    assert found.tolist() == [False, True, True, False, True, False]

@@ -1,0 +1,277 @@
+"""A model with its actors as an edit wants them: who changes, where it then is, and that nothing else changes."""
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import about_z
+from helpers.hand_made_street import (
+    AHEAD,
+    DRIVERS,
+    GONE,
+    SPEED,
+    TURNING,
+    straight,
+    street_model,
+    street_scene,
+)
+from helpers.hand_made_traffic import placed
+
+from drivesplat.editing.cast import Role, edited_cast
+from drivesplat.editing.ego import edited_camera_path
+from drivesplat.editing.film import actors_of, appearances
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
+from drivesplat.rendering.film import Shot
+from drivesplat.rendering.frames import film_frame
+from drivesplat.rendering.trajectory import film_path
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.edit import Edit
+from drivesplat.settings.render import FilmFormat, TrajectorySettings
+
+LAST = 4.5
+"""The tiny drive's first image is at 0, its last at this second."""
+TIMES = np.array([0.0, 1.3, 2.2, 3.1, LAST])
+"""At the third the actor that is gone for a while is absent."""
+
+
+def an_edit(*steps: dict[str, Any]) -> Edit:
+    return Edit.model_validate({"steps": steps})
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene) -> Scene:
+    return street_scene(tiny_scene)
+
+
+@pytest.fixture(scope="module")
+def model() -> SplatModel:
+    return street_model()
+
+
+def cast(model: SplatModel, scene: Scene, *steps: dict[str, Any]) -> list[Role]:
+    return edited_cast(actors_of(model, scene, "here"), an_edit(*steps), "here")
+
+
+def staged(model: SplatModel, scene: Scene, *steps: dict[str, Any], times: np.ndarray = TIMES) -> list[Gaussians]:
+    """What is there at `times` after these steps."""
+    present = appearances(cast(model, scene, *steps), times)
+    return [model.staged_at(float(time), shown) for time, shown in zip(times, present, strict=True)]
+
+
+def rows_of(model: SplatModel, *names: str) -> torch.Tensor:
+    """Which rows of the model's Gaussians belong to these actors: (n,) bool."""
+    nobody = torch.zeros(len(model), dtype=torch.bool)
+    return torch.stack([nobody, *(model.of_track(name) for name in names)]).any(dim=0)
+
+
+STEPS = {
+    "remove": (AHEAD,),
+    "speed": (AHEAD,),
+    "to": (TURNING,),
+    "stop": (TURNING,),
+    "reverse": (AHEAD,),
+    "shift": (GONE,),
+    "swap": (AHEAD, GONE),
+    "duplicate": (),
+    "rescale": (TURNING,),
+    "ego": (),
+}
+"""Kinds of steps, and whom the one below changes."""
+STEP = {
+    "remove": {"remove": {"track": AHEAD}},
+    "speed": {"speed": {"track": AHEAD, "factor": 0.5}},
+    "to": {"speed": {"track": TURNING, "to": 2.0}},
+    "stop": {"stop": {"track": TURNING, "at": 0.5, "duration": 1.0}},
+    "reverse": {"reverse": {"track": AHEAD}},
+    "shift": {"shift": {"track": GONE, "lateral": 3.0, "yaw": 20.0}},
+    "swap": {"swap": {"track": AHEAD, "with": GONE}},
+    "duplicate": {"duplicate": {"track": AHEAD, "as": "twin", "longitudinal": 5.0}},
+    "rescale": {"rescale": {"track": TURNING, "factor": 1.5}},
+    "ego": {"ego": {"lateral": 1.0}},
+}
+
+
+@pytest.mark.parametrize("kind", STEPS)
+def test_no_parameter_of_anything_that_an_edit_does_not_name_changes(model, scene, kind):
+    before = {key: value.clone() for key, value in model.state_dict().items()}
+    others = ~rows_of(model, *STEPS[kind])
+    differs = False
+    for time, edited in zip(TIMES, staged(model, scene, STEP[kind]), strict=True):
+        recorded = model.gaussians_at(float(time))
+        for field in fields(Gaussians):
+            now, then = (getattr(gaussians, field.name)[: len(model)] for gaussians in (edited, recorded))
+            assert torch.equal(now[others], then[others]), field.name
+            differs |= not torch.equal(now, then)
+    assert differs == bool(STEPS[kind])
+    after = model.state_dict()
+    assert all(torch.equal(after[key], value) for key, value in before.items()) and after.keys() == before.keys()
+
+
+def view_at(scene: Scene, time: float) -> View:
+    """The recorded camera's at a second of the film."""
+    form = FilmFormat(camera="CAM_FRONT", fps=10, width=64, height=36, horizontal_fov=None, crf=18)
+    cameras, number = film_path(scene, "CAM_FRONT", 10, TrajectorySettings()), round(10 * time)
+    return next(Shot(scene, cameras[number : number + 1], form, (64, 36)).views(torch.device("cpu")))
+
+
+def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
+    error = float((a.double() - b.double()).square().mean())
+    return np.inf if error == 0.0 else -10.0 * np.log10(error)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in STEPS if kind != "ego"])
+def test_no_pixel_changes_that_the_edited_actor_does_not_reach(model, scene, kind):
+    """Where its own alpha, alone, is under 1/255 at its old and at its new place."""
+    changed = []
+    for time, edited in zip(TIMES, staged(model, scene, STEP[kind]), strict=True):
+        view, recorded = view_at(scene, time), model.gaussians_at(float(time))
+        own = rows_of(model, *STEPS[kind])
+        own_now = torch.cat([own, torch.ones(len(edited) - len(own), dtype=torch.bool)])
+        alone = [model.render(view, gaussians=gaussians) for gaussians in (recorded[own], edited[own_now])]
+        out_of_reach = (alone[0].alpha < 1 / 255) & (alone[1].alpha < 1 / 255)
+        then, now = (model.render(view, gaussians=gaussians).image for gaussians in (recorded, edited))
+        assert out_of_reach.sum() > 300
+        assert psnr(then[out_of_reach], now[out_of_reach]) >= 90.0
+        changed.append(float((then - now).abs().max()))
+    assert max(changed) > 0.05
+
+
+NOTHING = {
+    "shift after the film": [{"shift": {"track": AHEAD, "lateral": 3.0, "start": 4.6}}],
+    "speed after the film": [{"speed": {"track": TURNING, "to": 3.0, "start": 4.6}}],
+    "stop after the film": [{"stop": {"track": TURNING, "at": 4.6}}],
+    "the same speed": [{"speed": {"track": GONE, "factor": 1.0}}],
+    "there and back": [{"reverse": {"track": TURNING}}, {"reverse": {"track": TURNING}}],
+    "swapped twice": [{"swap": {"track": AHEAD, "with": GONE}}, {"swap": {"track": AHEAD, "with": GONE}}],
+    "larger and smaller": [{"rescale": {"track": GONE, "factor": 2.0}}, {"rescale": {"track": GONE, "factor": 0.5}}],
+    "a copy in its place": [{"duplicate": {"track": TURNING, "as": "copy"}}, {"remove": {"track": TURNING}}],
+}
+
+
+@pytest.mark.parametrize("steps", NOTHING.values(), ids=NOTHING)
+def test_an_edit_that_changes_nothing_leaves_the_pixels_as_recorded(model, scene, steps):
+    """By a rounding of float32: no value of a picture differs by more than 0.002, none of its bytes by more than 1."""
+    for time, edited in zip(TIMES, staged(model, scene, *steps), strict=True):
+        view = view_at(scene, time)
+        then, now = (model.render(view, gaussians=gaussians).image for gaussians in (None, edited))
+        assert (then - now).abs().max() < 0.002
+        bytes_then, bytes_now = film_frame(model, view).astype(int), film_frame(model, view, edited)
+        assert np.abs(bytes_then - bytes_now).max() <= 1
+    path = edited_camera_path(scene, "CAM_FRONT", 10, an_edit(*steps), "")
+    recorded = film_path(scene, "CAM_FRONT", 10, TrajectorySettings())
+    np.testing.assert_array_equal(path.timestamps, recorded.timestamps)
+    np.testing.assert_allclose(path.camera_to_world, recorded.camera_to_world, atol=1e-9)
+
+
+def own_gaussians(model: SplatModel, name: str, time: float) -> Gaussians:
+    """An actor's in its own frame."""
+    return model.pieces(time)[name].gaussians
+
+
+def assert_is(found: Gaussians, model: SplatModel, source: str, time: float, pose: np.ndarray, scale: float) -> None:
+    """That Gaussians are those of the actor `source`, enlarged, at a pose (4, 4)."""
+    own = own_gaussians(model, source, time)
+    expected = placed(replace(own, means=scale * own.means, scales=scale * own.scales), pose)
+    np.testing.assert_allclose(found.means, expected.means, atol=2e-4)
+    np.testing.assert_allclose(found.scales, expected.scales, rtol=1e-5)
+    np.testing.assert_allclose(found.opacities, expected.opacities, atol=1e-6)
+    turned, wanted = (torch.nn.functional.normalize(quats, dim=-1) for quats in (found.quats, expected.quats))
+    np.testing.assert_allclose((turned * wanted).sum(dim=-1).abs(), 1.0, atol=1e-5)
+    np.testing.assert_allclose(found.sh[:, : expected.sh.shape[1]], expected.sh, atol=1e-4)
+
+
+def raised(pose: np.ndarray, metres: float) -> np.ndarray:
+    """A pose on level ground, higher."""
+    return rigid(np.eye(3), np.array([0.0, 0.0, metres])) @ pose
+
+
+def left_of(pose: np.ndarray, metres: float, degrees: float = 0.0) -> np.ndarray:
+    return pose @ rigid(about_z(np.radians(degrees)), np.array([0.0, metres, 0.0]))
+
+
+def braked(seconds: float) -> float:
+    """How many seconds of its way it has come that brakes to rest from second 1 to 3: its pace falls along the quintic
+    from 1 to 0 that has neither jolt nor jump, of which this is the integral."""
+    x = np.clip((seconds - 1.0) / 2.0, 0.0, 1.0)
+    return min(seconds, 1.0) + 2.0 * (x - (2.5 * x**4 - 3.0 * x**5 + x**6))
+
+
+CLOSED_FORMS = {
+    "speed": ({"speed": {"track": AHEAD, "factor": 0.5}}, lambda t: straight(0.5 * t)),
+    "to": ({"speed": {"track": AHEAD, "to": 1.5}}, lambda t: straight(t * 1.5 / SPEED)),
+    "stop": ({"stop": {"track": AHEAD, "at": 1.0, "duration": 2.0}}, lambda t: straight(braked(t))),
+    "reverse": ({"reverse": {"track": AHEAD}}, lambda t: straight(4.535 + 0.035 - t)),
+    "lateral": ({"shift": {"track": AHEAD, "lateral": -2.0}}, lambda t: left_of(straight(t), -2.0)),
+    "longitudinal": ({"shift": {"track": AHEAD, "longitudinal": 9.0}}, lambda t: straight(t + 9.0 / SPEED)),
+    "yaw": ({"shift": {"track": AHEAD, "yaw": 30.0}}, lambda t: left_of(straight(t), 0.0, 30.0)),
+    "late": ({"shift": {"track": AHEAD, "lateral": 2.0, "start": 3.0, "duration": 0.0}},
+             lambda t: left_of(straight(t), 2.0 * (t >= 3.0))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("step", "pose"), CLOSED_FORMS.values(), ids=CLOSED_FORMS)
+def test_where_a_step_sends_an_actor_its_gaussians_are(model, scene, step, pose):
+    for time, edited in zip(TIMES, staged(model, scene, step), strict=True):
+        assert_is(edited[rows_of(model, AHEAD)], model, AHEAD, time, pose(time), 1.0)
+
+
+@pytest.mark.parametrize("name", [AHEAD, TURNING])
+def test_who_is_enlarged_stands_where_it_stood(model, scene, name):
+    """The box grows about the middle of its floor."""
+    motion = {actor.id: actor.motion for actor in actors_of(model, scene, "here")}[name]
+    for time, edited in zip(TIMES, staged(model, scene, {"rescale": {"track": name, "factor": 1.4}}), strict=True):
+        stood = motion.poses(np.array([time]))[0]
+        pose = stood @ rigid(np.eye(3), np.array([0.0, 0.0, 0.4 * DRIVERS[name].size[2] / 2]))
+        assert_is(edited[rows_of(model, name)], model, name, time, pose, 1.4)
+
+
+def test_who_is_removed_is_absent(model, scene):
+    own = rows_of(model, AHEAD)
+    for time, edited in zip(TIMES, staged(model, scene, {"remove": {"track": "6e5c"}}), strict=True):
+        assert (edited.opacities[own] == 0).all() and len(edited) == len(model)
+        view, without = view_at(scene, time), model.gaussians_at(float(time))[~own]
+        assert torch.equal(model.render(view, gaussians=edited).image, model.render(view, gaussians=without).image)
+
+
+def test_each_of_two_that_swap_is_in_the_others_place_on_the_same_ground(model, scene):
+    """At the other's times, too: the truck is a metre and a half higher and absent for a while."""
+    motions = {actor.id: actor.motion for actor in actors_of(model, scene, "here")}
+    heights = {name: driver.size[2] for name, driver in DRIVERS.items()}
+    for time, edited in zip(TIMES, staged(model, scene, {"swap": {"track": AHEAD, "with": GONE}}), strict=True):
+        for name, other in ((AHEAD, GONE), (GONE, AHEAD)):
+            found, there = edited[rows_of(model, name)], motions[other].present(np.array([time]))[0]
+            assert bool((found.opacities > 0).any()) == there
+            if there:
+                pose = motions[other].poses(np.array([time]))[0]
+                assert_is(found, model, name, time, raised(pose, (heights[name] - heights[other]) / 2), 1.0)
+
+
+def test_a_duplicate_is_there_beside_its_original(model, scene):
+    steps = [
+        {"duplicate": {"track": AHEAD, "as": "behind", "longitudinal": -6.0, "lateral": 2.0}},
+        {"duplicate": {"track": AHEAD, "as": "later", "delay": 1.0}},
+        {"shift": {"track": "later", "lateral": -3.0}},
+    ]
+    own = rows_of(model, AHEAD)
+    for time, edited in zip(TIMES, staged(model, scene, *steps), strict=True):
+        recorded, count = model.gaussians_at(float(time)), int(own.sum())
+        assert len(edited) == len(model) + 2 * count
+        assert torch.equal(edited.means[: len(model)], recorded.means)
+        assert torch.equal(edited.opacities[: len(model)], recorded.opacities)
+        copies = edited[len(model) : len(model) + count], edited[len(model) + count :]
+        assert_is(copies[0], model, AHEAD, time, left_of(straight(time - 1.0), 2.0), 1.0)
+        assert_is(copies[1], model, AHEAD, time, left_of(straight(time - 1.0), -3.0), 1.0)
+
+
+def test_where_it_was_not_annotated_an_actor_is_absent_until_it_is_made_to_drive_on(model, scene):
+    rows = rows_of(model, GONE)
+    shifted, slow = (
+        staged(model, scene, step) for step in (STEP["shift"], {"speed": {"track": GONE, "to": 1.0, "start": 1.0}})
+    )
+    assert [bool((edited.opacities[rows] > 0).any()) for edited in shifted] == [False, True, False, True, False]
+    assert [bool((edited.opacities[rows] > 0).any()) for edited in slow] == [False, True, True, True, True]

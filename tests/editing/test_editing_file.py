@@ -1,0 +1,212 @@
+"""Edits files: what is read, what travels as a rule's parameter, and what each mistake is answered with."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from helpers import REPOSITORY
+
+from drivesplat.demo.recorder import Recorder
+from drivesplat.demo.tables import token
+from drivesplat.editing.cast import Actor, edited_cast
+from drivesplat.editing.edits_file import read_edits
+from drivesplat.errors import ConfigError
+from drivesplat.io.storage import canonical_json
+from drivesplat.scene.motion import Motion
+from drivesplat.settings import Settings
+from drivesplat.settings.edit import Edit, Step
+from drivesplat.settings.world import WorldSettings
+
+DEMO = REPOSITORY / "presets" / "edits" / "demo.yaml"
+EVERY_STEP = """
+edits:
+  it:
+    - remove: {track: 6e5c}
+    - speed: {track: 7a, factor: 1.5, start: 2, duration: 3}
+    - speed: {track: 7a, to: 12.0}
+    - stop: {track: 7a, at: 6.0}
+    - reverse: {track: 7a, turn: true}
+    - shift: {track: 7a, lateral: 3.5, start: 2.0}
+    - swap: {track: 7a, with: 8b}
+    - duplicate: {track: 7a, as: twin, longitudinal: -12}
+    - rescale: {track: twin, factor: 1.3}
+    - ego: {lateral: 2.0, speed: 0.5}
+"""
+
+
+def read(text: str, folder: Path) -> dict[str, Edit]:
+    path = folder / "edits.yaml"
+    path.write_text(text, encoding="utf-8")
+    return read_edits(path)
+
+
+def refusal(text: str, folder: Path) -> str:
+    """What is said of a file, without its folder."""
+    with pytest.raises(ConfigError) as caught:
+        read(text, folder)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message.removeprefix(f"{folder}/")
+
+
+def test_a_file_holds_named_edits_in_order(tmp_path):
+    edits = read(
+        "edits:\n  b:\n  - remove: {track: x}\n  a:\n  - ego: {lateral: 1}\n  - stop: {track: y, at: 1}", tmp_path
+    )
+    assert {name: [step.kind for step in edit.steps] for name, edit in edits.items()} == {
+        "b": ["remove"],
+        "a": ["ego", "stop"],
+    }
+    assert list(edits) == ["b", "a"] and edits["a"].steps[1].change.at == 1.0
+    assert read("edits:\n", tmp_path) == {}
+
+
+def test_every_step_can_be_written(tmp_path):
+    steps = read(EVERY_STEP, tmp_path)["it"].steps
+    assert {step.kind for step in steps} == set(Step.model_fields)
+    assert (steps[6].change.other, steps[7].change.name, steps[3].change.duration) == ("8b", "twin", 2.0)
+
+
+def test_an_edit_survives_its_travel_as_a_rules_parameter(tmp_path):
+    class Job(Settings):
+        edit: Edit
+
+    edit = read(EVERY_STEP, tmp_path)["it"]
+    for record in (edit, Job(edit=edit)):
+        text = canonical_json(record.model_dump(mode="json"))
+        assert type(record).model_validate_json(text) == record
+    assert canonical_json(edit.steps[0].model_dump(mode="json")) == '{"remove":{"track":"6e5c"}}'
+
+
+def test_reading_edits_imports_nothing_heavy():
+    code = "import sys, drivesplat.editing.edits_file as _; print(' '.join(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert not {"torch", "scipy", "matplotlib", "nuscenes"} & set(done.stdout.split())
+
+
+def test_a_missing_file_is_said_to_be_missing(tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"nowhere\.yaml: the edits file cannot be read \(No such file or directory\)"
+    ):
+        read_edits(tmp_path / "nowhere.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x80")
+    with pytest.raises(ConfigError, match=r"binary\.yaml: the edits file is not UTF-8 text"):
+        read_edits(tmp_path / "binary.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("edits: [", "edits.yaml: not YAML: while parsing a flow node"),
+        ("steps: {}", "edits.yaml: an edits file holds the one key 'edits', under it a list of steps per name"),
+        ("", "edits.yaml: an edits file holds the one key 'edits'"),
+        ("edits: [1]", "edits.yaml: 'edits' is [1]; it holds a list of steps per name"),
+        ("edits: {}\nedits: {}", "edits.yaml: not YAML: the key 'edits' stands twice"),
+        ("edits: {a: [{stop: {track: x, at: 1, at: 2}}]}", "edits.yaml: not YAML: the key 'at' stands twice"),
+        ("edits: {a b: []}", "edits.yaml: edit 'a b' cannot name a file: use letters, digits, '_', '-' and '.'"),
+        ("edits: {../a: []}", "edits.yaml: edit '../a' cannot name a file: use letters, digits, '_', '-' and '.'"),
+        ("edits: {0103: []}", "edits.yaml: edit 67 is not text: put the name in quotes"),
+        ("edits: {a: []}", "edits.yaml: edit 'a' is []; it is a list of steps, at least one: - remove: {track: 6e5c}"),
+        ("edits: {a: {remove: {track: x}}}", "edits.yaml: edit 'a' is {'remove': {'track': 'x'}}; it is a"),
+    ],
+)  # fmt: skip
+def test_a_file_of_another_form_is_refused(tmp_path, text, said):
+    assert refusal(text, tmp_path).startswith(said)
+
+
+KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, rescale, ego"
+NAME = "cannot name a file: use letters, digits, '_', '-' and '.'"
+
+
+def refused_step(step: str, folder: Path) -> str:
+    """What is said of the second step of an edit, without where."""
+    said = refusal(f"edits:\n  a:\n  - stop: {{track: y, at: 1}}\n  - {step}\n", folder)
+    assert said.startswith("edits.yaml: edit 'a', step 2")
+    return said.removeprefix("edits.yaml: edit 'a', step 2")
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        ("remove", f" is 'remove'; a step has one key, one of {KINDS}"),
+        ("{remove: 1, ego: 2}", f" is {{'remove': 1, 'ego': 2}}; a step has one key, one of {KINDS}"),
+        ("{delete: {track: x}}", f": there is no step 'delete'; there are: {KINDS}"),
+        ("remove: x", " (remove) is 'x'; it is a mapping: remove: {track: 6e5c, ...}"),
+        ("ego:", " (ego) is None; it is a mapping: ego: {lateral: 2.0}"),
+    ],
+)
+def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, said):
+    assert refused_step(step, tmp_path) == said
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "said"),
+    [
+        ("remove", "", "'track' is missing; there are: track"),
+        ("remove", "track: 75", "'track' is 75: an id is text: put it in quotes as it stands in tracks.csv"),
+        ("remove", "track: ''", "'track' is '': string should have at least 1 character"),
+        ("remove", "track: x, trak: x", "unknown key 'trak'; there are: track"),
+        ("speed", "track: x", "give either 'factor' or 'to' (m/s)"),
+        ("speed", "track: x, factor: 2, to: 3", "give either 'factor' or 'to' (m/s)"),
+        ("speed", "track: x, factor: 0", "'factor' is 0: input should be greater than 0"),
+        ("speed", "track: x, to: -3", "'to' is -3: input should be greater than 0"),
+        ("speed", "track: x, to: 1e1",
+         "'to' is '1e1': input should be a number (YAML reads 1e-3 as text: write 1.0e-3)"),
+        ("speed", "track: x, to: 3, duration: 2", "'duration' without 'start': say at which second the change begins"),
+        ("speed", "track: x, to: 3, start: 1, duration: -2",
+         "'duration' is -2: input should be greater than or equal to 0"),
+        ("speed", "track: x, to: 3, start: -1", "'start' is -1: input should be greater than or equal to 0"),
+        ("stop", "track: x", "'at' is missing; there are: track, at, duration"),
+        ("stop", "track: x, at: 1, duration: -1", "'duration' is -1: input should be greater than or equal to 0"),
+        ("stop", "track: x, at: .nan", "'at' is nan: input should be a finite number"),
+        ("reverse", "track: x, turn: 1", "'turn' is 1: input should be true or false"),
+        ("shift", "track: x", "give at least one of 'lateral', 'longitudinal' and 'yaw'"),
+        ("shift", "track: x, lateral: 51", "'lateral' is 51: input should be less than or equal to 50"),
+        ("swap", "track: x", "'with' is missing; there are: track, with"),
+        ("duplicate", "track: x", "'as' is missing; there are: track, as, longitudinal, lateral, delay"),
+        ("duplicate", "track: x, as: a/b", f"'as' 'a/b' {NAME}"),
+        ("duplicate", "track: x, as: ego", "'as' 'ego' is a name kept for the camera's car; choose another"),
+        ("rescale", "track: x, factor: 0.01", "'factor' is 0.01: input should be greater than or equal to 0.1"),
+        ("ego", "", "give 'lateral', or a 'speed' other than 1"),
+        ("ego", "speed: -1", "'speed' is -1: input should be greater than or equal to 0"),
+    ],
+)  # fmt: skip
+def test_a_step_with_other_fields_is_refused_by_its_number_and_kind(tmp_path, kind, fields, said):
+    assert refused_step(f"{kind}: {{{fields}}}", tmp_path) == f" ({kind}): {said}"
+
+
+def test_a_decimal_comma_is_told_apart_from_a_point(tmp_path):
+    said = refused_step("shift: {track: x, lateral: 3,5}", tmp_path)
+    assert said == " (shift): 5 stands where a key should; a decimal has a point: 3.5, not 3,5"
+
+
+def test_yaml_merges_stay_possible(tmp_path):
+    text = "edits:\n  a:\n  - stop: &s {track: x, at: 1}\n  - stop: {<<: *s, at: 2}\n"
+    assert [step.change.at for step in read(text, tmp_path)["a"].steps] == [1.0, 2.0]
+
+
+@pytest.fixture(scope="module")
+def demo_actors() -> list[Actor]:
+    """What moves in the demo's drive, at all its key frames."""
+    recorder, times = Recorder(WorldSettings()), 0.5 * np.arange(20)
+    return [
+        Actor(
+            token("demo", "instance", thing.name), thing.category, np.asarray(thing.body.size),
+            Motion(times, np.stack([recorder.box_to_global(thing, t) for t in times]), ((0, 19),), 0.25),
+        )
+        for thing in recorder.things
+        if thing.moves and thing.category == "vehicle.car"
+    ]  # fmt: skip
+
+
+def test_the_demos_edits_name_what_is_there_and_use_every_step(demo_actors):
+    edits = read_edits(DEMO)
+    assert {step.kind for edit in edits.values() for step in edit.steps} == set(Step.model_fields)
+    for name, edit in edits.items():
+        cast = edited_cast(demo_actors, edit, name)
+        moved = [role for role in cast if role.edited]
+        assert moved or len(cast) < len(demo_actors) or any(step.kind == "ego" for step in edit.steps), name
+    assert yaml.safe_load(DEMO.read_text())["edits"].keys() == edits.keys()

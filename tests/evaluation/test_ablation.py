@@ -1,0 +1,508 @@
+"""The ablation of a method: which trainings it takes, and what it says of them."""
+
+import csv
+import json
+import re
+import subprocess
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from helpers import REPOSITORY
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy, complaints
+
+from drivesplat.errors import ConfigError, ResultError
+from drivesplat.evaluation.ablation import ablation, markdown, write_csv
+from drivesplat.settings.ablation import AblationJob
+from drivesplat.settings.config import Config, for_scene, load, merged
+from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.stages import METHOD_STAGES, SCENE_STAGES, TRAINING_INPUTS, stage_settings, training_inputs
+
+VARIANTS = (
+    "actors", "track_correction", "sky", "sky_loss", "depth", "entropy", "colours_in_time", "dynamic_loss",
+)  # fmt: skip
+NOTHING = {"ablation": {"of": "nobody"}}
+"""No ablation, whatever the methods."""
+
+
+def names(seeds=(0, 1, 2), without=VARIANTS, of="street") -> list[str]:
+    """What the methods of an ablation are to be called."""
+    return [f"{stem}-seed{seed}" for stem in (of, *(f"{of}-without-{name}" for name in without)) for seed in seeds]
+
+
+def flat(value: Any, path: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {path.rstrip("."): value}
+    return {key: item for name, child in value.items() for key, item in flat(child, f"{path}{name}.").items()}
+
+
+def training(config: Config, method: str) -> dict[str, Any]:
+    """What the training of a method is told, by the paths of its settings."""
+    return flat(json.loads(stage_settings(config, "train", "0061", method)))
+
+
+# --- which methods there are ---
+
+
+def test_the_whole_and_every_variant_are_methods_with_every_seed():
+    config = load({})
+    assert list(config.ablated) == names() and len(config.ablated) == 27
+    assert list(config.all_methods) == ["vanilla", "street", *names()]
+    assert list(config.methods) == ["vanilla", "street"]
+
+
+LACKING = {
+    "actors": {"parts": ["background"]},
+    "track_correction": {"train.actors.tracks.corrected": False},
+    "sky": {"sky": "none", "train.sky_bce_weight": 0.0},
+    "sky_loss": {"train.sky_bce_weight": 0.0},
+    "depth": {"train.depth_weight": 0.0},
+    "entropy": {"train.entropy_weight": 0.0},
+    "colours_in_time": {"train.actors.fourier": 1},
+    "dynamic_loss": {"train.dynamic_weight": 0.0},
+}
+
+
+@pytest.mark.parametrize("without", VARIANTS)
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_variant_is_trained_as_the_method_is_but_for_the_one_thing(without, seed):
+    """Every default variant changes something: one that did not would be compared with itself."""
+    config = load({})
+    street, variant = training(config, "street"), training(config, f"street-without-{without}-seed{seed}")
+    changed = {key: value for key, value in variant.items() if street[key] != value}
+    assert street.keys() == variant.keys()
+    assert changed == LACKING[without] | ({"random_seed": seed} if seed else {})
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_whole_is_the_method_itself_with_each_seed(seed):
+    config = load({})
+    assert training(config, f"street-seed{seed}") == training(config, "street") | {"random_seed": seed}
+
+
+def test_a_variants_overrides_are_laid_over_the_methods_own():
+    """Key by key; the method's own others stay, and the ablation's seeds come over a seed of the method's own."""
+    mine = {
+        "parts": ["background", "actors"],
+        "overrides": {"train": {"iterations": 7, "mcmc": {"noise_lr": 3.0}, "depth_weight": 0.5}, "random_seed": 9},
+    }
+    without = {"noise": {"overrides": {"train": {"mcmc": {"noise_lr": 0.0}}}}, "sky": {"overrides": {"sky": "mask"}}}
+    config = load({"methods": {"mine": mine}, "ablation": {"of": "mine", "seeds": [4], "without": without}})
+    assert list(config.ablated) == ["mine-seed4", "mine-without-noise-seed4", "mine-without-sky-seed4"]
+    told = {name: training(config, name) for name in config.all_methods}
+    for name, settings in told.items():
+        assert (settings["train.iterations"], settings["train.depth_weight"]) == (7, 0.5), name
+        assert settings["parts"] == ["background", "actors"]
+        assert settings["random_seed"] == (9 if name == "mine" else 4)
+        assert settings["train.mcmc.noise_lr"] == (0.0 if "noise" in name else 3.0)
+        assert settings["sky"] == ("mask" if "sky" in name else "cubemap")
+    assert config.methods["mine"].overrides == mine["overrides"], "the method itself stays as it is"
+
+
+def test_a_variant_goes_over_what_a_dataset_sets_for_itself():
+    values = {"datasets": {"nuscenes": {"overrides": {"train": {"entropy_weight": 0.7, "iterations": 5}}}}}
+    told = training(load(values), "street-without-entropy-seed1")
+    assert (told["train.entropy_weight"], told["train.iterations"]) == (0.0, 5)
+
+
+def test_users_leave_variants_out_and_add_their_own():
+    mine = {"ablation": {"without": {"sky": None, "ssim": {"overrides": {"train": {"ssim_weight": 0.0}}}}}}
+    defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
+    config = load(merged(defaults, mine))
+    kept = [name for name in VARIANTS if name != "sky"]
+    assert list(config.ablated) == names(without=(*kept, "ssim"))
+    assert json.loads(stage_settings(config, "ablation", "0061"))["without"] == [*kept, "ssim"]
+    assert training(config, "street-without-ssim-seed0")["train.ssim_weight"] == 0.0
+
+
+def test_a_methods_own_random_seed_is_that_of_its_training_alone():
+    config = load({"methods": {"vanilla": {}, "again": {"overrides": {"random_seed": 5}}}})
+    assert (training(config, "again")["random_seed"], training(config, "vanilla")["random_seed"]) == (5, 0)
+    assert for_scene(config, "0061").random_seed == 0
+    assert stage_settings(config, "evaluate", "0061", "again") == stage_settings(config, "evaluate", "0061", "vanilla")
+
+
+def test_only_what_has_actors_takes_actors_and_only_what_is_held_to_depth_takes_depth():
+    taken = {name: training_inputs(load({}), "0061", name) for name in names(seeds=[1])}
+    for name, inputs in taken.items():
+        expected = {"actors": "without-actors" not in name, "lidar_depth": "without-depth" not in name}
+        expected["free_space"] = False  # asked for by no default
+        assert {stage: stage in inputs for stage in TRAINING_INPUTS} == expected, name
+
+
+# --- what is refused ---
+
+
+def refusal(values: dict[str, Any]) -> str:
+    with pytest.raises(ConfigError) as failure:
+        load(values)
+    message = str(failure.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("name", ["street-seed1", "street-without-sky_loss-seed2"])
+def test_a_method_called_like_a_variant_is_refused(name):
+    message = refusal({"methods": {"street": {}, name: {}}})
+    assert name in message and "ablation" in message and "rename" in message
+    assert name in load({"methods": {"vanilla": {}, name: {}}}).methods, "no such ablation, no such variant"
+    assert name in load({"methods": {"street": {}, name: {}}, "ablation": {"seeds": [7]}}).methods
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ({"without": {"x": {}}}, ["ablation.without.x", "takes nothing out"]),
+        ({"without": {"x": {"overrides": {"train": {"iteration": 3}}}}}, ["ablation.without.x", "train.iteration"]),
+        ({"without": {"x": {"overrides": {"holdout": {"offset": 1}}}}}, ["ablation.without.x.overrides.holdout"]),
+        ({"without": {"x": {"overrides": {"random_seed": 3}}}}, ["ablation.without.x.overrides.random_seed", "train"]),
+        ({"without": {"x": {"parts": []}}}, ["ablation.without.x.parts", "lacks 'background'"]),
+        ({"without": {"x": {"parts": ["actors"]}}}, ["ablation.without.x.parts", "lacks 'background'"]),
+        ({"without": {"x": {"parts": ["background"] * 2}}}, ["ablation.without.x.parts", "twice"]),
+        ({"without": {"x": {"parts": ["wheels"]}}}, ["ablation.without.x.parts", "wheels"]),
+        ({"without": {"a/b": {"parts": ["background"]}}}, ["variant", "a/b", "letters"]),
+        ({"seeds": []}, ["ablation.seeds", "at least 1"]),
+        ({"seeds": [1, 1]}, ["ablation.seeds", "twice"]),
+        ({"seeds": [-1]}, ["ablation.seeds", "-1"]),
+        ({"seed": [1]}, ["ablation.seed"]),
+    ],
+    ids=str,
+)
+def test_what_is_wrong_in_the_section_is_told_in_one_line(section, words):
+    message = refusal({"ablation": section})
+    assert all(word in message for word in words), message
+
+
+def plan(**values: Any) -> Plan:
+    return Plan({"datasets": {"a": {"scenes": ["a1"]}}, **values}, str(REPOSITORY))
+
+
+@pytest.mark.parametrize("target", ["results/a1/ablation.csv", "results/a1/ablation.json"])
+def test_a_config_without_the_method_is_valid_until_its_ablation_is_asked_for(target):
+    made = plan(methods={"vanilla": {}, "mine": {}})
+    assert made.config.ablated == {} and list(made.config.all_methods) == ["vanilla", "mine"]
+    made.refuse_unknown(["all", "results/a1/metrics.json", "results/a1/mine/eval.json"])
+    with pytest.raises(ConfigError, match=r"ablation\.of.*'street'.*vanilla, mine"):
+        made.refuse_unknown([target])
+    plan().refuse_unknown([target])
+
+
+def told_to_drop(made: Plan, target: str) -> dict[str, Any]:
+    """What a refusal of an ablation says to add to the config."""
+    with pytest.raises(ConfigError) as failure:
+        made.refuse_unknown([target])
+    message, advice = str(failure.value).split("drop them with ")
+    assert "\n" not in message and "vanilla" in message and "a1" in message and "nothing" in message
+    return yaml.safe_load(advice)
+
+
+@pytest.mark.parametrize("target", ["results/a1/ablation.csv", "results/a1/ablation.json"])
+def test_variants_that_take_nothing_out_are_refused_with_what_drops_them(target):
+    """Vanilla has no actors, and is held neither to LiDAR's depth nor to masks of the sky: there is its sky alone."""
+    of_vanilla = {"ablation": {"of": "vanilla"}}
+    idle = [name for name in VARIANTS if name != "sky"]
+    assert told_to_drop(plan(**of_vanilla), target) == {"ablation": {"without": dict.fromkeys(idle)}}
+    defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
+    values = merged(merged(defaults, of_vanilla), {"ablation": {"without": dict.fromkeys(idle)}})
+    made = plan(**{**values, "datasets": {"a": {"scenes": ["a1"]}}})
+    made.refuse_unknown([target])
+    assert list(made.config.ablated) == names(of="vanilla", without=["sky"])
+
+
+def test_variants_that_take_nothing_out_hinder_nothing_but_the_ablation():
+    files = ("metrics.json", "street/eval.json", "vanilla-without-sky-seed0/eval.json")
+    plan(ablation={"of": "vanilla"}).refuse_unknown(["all", *(f"results/a1/{file}" for file in files)])
+
+
+def test_what_a_variant_takes_out_is_judged_by_what_holds_on_the_scene():
+    """Where the drive's settings have no loss of entropy the method is without it anyway."""
+    free = {"scenes": ["a1"], "overrides": {"train": {"entropy_weight": 0.0}}}
+    made = Plan({"datasets": {"a": free, "b": {"scenes": ["b1"]}}}, str(REPOSITORY))
+    made.refuse_unknown(["results/b1/ablation.csv"])
+    with pytest.raises(ConfigError, match=r"a1.*'street'.*: entropy; drop them.*\{entropy: null\}"):
+        made.refuse_unknown(["results/a1/ablation.csv"])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "without", "expected"),
+    [
+        ((0, 1), ("sky", "depth"), "it-seed{0,1}, it-without-{sky,depth}-seed{0,1}"),
+        ((2,), ("sky", "depth"), "it-seed2, it-without-{sky,depth}-seed2"),
+        ((2, 3), ("sky",), "it-seed{2,3}, it-without-sky-seed{2,3}"),
+        ((2,), (), "it-seed2"),
+    ],
+)
+def test_names_of_methods_are_spelled_as_a_shell_expands_them(seeds, without, expected):
+    job = AblationJob(of="it", seeds=seeds, without=without)
+    assert job.spelled == expected
+    command = ["bash", "-c", f"echo {expected.replace(', ', ' ')}"]
+    expanded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert sorted(expanded) == sorted(job.method(name, seed) for name in (None, *without) for seed in seeds)
+
+
+def test_a_variant_that_there_is_none_of_is_refused_with_those_there_are():
+    made = plan(ablation={"seeds": [3, 5]})
+    made.refuse_unknown(["results/a1/street-without-sky-seed3/eval.json", "results/a1/street-seed5/original.mp4"])
+    for unknown in ("street-without-sky-seed0", "street-without-skies-seed3", "street-without-sky"):
+        with pytest.raises(ConfigError) as failure:
+            made.refuse_unknown([f"results/a1/{unknown}/eval.json"])
+        message = str(failure.value)
+        assert f"'{unknown}'" in message and "vanilla, street;" in message
+        assert "street-seed{3,5}" in message and "street-without-{actors,track_correction," in message
+
+
+def test_variants_can_be_filmed_and_edited_as_far_as_they_have_actors():
+    made = plan()
+    made.refuse_unknown(["results/a1/street-without-sky-seed0/parts.mp4"])
+    with pytest.raises(ConfigError, match=r"street-without-actors-seed0.*those do: street$"):
+        made.refuse_unknown(["results/a1/street-without-actors-seed0/parts.mp4"])
+
+
+# --- what everything else is told ---
+
+
+def test_nothing_else_knows_of_the_ablation():
+    """Settings of all stages, films, edits and what a report expects are the same without any."""
+    edits = {"demo": str(REPOSITORY / "presets/edits/demo.yaml")}
+    datasets = {"a": {"scenes": ["a1", "demo"], "edits": edits}}
+    with_it, without = (Plan({"datasets": datasets, **more}, str(REPOSITORY)) for more in ({}, NOTHING))
+    for stage in (*SCENE_STAGES, *TRAINING_INPUTS):
+        assert stage_settings(with_it.config, stage, "a1") == stage_settings(without.config, stage, "a1")
+    for method in ("vanilla", "street"):
+        for stage in METHOD_STAGES:
+            told = (stage_settings(made.config, stage, "a1", method) for made in (with_it, without))
+            assert next(told) == next(told)
+    assert with_it.films(["a1", "demo"]) == without.films(["a1", "demo"])
+    assert with_it.edits(["a1", "demo"]) == without.edits(["a1", "demo"]) != []
+    assert {Path(edit).parts[2] for edit in with_it.edits(["demo"])} == {"street"}
+    assert with_it.report([]).settings == without.report([]).settings
+
+
+# --- what it says ---
+
+PROTOCOL = {"width": 640, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4}}
+
+
+def measured(static: float | None, moving: float | None, beyond: tuple = (None, None), **more: Any) -> dict[str, Any]:
+    """An eval.json with such PSNRs between training frames, and `beyond` them."""
+
+    def group(static: float | None, moving: float | None) -> dict[str, Any]:
+        gap = None if static is None or moving is None else static - moving
+        regions = {"static": static, "moving_vehicle": moving, "all": static}
+        return {"gap_db": gap, **{name: None if psnr is None else {"psnr": psnr} for name, psnr in regions.items()}}
+
+    result = {"interpolation": group(static, moving), "extrapolation": group(*beyond)}
+    return {
+        "scene": "0061", "dataset": "nuscenes", "protocol": PROTOCOL, "drive": {},
+        "result": {**result, "gaussians": 1000, "train_seconds": 60.0, **more},
+    }  # fmt: skip
+
+
+JOB = AblationJob(of="street", seeds=(0, 1, 2), without=("sky", "depth"))
+WHOLE = [measured(24.0, 20.0), measured(25.0, 21.0), measured(26.0, 20.5)]
+SKY = [
+    measured(23.0, 20.0, gaussians=900, train_seconds=50.0),
+    measured(23.0, 21.5, gaussians=1000, train_seconds=55.0),
+    measured(23.0, 22.0, gaussians=1400, train_seconds=60.0),
+]
+DEPTH = [measured(24.0, 20.0), measured(25.0, 21.0), measured(26.0, 20.5)]
+
+
+def evals(whole=WHOLE, sky=SKY, depth=DEPTH, job=JOB) -> dict[str, dict[str, Any]]:
+    stems = {"street": whole, "street-without-sky": sky, "street-without-depth": depth}
+    return {f"{stem}-seed{seed}": found[i] for stem, found in stems.items() for i, seed in enumerate(job.seeds)}
+
+
+def test_a_row_holds_means_spreads_and_differences_paired_by_seed():
+    """Static: 24, 25, 26 with the sky and 23 thrice without: -1, -2, -3; mean -2, its standard error 1 / sqrt(3)."""
+    record = ablation(evals(), JOB)
+    assert (record["scene"], record["of"], record["seeds"], record["protocol"]) == (
+        "0061",
+        "street",
+        [0, 1, 2],
+        PROTOCOL,
+    )
+    whole, sky, depth = record["rows"]
+    assert [row["variant"] for row in record["rows"]] == ["street", "street-without-sky", "street-without-depth"]
+    assert [(row["without"], row["seeds"]) for row in record["rows"]] == [(None, 3), ("sky", 3), ("depth", 3)]
+    static = {"mean": 25.0, "min": 24.0, "max": 26.0, "by_seed": [24.0, 25.0, 26.0]}
+    assert whole["interpolation"]["static"] == static
+    assert sky["interpolation"]["static"] == {"mean": 23.0, "min": 23.0, "max": 23.0, "by_seed": [23.0] * 3}
+    off = sky["interpolation"]["difference"]
+    assert (off["static"]["mean"], off["static"]["by_seed"]) == (-2.0, [-1.0, -2.0, -3.0])
+    assert off["static"]["standard_error"] == pytest.approx(1.0 / sqrt(3.0))
+    assert off["moving_vehicle"]["by_seed"] == [0.0, 0.5, 1.5]
+    assert off["moving_vehicle"]["mean"] == pytest.approx(2.0 / 3.0)
+    variance = ((2 / 3) ** 2 + (1 / 6) ** 2 + (5 / 6) ** 2) / 2.0
+    assert off["moving_vehicle"]["standard_error"] == pytest.approx(sqrt(variance / 3.0))
+    assert off["gap_db"]["by_seed"] == [-1.0, -2.5, -4.5]
+    assert depth["interpolation"]["difference"]["static"]["mean"] == 0.0
+    assert whole["interpolation"]["difference"] == {"static": None, "moving_vehicle": None, "gap_db": None}
+    assert (sky["gaussians"]["mean"], sky["gaussians"]["max"], sky["train_seconds"]["mean"]) == (1100.0, 1400, 55.0)
+
+
+@pytest.fixture
+def still() -> dict[str, Any]:
+    """The ablation on a scene where nothing moves, measured in both groups."""
+    runs = [measured(24.0 + i, None, beyond=(18.0 - i, None)) for i in range(3)]
+    return ablation(evals(runs, runs, runs), JOB)
+
+
+def test_where_nothing_moves_its_figures_are_null(still, tmp_path):
+    for row in still["rows"]:
+        for group in ("interpolation", "extrapolation"):
+            assert row[group]["moving_vehicle"] is row[group]["gap_db"] is None
+            assert row[group]["difference"]["moving_vehicle"] is None
+    assert json.loads(json.dumps(still, allow_nan=False)) == still
+    write_csv(tmp_path / "ablation.csv", still)
+    rows = read_csv(tmp_path / "ablation.csv")
+    assert {row["interpolation_moving_vehicle"] for row in rows} == {""}
+    assert "None" not in markdown(still) and "nan" not in markdown(still)
+
+
+@pytest.mark.parametrize("key", ["protocol", "scene", "dataset"])
+def test_what_was_measured_otherwise_is_not_compared(key):
+    other = {**SKY[1], key: {**PROTOCOL, "width": 320} if key == "protocol" else "other"}
+    with pytest.raises(ResultError) as failure:
+        ablation(evals(sky=[SKY[0], other, SKY[2]]), JOB)
+    message = str(failure.value)
+    assert "street-without-sky-seed1" in message and key in message and "\n" not in message
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_csv_has_a_line_per_variant_and_empty_cells_for_null(tmp_path):
+    write_csv(tmp_path / "ablation.csv", ablation(evals(), JOB))
+    whole, sky, depth = read_csv(tmp_path / "ablation.csv")
+    of = [f"_{name}" for name in ("min", "max", "difference", "difference_standard_error")]
+    assert list(whole) == [
+        "scene", "variant", "seeds",
+        *(
+            f"{group}_{name}{kind}"
+            for group in ("interpolation", "extrapolation") for name in ("static", "moving_vehicle", "gap_db")
+            for kind in ("", *of)
+        ),
+        *(f"{name}{kind}" for name in ("gaussians", "train_seconds") for kind in ("", "_min", "_max")),
+    ]  # fmt: skip
+    assert [row["variant"] for row in (whole, sky, depth)] == ["street", "street-without-sky", "street-without-depth"]
+    assert (sky["scene"], sky["seeds"], float(sky["interpolation_static"])) == ("0061", "3", 23.0)
+    assert float(sky["interpolation_static_difference"]) == -2.0
+    assert float(sky["interpolation_static_difference_standard_error"]) == pytest.approx(1.0 / sqrt(3.0))
+    assert float(whole["interpolation_moving_vehicle_max"]) == 21.0
+    assert whole["interpolation_static_difference"] == sky["extrapolation_static"] == ""
+    assert float(depth["train_seconds_min"]) == 60.0
+
+
+def tables(text: str) -> list[list[list[str]]]:
+    """The Markdown tables of a text: lines of cells."""
+    blocks = [block for block in re.split(r"\n\n", text) if block.startswith("|")]
+    return [[[cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()] for block in blocks]
+
+
+def test_the_markdown_is_a_table_ready_for_the_documentation():
+    text = markdown(ablation(evals(), JOB))
+    (table,) = tables(text)
+    assert len({len(line) for line in table}) == 1 and set(table[1]) == {"---"}
+    assert max(map(len, text.splitlines())) <= 120
+    assert table[0] == [
+        "without", "static", "difference", "moving vehicles", "difference", "gap", "Gaussians", "training",
+    ]  # fmt: skip
+    assert table[2] == ["nothing", "25.0 (24.0 to 26.0)", "-", "20.5 (20.0 to 21.0)", "-", "4.5", "1,000", "60 s"]
+    assert table[3] == [
+        "`sky`", "23.0 (23.0 to 23.0)", "-2.00 ± 0.58", "21.2 (20.0 to 22.0)", "+0.67 ± 0.44", "1.8", "1,100", "55 s",
+    ]  # fmt: skip
+    assert "0061" in text and "seeds 0, 1, 2" in text and "standard error" in text and "dB" in text
+    assert "beyond" not in text.lower(), "a group that was not measured has no table"
+
+
+def test_both_groups_have_a_table_where_both_were_measured(still):
+    text = markdown(still)
+    between, beyond = tables(text)
+    assert text.index("Between training frames") < text.index("Beyond the last training frame")
+    assert between[2][1:6] == ["25.0 (24.0 to 26.0)", "-", "-", "-", "-"]
+    assert beyond[3][1:6] == ["17.0 (16.0 to 18.0)", "+0.00 ± 0.00", "-", "-", "-"]
+
+
+# --- through Snakemake ---
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> WorkflowCopy:
+    """The workflow with a small ablation: of vanilla, without its sky, with one seed."""
+    without = dict.fromkeys(VARIANTS) | {"sky": {"overrides": {"sky": "none"}}}
+    section = {"of": "vanilla", "seeds": [2], "without": without}
+    train = {**TINY_TRAINING, "iterations": 20}
+    return WorkflowCopy.make(tmp_path_factory.mktemp("ablation"), ablation=section, train=train)
+
+
+def planned_files(copy: WorkflowCopy, target: str, rule: str) -> dict[str, list[str]]:
+    """The inputs of every job of `rule` that a dry run plans, by the wildcard `method`."""
+    done = copy.run(target, flags=("-n",))
+    assert done.returncode == 0, done.stdout
+    jobs = re.findall(rf"^(?:local)?rule {rule}:\n((?:    .*\n)+)", done.stdout, re.M)
+    fields = [dict(re.findall(r"^    (\w+): (.*)$", job, re.M)) for job in jobs]
+    methods = [re.search(r"method=([^, ]+)", job.get("wildcards", "method=")) for job in fields]
+    return {m.group(1) if m else "": job["input"].split(", ") for m, job in zip(methods, fields, strict=True)}
+
+
+@pytest.mark.workflow
+@pytest.mark.xdist_group("ablation")
+def test_asking_for_it_plans_exactly_the_trainings_of_all_variants_with_all_seeds(copy):
+    copy.write_config(yaml.safe_dump({key: value for key, value in copy.config.items() if key != "ablation"}))
+    try:
+        trainings = planned_files(copy, "results/0001/ablation.csv", "train")
+        plain = copy.planned("results/0001/ablation.csv")
+        compared = planned_files(copy, "results/0001/ablation.json", "ablation")
+        metrics = planned_files(copy, "results/0001/metrics.json", "train")
+    finally:
+        copy.write_config()
+    assert sorted(trainings) == sorted(names())
+    for name, files in trainings.items():
+        assert ("results/0001/actors.pkl" in files) == ("without-actors" not in name), name
+        assert ("results/0001/lidar_depth.pkl" in files) == ("without-depth" not in name), name
+    once = dict.fromkeys(
+        ("extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "ablation"), 1
+    )
+    assert plain == {**once, "train": 27, "evaluate": 27}
+    assert sorted(compared[""]) == sorted(f"results/0001/{name}/eval.json" for name in names())
+    assert sorted(metrics) == ["street", "vanilla"]
+
+
+@pytest.mark.workflow
+@pytest.mark.xdist_group("ablation")
+def test_it_runs_to_a_table_and_fails_in_one_line_where_protocols_differ(copy):
+    done = copy.run("results/0001/ablation.csv")
+    assert done.returncode == 0, done.stdout
+    methods = names(seeds=[2], without=["sky"], of="vanilla")
+    folders = {path.name for path in (copy.folder / "results/0001").iterdir() if (path / "train.json").is_file()}
+    assert folders == set(methods), "the method itself was not asked for"
+    for name in methods:
+        train = copy.read(f"results/0001/{name}/train.json")
+        assert train["random_seed"] == 2
+        assert train["provenance"]["stages"][f"{name}/train"]["settings"]["sky"] == (
+            "none" if "sky" in name else "cubemap"
+        )
+    record = copy.read("results/0001/ablation.json")
+    found = [copy.read(f"results/0001/{name}/eval.json")["result"]["extrapolation"]["static"] for name in methods]
+    whole, sky = (row["extrapolation"]["static"]["by_seed"] for row in record["rows"])
+    assert whole + sky == [region["psnr"] for region in found]
+    assert {f"{name}/train" for name in methods} < record["provenance"]["stages"].keys()
+    assert "| `sky` |" in done.stdout
+    assert [row["variant"] for row in read_csv(copy.folder / "results/0001/ablation.csv")] == [
+        "vanilla", "vanilla-without-sky",
+    ]  # fmt: skip
+    assert copy.planned("results/0001/ablation.csv") == {}
+
+    path = copy.folder / f"results/0001/{methods[-1]}/eval.json"
+    foreign = json.loads(path.read_text())
+    foreign["protocol"]["width"] += 1
+    path.write_text(json.dumps(foreign))
+    done = copy.run("results/0001/ablation.csv")
+    assert done.returncode != 0 and "Traceback" not in done.stdout
+    lines = complaints(done.stdout)
+    assert len(lines) == 1 and methods[-1] in lines.pop()

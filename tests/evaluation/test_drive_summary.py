@@ -1,0 +1,75 @@
+"""What stands beside the figures of a drive: how near held-out images are to training images, and how bright."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.small_drives import HELD_OUT
+from helpers.tiny_world import World
+from PIL import Image
+
+from drivesplat.evaluation.drive_summary import drive_record
+from drivesplat.evaluation.evaluate import measured_images
+from drivesplat.io.point_cloud import PointCloud
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.regions import LABELS
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.parser import ParserJob
+
+
+def recording_of(scene: Scene, holdout=HELD_OUT) -> Recording:
+    seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
+    return Recording(scene, parser_dict(scene, seed, ParserJob(holdout=holdout, images={})))
+
+
+def record_of(recording: Recording) -> dict:
+    return drive_record(recording, "CAM_FRONT", measured_images(recording.parser, "CAM_FRONT"))
+
+
+def test_held_out_images_are_as_far_from_training_images_as_the_car_came_between(tiny_scene):
+    """At 4 m/s, images every quarter of a second: those a quarter before 2, 6 and 8 are trained on, since cameras fire
+    35 ms early, those a quarter after are not; 9 comes a second and a quarter after the last."""
+    record = record_of(recording_of(tiny_scene))
+    assert record["interpolation"]["from_training_m"] == pytest.approx(1.0)
+    assert record["extrapolation"]["from_training_m"] == pytest.approx((1.0 + 3.0) / 2)
+    assert record["moved_m"] == pytest.approx(18.0) and record["seconds"] == pytest.approx(4.5)
+    keys = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
+    record = record_of(recording_of(dataclasses.replace(tiny_scene, frames=keys)))
+    assert record["interpolation"]["from_training_m"] == pytest.approx(2.0)
+    assert record["extrapolation"]["from_training_m"] == pytest.approx((2.0 + 4.0) / 2)
+
+
+def test_images_of_other_cameras_do_not_count_as_near(tiny_scene):
+    beside = tuple(dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames)
+    frames = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
+    both = recording_of(dataclasses.replace(tiny_scene, frames=(*frames, *beside)))
+    assert record_of(both)["interpolation"]["from_training_m"] == pytest.approx(2.0)
+    alone = tuple(frame for frame in frames if frame.sample_index in (2, 6, 8, 9))
+    only_held_out = recording_of(dataclasses.replace(tiny_scene, frames=(*alone, *beside)))
+    assert record_of(only_held_out)["interpolation"]["from_training_m"] is None
+
+
+def test_brightness_is_that_of_the_held_out_images_and_flat_psnr_that_of_their_static_pixels(tiny_scene):
+    recording = recording_of(tiny_scene)
+    measured = measured_images(recording.parser, "CAM_FRONT")
+    record = record_of(recording)
+    for group, key_frames in (("interpolation", (2, 6)), ("extrapolation", (8, 9))):
+        assert [recording.frame(i).sample_index for i in measured[group]] == list(key_frames)
+        images = [np.asarray(Image.open(recording.frame(i).image_path), dtype=float) / 255.0 for i in measured[group]]
+        luma = np.mean([0.2126 * i[..., 0] + 0.7152 * i[..., 1] + 0.0722 * i[..., 2] for i in images])
+        assert record[group]["luminance"] == pytest.approx(luma)
+        still = [recording.labels(i) == LABELS["static"] for i in measured[group]]
+        pixels = np.concatenate([image[mask] for image, mask in zip(images, still, strict=True)])
+        assert 1000 < len(pixels) < 2 * World().width * World().height
+        flat = np.mean((pixels - pixels.mean(axis=0)) ** 2)
+        assert record[group]["flat_psnr"] == pytest.approx(-10 * np.log10(flat))
+
+
+def test_a_group_without_images_and_images_of_one_colour_are_none(tiny_scene, tmp_path):
+    Image.new("RGB", (96, 54), (0, 0, 0)).save(tmp_path / "black.png")
+    frames = (dataclasses.replace(frame, image_path=str(tmp_path / "black.png")) for frame in tiny_scene.frames)
+    black = dataclasses.replace(tiny_scene, frames=tuple(frames))
+    record = record_of(recording_of(black, {"every_nth": 4, "offset": 2, "last_block": 0}))
+    assert record["extrapolation"] is None
+    assert (record["interpolation"]["luminance"], record["interpolation"]["flat_psnr"]) == (0.0, None)

@@ -1,0 +1,110 @@
+"""How far off rendered depth is: the figure, and which LiDAR it is held to."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import looking_at, recording_of, round_gaussians
+from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
+
+from drivesplat.evaluation.depth import DepthErrors
+from drivesplat.evaluation.evaluate import evaluate_groups, held_out_depths
+from drivesplat.evaluation.metrics import LEAST_REGION_PIXELS
+from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.preprocess.lidar_depth import Depths, lidar_depths
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.splits import frame_groups
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.lidar_depth import LidarDepthJob
+
+
+def job(holdout: dict[str, int] = HELD_OUT) -> LidarDepthJob:
+    return LidarDepthJob.model_validate(
+        {
+            "holdout": holdout, "images": {"width": None}, "own_car_radius": 2.5,
+            "ray_spacing": (1.5, 1.65), "box_margin": 0.1,
+        }
+    )  # fmt: skip
+
+
+def known(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray) -> Depths:
+    return {"rows": rows.astype(np.int32), "columns": columns.astype(np.int32), "depth": depth.astype(np.float32)}
+
+
+def test_the_figure_is_the_median_over_all_pixels_of_the_group():
+    """Not the mean, and not the mean of the images' medians: a third of the pixels belongs to the first image."""
+    random, errors = np.random.default_rng(0), DepthErrors()
+    expected = []
+    for count, spread in ((500, 0.3), (1000, 0.05)):
+        places = random.permutation(40 * 50)[:count]
+        depth, off = random.uniform(3.0, 60.0, count), random.normal(size=count) * spread
+        image = np.full((40, 50), np.nan, dtype=np.float32)
+        image[places // 50, places % 50] = depth * (1.0 + off)
+        errors.add(image, known(places // 50, places % 50, depth))
+        expected.append(np.abs(off))
+    record = errors.summary()["depth"]
+    assert record["median_relative_error"] == pytest.approx(np.median(np.concatenate(expected)), rel=1e-3)
+    assert record["pixels"] == 1500 and json.dumps(record, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("count", "summary"), [(None, {}), (0, {"depth": None}), (LEAST_REGION_PIXELS - 1, {"depth": None})]
+)
+def test_too_few_pixels_are_no_figure_and_no_sweep_is_no_entry(count, summary):
+    errors = DepthErrors()
+    if count is not None:
+        columns = np.arange(count)
+        errors.add(np.ones((1, 1000), np.float32), known(0 * columns, columns, np.ones(count)))
+    assert errors.summary() == summary
+
+
+def held_out_recording(root: Path) -> Recording:
+    return recording_of(scene_at(root), **HELD_OUT)
+
+
+def test_images_are_held_to_the_sweep_of_their_own_key_frame(tiny_root):
+    """To what a training would be held to, if nothing were held out. Only key frames that are held out are measured."""
+    recording = held_out_recording(tiny_root)
+    everything = lidar_depths(recording.scene, job(NOTHING_HELD_OUT))
+    groups = frame_groups(recording.scene, HoldoutSettings(**HELD_OUT))
+    depths = held_out_depths(recording, "CAM_FRONT", job())
+    assert [recording.scene.frames[i].sample_index for i in sorted(depths)] == [2, 6, 8, 9]
+    assert {groups[i] for i in depths} == {"interpolation", "extrapolation"}
+    for index, image in depths.items():
+        assert len(image["depth"]) > 100
+        for key, values in image.items():
+            np.testing.assert_array_equal(values, everything[index][key])
+
+
+def test_images_without_a_sweep_of_their_own_are_held_to_none(tiny_root, tmp_path):
+    """Not to that of another key frame, held out or not, half a second away."""
+    root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+    (root / "samples/LIDAR_TOP/0001__0008.pcd.bin").unlink()
+    depths = held_out_depths(held_out_recording(root), "CAM_FRONT", job())
+    assert [index // 2 for index in sorted(depths)] == [2, 6, 9]
+
+
+def test_groups_have_the_figure_beside_their_regions(tiny_root):
+    """Of a disc 5 metres before the first held-out image, known to be 4 metres away, and one of which nothing is."""
+    recording = held_out_recording(tiny_root)
+    index = 4
+    pose = recording.scene.frames[index].camera_to_world
+    model = SplatModel([round_gaussians([pose[:3, 3] + 5.0 * pose[:3, 2]], 2.0, 0.999)], None).requires_grad_(False)
+    rows, columns = (values.ravel() for values in np.mgrid[10:40, 20:70])
+    groups = evaluate_groups(
+        model, recording, "CAM_FRONT", None, torch.device("cpu"), {index: known(rows, columns, np.full(len(rows), 4.0))}
+    )
+    assert groups["interpolation"]["depth"] == {"median_relative_error": pytest.approx(0.25, abs=2e-3), "pixels": 1500}
+    assert "depth" not in groups["extrapolation"]
+
+
+def test_depth_is_rendered_beside_the_same_image():
+    model = SplatModel([round_gaussians([[6.0, 0.0, 0.0]], 0.5, 0.9)], None).requires_grad_(False)
+    view = looking_at([6.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    image, depth = rendered_with_depth(model, view)
+    np.testing.assert_allclose(image, rendered(model, view), atol=1e-6)
+    assert depth.shape == image.shape[:2] and depth[16, 24] == pytest.approx(5.0, abs=1e-3)

@@ -1,0 +1,93 @@
+"""What a metrics.json says, in sentences."""
+
+import json
+import subprocess
+import sys
+
+from helpers import REPOSITORY
+
+from drivesplat.evaluation.summary import in_words
+
+
+def method(**groups) -> dict:
+    empty = {"gap_db": None, "static": None, "moving_vehicle": None}
+    return {
+        "interpolation": groups.get("interpolation", empty), "extrapolation": groups.get("extrapolation", empty),
+        "gaussians": 40000, "train_seconds": 91.4, "device": "cpu (x86_64)",
+    }  # fmt: skip
+
+
+def group(static: float | None, moving: float | None) -> dict:
+    gap = static - moving if moving is not None else None
+    return {
+        "gap_db": gap, "static": {"psnr": static}, "moving_vehicle": {"psnr": moving} if moving is not None else None
+    }  # fmt: skip
+
+
+def test_each_group_is_a_sentence_with_its_gap():
+    metrics = {"methods": {"vanilla": method(interpolation=group(27.1, 16.0), extrapolation=group(22.0, 12.5))}}
+    lines = in_words(metrics, "results/demo/metrics.json")
+    assert "vanilla, frames between training frames: static 27.1 dB, moving vehicles 16.0 dB: a gap of 11.1 dB" in lines
+    assert (
+        "vanilla, frames beyond the last training frame: static 22.0 dB, moving vehicles 12.5 dB: a gap of 9.5 dB"
+        in lines
+    )
+    assert "vanilla: 40,000 Gaussians, trained in 91 s on cpu (x86_64)" in lines
+    figures = next(line for line in lines if line.startswith("All figures: "))
+    assert "results/demo/metrics.json" in figures and figures.endswith(" results/demo")
+
+
+def test_a_group_that_is_off_is_not_spoken_of():
+    lines = in_words({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}, "m.json")
+    assert not any("beyond" in line for line in lines)
+
+
+def test_a_scene_where_nothing_moves_has_no_gap():
+    lines = in_words({"methods": {"vanilla": method(interpolation=group(27.1, None))}}, "m.json")
+    assert lines[0].endswith("static 27.1 dB, no moving vehicle to compare with")
+
+
+def test_what_was_measured_against_truth_is_told():
+    lateral = {"2.0": {"all": {"psnr": 21.5}, "static": {"psnr": 22.7}}}
+    before = {"box": {"psnr": 14.3}, "outside": {"psnr": 25.9}}
+    removal = {"box": {"psnr": 17.0}, "outside": {"psnr": 26.2}, "not_removed": before}
+    metrics = {"methods": {"vanilla": {**method(), "lateral": lateral, "removal": removal}}}
+    lines = in_words(metrics, "m.json")
+    assert "vanilla, from 2 m to the left, against truth: static 22.7 dB" in lines
+    expected = "vanilla, the car ahead removed, against the empty street: 17.0 dB in its box (14.3 dB before)"
+    assert expected in lines
+
+
+def test_what_there_is_to_look_at_is_named_last_by_method(tmp_path):
+    """Of the files that are there; of a method that has none nothing is said."""
+    made = {"vanilla": ("viewer.html", "original.mp4", "train.json", "removal.png"), "plain": ("ghost_panel.png",)}
+    for name, files in {**made, "bare": ("train.json",)}.items():
+        (tmp_path / name).mkdir()
+        for file in files:
+            (tmp_path / name / file).touch()
+    (tmp_path / "plain" / "original.mp4").mkdir()
+    (tmp_path / "plain" / "edits").mkdir()
+    metrics = {"methods": {name: method() for name in ("vanilla", "plain", "bare", "absent")}}
+    lines = in_words(metrics, tmp_path / "metrics.json")
+    assert lines[-2:] == [
+        f"To look at, in {tmp_path}/vanilla: original.mp4, removal.png, viewer.html",
+        f"To look at, in {tmp_path}/plain: ghost_panel.png, edits/",
+    ]
+    assert sum("To look at" in line for line in lines) == 2
+
+
+def test_truth_over_too_few_pixels_is_not_spoken_of():
+    removal = {"box": None, "outside": {"psnr": 20.0}, "not_removed": {"box": None, "outside": {"psnr": 20.0}}}
+    metrics = {"methods": {"vanilla": {**method(), "lateral": {"2.0": {"static": None}}, "removal": removal}}}
+    lines = in_words(metrics, "m.json")
+    assert not any("truth" in line or "removed" in line for line in lines)
+
+
+def test_the_command_line_prints_it_and_names_a_missing_file(tmp_path):
+    file = tmp_path / "metrics.json"
+    command = [sys.executable, "-m", "drivesplat.evaluation.summary", str(file)]
+    absent = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert absent.returncode and str(file) in absent.stderr and "Traceback" not in absent.stderr
+    file.write_text(json.dumps({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}))
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert "a gap of 11.1 dB" in done.stdout

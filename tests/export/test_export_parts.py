@@ -1,0 +1,274 @@
+"""parts/: every piece of a model as a PLY in its own frame, from which parts.json makes the drive again."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import BLACK, recording_of, round_gaussians
+from helpers.hand_made_traffic import (
+    COURSES,
+    FADING,
+    GONE_AT_TIMES,
+    TURNING,
+    Traffic,
+    own_gaussians,
+    placed,
+    some_gaussians,
+    with_turning_track,
+)
+
+from drivesplat.export import splat_asset
+from drivesplat.export.names import distinct
+from drivesplat.export.parts_json import write_parts
+from drivesplat.export.sampled_motion import sampled
+from drivesplat.export.splat_asset import SplatFiles, export_splat
+from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
+from drivesplat.export.trained_parts import SampledPiece, trained_gaussians, trained_pieces
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.rigid import rigid
+
+DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
+PROVENANCE = {**DIGESTS, "stages": {}}
+MIDDLE = 2.25
+STREET = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]]
+
+
+def street() -> SplatModel:
+    """A static background of three Gaussians, without view dependence, and two vehicles, with."""
+    return SplatModel([round_gaussians(STREET, colors=BLACK), Traffic()], None)
+
+
+def export_all(folder, model, scene, monkeypatch):
+    """What the stage writes into `folder` for a model; returns parts.json's content."""
+    monkeypatch.setattr(splat_asset, "trained_model", lambda _: (model, None))
+    files = SplatFiles(folder / "splat.ply", folder / "cameras.json", folder / "parts/parts.json")
+    export_splat(files, {}, recording_of(scene).parser, scene, PROVENANCE)
+    return json.loads((folder / "parts/parts.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene):
+    return with_turning_track(tiny_scene)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, scene):
+    folder = tmp_path_factory.mktemp("street")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        export_all(folder, street(), scene, monkeypatch)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def record(folder):
+    return json.loads((folder / "parts/parts.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def parts(record):
+    return {part["name"]: part for part in record["parts"]}
+
+
+def unit(quats: torch.Tensor) -> torch.Tensor:
+    """Unit quaternions, each and its negative the same."""
+    quats = quats / quats.norm(dim=-1, keepdim=True)
+    return quats * torch.sign(quats.gather(1, quats.abs().argmax(dim=1, keepdim=True)))
+
+
+def assert_same(found: Gaussians, expected: Gaussians, atol: float = 1e-6) -> None:
+    torch.testing.assert_close(found.means, expected.means, rtol=0, atol=atol)
+    torch.testing.assert_close(unit(found.quats), unit(expected.quats), rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.scales, expected.scales, rtol=1e-5, atol=0)
+    torch.testing.assert_close(found.opacities, expected.opacities, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.sh, expected.sh, rtol=0, atol=1e-5)
+
+
+def test_every_piece_is_a_file_and_has_its_line(folder, record, parts):
+    assert list(parts) == ["background", TURNING, GONE_AT_TIMES]
+    files = {part["file"] for part in record["parts"]}
+    assert files == {"background.ply", f"{TURNING}.ply", f"{GONE_AT_TIMES}.ply"}
+    assert {path.name for path in (folder / "parts").iterdir()} == {"parts.json", *files}
+    assert [parts[name]["frame"] for name in parts] == ["world", "object", "object"]
+    assert [(parts[name]["gaussians"], parts[name]["sh_degree"]) for name in parts] == [(3, 0), (12, 1), (12, 1)]
+
+
+def test_objects_are_in_their_own_frame_in_the_colours_of_the_middle_image(folder, parts):
+    for track_id in COURSES:
+        found = read_splat_ply(folder / "parts" / parts[track_id]["file"])
+        assert_same(found, own_gaussians(track_id, MIDDLE))
+    background = read_splat_ply(folder / "parts/background.ply")
+    np.testing.assert_allclose(background.means, STREET)
+    assert background.sh_degree == 0
+
+
+def test_poses_are_those_of_the_closed_form_at_every_sample(parts):
+    for track_id, course in COURSES.items():
+        motion = parts[track_id]["motion"]
+        expected = np.stack([course.pose(seconds) for seconds in motion["seconds"]])
+        np.testing.assert_allclose(motion["object_to_world"], expected, rtol=0, atol=1e-9)
+
+
+def test_samples_are_dense_while_an_object_is_there_and_none_elsewhere(parts):
+    for track_id, course in COURSES.items():
+        motion = parts[track_id]["motion"]
+        seconds = np.array(motion["seconds"])
+        assert np.diff(seconds).min() > 0.0
+        expected = [[course.times[a] - 0.25, course.times[b] + 0.25] for a, b in course.runs]
+        np.testing.assert_allclose(motion["present"], expected, atol=1e-9)
+        held = [seconds[(seconds >= low - 1e-6) & (seconds <= high + 1e-6)] for low, high in expected]
+        assert sum(map(len, held)) == len(seconds)
+        for inside, (low, high) in zip(held, expected, strict=True):
+            np.testing.assert_allclose([inside[0], inside[-1]], [low, high], atol=1e-6)
+            assert np.diff(inside).max() < 1 / 30 + 2e-6
+
+
+def test_every_image_and_every_annotation_has_a_sample(parts, scene):
+    first = min(frame.timestamp for frame in scene.frames)
+    for track_id, course in COURSES.items():
+        motion = parts[track_id]["motion"]
+        images = {f.timestamp for f in scene.frames if course.is_there((f.timestamp - first) * 1e-6)}
+        assert len(images) > 5 and images <= set(motion["timestamps"])
+        assert np.abs(np.subtract.outer(course.times, motion["seconds"])).min(axis=1).max() < 1e-9
+        elapsed = (np.array(motion["timestamps"]) - first) * 1e-6
+        np.testing.assert_allclose(elapsed, motion["seconds"], rtol=0, atol=1e-9)
+
+
+def test_the_drive_can_be_put_together_again_at_any_image(folder, parts, scene):
+    """Files and poses of parts.json alone give what the model shows, in the colours of the middle image."""
+    first, model = min(frame.timestamp for frame in scene.frames), street()
+    for frame in scene.frames:
+        seconds = (frame.timestamp - first) * 1e-6
+        world = model.gaussians_at(seconds)
+        start = len(STREET)
+        for track_id in COURSES:
+            expected, start = world[slice(start, start + 12)], start + 12
+            motion = parts[track_id]["motion"]
+            if frame.timestamp not in motion["timestamps"]:
+                assert (expected.opacities == 0).all()
+                continue
+            pose = np.array(motion["object_to_world"][motion["timestamps"].index(frame.timestamp)])
+            found = placed(read_splat_ply(folder / "parts" / parts[track_id]["file"]), pose)
+            expected.sh0[:, 0] += FADING * (MIDDLE - seconds)
+            assert_same(found, expected, atol=2e-5)
+
+
+def test_splat_ply_holds_all_that_is_there_at_the_middle_image(folder):
+    found = read_splat_ply(folder / "splat.ply")
+    present = placed(own_gaussians(TURNING, MIDDLE), COURSES[TURNING].pose(MIDDLE))
+    assert len(found) == len(STREET) + len(present), "the absent vehicle is not there, invisible or not"
+    np.testing.assert_allclose(found.means[:3], STREET)
+    assert_same(found[slice(3, None)], present, atol=1e-5)
+    assert not found.sh[:3, 1:].any()
+
+
+def test_the_scene_says_of_what_class_and_size_an_object_is_where_it_knows_it(parts):
+    known, unknown, still = (parts[name] for name in (TURNING, GONE_AT_TIMES, "background"))
+    assert (known["category"], known["size"]) == ("vehicle.car", [4.0, 2.0, 1.6])
+    assert (unknown["category"], unknown["size"]) == (None, None)
+    assert (still["category"], still["size"], still["motion"]) == (None, None, None)
+
+
+def test_the_record_says_where_it_is_from_and_what_it_means(record, scene, folder):
+    first = min(frame.timestamp for frame in scene.frames)
+    assert (record["schema"], record["scene"], record["dataset"]) == (1, "0001", "tiny")
+    assert record["origin"] == scene.origin.tolist() and record["provenance"] == PROVENANCE
+    assert record["first_image"] == first and record["colors_timestamp"] == first + 2_250_000
+    assert all(sentence.endswith(".") for sentence in record["conventions"].values())
+    note = note_of(folder / f"parts/{TURNING}.ply")
+    assert note == {"scene": "0001", "piece": TURNING, "frame": "object", **DIGESTS}
+
+
+def test_vanilla_is_one_piece_that_holds_what_splat_ply_holds(tmp_path, tiny_scene, monkeypatch):
+    record = export_all(tmp_path, SplatModel([round_gaussians(STREET)], None), tiny_scene, monkeypatch)
+    assert [(part["file"], part["frame"], part["motion"]) for part in record["parts"]] == [
+        ("background.ply", "world", None)
+    ]
+    assert_same(read_splat_ply(tmp_path / "parts/background.ply"), read_splat_ply(tmp_path / "splat.ply"))
+
+
+def test_files_of_pieces_that_are_no_more_go_and_all_others_stay(tmp_path, scene, monkeypatch):
+    export_all(tmp_path, street(), scene, monkeypatch)
+    folder = tmp_path / "parts"
+    (folder / "mine.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment mine\nend_header\n")
+    (folder / "broken.ply").write_bytes(b'ply\ncomment drivesplat {"piece"\nend_header\n')
+    (folder / "notes.txt").write_text("mine")
+    write_splat_ply(folder / "together.ply", some_gaussians(2, 0, 0), {"scene": "0001"})
+    (folder / "parts.json").unlink()  # as Snakemake does before a job
+    export_all(tmp_path, SplatModel([round_gaussians(STREET)], None), scene, monkeypatch)
+    kept = {"mine.ply", "broken.ply", "notes.txt", "together.ply"}
+    assert {path.name for path in folder.iterdir()} == {"parts.json", "background.ply", *kept}
+
+
+def test_names_that_would_be_one_file_become_two(tmp_path, tiny_scene):
+    names = ["car 7", "car/7", "Car_7", "../up", ""]
+    pieces = {name: SampledPiece(some_gaussians(i + 1, 0, i)) for i, name in enumerate(names)}
+    write_parts(tmp_path / "parts/parts.json", pieces, tiny_scene, PROVENANCE)
+    record = json.loads((tmp_path / "parts/parts.json").read_text())
+    files = [part["file"] for part in record["parts"]]
+    assert files == ["car_7.ply", "car_7_2.ply", "Car_7_3.ply", "___up.ply", "_.ply"]
+    assert [len(read_splat_ply(tmp_path / "parts" / file)) for file in files] == [1, 2, 3, 4, 5]
+    assert [path.name for path in tmp_path.iterdir()] == ["parts"]
+
+
+def test_a_name_made_distinct_does_not_take_anothers():
+    assert distinct(["a", "A", "a_2"], str) == {"a": "a", "A": "A_2", "a_2": "a_2_2"}
+    assert distinct(["camera", "b"], str, taken=["Camera"]) == {"camera": "camera_2", "b": "b"}
+
+
+def test_what_is_not_finite_stays_behind_in_every_export(tiny_scene, monkeypatch, caplog):
+    def broken(track_id: str, time: float) -> Gaussians:
+        own = own_gaussians(track_id, time)
+        own.scales[4, 1] = torch.inf
+        own.opacities[5] = torch.nan
+        return own
+
+    monkeypatch.setattr("hand_made_traffic.own_gaussians", broken)
+    model = street()
+    with caplog.at_level(logging.WARNING):
+        together = trained_gaussians(model, tiny_scene)
+        pieces = trained_pieces(model, tiny_scene, np.array([], dtype=np.int64))
+    assert len(together) == 3 + 10
+    assert {name: len(piece.gaussians) for name, piece in pieces.items()} == {
+        "background": 3, TURNING: 10, GONE_AT_TIMES: 10,
+    }  # fmt: skip
+    assert f"{TURNING}: 2 of 12 Gaussians are not finite and left out" in caplog.text
+
+
+def test_a_faint_gaussian_that_stands_still_is_not_an_absent_object(tiny_scene):
+    model = SplatModel([round_gaussians(STREET, opacities=[0.0, 0.5, 0.9])], None)
+    assert len(trained_gaussians(model, tiny_scene)) == 3
+
+
+def ahead(x: float) -> np.ndarray:
+    return rigid(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("still", "x", "present"),
+    [
+        (0.2, 2.0, True),
+        (1.4, 14.0, True),
+        (2.0, 15.0, False),
+        (2.9, 80.0, False),
+        (3.1, 80.0, True),
+        (9.0, 80.0, False),
+    ],
+)
+def test_an_object_that_is_absent_stands_where_it_was_last_or_will_be_next(still, x, present):
+    """There from 0 to 1.5 s at ten metres a second, and standing from 3 to 4 s: its motion is not continued beyond."""
+    poses = np.stack([ahead(5.0), ahead(10.0), ahead(80.0)])
+    motion = sampled(Motion(np.array([0.5, 1.0, 3.5]), poses, ((0, 1), (2, 2)), 0.5), np.array([]), still)
+    assert motion.present_when_still == present
+    assert motion.still_pose[0, 3] == pytest.approx(x, abs=1e-9)
+
+
+def test_spans_that_overlap_are_one():
+    """Annotations 0.6 s apart that are not consecutive: each reaches half a second."""
+    poses = np.stack([ahead(0.0), ahead(1.0)])
+    motion = sampled(Motion(np.array([1.0, 1.6]), poses, ((0, 0), (1, 1)), 0.5), np.array([]), 0.0)
+    assert motion.spans == ((0.5, 2.1),)
+    assert np.diff(motion.seconds).max() < 1 / 30 + 2e-6

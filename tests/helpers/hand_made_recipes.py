@@ -1,0 +1,58 @@
+"""Recipes whose figures were never measured: eval.json files as a test wants them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchmarks.quality.groups import Group, groups_of, read_recipes
+from benchmarks.quality.recipes import RecipeFile
+from drivesplat.settings.method import with_seed
+from helpers import REPOSITORY
+
+PROTOCOL = {
+    "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "eval_camera": "CAM_FRONT", "width": 640, "height": 360,
+    "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4},
+    "held_out_frames": {"interpolation": [4, 12, 20, 28], "extrapolation": [35, 36, 37, 38]}, "train_images": 31,
+    "poses": "nuscenes", "regions": "boxes", "extra_points": None, "lidar_missing": 38, "images_missing": 0,
+    "key_frame_range": None, "own_car": None,
+}  # fmt: skip
+
+
+def recipe_file(folder: Path, **content: Any) -> tuple[RecipeFile, list[Group]]:
+    """Recipes on scene 0061 with seeds 0 and 1, written and read, and their groups with results in `folder`."""
+    path = folder / "recipes.yaml"
+    path.write_text(yaml.safe_dump({"scene": "0061", "seeds": [0, 1], **content}, sort_keys=False))
+    recipes = read_recipes(path)
+    return recipes, groups_of(recipes, folder / "out", REPOSITORY)
+
+
+def evaluation(
+    static: float | None, moving: float | None = None, ssim: float = 0.5, protocol: dict | None = None, **result: Any
+) -> dict[str, Any]:
+    """An eval.json with such figures between training frames, and static ones 5 dB lower beyond them."""
+    between = {
+        "gap_db": None if static is None or moving is None else static - moving,
+        "static": None if static is None else {"psnr": static},
+        "moving_vehicle": None if moving is None else {"psnr": moving},
+        "all": {"psnr": static, "ssim": ssim, "lpips": None},
+    }
+    beyond = {"gap_db": None, "static": static and {"psnr": static - 5.0}, "moving_vehicle": None, "all": None}
+    costs = {
+        "gaussians": 1000, "train_seconds": 60.0, "train_iterations": 15000, "peak_gpu_memory_gb": 2.5,
+        "device": "NVIDIA H200",
+    }  # fmt: skip
+    return {
+        "scene": "0061", "dataset": "nuscenes", "protocol": {**PROTOCOL, **(protocol or {})},
+        "result": {"interpolation": between, "extrapolation": beyond, **costs, **result},
+    }  # fmt: skip
+
+
+def write_evaluation(group: Group, recipe: str, seed: int, content: dict[str, Any]) -> Path:
+    """Puts an eval.json where a run leaves it, with the provenance that the group's plan expects."""
+    path = group.evaluation(recipe, seed)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stages = group.plan.evaluation_stages(group.scene, [with_seed(recipe, seed)])
+    path.write_text(json.dumps({**content, "provenance": {"stages": stages}}))
+    return path

@@ -1,0 +1,43 @@
+"""Runs of Snakemake that are killed or fail."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from helpers.workflow_copy import WorkflowCopy, complaints
+
+
+def told(done: subprocess.CompletedProcess) -> str:
+    """The one line that a failed run says, checked to be one line and no traceback."""
+    assert done.returncode != 0, done.stdout
+    assert "Traceback" not in done.stdout, done.stdout
+    lines = complaints(done.stdout)
+    assert len(lines) == 1, done.stdout
+    return lines.pop()
+
+
+VANILLA = {"vanilla": {}}
+
+
+@pytest.fixture
+def copy(tmp_path) -> WorkflowCopy:
+    return WorkflowCopy.make(tmp_path / "workflow", methods=VANILLA)
+
+
+def training_process(copy: WorkflowCopy) -> int | None:
+    """The process id of the running train.py of this copy."""
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                arguments = (entry / "cmdline").read_bytes().split(b"\0")
+                where = str((entry / "cwd").readlink())
+            except OSError:
+                continue
+            if (
+                where == str(copy.folder)
+                and any(a.endswith(b".train.py") for a in arguments)
+                and b"python" in arguments[0]
+            ):
+                return int(entry.name)
+    return None

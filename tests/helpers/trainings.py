@@ -1,0 +1,236 @@
+"""Trainings of next to nothing, and what they are trained on."""
+
+import dataclasses
+import math
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from drivesplat.model.background import Background
+from drivesplat.model.sky import ConstantSky
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import View
+from drivesplat.preprocess.masks import mask_name
+from drivesplat.rasterization import rasterize
+from drivesplat.scene.regions import LABELS
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import (
+    DefaultSettings,
+    FloaterSettings,
+    McmcSettings,
+    PartName,
+    SkyKind,
+    TrainJob,
+    TrainSettings,
+)
+from drivesplat.training.run import (
+    TrainingFiles,
+    TrainingInputs,
+)
+from drivesplat.training.train import TrainingSummary, Workspace, train
+from drivesplat.training.views import LidarDepth, TrainingView
+from helpers import REPOSITORY
+from helpers.hand_made import actor_record, actors_of, motion_through, track_of
+
+CPU = torch.device("cpu")
+
+
+WIDTH, HEIGHT = 32, 24
+
+
+ITERATIONS, CHECKPOINT_AT, ENDED_AT = 60, 30, 43
+
+
+def recorded_views(count: int = 5, width: int = WIDTH, height: int = HEIGHT, device: torch.device = CPU) -> list:
+    """What `count` cameras in a row see of a cloud of random Gaussians."""
+    rng = np.random.default_rng(0)
+    n = 80
+    cloud = [
+        rng.uniform([-3, -1.5, 3], [3, 1.5, 6], (n, 3)), rng.normal(size=(n, 4)), rng.uniform(0.1, 0.5, (n, 3)),
+        rng.uniform(0.3, 1.0, n), rng.uniform(0, 1, (n, 3)),
+    ]  # fmt: skip
+    tensors = [torch.from_numpy(values).float() for values in cloud]
+    views = []
+    for i in range(count):
+        camera_to_world = torch.eye(4)
+        camera_to_world[0, 3] = 2.0 * i / max(1, count - 1) - 1.0
+        intrinsics = torch.tensor([[0.7 * width, 0.0, width / 2], [0.0, 0.7 * width, height / 2], [0.0, 0.0, 1.0]])
+        view = View(intrinsics, camera_to_world, width, height, time=0.5 * i)
+        image = rasterize(*tensors, view.viewmat[None], view.K[None], width, height, backend="reference").image[0]
+        moved = View(view.K.to(device), camera_to_world.to(device), width, height, view.time)
+        views.append(TrainingView(moved, (image.clamp(0, 1) * 255).to(torch.uint8).to(device), None))
+    return views
+
+
+def seed_points(count: int = 90) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    return rng.uniform([-3, -1.5, 3], [3, 1.5, 6], (count, 3)), rng.uniform(0.3, 0.7, (count, 3))
+
+
+def untrained(settings: TrainSettings, sky: bool = False) -> SplatModel:
+    part = Background.from_points(*seed_points(), settings.gaussians, 1.0)
+    return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
+
+
+def cars() -> list[ActorTrack]:
+    """Two that cross what the cameras of `recorded_views` see; the second comes when half of them have looked."""
+    early, late = 0.5 * np.arange(5), 1.0 + 0.5 * np.arange(3)
+    size = (1.6, 0.8, 0.8)
+    return [
+        track_of(motion_through(early, [[t - 1.5, 0.3, 4.0] for t in early], 0.3 * early), "early", size),
+        track_of(motion_through(late, [[2.0 - t, -0.6, 4.5] for t in late], -0.4 * late), "late", size),
+    ]
+
+
+def untrained_street(settings: TrainSettings) -> SplatModel:
+    """Background, two cars and a sky."""
+    still = untrained(settings, sky=True)
+    return SplatModel([*still.parts, actors_of(*cars(), count=25, settings=settings.actors, shaken=False)], still.sky)
+
+
+def guided_views(device: torch.device = CPU) -> list[TrainingView]:
+    """Recorded views of which all is known that a training can be told."""
+    views = []
+    for view in recorded_views(device=device):
+        rows = torch.arange(HEIGHT, device=device)[:, None].expand(HEIGHT, WIDTH)
+        lidar = LidarDepth(torch.arange(200, 400).to(device), torch.linspace(3.0, 6.0, 200).to(device))
+        views.append(dataclasses.replace(view, sky=rows < 5, moving=(rows > 8) & (rows < 15), lidar=lidar))
+    return views
+
+
+ALL_TERMS = {"sky_bce_weight": 0.05, "depth_weight": 0.01, "entropy_weight": 0.1, "dynamic_weight": 0.1}
+
+
+def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:
+    """A training of 60 iterations in which everything happens that happens in one of 30,000."""
+    common = {
+        "iterations": ITERATIONS, "strategy": strategy, "cap_max": 200, "checkpoint_every": CHECKPOINT_AT,
+        "checkpoint_apart_s": 0.0, "log_every": 10, "image_every": 30,
+        "gaussians": GaussianSettings(sh_degree=1, lr_means=2e-3, lr_sh0=2e-2, lr_scales=1e-2),
+        "mcmc": McmcSettings(refine_every=5, noise_lr=1e3),
+        "default": DefaultSettings(refine_every=5, grow_grad2d=5e-3),
+        "floaters": FloaterSettings(every=7),
+    }  # fmt: skip
+    return TrainSettings(**{**common, **changes})
+
+
+def workspace_of(folder: Path, fingerprint: str) -> Workspace:
+    return Workspace(folder / "resume", folder / "tensorboard", fingerprint, "train")
+
+
+def trained(
+    folder: Path,
+    settings: TrainSettings,
+    views: list | None = None,
+    seed: int = 0,
+    device: torch.device = CPU,
+    model: SplatModel | None = None,
+    fingerprint: str = "of this training",
+) -> tuple[SplatModel, TrainingSummary]:
+    """The model after `train`, and its summary."""
+    model = untrained(settings) if model is None else model
+    views = recorded_views(device=device) if views is None else views
+    return model, train(model, views, settings, seed, device, workspace_of(folder, fingerprint))
+
+
+@torch.no_grad()
+def mean_psnr(model: SplatModel, views: list[TrainingView]) -> float:
+    errors = [float((model.render(v.view, 1).image.clamp(0, 1) - v.target()).square().mean()) for v in views]
+    return float(np.mean([-10.0 * math.log10(error) for error in errors]))
+
+
+class EndedError(Exception):
+    """Stands for whatever ends a training that could have gone on."""
+
+
+class EndingViews(list):
+    """Training images of which the `at`-th look ends the training."""
+
+    def __init__(self, views: list[TrainingView], at: int, kill: bool = False):
+        super().__init__(views)
+        self._looks_left, self._kill = at, kill
+
+    def __getitem__(self, index: int) -> TrainingView:
+        self._looks_left -= 1
+        if self._looks_left < 0 and self._kill:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self._looks_left < 0:
+            raise EndedError
+        return super().__getitem__(index)
+
+
+def in_subprocess(function: Callable[..., None], *arguments: str) -> subprocess.Popen:
+    """A process that calls a function of a test module."""
+    module = Path(sys.modules[function.__module__].__file__)
+    paths = [str(REPOSITORY), str(REPOSITORY / "tests"), str(module.parent)]
+    script = (
+        f"import sys; sys.path[:0] = {paths}; import {function.__module__} as m; m.{function.__name__}(*{arguments})"
+    )
+    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def same_parameters(a: SplatModel, b: SplatModel) -> bool:
+    first, second = a.state_dict(), b.state_dict()
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+def parser_record(folder: Path, views: list[TrainingView]) -> dict[str, Any]:
+    """What the stage `parser` would say of recorded views; the third is held out."""
+    n = len(views)
+    paths = [str(folder / f"{i}.png") for i in range(n)]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, view in zip(paths, views, strict=True):
+        Image.fromarray(view.pixels.numpy()).save(path)
+    points, colors = seed_points()
+    return {
+        "Ks": np.stack([v.view.K.double().numpy() for v in views]),
+        "camtoworlds": np.stack([v.view.camera_to_world.double().numpy() for v in views]),
+        "ego_to_world": np.stack([v.view.camera_to_world.double().numpy() for v in views]),
+        "image_paths": paths,
+        "image_sizes": np.array([[WIDTH, HEIGHT]] * n, dtype=np.int64),
+        "camera_names": ["CAM_FRONT"],
+        "camera_indices": np.zeros(n, dtype=np.int64),
+        "timestamps": 1_532_402_927_000_000 + 500_000 * np.arange(n),
+        "points": points.astype(np.float32),
+        "points_rgb": (colors * 255).astype(np.uint8),
+        "scene_scale": 1.0,
+        "splits": {"train": np.array([i for i in range(n) if i != 2]), "interpolation": np.array([2])},
+    }  # fmt: skip
+
+
+PROVENANCE = {"settings_sha256": "a", "code_sha256": "b", "inputs_sha256": "c", "stages": {}, "inputs": {}}
+
+
+def job_of(parts: tuple[PartName, ...] = ("background",), sky: SkyKind = "none", **changes: Any) -> TrainJob:
+    settings = settings_of(**{"iterations": 20, "checkpoint_every": 10, "pixels_per_gaussian": 0, **changes})
+    return TrainJob(parts=parts, sky=sky, train=settings, random_seed=3)
+
+
+def files_in(folder: Path) -> TrainingFiles:
+    return TrainingFiles(folder / "checkpoint.pt", folder / "train.json")
+
+
+def inputs_in(folder: Path, actors: bool = False) -> TrainingInputs:
+    """Recorded views; with `actors` also two cars, the lower half of each image marked as them, and depths."""
+    record = parser_record(folder / "images", recorded_views())
+    if not actors:
+        return TrainingInputs(record, folder / "masks", [], [])
+    for i, time in enumerate(record["timestamps"]):
+        labels = np.full((HEIGHT, WIDTH), LABELS["static"], np.uint8)
+        labels[HEIGHT // 2 :, : WIDTH // 2], labels[HEIGHT // 2 :, WIDTH // 2 :] = LABELS["moving_car"], 8
+        for kind, mask in (("regions", labels), ("sky", np.eye(HEIGHT, WIDTH, i, dtype=np.uint8) * 255)):
+            path = folder / "masks" / mask_name(kind, "CAM_FRONT", int(time))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(mask).save(path)
+    depth = {"rows": np.arange(9, dtype=np.int32), "columns": np.arange(9, dtype=np.int32), "depth": np.full(9, 4.0)}
+    records = [actor_record(track, 25, seed) for seed, track in enumerate(cars())]
+    return TrainingInputs(record, folder / "masks", records, [depth] * 5)

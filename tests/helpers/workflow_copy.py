@@ -1,0 +1,153 @@
+"""A copy of the workflow in a folder of its own, run as users run it: as a subprocess, with a config file."""
+
+import compileall
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from helpers import REPOSITORY
+from helpers.forked_snakemake import run_snakemake
+from helpers.tiny_world import World, write_world
+
+PARTS = (
+    "Snakefile",
+    "benchmarks",
+    "config.yaml",
+    "config.schema.json",
+    "drivesplat",
+    "envs",
+    "presets",
+    "profiles",
+    "report",
+    "rules",
+    "workflow_scripts",
+)
+TINY_TRAINING = {
+    "iterations": 60,
+    "log_every": 10,
+    "checkpoint_every": 20,
+    "checkpoint_apart_s": 0.0,
+    "image_every": 30,
+    "gaussians": {"sh_degree": 1},
+    "sky_resolution": 8,
+}
+
+
+_COSTS = re.compile(r"drivesplat: (\d+ jobs?, about |\d+ % of the work, |what was finished, )")
+
+
+def complaints(output: str) -> set[str]:
+    """The workflow's own lines in a run's output, but for those that say what it costs, how far it is, and where the
+    report of what was finished lies."""
+    return {line for line in output.splitlines() if line.startswith("drivesplat: ") and not _COSTS.match(line)}
+
+
+@dataclass
+class WorkflowCopy:
+    """The workflow at `folder`, with `config` in its mine.yaml."""
+
+    folder: Path
+    config: dict[str, Any]
+
+    @classmethod
+    def make(cls, folder: Path, world: World | None = None, **config: Any) -> "WorkflowCopy":
+        """Copies the workflow and writes a tiny world beside it; `config` is laid over the tests' settings. The methods
+        that it names are all there are."""
+        folder.mkdir(parents=True, exist_ok=True)
+        _compiled()
+        for part in PARTS:
+            source = REPOSITORY / part
+            ignore = shutil.ignore_patterns("kernels-*", "*.opt-jaxtyping*.pyc")
+            shutil.copytree(source, folder / part, ignore=ignore) if source.is_dir() else shutil.copy2(
+                source, folder / part
+            )
+        if "methods" in config:
+            _drop(folder / "config.yaml", "methods")  # what is laid over that file can only add to them
+        world = world or World()
+        write_world(folder / "data", world)
+        base = {
+            "datasets": {"nuscenes": {"dataroot": "data", "scenes": list(world.scenes)}},
+            "refine_poses": {"enabled": False},
+            "lidar_seed": {"max_points": 500, "far_points": 100},
+            "train": TINY_TRAINING,
+            "render": {"width": 64, "height": 36, "fps": 4},
+            "lpips": {"enabled": False},
+            "device": "cpu",
+        }
+        copy = cls(folder, {**base, **config})
+        copy.write_config()
+        return copy
+
+    def again(self, folder: Path) -> "WorkflowCopy":
+        """Another copy, with all that this one has made by now."""
+        return WorkflowCopy(Path(shutil.copytree(self.folder, folder, symlinks=True)), dict(self.config))
+
+    def write_config(self, text: str | None = None) -> None:
+        (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))
+
+    def command(self, *arguments: str) -> list[str]:
+        return [sys.executable, "-m", "snakemake", *self._told(*arguments)]
+
+    def _told(self, *arguments: str) -> list[str]:
+        """What Snakemake is told."""
+        return ["--configfile", "mine.yaml", *arguments]
+
+    def run(
+        self,
+        *targets: str,
+        cores: int = 2,
+        flags: tuple[str, ...] = (),
+        cards: str = "",
+        under: tuple[str, ...] = (),
+        timeout: float = 600,
+    ) -> subprocess.CompletedProcess:
+        """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `cards`, by the program
+        `under` where one is given; the result holds its output (both streams) as `stdout`."""
+        arguments = ("--cores", str(cores), *flags, "--", *targets)
+        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": cards}
+        if not under:
+            return run_snakemake(self._told(*arguments), self.folder, environment, timeout)
+        return subprocess.run(
+            [*under, *self.command(*arguments)],
+            cwd=self.folder,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=timeout,
+        )
+
+    def planned(self, *targets: str) -> dict[str, int]:
+        """How many jobs of each rule `snakemake -n` plans; raises where planning fails."""
+        done = self.run(*targets, flags=("-n",))
+        if done.returncode:
+            raise AssertionError(done.stdout)
+        table = done.stdout.rpartition("Job stats:")[2].partition("total")[0]
+        return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", table, re.M) if name != "all"}
+
+    def read(self, path: str) -> Any:
+        return json.loads((self.folder / path).read_text())
+
+
+@cache
+def _compiled() -> None:
+    """Compiles the library once, for every copy: what is compiled goes along, and is valid where its source is as old.
+    Otherwise each copy's first call, and its first job, would compile a hundred modules of their own."""
+    if not sys.dont_write_bytecode:
+        compileall.compile_dir(REPOSITORY / "drivesplat", quiet=2)
+
+
+def _drop(config: Path, key: str) -> None:
+    """Takes a key out of a YAML file."""
+    content = yaml.safe_load(config.read_text())
+    del content[key]
+    config.write_text(yaml.safe_dump(content, sort_keys=False))

@@ -1,0 +1,146 @@
+"""What moves in a drive, as a table and as pictures with labels."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.hand_made import recording_of
+from matplotlib.figure import Figure
+
+from drivesplat.errors import ResultError
+from drivesplat.inspection.track_table import (
+    MOST_PICTURES,
+    draw_tracks,
+    fewest_that_show_all,
+    sightings_of,
+    track_rows,
+    write_tracks,
+)
+from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.tracks import SHORT, beginnings
+
+
+@pytest.fixture(scope="module")
+def recording(tiny_scene) -> Recording:
+    return recording_of(tiny_scene)
+
+
+def rows_of(recording: Recording) -> list:
+    return track_rows(recording, sightings_of(recording, "CAM_FRONT"))
+
+
+def drawn(recording: Recording) -> Figure:
+    sightings = sightings_of(recording, "CAM_FRONT")
+    return draw_tracks(recording, sightings, track_rows(recording, sightings), "CAM_FRONT")
+
+
+def texts(figure: Figure) -> list[str]:
+    return [text.get_text() for axis in figure.axes for text in axis.texts]
+
+
+def test_everything_that_can_move_is_a_row_and_movers_come_first(recording):
+    """The tiny street: a car at 4.2 m/s, a walker at 1.2 m/s, a parked truck; a cone cannot move."""
+    rows = rows_of(recording)
+    assert {row.category for row in rows[:2]} == {"vehicle.car", "human.pedestrian.adult"}
+    assert [row.category for row in rows[2:]] == ["vehicle.truck"]
+    by_class = {row.category: row for row in rows}
+    assert [row.moves for row in rows] == [True, True, False]
+    assert by_class["vehicle.car"].speed_mean == pytest.approx(4.2, abs=0.01)
+    assert by_class["human.pedestrian.adult"].speed_max == pytest.approx(1.2, abs=0.01)
+    truck = by_class["vehicle.truck"]
+    assert (truck.length, truck.width, truck.height, truck.speed_max) == (6.0, 2.4, 2.6, 0.0)
+
+
+def test_times_are_those_of_the_annotations_and_of_the_images_that_show_it(recording, tiny_scene):
+    car = next(row for row in rows_of(recording) if row.category == "vehicle.car")
+    track = next(track for track in tiny_scene.tracks if track.id == car.id)
+    assert car.seconds == pytest.approx((track.timestamps[-1] - track.timestamps[0]) * 1e-6)
+    sightings = sightings_of(recording, "CAM_FRONT")
+    showing = sum(any(s.box.track_id == car.id for s in seen) for seen in sightings.values())
+    assert showing == len(track.timestamps) and car.seconds_visible == car.seconds, "in all of it"
+    pixels = {
+        recording.frame(i).sample_index: s.pixels for i, seen in sightings.items() for s in seen
+        if s.box.track_id == car.id
+    }  # fmt: skip
+    assert car.pixels == max(pixels.values()) == pixels[car.key_frame]
+
+
+def test_what_is_never_seen_has_a_row_without_a_key_frame(tiny_scene):
+    behind = [
+        dataclasses.replace(track, object_to_world=_moved(track, [-500.0, 0.0, 0.0])) for track in tiny_scene.tracks
+    ]
+    rows = rows_of(recording_of(dataclasses.replace(tiny_scene, tracks=tuple(behind))))
+    assert rows and all((row.key_frame, row.pixels, row.seconds_visible) == (None, 0, 0.0) for row in rows)
+
+
+def _moved(track, by) -> np.ndarray:
+    poses = track.object_to_world.copy()
+    poses[:, :3, 3] += by
+    return poses
+
+
+def test_the_table_reads_back(recording, tmp_path):
+    rows = rows_of(recording)
+    write_tracks(tmp_path / "tracks.csv", rows)
+    with open(tmp_path / "tracks.csv", encoding="utf-8") as file:
+        read = list(csv.DictReader(file))
+    assert [row["id"] for row in read] == [row.id for row in rows]
+    assert [float(row["speed_max"]) for row in read] == [row.speed_max for row in rows]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultError, match=r"file/tracks\.csv"):
+        write_tracks(tmp_path / "file" / "tracks.csv", rows)
+
+
+def test_every_mover_is_labelled_and_what_stands_is_not(recording):
+    rows = rows_of(recording)
+    found = set(texts(drawn(recording)))
+    movers = [row.id for row in rows if row.moves and row.pixels >= 100]
+    assert len(movers) == len(found) == 2
+    assert all(any(name.startswith(label) for name in movers) for label in found)
+
+
+@pytest.mark.parametrize(
+    ("ids", "length"),
+    [
+        ([], 0),
+        (["a" * 32], SHORT),
+        (["12345678aa", "12345678ab"], 10),
+        (["0123456789", "9123456789"], SHORT),
+        (["a"], 1),
+    ],
+)
+def test_labels_are_short_and_tell_all_apart(ids, length):
+    names = beginnings(ids)
+    assert list(names) == ids and len(set(names.values())) == len(ids)
+    assert all(name == names[name] or name.startswith(names[name]) for name in ids)
+    assert {len(name) for name in names.values()} <= {length}
+
+
+def test_where_nothing_moves_the_picture_says_so(tiny_scene):
+    figure = drawn(recording_of(standing(tiny_scene)))
+    assert "nothing moves" in figure.get_suptitle() and texts(figure) == [] and len(figure.axes) == 1
+
+
+def standing(scene: Scene) -> Scene:
+    tracks = (
+        dataclasses.replace(track, object_to_world=np.repeat(track.object_to_world[:1], len(track.timestamps), axis=0))
+        for track in scene.tracks
+    )
+    return dataclasses.replace(scene, tracks=tuple(tracks))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "expected"),
+    [
+        ({}, []),
+        ({4: {}}, []),
+        ({0: {"a": 5}, 1: {"a": 9}}, [1]),
+        ({0: {"a": 5, "b": 5}, 1: {"a": 900}}, [0]),
+        ({0: {"a": 1}, 1: {"b": 1}, 2: {"a": 1, "c": 1}}, [1, 2]),
+        ({i: {str(i): 1} for i in range(9)}, list(range(MOST_PICTURES))),
+    ],
+)
+def test_few_images_show_all(pixels, expected):
+    assert fewest_that_show_all(pixels) == expected

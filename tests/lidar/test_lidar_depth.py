@@ -1,0 +1,368 @@
+"""The depth that LiDAR gives training images: against the depth that rays cast at each image's own moment find."""
+
+import dataclasses
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, Speeding, drive, scene_at, seconds_of, shows, true_depths
+from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
+from PIL import Image
+
+from drivesplat.errors import ResultError
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.lidar.movers import Mover, movers
+from drivesplat.lidar.occlusion import patches, unhidden
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.lidar_depth import Depths, lidar_depths, taken_apart
+from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
+from drivesplat.scene.truth import read_truth
+from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
+
+CAR, TRUCK = World().things[:2]
+AHEAD = Thing("vehicle.truck", (4.0, 2.0, 2.6), (8.5, 0.0, 1.3), (4.2, 0.0))
+"""Its rear is 4.8 m before the camera at first. So tall that LiDAR does not see its roof, as the camera does not."""
+SPEEDING = Speeding("vehicle.truck", (4.0, 2.0, 2.6), (9.0, 0.5, 1.3), (1.0, 0.0), gain=(3.0, 0.0))
+CROSSING = Thing("vehicle.truck", (4.0, 2.0, 2.6), (24.0, -9.0, 1.3), (0.0, 4.0), heading=np.pi / 2)
+"""It crosses the road before the own car, from the right to the left."""
+
+
+TINY_SPACING = (1.5, 1.65)
+"""Degrees between the tiny world's LiDAR rays."""
+
+
+def job(
+    holdout=HELD_OUT, width=None, radius=2.5, margin=0.1, spacing: tuple[float, float] = TINY_SPACING
+) -> LidarDepthJob:
+    return LidarDepthJob.model_validate(
+        {
+            "ray_spacing": spacing,
+            "holdout": holdout,
+            "images": {"width": width},
+            "own_car_radius": radius,
+            "box_margin": margin,
+        }
+    )
+
+
+@pytest.fixture
+def root(tiny_root, tmp_path) -> Path:
+    """A copy of the tiny drive that a test may damage."""
+    return Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+
+
+def lost(root: Path, *key_frames: int) -> Scene:
+    """The tiny drive without the LiDAR files of some key frames."""
+    scene = scene_at(root)
+    for index in key_frames:
+        (root / f"samples/LIDAR_TOP/0001__{index:04}.pcd.bin").unlink()
+    return scene
+
+
+def of(image: Depths, values: np.ndarray) -> np.ndarray:
+    """The values (m, ...) that an array (h, w, ...) has at an image's pixels."""
+    return values[image["rows"], image["columns"]]
+
+
+def fits(world: World, frame, image: Depths, within: float = 0.02) -> np.ndarray:
+    """Which depths (m,) are those of a surface that their pixel shows somewhere at the image's own moment."""
+    truth = of(image, true_depths(world, frame, subpixels=7))
+    return (image["depth"] > truth.min(axis=1) - within) & (image["depth"] < truth.max(axis=1) + within)
+
+
+@pytest.mark.parametrize("things", [World().things, [CROSSING], [SPEEDING]], ids=["street", "crossing", "speeding"])
+def test_depths_are_those_of_what_is_seen_at_the_images_own_moment(tmp_path, things):
+    """Images are taken up to a quarter of a second after the sweep: what moves has gone on by a metre. LiDAR and camera
+    stand apart: some returns lie behind what LiDAR looks past."""
+    world, scene = World(things=things), drive(tmp_path, *things)
+    images = lidar_depths(scene, job(NOTHING_HELD_OUT))
+    fitting = [fits(world, frame, image) for frame, image in zip(scene.frames, images, strict=True)]
+    assert min(map(len, fitting)) > 150, "a return for every thirtieth pixel"
+    assert np.concatenate(fitting).mean() > 0.96
+
+
+@pytest.mark.parametrize("mover", [CROSSING, SPEEDING], ids=["crossing", "speeding"])
+def test_what_moves_is_where_it_is_in_the_image(tmp_path, mover):
+    """In its pixels every depth is its own, within a centimetre, but for a return from the road before it; also where
+    it gains speed: straight lines between annotations would be off by 9 cm. The first and last second are left out: a
+    spline that starts straight does not know the acceleration there."""
+    world, scene = World(things=[mover]), drive(tmp_path, mover)
+    images = lidar_depths(scene, job(NOTHING_HELD_OUT))
+    fitting = [
+        fits(world, frame, image, within=0.01)[of(image, shows(world, frame, mover))]
+        for frame, image in list(zip(scene.frames, images, strict=True))[4:-4]
+    ]
+    assert min(map(len, fitting)) > 30 and np.concatenate(fitting).mean() > 0.99
+
+
+def test_the_rear_of_what_drives_ahead_is_as_far_away_as_its_speed_says(tmp_path):
+    """4.8 m at first, and 0.2 m/s farther; from sweeps that saw it up to 0.9 m further back."""
+    world, scene = World(things=[AHEAD]), drive(tmp_path, AHEAD)
+    for frame, image in zip(scene.frames, lidar_depths(scene, job(NOTHING_HELD_OUT)), strict=True):
+        own = of(image, shows(world, frame, AHEAD))
+        assert own.sum() > 80
+        off = image["depth"][own] - (4.8 + 0.2 * seconds_of(frame.timestamp))
+        assert (np.abs(off) < 1e-3).mean() > 0.95, "but for the road before it"
+
+
+def test_a_return_is_in_the_pixel_and_at_the_depth_that_geometry_says(tiny_scene):
+    """Of what stands still, 35 ms before the sweep."""
+    image = lidar_depths(tiny_scene, job())[0]
+    points = cast_lidar(World(), 0.0)[:, :3].astype(float) + LIDAR_AT
+    away = points - World().ego_at(-0.035) - CAMERA_AT
+    pixels = np.stack([-away[:, 1], -away[:, 2], away[:, 0]], axis=1) @ World().intrinsics.T
+    known = np.column_stack([np.floor(pixels[:, 1::-1] / pixels[:, 2:] + 0.5), away[:, 0]])
+    on_truck = of(image, shows(World(), tiny_scene.frames[0], TRUCK))
+    found = np.stack([image["rows"], image["columns"], image["depth"]], axis=1)[on_truck]
+    assert len(found) > 20
+    off = np.abs(found[:, None] - known).max(axis=2).min(axis=1)
+    assert (off < 1e-3).mean() > 0.9, "but for those on the edge of two pixels"
+
+
+HEDGE = Thing("movable_object.barrier", (0.5, 8.0, 1.6), (6.0, 0.0, 0.8))
+HOUSE = Thing("static_object.bicycle_rack", (2.0, 30.0, 4.0), (25.0, 0.0, 2.0))
+"""LiDAR, 30 cm above the camera, looks over the hedge at windows of the house that the camera does not see."""
+
+
+def test_what_lidar_sees_over_a_hedge_is_not_what_the_image_shows(tmp_path):
+    """Rays are ten and more pixels apart: between two returns from the hedge there is room for one from the house."""
+    size = {"key_frames": 2, "sweeps_between": 0, "width": 480, "height": 270}
+    world, scene = World(things=[HEDGE, HOUSE], **size), drive(tmp_path, HEDGE, HOUSE, **size)
+    truth, wrong = true_depths(world, scene.frames[0])[..., 0], {}
+    for spacing in ((0.0, 0.0), TINY_SPACING):
+        image = lidar_depths(scene, job(NOTHING_HELD_OUT, spacing=spacing))[0]
+        true = of(image, truth)
+        wrong[spacing] = ((true < 10.0) & (image["depth"] > 20.0)).sum()
+    assert wrong[0.0, 0.0] > 50 and wrong[TINY_SPACING] < 0.1 * wrong[0.0, 0.0]
+    assert ((true > 20.0) & (np.abs(image["depth"] - true) < 1.0)).sum() > 70, "the house over the hedge is seen"
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "depth", "seen"),
+    [(50, 60, 12.0, False), (45, 60, 12.0, False), (44, 60, 12.0, True), (50, 53, 12.0, False), (50, 52, 12.0, True),
+     (50, 60, 10.9, True), (50, 60, 9.0, True), (0, 0, 12.0, True)],
+)  # fmt: skip
+def test_a_return_hides_what_lies_clearly_behind_it_in_its_window(row, column, depth, seen):
+    """One at 10 metres, 15 pixels wide and 11 high about (50, 60); clearly: by a twentieth and half a metre."""
+    rows, columns, depths = np.array([50, row]), np.array([60, column]), np.array([10.0, depth])
+    halves = np.array([[7.2, 4.8], [0.0, 0.0]])
+    assert unhidden(rows, columns, depths, halves, (100, 100))[1] == seen
+
+
+def test_windows_grow_with_nearness():
+    """Ten metres from LiDAR rays of a degree are 17 cm apart: at nine metres before a camera of 900 pixels' focal
+    length 17 pixels, at 4.5 metres 35."""
+    intrinsics = np.array([[900.0, 0.0, 400.0], [0.0, 1800.0, 300.0], [0.0, 0.0, 1.0]])
+    found = patches(np.array([10.0, 10.0, 5.0]), np.array([9.0, 4.5, 4.5]), intrinsics, (1.0, 0.5))
+    np.testing.assert_allclose(found, np.array([[17.45, 17.45], [34.9, 34.9], [17.45, 17.45]]) / 2, rtol=1e-3)
+
+
+def test_each_pixel_has_one_depth_and_each_frame_its_place(tiny_scene):
+    images = lidar_depths(tiny_scene, job())
+    groups = frame_groups(tiny_scene, job().holdout)
+    assert len(images) == len(tiny_scene.frames)
+    for image, group in zip(images, groups, strict=True):
+        assert [image[key].dtype for key in ("rows", "columns", "depth")] == [np.int32, np.int32, np.float32]
+        assert len(image["rows"]) == len(image["columns"]) == len(image["depth"])
+        assert (len(image["depth"]) > 100) == (group == "train")
+        places = image["rows"].astype(int) * 96 + image["columns"]
+        assert len(np.unique(places)) == len(places)
+        assert ((image["rows"] >= 0) & (image["rows"] < 54) & (image["columns"] >= 0) & (image["columns"] < 96)).all()
+
+
+def test_of_two_returns_in_a_pixel_the_nearer_counts(tmp_path):
+    """A tenth as wide, a pixel has the least depth of the finer pixels in it, or less."""
+    scene = drive(tmp_path, TRUCK)
+    fine, coarse = (lidar_depths(scene, job(width=width))[0] for width in (480, 48))
+    least: dict[tuple, float] = {}
+    for r, c, d in zip(fine["rows"] // 10, fine["columns"] // 10, fine["depth"], strict=True):
+        least[r, c] = min(d, least.get((r, c), np.inf))
+    shared = [(d, least[r, c]) for r, c, d in zip(*coarse.values(), strict=True) if (r, c) in least]
+    assert len(shared) > 100 and len(fine["depth"]) > 1.5 * len(shared)
+    assert all(d <= expected + 1e-6 for d, expected in shared)
+
+
+@pytest.mark.parametrize("width", [48, 192])
+def test_pixels_are_those_of_the_size_at_which_images_are_trained(tiny_scene, width):
+    world = World(width=width, height=width * 54 // 96)
+    (image, *_) = lidar_depths(tiny_scene, job(width=width))
+    assert image["columns"].max() > 0.9 * width and image["columns"].max() < width
+    assert fits(world, tiny_scene.frames[0], image, within=0.05).mean() > 0.95
+
+
+def test_an_image_gets_the_training_sweep_nearest_in_time_within_a_key_frames_interval(root):
+    """Sweeps 2, 6, 8 and 9 are held out; then 0, 1 and 3 are lost as well. An image at a key frame is taken 35 ms
+    before its sweep, and so 465 ms after the one before; the next sweep but one is more than half a second away."""
+    scene = scene_at(root)
+    whole = lidar_depths(scene, job())
+    images = lidar_depths(lost(root, 0, 1, 3), job())
+    groups = frame_groups(scene, job().holdout)
+    kinds = []
+    for frame, group, image, before in zip(scene.frames, groups, images, whole, strict=True):
+        away = {sweep: abs(0.5 * sweep - seconds_of(frame.timestamp)) for sweep in (0, 1, 3, 4, 5, 7)}
+        near = [sweep for sweep in (4, 5, 7) if away[sweep] < 0.5] if group == "train" else []
+        assert (len(image["depth"]) > 0) == bool(near)
+        if near:
+            same = all(np.array_equal(image[key], before[key]) for key in before)
+            assert same == (min(away, key=away.get) in near)
+            kinds.append(same)
+    assert kinds.count(True) >= 6 and kinds.count(False) == 1, "at 1.715 s the next sweep stands in for the last"
+
+
+def test_held_out_sweeps_and_images_contribute_nothing(root):
+    scene = lost(root, 1, 7)
+    before = lidar_depths(scene, job())
+    random = np.random.default_rng(0)
+    for frame, group in zip(scene.frames, frame_groups(scene, job().holdout), strict=True):
+        if group != "train":
+            Image.new("RGB", (96, 54), (255, 0, 255)).save(frame.image_path)
+    for sweep, group in zip(scene.sweeps, sweep_groups(scene, job().holdout), strict=True):
+        if group != "train":
+            random.uniform(-30.0, 30.0, (5000, 5)).astype(np.float32).tofile(sweep.path)
+    assert pickle.dumps(lidar_depths(scene_at(root), job())) == pickle.dumps(before)
+    Path(scene.sweeps[0].path).write_bytes(Path(scene.sweeps[4].path).read_bytes())
+    assert pickle.dumps(lidar_depths(scene_at(root), job())) != pickle.dumps(before), "training sweeps do contribute"
+
+
+def test_what_is_absent_in_the_image_takes_its_returns_along(root):
+    """The car is annotated up to key frame 3 and so there until 1.75 s; the image at 1.965 s sees the sweep of 1.5 s,
+    since that of its own key frame is lost. Nobody knows where the car is by then."""
+    scene = lost(root, 4)
+    ending = [
+        dataclasses.replace(
+            track, timestamps=track.timestamps[:4], sample_indices=track.sample_indices[:4],
+            object_to_world=track.object_to_world[:4], visibility=track.visibility[:4],
+        )
+        if track.category == "vehicle.car" else track
+        for track in scene.tracks
+    ]  # fmt: skip
+    number = next(i for i, frame in enumerate(scene.frames) if frame.is_key_frame and frame.sample_index == 4)
+    for tracks, carried in ((scene.tracks, True), (tuple(ending), False)):
+        image = lidar_depths(dataclasses.replace(scene, tracks=tracks), job())[number]
+        own = of(image, shows(World(), scene.frames[number], CAR))
+        on_car = own & fits(World(things=[CAR]), scene.frames[number], image)
+        assert (on_car.sum() > 10) == carried
+
+
+def test_returns_of_the_own_car_are_left_out(tiny_scene):
+    """The LiDAR is 0.8 m behind the camera and 0.3 m above it."""
+    image = lidar_depths(tiny_scene, job(radius=8.0))[0]
+    places = np.stack([image["columns"], image["rows"], np.ones(len(image["rows"]))], axis=1)
+    rays = places @ np.linalg.inv(World().intrinsics).T
+    points = rays * image["depth"][:, None]
+    from_lidar = np.hypot(points[:, 0], points[:, 2] + 0.8)
+    assert len(points) > 100 and from_lidar.min() > 7.7
+    assert lidar_depths(tiny_scene, job())[0]["depth"].min() < 6.0
+
+
+def test_pixels_of_the_own_cars_body_have_no_depth(tiny_scene):
+    outline = ((0.0, 0.5), (0.5, 0.5), (0.5, 1.0), (0.0, 1.0))
+    whole, cut = (lidar_depths(tiny_scene, job(), OwnCar(seen))[0] for seen in ({}, {"CAM_FRONT": (outline,)}))
+    body = [(image["rows"] >= 27) & (image["columns"] <= 48) for image in (whole, cut)]
+    assert body[0].sum() > 50 and body[1].sum() == 0
+    for key in whole:
+        np.testing.assert_array_equal(whole[key][~body[0]], cut[key])
+
+
+def one_mover(tiny_scene: Scene) -> Mover:
+    (mover,) = [mover for mover in movers(tiny_scene) if mover.track.category == "vehicle.car"]
+    return mover
+
+
+def test_returns_under_a_moving_box_are_neither_its_own_nor_still(tiny_scene):
+    """The car's centre is at x = 8.5 m when its first key frame is taken, 35 ms after the first image; its box is 4 m
+    long, 2 m wide, 1.6 m high, and stands on the road."""
+    heights = np.array([-0.3, -0.15, 0.0, 0.05, 0.15, 0.8, 1.65, 1.75])
+    under = np.stack([np.full(8, 8.5), np.full(8, 0.3), heights], axis=1)
+    beside = np.array([[8.5, 1.05, 0.5], [8.5, 1.15, 0.5], [6.45, 0.0, 0.5], [6.35, 0.0, 0.5]])
+    cloud = taken_apart(tiny_scene.sweeps[0], np.concatenate([under, beside]), 0.035, [one_mover(tiny_scene)], 0.1)
+    np.testing.assert_allclose(cloud.still, [*under[[0, 1, 7]], *beside[[1, 3]]])
+    ((_, own),) = cloud.moving
+    np.testing.assert_allclose(own, np.array([*under[4:7], *beside[[0, 2]]]) - [8.5, 0.0, 0.8], atol=1e-6)
+
+
+def test_people_are_carried_along_and_what_never_moves_is_still(tiny_scene):
+    assert {mover.track.category for mover in movers(tiny_scene)} == {"vehicle.car", "human.pedestrian.adult"}
+
+
+def test_a_drive_without_lidar_has_no_depths_and_a_record_of_them(root, tmp_path):
+    shutil.rmtree(root / "samples" / "LIDAR_TOP")
+    scene = scene_at(root)
+    write_plain_pickle(tmp_path / "lidar_depth.pkl", {"images": lidar_depths(scene, job()), "provenance": {}})
+    images = read_lidar_depth(tmp_path / "lidar_depth.pkl")["images"]
+    assert len(images) == len(scene.frames) and not any(len(image["depth"]) for image in images)
+
+
+def test_the_record_reads_as_it_was_written(tiny_scene, tmp_path):
+    record = {"images": lidar_depths(tiny_scene, job()), "provenance": {"stages": {}}}
+    write_plain_pickle(tmp_path / "lidar_depth.pkl", record)
+    assert pickle.dumps(read_lidar_depth(tmp_path / "lidar_depth.pkl")) == pickle.dumps(record)
+    assert pickle.dumps(lidar_depths(tiny_scene, job())) == pickle.dumps(record["images"])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [None, b"", b"text", [], {}, {"images": []},
+     *({"images": images, "provenance": {}} for images in (None, ["x"], [{"rows": 1}]))],
+    ids=str,
+)  # fmt: skip
+def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
+    path = tmp_path / "lidar_depth.pkl"
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else pickle.dumps(content))
+    with pytest.raises(ResultError, match=r"lidar_depth\.pkl: .*the rule 'lidar_depth' rebuilds it"):
+        read_lidar_depth(path)
+
+
+def demo_scene(root: Path) -> Scene:
+    source = SceneSource(
+        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None, cameras=("CAM_FRONT",),
+        sweeps=False, on_missing="stop",
+    )  # fmt: skip
+    return extract_scene(source, root)
+
+
+def test_on_the_demo_world_depths_agree_with_its_truth(demo_root):
+    """Bodies that are no boxes, noise of 2 cm, LiDAR on the roof: nineteen in twenty are right within 5 % and 0.3 m,
+    and of what moves nearly all."""
+    scene = demo_scene(demo_root)
+    truth = read_truth(demo_root / "truth/truth.json")
+    moving = {mover.track.id for mover in movers(scene)}
+    numbers = [int(number) for number, track in truth.instances.items() if track in moving]
+    errors, allowed, own = [], [], []
+    told = job(NOTHING_HELD_OUT, margin=0.2, spacing=LidarDepthSettings().ray_spacing)
+    for frame, image in zip(scene.frames, lidar_depths(scene, told), strict=True):
+        record = truth.by_image()[frame.token]
+        depth, things = (
+            np.asarray(Image.open(demo_root / "truth" / name)) for name in (record.depth, record.instances)
+        )
+        true = of(image, depth) / 256.0
+        true[true == 0] = 1e3
+        errors.append(np.abs(image["depth"] - true))
+        allowed.append(0.05 * true + 0.3)
+        own.append(np.isin(of(image, things), numbers))
+    right, of_movers = np.concatenate(errors) < np.concatenate(allowed), np.concatenate(own)
+    assert right.mean() > 0.95
+    assert of_movers.sum() > 100 and right[of_movers].mean() > 0.98
+
+
+def test_turned_boxes_carry_their_returns_round(tiny_scene):
+    """A car that turns by 90 degrees a second about itself: a return at its nose goes a quarter round in a second."""
+    car = one_mover(tiny_scene).track
+    angles = np.pi / 4 * np.arange(10)
+    turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
+    poses = np.stack([rigid(turn, np.array([12.0, 1.0 * i, 0.8])) for i, turn in enumerate(turns)])
+    turning = dataclasses.replace(car, object_to_world=poses)
+    (mover,) = movers(dataclasses.replace(tiny_scene, tracks=(turning,)))
+    nose = poses[0, :3, 3] + [1.9, 0.0, 0.0]
+    ((_, own),) = taken_apart(tiny_scene.sweeps[0], nose[None], 0.035, [mover], 0.1).moving
+    np.testing.assert_allclose(own, [[1.9, 0.0, 0.0]], atol=1e-6)
+    later = mover.pose(1.035)
+    np.testing.assert_allclose(later[:3, :3] @ own[0] + later[:3, 3], [12.0, 2.0 + 1.9, 0.8], atol=1e-6)

@@ -1,0 +1,284 @@
+"""What lies between key frames, images at 12 Hz and LiDAR at 10 Hz: what of it is read, what a training may see, and
+that nothing near a held-out key frame reaches anything a training starts from."""
+
+import dataclasses
+import json
+import logging
+import pickle
+import shutil
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.small_drives import scene_at, seconds_of
+from helpers.small_runs import S, settings_of
+from helpers.tiny_world import LIDAR_AT, START_US, World, cast_lidar, write_world
+from PIL import Image
+
+from drivesplat.errors import DatasetError
+from drivesplat.preprocess.actor_seed import actors_record
+from drivesplat.preprocess.ego_mask import own_car_record
+from drivesplat.preprocess.free_space import free_space_record
+from drivesplat.preprocess.lidar_depth import lidar_depths
+from drivesplat.preprocess.lidar_seed import lidar_points, seed_points
+from drivesplat.preprocess.masks import make_masks, read_sky_mask
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
+from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.config import load
+from drivesplat.settings.ego_mask import OwnCarJob
+from drivesplat.settings.free_space import FreeSpaceJob
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.lidar_depth import LidarDepthJob
+from drivesplat.settings.lidar_seed import SeedJob
+from drivesplat.settings.masks import MaskJob
+from drivesplat.settings.parser import ParserJob
+
+HALF_AN_INTERVAL = 250_000
+WORLD = World(key_frames=8, sweeps_between=5, lidar_between=4)
+IMAGES, SWEEPS = 7 * 6 + 1, 7 * 5 + 1
+CAR = WORLD.things[0]
+EVERYTHING = {"lidar_sweeps": True}
+
+
+@pytest.fixture(scope="module")
+def rich_root(tmp_path_factory) -> Path:
+    """A tiny drive with images and LiDAR sweeps between key frames, read only."""
+    return write_world(tmp_path_factory.mktemp("rich"), WORLD)
+
+
+@pytest.fixture
+def root(rich_root, tmp_path) -> Path:
+    """A copy of it that a test may damage."""
+    return Path(shutil.copytree(rich_root, tmp_path / "nuscenes"))
+
+
+def table(root: Path, name: str) -> list[dict]:
+    return json.loads((root / "v1.0-mini" / f"{name}.json").read_text())
+
+
+@pytest.mark.parametrize("frames", [None, (2, 6)])
+@pytest.mark.parametrize("sweeps", [False, True])
+@pytest.mark.parametrize("lidar_sweeps", [False, True])
+def test_images_and_lidar_between_key_frames_are_read_where_asked_for(rich_root, frames, sweeps, lidar_sweeps):
+    scene = scene_at(rich_root, sweeps, lidar_sweeps=lidar_sweeps, frames=frames)
+    first, last = frames or (0, 8)
+    intervals = last - first - 1
+    assert len(scene.frames) == intervals * (6 if sweeps else 1) + 1
+    assert len(scene.sweeps) == intervals * (5 if lidar_sweeps else 1) + 1
+    times = np.array([sweep.timestamp for sweep in scene.sweeps])
+    assert times[0] == START_US + 500_000 * first and times[-1] == START_US + 500_000 * (last - 1)
+    assert set(np.diff(times)) == {100_000 if lidar_sweeps else 500_000}
+    for sweep in scene.sweeps:
+        expected = WORLD.ego_at(seconds_of(sweep.timestamp) - 0.5 * first) + LIDAR_AT
+        np.testing.assert_allclose(sweep.sensor_to_world[:3, 3], expected, atol=1e-6)
+        assert sweep.is_key_frame == ((sweep.timestamp - START_US) % 500_000 == 0) == ("samples" in sweep.path)
+
+
+BOTH_KINDS, IN_A_RANGE = "between and at the end", "in a range"
+HOLDOUTS = {
+    BOTH_KINDS: ({"every_nth": 4, "offset": 2, "last_block": 2}, None, {2, 6, 7}),
+    "the first frame": ({"every_nth": 3, "offset": 0, "last_block": 0}, None, {0, 3, 6}),
+    "the last frame alone": ({"every_nth": 0, "last_block": 1}, None, {7}),
+    IN_A_RANGE: ({"every_nth": 3, "offset": 1, "last_block": 1}, (2, 8), {3, 6, 7}),
+    "at a range's first frame": ({"every_nth": 4, "offset": 0, "last_block": 0}, (3, 7), {3}),
+}
+"""The hold-out, the range of key frames that is read, and the key frames of the dataset held out then."""
+
+
+@pytest.fixture(params=HOLDOUTS.values(), ids=HOLDOUTS.keys())
+def case(request, root) -> tuple[Path, dict, tuple[int, int] | None, set[str]]:
+    """A drive, a hold-out, a range, and the files that then are held out or near what is, told by the tables alone."""
+    holdout, frames, key_frames = request.param
+    samples = sorted(table(root, "sample"), key=lambda sample: sample["timestamp"])
+    near = set()
+    for data in table(root, "sample_data"):
+        for sample in (samples[i] for i in key_frames):
+            own = data["is_key_frame"] and data["sample_token"] == sample["token"]
+            if own or (not data["is_key_frame"] and abs(data["timestamp"] - sample["timestamp"]) < HALF_AN_INTERVAL):
+                near.add(str(root / data["filename"]))
+    return root, holdout, frames, near
+
+
+def spoil(path: str, random: np.random.Generator) -> None:
+    """Makes an image magenta, a sweep garbage."""
+    if path.endswith(".jpg"):
+        Image.new("RGB", (WORLD.width, WORLD.height), (255, 0, 255)).save(path)
+    else:
+        random.uniform(-25.0, 25.0, (4000, 5)).astype(np.float32).tofile(path)
+
+
+def job(stage: str, kind: type[S], holdout: dict) -> S:
+    """The settings that a stage gets of the config, with nothing of what LiDAR gives thinned away."""
+    whole = {"lidar_seed": {"far_points": 200, "voxel_size": 0.0}, "actors": {"min_points": 0}}
+    return settings_of(load({"datasets": {"nuscenes": {"scenes": ["0001"]}}, "holdout": holdout, **whole}), stage, kind)
+
+
+def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
+    """All that a training of the scene starts from, each as bytes."""
+    groups = frame_groups(scene, HoldoutSettings(**holdout))
+    training = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
+    seed = seed_points(scene, job("lidar_seed", SeedJob, holdout))
+    parser = parser_dict(scene, seed, job("parser", ParserJob, holdout))
+    make_masks(scene, job("masks", MaskJob, holdout), folder)
+    found = {
+        "seed": seed,
+        "actors": actors_record(scene, job("actors", ActorSeedJob, holdout)),
+        "lidar_depth": lidar_depths(scene, job("lidar_depth", LidarDepthJob, holdout)),
+        "free_space": free_space_record(scene, job("free_space", FreeSpaceJob, holdout)),
+        "own_car": own_car_record(scene, job("own_car", OwnCarJob, holdout)),
+        "sky": [read_sky_mask(folder, f.camera, f.timestamp, (f.width, f.height)) for f in training],
+        "images": [Path(parser["image_paths"][i]).read_bytes() for i in parser["splits"]["train"]],
+    }
+    return {name: pickle.dumps(value) for name, value in found.items()}
+
+
+def test_nothing_near_a_held_out_key_frame_reaches_a_training(case, tmp_path):
+    root, holdout, frames, near = case
+    before = made(scene_at(root, frames=frames, **EVERYTHING), holdout, tmp_path / "before")
+    random = np.random.default_rng(0)
+    assert {Path(path).parent.parent.name for path in near} == {"samples", "sweeps"}
+    for path in near:
+        spoil(path, random)
+    after = made(scene_at(root, frames=frames, **EVERYTHING), holdout, tmp_path / "after")
+    assert {name for name in before if before[name] != after[name]} == set()
+
+
+@pytest.mark.parametrize("case", [HOLDOUTS[name] for name in (BOTH_KINDS, IN_A_RANGE)], indirect=True)
+def test_what_lies_just_beyond_does(case, tmp_path):
+    """The recordings next to those that are held out or near: each kind reaches what it should."""
+    root, holdout, frames, near = case
+    scene = scene_at(root, frames=frames, **EVERYTHING)
+    before = made(scene, holdout, tmp_path / "before")
+    images, sweeps = [f.image_path for f in scene.frames], [s.path for s in scene.sweeps]
+    random = np.random.default_rng(0)
+    for paths, reached in ((sweeps, {"seed", "lidar_depth", "free_space", "sky"}), (images, {"seed", "images"})):
+        beside = {
+            path for other, path in [*pairwise(paths), *pairwise(reversed(paths))] if other in near and path not in near
+        }
+        assert beside and all("sweeps" in path for path in beside)
+        for path in beside:
+            spoil(path, random)
+        after = made(scene_at(root, frames=frames, **EVERYTHING), holdout, tmp_path / "after")
+        assert {name for name in before if before[name] != after[name]} >= reached
+        before = after
+
+
+def test_key_frames_that_come_unevenly_exclude_by_time(rich_root):
+    """nuScenes' key frames are 400 to 600 ms apart; half the median interval counts, on every side."""
+    scene = scene_at(rich_root, **EVERYTHING)
+    offsets = np.array([0, 30_000, -50_000, 0, 50_000, -40_000, 20_000, 0])
+    uneven = dataclasses.replace(scene, key_frame_timestamps=scene.key_frame_timestamps + offsets)
+    holdout = HoldoutSettings(every_nth=3, offset=1, last_block=1)
+    held_out = uneven.key_frame_timestamps[[1, 4, 7]]
+    half = np.median(np.diff(uneven.key_frame_timestamps)) / 2
+    for records, groups in (
+        (uneven.frames, frame_groups(uneven, holdout)), (uneven.sweeps, sweep_groups(uneven, holdout))
+    ):  # fmt: skip
+        between = [(r, g) for r, g in zip(records, groups, strict=True) if not r.is_key_frame]
+        nearest = np.array([np.abs(held_out - record.timestamp).min() for record, _ in between])
+        assert [group for _, group in between] == ["excluded" if away < half else "train" for away in nearest]
+        assert {group for _, group in between} == {"excluded", "train"}
+
+
+HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}
+
+
+def training_seconds(scene: Scene) -> list[float]:
+    groups = sweep_groups(scene, HoldoutSettings(**HELD_OUT))
+    return [seconds_of(s.timestamp) for s, group in zip(scene.sweeps, groups, strict=True) if group == "train"]
+
+
+def test_the_seed_has_the_static_returns_of_all_training_sweeps(rich_root):
+    scene = scene_at(rich_root, **EVERYTHING)
+    settings = SeedJob(lidar_seed={"voxel_size": 0.0}, holdout=HELD_OUT, images={}, random_seed=0)
+    points, times, missing = lidar_points(scene, settings)
+    seconds = training_seconds(scene)
+    assert missing == 0 and len(seconds) == 23 and {round(s % 0.5, 1) for s in seconds} == {0.0, 0.1, 0.2, 0.3, 0.4}
+    assert set(seconds_of(times).round(6)) == set(np.round(seconds, 6))
+    for moment in seconds[::4]:
+        found = points[times == START_US + round(moment * 1e6)]
+        returns = cast_lidar(WORLD, moment)[:, :3].astype(float)
+        kept = np.hypot(returns[:, 0], returns[:, 1]) > 2.5
+        world = returns + WORLD.ego_at(moment) + LIDAR_AT
+        for thing in (CAR, WORLD.things[2]):
+            kept &= ~(np.abs(world - thing.at(moment)) < np.array(thing.size) / 2 + 0.2).all(axis=1)
+        np.testing.assert_allclose(found, world[kept], atol=1e-3)
+
+
+def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
+    """Five times as many moments as key frames alone give, each in the car's own frame where it then is."""
+    settings = ActorSeedJob(
+        actors={"min_points": 0, "box_margin": 0.0}, holdout=HELD_OUT, images={}, own_car_radius=2.5,
+        random_seed=0,
+    )  # fmt: skip
+    scene = scene_at(rich_root, **EVERYTHING)
+    few, many = (actors_record(s, settings)["actors"][0]["points"] for s in (scene_at(rich_root), scene))
+    expected = []
+    for moment in training_seconds(scene):
+        own = cast_lidar(WORLD, moment)[:, :3].astype(float) + WORLD.ego_at(moment) + LIDAR_AT - CAR.at(moment)
+        inside = (np.abs(own[:, :2]) < np.array(CAR.size[:2]) / 2).all(axis=1) & (np.abs(own[:, 2] - 0.05) < 0.75)
+        expected.append(own[inside])
+    np.testing.assert_allclose(many, np.concatenate(expected), atol=1e-4)
+    assert len(many) > 3 * len(few) > 0
+
+
+def test_an_image_sees_the_training_sweep_of_its_moment(rich_root):
+    """Of the sweeps alone that is nearest in time, what moves is carried on by at most half a sweep's time."""
+    scene = scene_at(rich_root, **EVERYTHING)
+    settings = LidarDepthJob(holdout=HELD_OUT, images={}, own_car_radius=2.5, box_margin=0.1, ray_spacing=(1.5, 1.65))
+    whole = lidar_depths(scene, settings)
+    training = [s for s in scene.sweeps if seconds_of(s.timestamp) in training_seconds(scene)]
+    groups = frame_groups(scene, settings.holdout)
+    for number in np.flatnonzero([group == "train" for group in groups])[::5]:
+        frame = scene.frames[number]
+        nearest = min(training, key=lambda sweep: abs(sweep.timestamp - frame.timestamp))
+        others = tuple(sweep for sweep in scene.sweeps if sweep is not nearest)
+        alone, without = (
+            lidar_depths(dataclasses.replace(scene, sweeps=sweeps), settings)[number] for sweeps in ((nearest,), others)
+        )
+        assert abs(nearest.timestamp - frame.timestamp) <= 100_000
+        assert pickle.dumps(alone) == pickle.dumps(whole[number]) != pickle.dumps(without)
+
+
+def delete(root: Path, channel: str, count: int) -> list[Path]:
+    """Deletes the first so many recordings of a channel between key frames."""
+    paths = sorted((root / "sweeps" / channel).iterdir())[:count]
+    for path in paths:
+        path.unlink()
+    return paths
+
+
+def test_a_missing_image_between_key_frames_stops_and_says_how_to_do_without(root):
+    (path,) = delete(root, "CAM_FRONT", 1)
+    with pytest.raises(DatasetError) as failure:
+        scene_at(root)
+    for part in ("between key frames", "0001 CAM_FRONT 1 ", str(path), "sweeps: false", "extract.on_missing: warn"):
+        assert part in str(failure.value)
+    assert len(scene_at(root, sweeps=False).frames) == 8
+
+
+@pytest.mark.parametrize("count", [3, 35])
+def test_missing_images_between_key_frames_are_left_out_and_counted_where_told_to_go_on(root, count, caplog):
+    """Who has no sweeps/ at all reads ten names, not a thousand."""
+    paths = delete(root, "CAM_FRONT", count)
+    with caplog.at_level(logging.WARNING, logger="drivesplat.preprocess.extract"):
+        scene = scene_at(root, on_missing="warn")
+    assert (scene.missing_images, len(scene.frames)) == (count, IMAGES - count)
+    messages = [record.getMessage() for record in caplog.records if "left out" in record.getMessage()]
+    assert len(messages) == (3 if count == 3 else 11) and str(paths[0]) in messages[0]
+    assert count == 3 or f"{count - 10} more of {IMAGES} images" in messages[-1]
+
+
+def test_a_missing_lidar_sweep_between_key_frames_stops_and_says_how_to_do_without(root):
+    (path,) = delete(root, "LIDAR_TOP", 1)
+    settings = SeedJob(lidar_seed={"far_points": 0}, holdout=HELD_OUT, images={}, random_seed=0)
+    with pytest.raises(DatasetError) as failure:
+        lidar_points(scene_at(root, **EVERYTHING), settings)
+    words = ("between key frames", "0001 LIDAR_TOP 1:", str(path), "lidar_seed.sweeps: false", "on_missing: warn")
+    assert all(word in str(failure.value) for word in words), failure.value
+    assert lidar_points(scene_at(root), settings)[2] == 0
+    going_on = settings.model_copy(update={"lidar_seed": settings.lidar_seed.model_copy(update={"on_missing": "warn"})})
+    assert lidar_points(scene_at(root, **EVERYTHING), going_on)[2] == 1

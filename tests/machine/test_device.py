@@ -1,0 +1,251 @@
+"""Where the work runs: what is refused before training, and in which words."""
+
+import importlib.machinery
+import importlib.util
+import json
+import subprocess
+import sys
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import torch
+from helpers import REPOSITORY
+
+from drivesplat.errors import DeviceError
+from drivesplat.machine.device import choose_device, device_name, telling_out_of_memory
+from drivesplat.machine.gsplat_build.installed import RECORD, versions
+from drivesplat.settings.device import DeviceSettings
+
+
+@pytest.fixture
+def no_gpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+@pytest.fixture
+def a_gpu(monkeypatch):
+    """A card of 24 GB of which 10 are free, and a gsplat compiled for it."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (10_000_000_000, 24_000_000_000))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "NVIDIA RTX 4090")
+    install_gsplat(monkeypatch, object())
+
+
+def install_gsplat(monkeypatch, compiled: object) -> None:
+    """Stands in for the module that loads gsplat's kernels; an exception as `compiled` is raised by its import."""
+    backend = ModuleType("gsplat.cuda._backend")
+
+    def missing(name: str) -> object:
+        raise compiled
+
+    if isinstance(compiled, Exception):
+        backend.__getattr__ = missing
+    else:
+        backend._C = compiled
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
+
+
+def refusal(kind: str = "auto", **settings: float) -> str:
+    """The sentence with which a device is refused."""
+    with pytest.raises(DeviceError) as error:
+        choose_device(DeviceSettings(kind=kind, **settings))
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["auto", "cuda"])
+def test_without_a_gpu_nothing_falls_back_to_the_cpu_silently(no_gpu, kind):
+    message = refusal(kind)
+    assert "no usable GPU" in message and "device: cpu" in message
+
+
+@pytest.mark.parametrize(
+    ("cuda", "hip", "said"),
+    [(None, None, "built without GPU support"), ("13.0", None, "sees no GPU"), (None, "6.4", "sees no GPU")],
+)
+def test_without_a_gpu_it_says_whether_torch_or_the_driver_is_at_fault(no_gpu, monkeypatch, cuda, hip, said):
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    monkeypatch.setattr(torch.version, "hip", hip)
+    message = refusal()
+    assert said in message and torch.__version__ in message
+
+
+def test_who_writes_cpu_gets_it(no_gpu):
+    assert choose_device(DeviceSettings(kind="cpu")) == torch.device("cpu")
+    assert choose_device(DeviceSettings.model_validate("cpu")) == torch.device("cpu")
+
+
+def test_who_writes_cpu_gets_it_even_with_a_gpu(a_gpu):
+    assert choose_device(DeviceSettings(kind="cpu", min_free_gb=1000)) == torch.device("cpu")
+
+
+@pytest.mark.parametrize("kind", ["auto", "cuda"])
+def test_a_usable_gpu_is_taken(a_gpu, kind):
+    assert choose_device(DeviceSettings(kind=kind)) == torch.device("cuda")
+
+
+def test_too_little_free_memory_is_refused_with_both_numbers(a_gpu):
+    message = refusal(min_free_gb=12.5)
+    assert "RTX 4090" in message
+    assert "10.0 GB" in message and "12.5" in message
+    assert "device.min_free_gb" in message and "train.cap_max" in message
+
+
+def test_what_makes_do_with_the_cpu_says_why_it_does(a_gpu, caplog):
+    assert choose_device(DeviceSettings(kind="any", min_free_gb=1.0)) == torch.device("cuda")
+    assert not caplog.records
+    assert choose_device(DeviceSettings(kind="any", min_free_gb=12.5)) == torch.device("cpu")
+    assert "going on with the CPU" in caplog.text and "12.5" in caplog.text
+
+
+@pytest.mark.parametrize(("max_gb", "fraction"), [(None, None), (6.0, 0.25), (48.0, 1.0)])
+def test_a_job_takes_no_more_memory_than_it_may(a_gpu, monkeypatch, max_gb, fraction):
+    limits = []
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda *_: SimpleNamespace(total_memory=24_000_000_000))
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", limits.append)
+    choose_device(DeviceSettings(max_gb=max_gb, min_free_gb=1.0))
+    assert limits == ([] if fraction is None else [fraction])
+
+
+@pytest.mark.parametrize(("asked", "enough"), [(10.0, True), (10.1, False), (0.0, True)])
+def test_free_memory_is_compared_with_what_is_asked(a_gpu, asked, enough):
+    if enough:
+        assert choose_device(DeviceSettings(min_free_gb=asked)) == torch.device("cuda")
+    else:
+        refusal(min_free_gb=asked)
+
+
+def test_a_stage_that_needs_less_memory_than_a_training_may_say_so(a_gpu):
+    assert choose_device(DeviceSettings(min_free_gb=500), min_free_gb=0.0) == torch.device("cuda")
+
+
+def test_gsplat_that_cannot_be_imported_is_named_with_what_to_do(a_gpu, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
+    message = refusal()
+    assert "gsplat cannot be loaded" in message and "reinstall" in message and "device: cpu" in message
+
+
+@pytest.mark.parametrize("error", [IndexError("list index out of range"), RuntimeError("Error building\nextension")])
+def test_gsplat_that_fails_to_build_is_named_with_its_error(a_gpu, monkeypatch, error):
+    install_gsplat(monkeypatch, error)
+    message = refusal()
+    assert type(error).__name__ in message and str(error).split()[-1] in message
+
+
+def test_cuda_without_nvcc_is_named_with_what_to_do(a_gpu, monkeypatch):
+    install_gsplat(monkeypatch, None)
+    message = refusal()
+    assert "nvcc" in message and "toolkit" in message and "device: cpu" in message
+
+
+@pytest.fixture
+def gsplat_package(a_gpu, monkeypatch, tmp_path):
+    """The card of `a_gpu`, of compute capability 8.9, and a gsplat that is sources alone and would compile if asked."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda *_: (8, 9))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    package = tmp_path / "gsplat"
+    (package / "cuda").mkdir(parents=True)
+    for folder in (package, package / "cuda"):
+        (folder / "__init__.py").touch()
+    (package / "cuda/_backend.py").write_text("raise SystemExit('compiles for minutes')")
+    yield package
+    for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
+        del sys.modules[name]
+
+
+def compiled_into(package: Path, archs: list[str] | None, code: str = "") -> None:
+    """Kernels in the package: those of a wheel, or where `archs` are given those of the set-up."""
+    (package / f"csrc{EXTENSION_SUFFIXES[0]}").touch()
+    (package / "csrc.py").write_text(code)  # found where the empty file cannot be loaded
+    (package / "cuda/_backend.py").write_text("from gsplat import csrc as _C")
+    if archs:
+        (package / RECORD).write_text(json.dumps({"archs": archs, "versions": versions()}))
+
+
+@pytest.fixture
+def loadable(monkeypatch):
+    """Python modules in the place of compiled ones."""
+    real = importlib.machinery.FileFinder.find_spec
+
+    def sources_first(self, name, target=None):
+        if name == "gsplat.csrc":
+            return importlib.util.spec_from_file_location(name, Path(self.path) / "csrc.py")
+        return real(self, name, target)
+
+    monkeypatch.setattr(importlib.machinery.FileFinder, "find_spec", sources_first)
+
+
+def test_a_run_does_not_start_compiling_gsplat(gsplat_package):
+    message = refusal()
+    assert "not compiled" in message and "make setup" in message and "make doctor" in message
+    assert f"{sys.executable} -m drivesplat.machine.gsplat_build" in message and "device: cpu" in message
+
+
+def test_a_prebuilt_gsplat_is_taken_as_it_is(gsplat_package, loadable):
+    compiled_into(gsplat_package, None)
+    assert choose_device(DeviceSettings()) == torch.device("cuda")
+
+
+def test_gsplat_compiled_for_this_card_is_taken(gsplat_package, loadable):
+    compiled_into(gsplat_package, ["7.5", "8.6"])
+    assert choose_device(DeviceSettings()) == torch.device("cuda")
+
+
+def test_gsplat_compiled_for_another_card_names_both_and_the_command(gsplat_package, loadable):
+    compiled_into(gsplat_package, ["7.5"])
+    message = refusal()
+    assert "RTX 4090" in message and "8.9" in message and 'GSPLAT_ARCHS="7.5;8.9" make setup' in message
+
+
+def test_compiled_gsplat_that_does_not_load_is_not_compiled_anew(gsplat_package, loadable):
+    compiled_into(gsplat_package, None, "raise ImportError('undefined symbol: _ZN3c10')")
+    message = refusal()
+    assert "gsplat cannot be loaded" in message and "undefined symbol" in message and "make doctor" in message
+
+
+def test_on_amd_gsplat_loads_its_own_way(gsplat_package, monkeypatch):
+    monkeypatch.setattr(torch.version, "cuda", None)
+    (gsplat_package / "cuda/_backend.py").write_text("_C = object()")
+    assert choose_device(DeviceSettings()) == torch.device("cuda")
+
+
+def test_without_gsplat_the_training_stage_still_comes_to_its_one_sentence():
+    """What the script of the rule `train` does on a machine where gsplat is not installed."""
+    script = (
+        "import sys; sys.modules['gsplat'] = None\n"
+        "import torch; torch.cuda.is_available = lambda: True\n"
+        "torch.cuda.mem_get_info = lambda *_: (10**11, 10**11); torch.cuda.get_device_name = lambda *_: 'card'\n"
+        "import drivesplat.training.run\n"
+        "from drivesplat.machine.device import choose_device\n"
+        "from drivesplat.settings.device import DeviceSettings\n"
+        "from drivesplat.errors import DeviceError\n"
+        "try: choose_device(DeviceSettings())\n"
+        "except DeviceError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "gsplat cannot be loaded" in done.stdout
+
+
+def test_the_cpu_is_named_with_its_kind():
+    assert device_name(torch.device("cpu")).startswith("cpu (")
+
+
+def test_out_of_memory_is_told_with_what_lowers_the_need():
+    count = 1
+    with pytest.raises(DeviceError) as error, telling_out_of_memory(lambda: count):
+        count = 1_234_567
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+    message = str(error.value)
+    assert "1,234,567 Gaussians" in message and "peak" in message and "train.cap_max" in message
+    assert "\n" not in message
+
+
+def test_other_errors_are_not_taken_for_out_of_memory():
+    with pytest.raises(ZeroDivisionError), telling_out_of_memory(lambda: 1):
+        raise ZeroDivisionError

@@ -1,0 +1,400 @@
+"""Compiling gsplat at set-up: everything around the compiler, with made-up compilers."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from time import monotonic
+
+import pytest
+from helpers import REPOSITORY
+
+from drivesplat.errors import DeviceError
+from drivesplat.machine.gsplat_build import __main__ as command
+from drivesplat.machine.gsplat_build import compile as building
+from drivesplat.machine.gsplat_build import diagnose, installed, toolkit
+from drivesplat.machine.gsplat_build.compile_job import sources
+from drivesplat.machine.gsplat_build.toolkit import Toolkit
+
+TOOLKIT = Toolkit(Path("/opt/cuda"), "13.0", "CUDA_HOME")
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch) -> Path:
+    """A gsplat package of sources alone, and an environment of its own to build in."""
+    folder = tmp_path / "site/gsplat"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    for module in (installed, building):
+        monkeypatch.setattr(module, "package_folder", lambda: folder)
+    monkeypatch.setattr(building, "build_folder", lambda: tmp_path / "build")
+    monkeypatch.setattr(building, "log_file", lambda: tmp_path / "build.log")
+    monkeypatch.setattr(building, "POLL_S", 0.02)
+    return folder
+
+
+# What is installed.
+
+
+def test_sources_alone_are_not_compiled(package):
+    assert installed.compiled_extension() is None and installed.build_record() == {}
+
+
+@pytest.mark.parametrize("name", ["csrc.so", f"csrc{installed.EXTENSION_SUFFIXES[0]}"])
+def test_the_kernels_of_a_prebuilt_wheel_are_found(package, name):
+    (package / name).touch()
+    assert installed.compiled_extension() == package / name
+    assert command.already_done(["7.5", "12.0"]), "a wheel's kernels are trusted"
+
+
+def test_what_was_compiled_is_remembered_with_its_versions(package, tmp_path, monkeypatch):
+    (tmp_path / "csrc.so").write_bytes(b"code")
+    target = building.install(tmp_path / "csrc.so", package, ["7.5", "8.6"])
+    assert target.read_bytes() == b"code" and installed.compiled_extension() == target
+    assert installed.build_record()["archs"] == ["7.5", "8.6"]
+    assert [file.name for file in package.glob(".*")] == []
+    assert command.already_done(["8.6"]) and command.already_done(["8.9"]) and not command.already_done(["9.0"])
+    monkeypatch.setattr(installed, "versions", lambda: {"torch": "9.9", "gsplat": "1.5.3"})
+    assert installed.compiled_extension() is None and not command.already_done(["8.6"])
+
+
+@pytest.mark.parametrize("content", ["{", "[1]", ""])
+def test_an_unreadable_note_is_none(package, content):
+    (package / installed.RECORD).write_text(content)
+    assert installed.build_record() == {}
+
+
+@pytest.mark.parametrize(
+    ("archs", "capability", "runs"),
+    [
+        (["8.6"], (8, 6), True),
+        (["8.6"], (8, 9), True),
+        (["8.9"], (8, 6), False),
+        (["7.5"], (8, 6), False),
+        (["8.6+PTX"], (12, 0), True),
+        (["9.0a"], (9, 0), True),
+        (["7.5", "8.0"], (8, 6), True),
+        (["12.0"], (8, 6), False),
+        ([], (8, 6), False),
+    ],
+)
+def test_machine_code_runs_within_a_major_version_and_ptx_later(archs, capability, runs):
+    assert installed.covers(archs, capability) is runs
+
+
+def test_the_platform_of_torch_is_read_without_importing_it():
+    code = (
+        "import sys; from drivesplat.machine.gsplat_build.installed import torch_platform; found = torch_platform(); "
+        "assert 'torch' not in sys.modules; from torch import version; assert found == (version.cuda, version.hip)"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, check=True)
+
+
+# What to compile for.
+
+
+@pytest.mark.parametrize(
+    ("variable", "cards", "archs"),
+    [
+        (None, [], []),
+        (None, [(8, 6), (7, 5), (8, 6)], ["7.5", "8.6"]),
+        (None, [(6, 1), (8, 6)], ["8.6"]),
+        ("7.5;8.6;8.9", [(12, 0)], ["7.5", "8.6", "8.9"]),
+        ("7.5, 8.6+PTX", [], ["7.5", "8.6+PTX"]),
+        ("none", [(8, 6)], []),
+    ],
+)
+def test_the_variable_goes_before_the_cards(variable, cards, archs):
+    assert command.wanted_archs({} if variable is None else {"GSPLAT_ARCHS": variable}, cards) == archs
+
+
+@pytest.mark.parametrize(
+    ("archs", "cuda", "said"),
+    [
+        (["8.6", "12.0+PTX"], "13.0", None),
+        (["7.0"], "12.6", None),
+        (["7.0"], "13.0", "TORCH_CUDA=cu126"),
+        (["6.1"], "12.6", "7.0 (Volta)"),
+        (["sm_86"], "13.0", "7.5;8.6;8.9"),
+        (["86"], "13.0", "no compute capability"),
+        ([], "13.0", "GSPLAT_ARCHS"),
+    ],
+)
+def test_wrong_archs_are_refused_before_anything_is_compiled(archs, cuda, said):
+    problem = diagnose.arch_problem(archs, cuda)
+    assert problem is None if said is None else said in problem
+
+
+def run_command(monkeypatch, platform, cards=(), archs=None, done=False, arguments=()):
+    monkeypatch.setattr(command, "torch_platform", lambda: platform)
+    monkeypatch.setattr(command, "read_cards", lambda: (list(cards), None))
+    monkeypatch.setattr(command, "already_done", lambda _: done)
+    monkeypatch.setattr(command, "provide_toolkit", lambda _: TOOLKIT)
+    monkeypatch.setattr(diagnose, "what_is_missing", lambda: None)
+    built = []
+    monkeypatch.setattr(building, "compile_and_install", lambda *a: built.append(a) or Path("/gsplat/csrc.so"))
+    monkeypatch.delenv("GSPLAT_ARCHS", raising=False)
+    if archs:
+        monkeypatch.setenv("GSPLAT_ARCHS", archs)
+    return command.main(arguments), built
+
+
+def test_without_a_card_nothing_is_compiled_and_a_line_says_so(monkeypatch, capsys):
+    assert run_command(monkeypatch, ("13.0", None)) == (0, [])
+    assert "no NVIDIA GPU here" in capsys.readouterr().err
+    assert run_command(monkeypatch, ("13.0", None), arguments=["--if-needed"]) == (0, [])
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("platform", "said"), [((None, None), "CPU alone"), ((None, "6.4"), "docs/amd.md")])
+def test_other_builds_of_torch_need_no_compiling(monkeypatch, capsys, platform, said):
+    assert run_command(monkeypatch, platform, archs="8.6") == (0, [])
+    assert said in capsys.readouterr().err
+
+
+def test_for_named_archs_it_compiles_without_a_card_and_says_how_long(monkeypatch, capsys):
+    monkeypatch.setenv("MAX_JOBS", "2")
+    status, built = run_command(monkeypatch, ("13.0", None), archs="7.5;8.9")
+    said = capsys.readouterr().err
+    assert status == 0 and built[0][:3] == (TOOLKIT, ["7.5", "8.9"], 2)
+    assert f"about {building.expected_minutes(2, 2)} min" in said and "build.log" in said
+
+
+def test_what_is_done_is_not_done_again(monkeypatch, capsys):
+    assert run_command(monkeypatch, ("13.0", None), archs="7.5", done=True) == (0, [])
+    assert capsys.readouterr().err == ""
+
+
+def test_a_missing_compiler_is_an_error_with_what_to_install(monkeypatch, capsys):
+    assert run_command(monkeypatch, ("13.0", None), archs="7.5")[0] == 0
+    monkeypatch.setattr(command, "provide_toolkit", lambda _: pytest.fail("fetched in vain"))
+    monkeypatch.setattr(diagnose, "what_is_missing", lambda: "no C++ compiler: `sudo apt-get install g++`")
+    assert command.main([]) == 1 and "apt-get install g++" in capsys.readouterr().err
+
+
+def test_a_cpp_compiler_and_python_headers_are_looked_for(monkeypatch, tmp_path):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "apt-get install g++" in diagnose.what_is_missing()
+    (tmp_path / "c++").touch(mode=0o755)
+    monkeypatch.setattr(diagnose.sysconfig, "get_paths", lambda: {"include": str(tmp_path)})
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert f"apt-get install python{version}-dev" in diagnose.what_is_missing()
+    (tmp_path / "Python.h").touch()
+    assert diagnose.what_is_missing() is None
+
+
+# The toolkit.
+
+
+def make_toolkit(home: Path, release: str) -> Path:
+    (home / "bin").mkdir(parents=True)
+    (home / "include").mkdir()
+    (home / "include/cuda_runtime.h").touch()
+    (home / "bin/nvcc").write_text(f"#!/bin/sh\necho 'Cuda compilation tools, release {release}, V{release}.1'\n")
+    (home / "bin/nvcc").chmod(0o755)
+    return home
+
+
+@pytest.fixture
+def no_toolkit(monkeypatch, tmp_path):
+    for variable in ("CUDA_HOME", "CUDA_PATH"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(toolkit, "system_homes", lambda: iter(()))
+
+
+def test_cuda_home_is_taken_where_it_is_of_torchs_major_version(no_toolkit, monkeypatch, tmp_path):
+    monkeypatch.setenv("CUDA_HOME", str(make_toolkit(tmp_path / "cuda", "13.2")))
+    assert toolkit.provide_toolkit("13.0") == Toolkit(tmp_path / "cuda", "13.2", "CUDA_HOME")
+    with pytest.raises(DeviceError, match=r"nvcc 13\.2, but torch is built for CUDA 12\.6"):
+        toolkit.provide_toolkit("12.6")
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "none"))
+    with pytest.raises(DeviceError, match="no bin/nvcc"):
+        toolkit.provide_toolkit("13.0")
+
+
+def test_cuda_13_comes_from_pypi(no_toolkit, monkeypatch):
+    monkeypatch.setattr(toolkit, "_from_pypi", lambda: TOOLKIT)
+    assert toolkit.provide_toolkit("13.0") is TOOLKIT
+    with pytest.raises(DeviceError, match=r"PyPI has no nvcc for CUDA 12\.6.*CUDA_HOME="):
+        toolkit.provide_toolkit("12.6")
+
+
+def test_where_pypi_is_out_of_reach_an_installed_toolkit_does(no_toolkit, monkeypatch, tmp_path):
+    def unreachable():
+        raise DeviceError("`pip install` failed (no route)")
+
+    monkeypatch.setattr(toolkit, "_from_pypi", unreachable)
+    with pytest.raises(DeviceError, match=r"no route.*CUDA_HOME="):
+        toolkit.provide_toolkit("13.0")
+    homes = [make_toolkit(tmp_path / "a", "12.4"), make_toolkit(tmp_path / "b", "13.1")]
+    monkeypatch.setattr(toolkit, "system_homes", lambda: iter(homes))
+    assert toolkit.provide_toolkit("13.0").home == tmp_path / "b"
+    assert toolkit.provide_toolkit("12.6").home == tmp_path / "a"
+
+
+def test_an_nvcc_in_path_counts_with_its_headers_only(monkeypatch, tmp_path):
+    home = make_toolkit(tmp_path / "cuda", "13.0")
+    monkeypatch.setenv("PATH", str(home / "bin"))
+    assert home in toolkit.system_homes()
+    (home / "include/cuda_runtime.h").unlink()
+    assert home not in toolkit.system_homes()
+
+
+def test_pypis_packages_become_a_folder_that_linkers_understand(tmp_path):
+    packages = make_toolkit(tmp_path / "nvidia/cu13", "13.0")
+    for name in ("lib/libcudart.so.13", "lib/libcublas.so.13", "nvvm/bin/cicc"):
+        (packages / name).parent.mkdir(parents=True, exist_ok=True)
+        (packages / name).touch()
+    for _ in range(2):  # a second time over the first
+        home = toolkit.arrange(packages, tmp_path / "venv/cuda-toolkit")
+    assert toolkit.nvcc_release(home) == "13.0"
+    assert (home / "lib64/libcudart.so").resolve() == packages / "lib/libcudart.so.13"
+    assert (home / "lib64/libcublas.so.13").exists() and (home / "nvvm/bin/cicc").exists()
+
+
+# Compiling.
+
+
+def test_jobs_are_limited_by_cores_and_memory():
+    assert building.parallel_jobs(16, 100.0) == 16
+    assert building.parallel_jobs(16, 3 * building.JOB_MEMORY_GB) == 3
+    assert building.parallel_jobs(8, 0.5) == 1
+
+
+def test_free_memory_is_read(tmp_path):
+    (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:  2000000 kB\n")
+    assert building.free_memory_gb(tmp_path / "meminfo") == pytest.approx(2.048)
+    assert building.free_memory_gb(tmp_path / "none") == 4.0
+
+
+def test_the_compiler_gets_its_toolkit_whatever_the_machine_has(monkeypatch):
+    monkeypatch.setenv("CUDA_HOME", "/usr/local/cuda")
+    monkeypatch.setenv("PATH", "/usr/bin")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "5.0")
+    env = building.compile_environment(TOOLKIT, ["7.5", "8.6"], 3)
+    assert env["CUDA_HOME"] == "/opt/cuda" and env["TORCH_CUDA_ARCH_LIST"] == "7.5;8.6" and env["MAX_JOBS"] == "3"
+    assert env["PATH"].split(":") == [str(Path(sys.executable).parent), "/opt/cuda/bin", "/usr/bin"]
+    assert str(REPOSITORY) in env["PYTHONPATH"].split(":")
+
+
+def test_all_kernels_are_compiled(tmp_path):
+    cuda = tmp_path / "cuda"
+    (cuda / "csrc").mkdir(parents=True)
+    names = ["csrc/Null.cpp", "csrc/NullCUDA.cu", "ext.cpp"]
+    for name in [*names, "csrc/Null.h"]:
+        (cuda / name).touch()
+    assert sorted(sources(tmp_path)) == sorted(str(cuda / name) for name in names)
+
+
+def shell(script: str) -> list[str]:
+    return ["bash", "-c", textwrap.dedent(script)]
+
+
+def test_progress_is_told_with_the_time_left(package, tmp_path):
+    said = []
+    steps = shell("echo '[1/2] nvcc one'; sleep 0.3; echo '[2/2] nvcc two'; sleep 0.3")
+    building.run_with_progress(steps, os.environ, tmp_path / "log", said.append)
+    assert [line.split()[0] for line in said] == ["1/2", "2/2"] and "min to go" in said[0]
+
+
+def test_an_interruption_takes_the_compilers_along(package, tmp_path, monkeypatch):
+    log = tmp_path / "log"
+
+    def interrupt(_):
+        if log.stat().st_size:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(building.time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        building.run_with_progress(shell("sleep 60 & echo $!; wait"), os.environ, log, print)
+    compiler, patience = Path("/proc", log.read_text().strip(), "stat"), monotonic() + 10
+    while compiler.exists() and compiler.read_text().split()[2] != "Z":
+        assert monotonic() < patience, "the compiler goes on"
+
+
+@pytest.mark.parametrize(
+    ("log", "said"),
+    [
+        ("c++: fatal error: Killed signal terminated program cc1plus", "MAX_JOBS=1"),
+        ("nvcc error : 'cicc' died due to signal 9 (Kill signal)", "MAX_JOBS=1"),
+        ("error: #error -- unsupported GNU version! gcc versions later than 15 are not supported!", "CXX=g++-13"),
+        ("nvcc fatal   : Unsupported gpu architecture 'compute_70'", "GSPLAT_ARCHS"),
+        ("fatal error: Python.h: No such file or directory", "python3-dev"),
+        ("fatal error: cusparse.h: No such file or directory", "CUDA_HOME"),
+        ("/usr/bin/ld: cannot find -lcudart: No such file or directory", "libcudart"),
+        ('error: namespace "cooperative_groups" has no member "labeled_partition"', "7.0"),
+        ("fatal error: error writing to /tmp/x.s: No space left on device", "disk is full"),
+        ("/bin/sh: 1: c++: not found", "apt-get install g++"),
+        ("something nobody has seen", "docs/installation.md"),
+    ],
+)
+def test_a_failed_build_names_its_cause_and_the_log(package, tmp_path, log, said):
+    lines = []
+    with pytest.raises(DeviceError) as error:
+        building.run_with_progress(
+            ["bash", "-c", f'echo {"x" * 5000}; echo "$0"; exit 1', log], os.environ, tmp_path / "log", lines.append
+        )
+    assert said in str(error.value) and str(tmp_path / "log") in str(error.value)
+    assert log in "\n".join(lines) and max(map(len, "\n".join(lines).splitlines())) < 400
+
+
+def test_errors_far_from_the_end_are_shown_too():
+    log = "nvcc fatal : first\n" + "\n".join(f"note {i}" for i in range(100))
+    assert diagnose.last_lines(log).splitlines()[0] == "nvcc fatal : first"
+    assert diagnose.last_lines(log).endswith("note 99")
+
+
+def fake_job(monkeypatch, body: str) -> None:
+    monkeypatch.setattr(building.sys, "executable", "/bin/true")
+    real = building.run_with_progress
+    monkeypatch.setattr(
+        building, "run_with_progress", lambda command, *rest: real([*shell(body), "job", command[-1]], *rest)
+    )
+    monkeypatch.setattr(building, "check_loads", lambda env: None)
+
+
+def test_a_build_ends_inside_the_package_and_leaves_nothing_else(package, monkeypatch, tmp_path):
+    fake_job(monkeypatch, 'echo "[1/1] nvcc"; echo code > "$1/csrc.so"')
+    target = building.compile_and_install(TOOLKIT, ["8.6"], 1, print)
+    assert target == package / "csrc.so" and target.read_text() == "code\n"
+    assert not (tmp_path / "build").exists()
+
+
+def test_a_build_that_fails_keeps_what_it_has_compiled(package, monkeypatch, tmp_path):
+    fake_job(monkeypatch, 'touch "$1/One.cuda.o" "$1/lock"; exit 1')
+    with pytest.raises(DeviceError):
+        building.compile_and_install(TOOLKIT, ["8.6"], 1, lambda _: None)
+    assert (tmp_path / "build/One.cuda.o").exists() and not (package / "csrc.so").exists()
+
+
+def test_torchs_stale_lock_is_gone_when_the_compiler_starts(package, monkeypatch, tmp_path):
+    fake_job(monkeypatch, 'test ! -e "$1/lock" && touch "$1/csrc.so"')
+    (tmp_path / "build").mkdir()
+    (tmp_path / "build/lock").touch()
+    assert building.compile_and_install(TOOLKIT, ["8.6"], 1, print).exists()
+
+
+def test_two_builds_at_once_are_told_apart(package, tmp_path):
+    with building._alone(tmp_path / "build"), pytest.raises(DeviceError, match="another process"):
+        building.compile_and_install(TOOLKIT, ["8.6"], 1, print)
+
+
+def test_the_result_is_tried_as_a_run_will_import_it(tmp_path):
+    backend = tmp_path / "gsplat/cuda/_backend.py"
+    backend.parent.mkdir(parents=True)
+    for folder in (backend.parent, backend.parent.parent):
+        (folder / "__init__.py").touch()
+    kernels = tmp_path / "gsplat/csrc.py"
+    kernels.write_text("import os; assert 'CUDA_HOME' not in os.environ")
+    backend.write_text("from gsplat import csrc as _C")
+    env = {"PYTHONPATH": str(tmp_path), "CUDA_HOME": "/opt/cuda"}
+    building.check_loads(env)
+    backend.write_text("_C = None")
+    with pytest.raises(DeviceError, match="cannot be loaded"):
+        building.check_loads(env)
+    kernels.write_text("raise ImportError('undefined symbol: _ZN3c10')")
+    backend.write_text("import sys; sys.exit('compiles for minutes')")
+    with pytest.raises(DeviceError, match="undefined symbol"):
+        building.check_loads(env)

@@ -1,0 +1,308 @@
+"""`make setup` and `make doctor` before there is anything: run on a copy with made-up tools, without network."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import REPOSITORY
+
+TOOLS = ("bash", "cat", "cut", "sha256sum", "rm", "grep", "awk", "dirname", "du", "df", "mkdir", "cp", "env")
+
+PYTHON = """#!/usr/bin/env bash
+case "$*" in
+  *version_info*) echo "${FAKE_VERSION:-3.11}" ;;
+  *"import venv, ensurepip"*) [ -z "${FAKE_NO_VENV:-}" ] ;;
+  *_base_executable*) echo "$FAKE_BIN/python3.11" ;;
+  --version) echo "Python 3.11.9" ;;
+  "-m venv .venv") mkdir -p .venv/bin && cp "$FAKE_BIN/python3.11" .venv/bin/python ;;
+  "-m pip check") ;;
+  "-m pip "*) echo "pip ${*:3}" >> "$FAKE_LOG"; [ -z "${FAKE_PIP_FAILS:-}" ] ;;
+  *torch_builds*) exec "$REAL_PYTHON" "$@" ;;
+  *gsplat_build*) echo "gsplat_build ${*:3}" >> "$FAKE_LOG"; exit "${FAKE_BUILD_STATUS:-0}" ;;
+  *compileall*) echo "compileall ${*:4}" >> "$FAKE_LOG" ;;
+  *rehearsal*) echo "rehearsal" >> "$FAKE_LOG"; [ -z "${FAKE_REHEARSAL_FAILS:-}" ] ;;
+  *importlib.metadata*) [ -z "${FAKE_WRONG_TORCH:-}" ] ;;
+  *) echo "unexpected: $*" >&2; exit 9 ;;
+esac
+"""
+NVIDIA_SMI = """#!/usr/bin/env bash
+echo "$FAKE_CARDS"
+"""
+
+
+class Machine:
+    """A copy of what the set-up reads, and a PATH with nothing else than a few tools and made-up programs."""
+
+    def __init__(self, folder: Path):
+        self.checkout, self.bin, self.log = folder / "checkout", folder / "bin", folder / "log"
+        self.checkout.mkdir()
+        self.bin.mkdir()
+        shutil.copytree(REPOSITORY / "scripts", self.checkout / "scripts")
+        for name in ("requirements.txt", "constraints.txt"):
+            shutil.copy(REPOSITORY / name, self.checkout)
+        (self.checkout / "drivesplat").symlink_to(REPOSITORY / "drivesplat")
+        for tool in TOOLS:
+            (self.bin / tool).symlink_to(shutil.which(tool))
+        self.program("python3.11", PYTHON)
+
+    def program(self, name: str, content: str) -> None:
+        file = self.bin / name
+        file.unlink(missing_ok=True)
+        file.write_text(content)
+        file.chmod(0o755)
+
+    def cards(self, *lines: str) -> dict[str, str]:
+        self.program("nvidia-smi", NVIDIA_SMI)
+        return {"FAKE_CARDS": "\n".join(lines)}
+
+    def run(self, *arguments: str, script: str = "setup", **environment: str) -> subprocess.CompletedProcess:
+        known = {
+            "PATH": str(self.bin),
+            "HOME": str(self.checkout),
+            "FAKE_BIN": str(self.bin),
+            "FAKE_LOG": str(self.log),
+            "REAL_PYTHON": sys.executable,
+            "OS_RELEASE": os.devnull,
+        }
+        command = [self.bin / "bash", f"scripts/{script}.sh", *arguments]
+        return subprocess.run(
+            command, cwd=self.checkout, env=known | environment, capture_output=True, text=True, check=False
+        )
+
+    def done(self) -> list[str]:
+        """What was installed and compiled since the last call, a line each."""
+        lines = self.log.read_text().splitlines() if self.log.exists() else []
+        self.log.unlink(missing_ok=True)
+        return lines
+
+    @property
+    def stamp(self) -> Path:
+        return self.checkout / ".venv/.made-from"
+
+
+@pytest.fixture
+def machine(tmp_path) -> Machine:
+    return Machine(tmp_path)
+
+
+TURING_OLD_DRIVER = "NVIDIA GeForce RTX 2070, 550.120, 8192, 7900, 7.5"
+VOLTA = "Tesla V100-PCIE-16GB, 580.65.06, 16384, 16000, 7.0"
+PASCAL = "NVIDIA GeForce GTX 1080 Ti, 580.65.06, 11264, 11000, 6.1"
+ADA = "NVIDIA GeForce RTX 4090, 580.65.06, 24564, 24000, 8.9"
+
+
+def test_a_good_venv_is_left_alone(machine):
+    assert machine.run().returncode == 0
+    digest = hashlib.sha256()
+    for name in ("requirements.txt", "constraints.txt"):
+        digest.update((REPOSITORY / name).read_bytes())
+    assert machine.stamp.read_text().strip() == digest.hexdigest()
+    assert [line.split()[0] for line in machine.done()] == ["pip", "pip", "gsplat_build", "compileall", "rehearsal"]
+    second = machine.run()
+    assert second.returncode == 0 and machine.done() == [] and second.stderr == ""
+
+
+def test_a_machine_on_which_nothing_can_be_trained_is_told_at_once(machine):
+    result = machine.run(FAKE_REHEARSAL_FAILS="1")
+    assert result.returncode == 0, "who has a GPU may do without"
+    assert "a first training on the processors fails" in result.stderr and "make doctor" in result.stderr
+    machine.done()
+    assert "a first training" in machine.run(FAKE_REHEARSAL_FAILS="1").stderr, (
+        "and again, though all packages are there"
+    )
+    assert [line.split()[0] for line in machine.done()] == ["compileall", "rehearsal"]
+    assert machine.run().returncode == 0 and [line.split()[0] for line in machine.done()] == ["compileall", "rehearsal"]
+    assert machine.run().returncode == 0 and machine.done() == []
+
+
+def test_changed_requirements_remake_it(machine):
+    machine.run()
+    machine.done()
+    with open(machine.checkout / "constraints.txt", "a") as file:
+        file.write("# more\n")
+    assert machine.run().returncode == 0
+    assert any("-r requirements.txt -c constraints.txt" in line for line in machine.done())
+
+
+def test_an_interrupted_installation_is_remade_whole(machine):
+    assert machine.run(FAKE_PIP_FAILS="1").returncode != 0
+    assert (machine.checkout / ".venv/bin/python").exists() and not machine.stamp.exists()
+    (machine.checkout / ".venv/half").touch()
+    machine.done()
+    assert machine.run().returncode == 0
+    assert machine.stamp.exists() and not (machine.checkout / ".venv/half").exists()
+    assert any("requirements.txt" in line for line in machine.done())
+
+
+def test_the_stamp_goes_first_where_a_venv_is_remade(machine):
+    """A removal that is interrupted must not leave a stamp beside missing packages."""
+    machine.run()
+    (machine.bin / "rm").unlink()
+    machine.program("rm", f'#!/usr/bin/env bash\n[ "$1" = -rf ] && exit 1\nexec {shutil.which("rm")} "$@"\n')
+    (machine.checkout / "requirements.txt").write_text("torch\n")
+    assert machine.run().returncode != 0
+    assert (machine.checkout / ".venv/bin/python").exists() and not machine.stamp.exists()
+
+
+def test_pip_that_fails_points_to_proxies(machine):
+    done = machine.run(FAKE_PIP_FAILS="1")
+    assert done.returncode == 1 and "docs/installation.md" in done.stderr and "proxy" in done.stderr
+
+
+def test_python_without_venv_is_told_from_no_python(machine):
+    done = machine.run(FAKE_NO_VENV="1")
+    assert done.returncode == 1 and "sudo apt-get install python3.11-venv" in done.stderr
+    assert not (machine.checkout / ".venv").exists()
+
+
+@pytest.mark.parametrize(
+    ("release", "said"),
+    [
+        ('ID=ubuntu\nVERSION_ID="24.04"\n', "apt-get install python3.12 python3.12-venv python3.12-dev"),
+        ('ID=ubuntu\nVERSION_ID="22.04"\n', "apt-get install python3.11 python3.11-venv python3.11-dev"),
+        ('ID=debian\nVERSION_ID="12"\n', "apt-get install python3.11 python3.11-venv python3.11-dev"),
+        ('ID=debian\nVERSION_ID="13"\n', "conda create"),
+        ("", "conda create"),
+    ],
+)
+def test_no_suitable_python_names_the_packages_of_the_distribution(machine, tmp_path, release, said):
+    (tmp_path / "os-release").write_text(release)
+    machine.program("python3", PYTHON)
+    (machine.bin / "python3.11").unlink()
+    done = machine.run(FAKE_VERSION="3.13", OS_RELEASE=str(tmp_path / "os-release"))
+    assert done.returncode == 1 and said in done.stderr and "python3 is 3.13" in done.stderr
+
+
+def test_a_python_of_ones_own_is_taken(machine, tmp_path):
+    (machine.bin / "python3.11").rename(tmp_path / "mine")
+    assert machine.run().returncode == 1
+    machine.program("python3.11", PYTHON.replace("FAKE_VERSION:-3.11", "FAKE_VERSION:-3.9"))
+    assert machine.run("--check", PYTHON=str(tmp_path / "mine")).returncode == 0
+    done = machine.run("--check", PYTHON=str(tmp_path / "other"))
+    assert done.returncode == 1 and f"PYTHON={tmp_path / 'other'}" in done.stderr
+
+
+def df(free_mb: int) -> str:
+    return f"#!/usr/bin/env bash\necho head\necho disk 1 1 {free_mb * 1024} 1% /\n"
+
+
+@pytest.mark.parametrize(("free_mb", "build", "enough"), [(6500, "", False), (7100, "", True), (3100, "cpu", True)])
+def test_too_little_disk_is_refused_before_anything_is_removed(machine, free_mb, build, enough):
+    machine.program("df", df(free_mb))
+    done = machine.run(TORCH_CUDA=build)
+    assert (done.returncode == 0) is enough
+    if not enough:
+        assert "too little disk" in done.stderr and "7 GB" in done.stderr and "6.5 GB free" in done.stderr
+        assert machine.done() == []
+
+
+def test_a_small_folder_for_downloads_is_named(machine):
+    machine.program("df", df(9000).replace("echo disk", 'case "$2" in /small) set 1;; esac\necho disk').replace(
+        str(9000 * 1024), "$([ $1 = 1 ] && echo 1024 || echo 9216000)"))  # fmt: skip
+    done = machine.run(TMPDIR="/small")
+    assert done.returncode == 1 and "TMPDIR=" in done.stderr
+
+
+def test_a_card_that_the_default_build_suits_is_not_mentioned(machine):
+    done = machine.run(**machine.cards(ADA))
+    assert done.returncode == 0 and "TORCH_CUDA" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("card", "said"),
+    [
+        (TURING_OLD_DRIVER, ["driver 550.120", "580", "TORCH_CUDA=cu126 make setup"]),
+        (VOLTA, ["Volta", "7.0", "TORCH_CUDA=cu126 make setup"]),
+        (PASCAL, ["Pascal", "too old for gsplat", "TORCH_CUDA=cpu make setup"]),
+    ],
+)
+def test_an_unsuitable_card_or_driver_stops_before_gigabytes_are_fetched(machine, card, said):
+    cards = machine.cards(card)
+    done = machine.run(**cards)
+    assert done.returncode == 1 and machine.done() == []
+    assert all(part in done.stderr for part in said), done.stderr
+
+
+def test_the_build_asked_for_comes_from_pytorchs_index_and_is_remembered(machine):
+    cards = machine.cards(VOLTA)
+    assert machine.run(TORCH_CUDA="cu126", **cards).returncode == 0
+    lines = machine.done()
+    assert (
+        "pip install --quiet torch==2.11.0 torchvision==0.26.0 --index-url https://download.pytorch.org/whl/cu126"
+        in lines
+    )
+    assert machine.stamp.read_text().split()[1:] == ["cu126"]
+    assert machine.run(**cards).returncode == 0
+    assert not [line for line in machine.done() if line.startswith("pip")], "make test keeps the build"
+
+
+def test_another_build_remakes_it_and_back(machine):
+    machine.run()
+    machine.done()
+    assert machine.run(TORCH_CUDA="cpu").returncode == 0
+    assert any("whl/cpu" in line for line in machine.done())
+    assert machine.run(TORCH_CUDA="cu130").returncode == 0
+    lines = machine.done()
+    assert lines and not any("--index-url" in line for line in lines)
+    assert len(machine.stamp.read_text().split()) == 1
+
+
+def test_changed_requirements_keep_the_build_that_was_chosen(machine):
+    machine.run(TORCH_CUDA="cpu")
+    machine.done()
+    (machine.checkout / "requirements.txt").write_text("torch\n")
+    assert machine.run().returncode == 0
+    assert any("whl/cpu" in line for line in machine.done())
+
+
+def test_a_mirror_of_pytorchs_index_is_taken(machine):
+    machine.run(TORCH_CUDA="cpu", TORCH_INDEX="https://mirror.example/whl")
+    assert any("--index-url https://mirror.example/whl/cpu" in line for line in machine.done())
+
+
+def test_an_index_that_gives_another_torch_is_noticed(machine):
+    done = machine.run(TORCH_CUDA="cu126", FAKE_WRONG_TORCH="1")
+    assert done.returncode == 1 and "TORCH_INDEX" in done.stderr and not machine.stamp.exists()
+
+
+def test_an_unsuitable_build_is_made_where_it_was_asked_for(machine):
+    done = machine.run(TORCH_CUDA="cu130", **machine.cards(VOLTA))
+    assert done.returncode == 0 and "going on" in done.stderr
+
+
+def test_an_unknown_build_is_refused_with_those_there_are(machine):
+    done = machine.run(TORCH_CUDA="cu118")
+    assert done.returncode == 1 and "cu130, cu128, cu126, cpu" in done.stderr and machine.done() == []
+
+
+def test_gsplat_is_seen_to_on_every_call_where_there_is_a_card_or_archs_are_named(machine):
+    machine.run()
+    machine.done()
+    assert machine.run(GSPLAT_ARCHS="8.6").returncode == 0
+    assert machine.done() == ["gsplat_build --if-needed"]
+    assert machine.run(**machine.cards(ADA)).returncode == 0
+    assert machine.done() == ["gsplat_build --if-needed"]
+
+
+def test_gsplat_that_does_not_compile_fails_the_setup_but_not_the_packages(machine):
+    done = machine.run(FAKE_BUILD_STATUS="1")
+    assert done.returncode == 1 and "GSPLAT_ARCHS=none" in done.stderr
+    assert machine.stamp.exists()
+
+
+def test_the_doctor_without_venv_says_what_stands_in_the_way(machine):
+    done = machine.run(script="doctor")
+    assert done.returncode == 1 and "make setup" in done.stdout and "nothing stands in the way" in done.stderr
+    done = machine.run(script="doctor", FAKE_NO_VENV="1", **machine.cards(PASCAL))
+    assert done.returncode == 1 and "python3.11-venv" in done.stderr
+    assert not (machine.checkout / ".venv").exists()
+
+
+def test_the_doctor_does_not_trust_a_half_made_venv(machine):
+    machine.run(FAKE_PIP_FAILS="1")
+    done = machine.run(script="doctor")
+    assert done.returncode == 1 and "half-made" in done.stdout

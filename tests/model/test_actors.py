@@ -1,0 +1,447 @@
+"""Gaussians that ride in moving boxes: where they are, what colours they have, and what corrects their boxes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import about_z, actors_of, looking_at, motion_through, track_of
+from scipy.spatial.transform import Rotation
+
+from drivesplat.model.actors import Actors, Placements, track_penalties
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.settings.actors import ActorSettings, TrackSettings
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import DefaultSettings, McmcSettings
+from drivesplat.training.optimizers import make_optimizers
+
+TIMES = np.linspace(1.0, 3.0, 5)
+"""Of the van's annotations."""
+VELOCITY, RATE = np.array([4.0, -1.0, 0.1]), 0.7
+"""Metres and radians a second."""
+
+
+def van() -> ActorTrack:
+    """At (4, -1, 0.1) t, its heading 0.7 t, from 1 to 3 seconds."""
+    return track_of(motion_through(TIMES, TIMES[:, None] * VELOCITY, RATE * TIMES), "van", (5.0, 2.0, 2.2))
+
+
+def tilted(track: ActorTrack) -> ActorTrack:
+    """The same, its nose 0.3 rad down."""
+    poses = track.motion.object_to_world.copy()
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_euler("y", 0.3).as_matrix()
+    return dataclasses.replace(track, motion=dataclasses.replace(track.motion, object_to_world=poses))
+
+
+def car() -> ActorTrack:
+    """Winding from 0 to 1 second and from 2.5 to 3.5."""
+    times = np.array([0.0, 0.5, 1.0, 2.5, 3.0, 3.5])
+    places = np.random.default_rng(5).uniform(-9, 9, (6, 3))
+    return track_of(motion_through(times, places, 0.4 * times**2, runs=((0, 2), (3, 5))), "car")
+
+
+def constant_colors(degree: int = 1) -> ActorSettings:
+    return ActorSettings(sh_degree=degree, fourier=1)
+
+
+def matrices(quats: torch.Tensor) -> np.ndarray:
+    return Rotation.from_quat(quats.detach().double().numpy(), scalar_first=True).as_matrix()
+
+
+def doubled(actors: Actors) -> dict[str, np.ndarray]:
+    return {name: value.detach().double().numpy() for name, value in (*actors.params.items(), *actors.shared.items())}
+
+
+# ---- rotations
+
+
+def test_a_quaternions_left_factor_rotates_after_another():
+    a, b = Rotation.random(20, random_state=1), Rotation.random(20, random_state=2)
+    first, second = (torch.from_numpy(r.as_quat(scalar_first=True)) for r in (b, a))
+    product = (left_factor(second) @ first[..., None])[..., 0]
+    np.testing.assert_allclose(matrices(product), (a * b).as_matrix(), atol=1e-12)
+    torch.testing.assert_close(product.norm(dim=1), torch.ones(20, dtype=torch.float64))
+
+
+def test_a_quaternions_matrix_is_that_of_its_rotation():
+    rotations = Rotation.random(20, random_state=4)
+    found = rotation_matrix(torch.from_numpy(rotations.as_quat(scalar_first=True)))
+    np.testing.assert_allclose(found, rotations.as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, -2.0, np.pi])
+def test_turns_about_the_vertical_are_counterclockwise_from_above(angle):
+    quat = about_vertical(torch.tensor([angle], dtype=torch.float64))
+    np.testing.assert_allclose(matrices(quat)[0], about_z(angle), atol=1e-12)
+
+
+# ---- where they are
+
+
+def linear(values: np.ndarray, slope: float, start: float) -> np.ndarray:
+    return start + slope * values
+
+
+@pytest.mark.parametrize("time", [0.8, 1.0, 1.37, 2.0, 2.9, 3.0, 3.2])
+def test_a_turning_actor_is_where_its_corrected_box_takes_it(time):
+    """Corrections along the world's axes and about the object's vertical, linear in time as its motion is, so that the
+    closed form holds between annotations, too."""
+    actors = actors_of(van())
+    shift, turn = np.array([0.1, -0.2, 0.05]), 0.11
+    with torch.no_grad():
+        actors.shared["translation"].copy_(torch.from_numpy(TIMES[:, None] * shift - 0.3))
+        actors.shared["yaw"].copy_(torch.from_numpy(turn * TIMES - 0.2))
+    p, gaussians = doubled(actors), actors.at(time)
+    box = about_z(RATE * time + turn * time - 0.2)
+    means = p["means"] @ box.T + time * VELOCITY + time * shift - 0.3
+    np.testing.assert_allclose(gaussians.means.detach(), means, atol=1e-5)
+    np.testing.assert_allclose(matrices(gaussians.quats), box @ matrices(actors.params["quats"]), atol=1e-5)
+    np.testing.assert_allclose(gaussians.scales.detach(), np.exp(p["scales"]), rtol=1e-5)
+    np.testing.assert_allclose(gaussians.opacities.detach(), 1.0 / (1.0 + np.exp(-p["opacities"])), rtol=1e-5)
+
+
+@pytest.mark.parametrize("index", [0, 2, 4])
+def test_at_an_annotation_its_own_correction_holds(index):
+    """Whatever those of its neighbours are; a box that is tilted, too, is turned about its own vertical."""
+    actors = actors_of(tilted(van()))
+    p, gaussians = doubled(actors), actors.at(TIMES[index])
+    box = tilted(van()).motion.object_to_world[index, :3, :3] @ about_z(p["yaw"][index])
+    means = p["means"] @ box.T + TIMES[index] * VELOCITY + p["translation"][index]
+    np.testing.assert_allclose(gaussians.means.detach(), means, atol=1e-5)
+    np.testing.assert_allclose(matrices(gaussians.quats), box @ matrices(actors.params["quats"]), atol=1e-5)
+
+
+def test_between_annotations_corrections_are_weighted_as_positions_are():
+    actors = actors_of(van())
+    weights = van().motion.weights(np.array([1.8]))[0]
+    placements, p = actors.placements(actors.moment(1.8)), doubled(actors)
+    np.testing.assert_allclose(
+        placements.translations[0].detach(), 1.8 * VELOCITY + weights @ p["translation"], atol=1e-5
+    )
+    np.testing.assert_allclose(matrices(placements.quats)[0], about_z(RATE * 1.8 + weights @ p["yaw"]), atol=1e-5)
+
+
+def test_actors_can_be_placed_anywhere_and_enlarged():
+    actors = actors_of(van(), car())
+    turns = Rotation.random(2, random_state=3)
+    places, scales = np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 1.0]]), np.array([1.5, 0.5])
+    placements = Placements(
+        *(torch.from_numpy(x).float() for x in (turns.as_quat(scalar_first=True), places)),
+        torch.tensor([True, True]),
+        torch.from_numpy(scales).float(),
+    )
+    gaussians, p = actors.placed(actors.moment(9.0), placements), doubled(actors)
+    for i, rotation in enumerate(turns.as_matrix()):
+        own = p["owner"] == i
+        means = scales[i] * p["means"][own] @ rotation.T + places[i]
+        np.testing.assert_allclose(gaussians.means[own].detach(), means, atol=1e-5)
+        np.testing.assert_allclose(gaussians.scales[own].detach(), scales[i] * np.exp(p["scales"][own]), rtol=1e-5)
+        own_turns = matrices(actors.params["quats"])[own]
+        np.testing.assert_allclose(matrices(gaussians.quats[own]), rotation @ own_turns, atol=1e-5)
+    assert (gaussians.opacities > 0).all(), "absent by their tracks at this time, present where they are put"
+
+
+@pytest.mark.parametrize(
+    ("time", "there"),
+    [(0.5, [False, True]), (0.9, [True, True]), (2.0, [True, False]), (3.4, [False, True]), (7.0, [False, False])],
+)
+def test_absent_actors_keep_their_rows_and_have_no_opacity(time, there):
+    actors = actors_of(van(), car(), count=7)
+    gaussians = actors.at(time)
+    assert len(gaussians) == len(actors) == 14
+    assert actors.params["owner"].tolist() == [0] * 7 + [1] * 7
+    for i, present in enumerate(there):
+        opacities = gaussians.opacities[actors.params["owner"] == i]
+        assert (opacities > 0).all() if present else (opacities == 0).all()
+    assert all(torch.isfinite(getattr(gaussians, f.name)).all() for f in dataclasses.fields(Gaussians))
+
+
+def alone(actors: Actors, index: int, settings: ActorSettings) -> Actors:
+    """One of several actors with its Gaussians and corrections."""
+    own = actors.params["owner"] == index
+    params = {name: value.detach()[own].clone() for name, value in actors.params.items()}
+    params["owner"] = torch.zeros_like(params["owner"])
+    one = Actors(params, [actors.timeline.tracks[index]], settings, GaussianSettings())
+    with torch.no_grad():
+        for name, value in one.shared.items():
+            value.copy_(actors.shared[name][actors.timeline.owned[index]])
+    return one
+
+
+@pytest.mark.parametrize("time", [0.9, 1.9, 3.1])
+def test_several_actors_at_once_are_each_as_alone(time):
+    settings = ActorSettings(sh_degree=2)
+    actors = actors_of(van(), car(), van(), settings=settings, count=5)
+    shuffled = torch.randperm(15, generator=torch.Generator().manual_seed(0))
+    for value in actors.params.values():
+        value.data = value.data[shuffled]
+    together = actors.at(time)
+    for i in range(3):
+        one, own = alone(actors, i, settings).at(time), together[actors.params["owner"] == i]
+        for field in dataclasses.fields(Gaussians):
+            torch.testing.assert_close(getattr(own, field.name), getattr(one, field.name), rtol=1e-5, atol=1e-6)
+
+
+# ---- their colours
+
+
+def test_new_actors_have_their_points_colours_at_all_times():
+    rng = np.random.default_rng(3)
+    points, colors = rng.uniform(-1, 1, (9, 3)), rng.uniform(0, 1, (9, 3))
+    actors = Actors.from_points([van()], [points], [colors], ActorSettings(), GaussianSettings())
+    np.testing.assert_allclose(actors.params["means"].detach(), points, atol=1e-6)
+    for time in (1.0, 1.7, 3.0):
+        sh = actors.at(time).sh.detach()
+        assert sh.shape == (9, 4, 3)
+        np.testing.assert_allclose(0.5 + 0.28209479 * sh[:, 0], colors, atol=1e-5)
+        np.testing.assert_allclose(sh[:, 1:], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("time", "progress"), [(0.8, 0.0), (1.0, 0.0), (1.6, 0.3), (2.0, 0.5), (3.0, 1.0), (3.2, 1.0)])
+def test_colours_are_a_series_of_cosines_over_the_annotations(time, progress):
+    """Equation 5 of Street Gaussians, for every coefficient; beyond the annotations the ends' colours stay."""
+    actors = actors_of(van(), settings=ActorSettings(fourier=4, sh_degree=1))
+    p = doubled(actors)
+    f = np.concatenate([p["sh0"], p["shN"]], axis=2)
+    assert f.shape == (6, 4, 4, 3)
+    expected = sum(f[:, i] * np.cos(np.pi * i * progress) for i in range(4))
+    np.testing.assert_allclose(actors.harmonics(actors.moment(time)).detach(), expected, atol=1e-5)
+
+
+def test_with_the_constant_term_alone_colours_do_not_change():
+    actors = actors_of(van(), settings=ActorSettings(fourier=5))
+    with torch.no_grad():
+        actors.params["sh0"][:, 1:], actors.params["shN"][:, 1:] = 0.0, 0.0
+    first = actors.harmonics(actors.moment(1.0))
+    assert first.std() > 0.1
+    for time in (1.4, 2.2, 3.0):
+        torch.testing.assert_close(actors.harmonics(actors.moment(time)), first)
+
+
+def test_each_actors_series_runs_over_its_own_annotations():
+    actors = actors_of(van(), car(), settings=ActorSettings(fourier=2, sh_degree=0))
+    coefficients = actors.params["sh0"][:, :, 0].detach()
+    progress = torch.tensor([0.5, 2.0 / 3.5])[actors.params["owner"]]  # at 2 s, from 1 to 3 and from 0 to 3.5
+    expected = coefficients[:, 0] + coefficients[:, 1] * torch.cos(torch.pi * progress)[:, None]
+    torch.testing.assert_close(actors.harmonics(actors.moment(2.0))[:, 0].detach(), expected)
+
+
+def first_degree(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Colours (n, d, 3) of coefficients (n, 4, 3) along directions (d, 3), in closed form."""
+    x, y, z = directions.T
+    basis = np.stack([np.full_like(x, 0.28209479), -0.48860251 * y, 0.48860251 * z, -0.48860251 * x], axis=1)
+    return np.einsum("dk,nkc->ndc", basis, sh)
+
+
+def test_an_actor_that_turns_keeps_its_colours_on_its_sides():
+    """Seen from the world along d it has the colours that its own frame has along R^T d, whatever corrects its box."""
+    actors = actors_of(van())
+    rng = np.random.default_rng(4)
+    directions = rng.normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = []
+    for time in (1.0, 2.1, 2.9):
+        box = matrices(actors.placements(actors.moment(time)).quats)[0]
+        expected = first_degree(actors.harmonics(actors.moment(time)).detach().double().numpy(), directions @ box)
+        seen.append(first_degree(actors.at(time).sh.detach().double().numpy(), directions))
+        np.testing.assert_allclose(seen[-1], expected, atol=1e-5)
+    assert np.abs(seen[0] - seen[1]).max() > 0.1, "turned far enough to tell"
+
+
+def test_a_passing_camera_sees_front_and_back():
+    """Through the renderer: an object red along its x axis and blue against it, before a camera that it faces and, half
+    a turn later, turns its back on."""
+    motion = motion_through([0.0, 1.0], [[0.0, 0.0, 0.0]] * 2, [0.0, np.pi])
+    actors = actors_of(track_of(motion), count=1, settings=constant_colors(), shaken=False)
+    with torch.no_grad():
+        actors.params["means"].zero_()
+        actors.params["scales"].fill_(np.log(0.5))
+        actors.params["sh0"].zero_()
+        actors.params["shN"][0, 0, 2] = torch.tensor([0.6, 0.0, -0.6])  # times -0.4886 x of the way it is looked along
+    model = SplatModel([actors], None)
+    for time, (red, blue) in ((0.0, (0.5 + 0.2932, 0.5 - 0.2932)), (1.0, (0.5 - 0.2932, 0.5 + 0.2932))):
+        picture = model.render(looking_at([0.0, 0.0, 0.0], [6.0, 0.0, 0.0], time))
+        color = (picture.image[16, 24] / picture.alpha[16, 24]).detach()
+        np.testing.assert_allclose(color, [red, 0.5, blue], atol=5e-3)
+
+
+# ---- what corrects their boxes
+
+
+def in_double(actors: Actors) -> Actors:
+    """The same actors, computed in float64."""
+    moment_at = actors.timeline.at
+
+    def doubled_moment(time, device):
+        moment = moment_at(time, device)
+        return moment._replace(**{n: value.double() for n, value in moment._asdict().items() if n != "present"})
+
+    actors.timeline.at = doubled_moment
+    return actors.double()
+
+
+def test_an_image_corrects_positions_and_headings_by_its_gradient():
+    """Autograd against finite differences, for every entry of the corrections, through a rendering between annotations.
+    Of one colour all around, since colours turn without a gradient by design."""
+    motion = motion_through(
+        [0.0, 0.5, 1.0, 1.5], [[4.0 * t, 0.0, 0.0] for t in (0.0, 0.5, 1.0, 1.5)], [0, 0.3, 0.6, 0.9]
+    )
+    settings = ActorSettings(sh_degree=0, fourier=2)
+    actors = in_double(actors_of(track_of(motion, size=(2.0, 1.0, 1.0)), settings=settings, count=8))
+    model = SplatModel([actors], None)
+    view = looking_at([2.8, 0.0, 0.0], [2.8, -5.0, 1.0], time=0.7)
+    view = dataclasses.replace(view, K=view.K.double(), camera_to_world=view.camera_to_world.double())
+    ramp = torch.linspace(-1.0, 1.0, 48, dtype=torch.float64)[:, None] * torch.tensor([1.0, -2.0, 1.5])
+
+    def loss() -> torch.Tensor:
+        return (model.render(view).image * ramp).sum()
+
+    loss().backward()
+    for name in ("translation", "yaw"):
+        value, step = actors.shared[name].detach().view(-1), 1e-6
+        found = torch.zeros_like(value)
+        for i in range(len(value)):
+            ends = []
+            for sign in (1.0, -1.0):
+                value[i] += sign * step
+                ends.append(float(loss().detach()))
+                value[i] -= sign * step
+            found[i] = (ends[0] - ends[1]) / (2 * step)
+        gradient = actors.shared[name].grad.view(-1)
+        assert float(gradient.abs().max()) > 0.1
+        torch.testing.assert_close(gradient, found, rtol=1e-5, atol=1e-6)
+
+
+def test_corrections_learn_at_their_own_rates():
+    tracks = TrackSettings(lr_translation=0.02, lr_yaw=0.03)
+    actors = actors_of(van(), settings=ActorSettings(tracks=tracks))
+    rates = {name: o.param_groups[0]["lr"] for name, o in make_optimizers(SplatModel([actors], None)).shared[0].items()}
+    assert rates == {"translation": 0.02, "yaw": 0.03}
+
+
+def test_positions_learn_in_proportion_to_the_middling_size_of_the_boxes():
+    actors = actors_of(van(), car(), track_of(van().motion, "bus", (12.0, 3.0, 4.0)))
+    assert actors.extent == pytest.approx(np.linalg.norm([5.0, 2.0, 2.2]))
+    assert actors.learning_rates()["means"] == pytest.approx(1.6e-4 * actors.extent)
+
+
+def test_tracks_that_are_not_to_be_corrected_stay_as_they_are():
+    actors = actors_of(van(), settings=ActorSettings(tracks=TrackSettings(corrected=False)), shaken=False)
+    model = SplatModel([actors], None)
+    assert make_optimizers(model).shared == [{}] and actors.penalties() == {}
+    model.render(looking_at([8.0, -2.0, 0.0], [8.0, -12.0, 1.0], 2.0)).image.sum().backward()
+    assert all(value.grad is None and not value.any() for value in actors.shared.values())
+    assert actors.params["means"].grad.abs().sum() > 0
+
+
+def penalties_of(translation: np.ndarray, yaw: np.ndarray, *tracks: ActorTrack, **settings: float) -> dict[str, float]:
+    actors = actors_of(*tracks, settings=ActorSettings(tracks=TrackSettings(**settings)), shaken=False)
+    with torch.no_grad():
+        actors.shared["translation"].copy_(torch.from_numpy(translation))
+        actors.shared["yaw"].copy_(torch.from_numpy(yaw))
+    return {name: float(value.detach()) for name, value in actors.penalties().items()}
+
+
+def test_no_corrections_cost_nothing():
+    assert penalties_of(np.zeros((5, 3)), np.zeros(5), van()) == {"track_size": 0.0, "track_bend": 0.0}
+
+
+def test_penalties_are_mean_squares_in_units_of_what_annotations_are_off():
+    rng = np.random.default_rng(7)
+    translation, yaw = rng.normal(size=(5, 3)), rng.normal(size=5)
+    found = penalties_of(
+        translation, yaw, van(), sigma_translation=0.2, sigma_yaw=0.05, size_weight=0.3, bend_weight=0.7
+    )
+    size = np.mean([(np.sum(translation[i] ** 2) / 0.2**2 + yaw[i] ** 2 / 0.05**2) for i in range(5)])
+    bends = [(values[:-2] - 2 * values[1:-1] + values[2:]) ** 2 for values in (translation / 0.2, yaw / 0.05)]
+    bend = np.mean([bends[0][i].sum() + bends[1][i] for i in range(3)])
+    assert found == pytest.approx({"track_size": 0.3 * size, "track_bend": 0.7 * bend}, rel=1e-5)
+
+
+def test_corrections_that_change_steadily_along_each_run_do_not_bend():
+    """The van's, and those of the car's two runs: across its gap, and from track to track, they may leap."""
+    steady = np.concatenate([np.arange(5.0), 20.0 + 3.0 * np.arange(3), -7.0 - np.arange(3)])
+    found = penalties_of(steady[:, None] * [0.1, -0.2, 0.3], 0.01 * steady, van(), car())
+    assert found["track_bend"] == pytest.approx(0.0, abs=1e-9) and found["track_size"] > 1.0
+
+
+def test_where_no_three_annotations_follow_one_another_nothing_bends():
+    pair = track_of(motion_through([0.0, 0.5], [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
+    assert penalties_of(np.ones((2, 3)), np.ones(2), pair).keys() == {"track_size"}
+
+
+def test_penalties_pull_corrections_back():
+    actors = actors_of(van())
+    sum(actors.penalties().values()).backward()
+    stepped = {name: (value - 1e-3 * value.grad).detach() for name, value in actors.shared.items()}
+    settings = TrackSettings()
+    less = track_penalties(stepped["translation"], stepped["yaw"], actors.timeline.neighbours, settings)
+    assert all(float(less[name]) < float(value.detach()) for name, value in actors.penalties().items())
+
+
+# ---- what else they are asked
+
+
+def test_gaussians_outside_their_own_grown_box_fade_and_no_others():
+    """The van's box is 5 x 2 x 2.2 m, the car's 4 x 2 x 1.6 m, both grown by 0.1 m on every side."""
+    cases = [
+        (0, (2.58, 0.0, 0.0), False), (0, (2.62, 0.0, 0.0), True), (1, (2.05, 0.9, 0.0), False),
+        (1, (2.55, 0.0, 0.0), True), (0, (0.0, -1.05, 0.0), False), (0, (0.0, -1.15, 0.0), True),
+        (1, (0.0, 0.0, 0.85), False), (1, (0.0, 0.0, -0.95), True), (0, (0.0, 0.0, -1.15), False),
+    ]  # fmt: skip
+    actors = actors_of(van(), car(), count=5, settings=ActorSettings(box_margin=0.1))
+    params = {name: value.detach()[: len(cases)].clone() for name, value in actors.params.items()}
+    params["owner"] = torch.tensor([owner for owner, _, _ in cases])
+    params["means"] = torch.tensor([place for _, place, _ in cases])
+    few = Actors(params, [van(), car()], ActorSettings(box_margin=0.1), GaussianSettings())
+    before = {name: value.detach().clone() for name, value in few.named_parameters()}
+    few.confine()
+    after = dict(few.named_parameters())
+    faded = torch.tensor([out for _, _, out in cases])
+    opacities = torch.sigmoid(few.params["opacities"].detach())
+    assert (opacities[faded] < min(McmcSettings().min_opacity, DefaultSettings().prune_opacity)).all()
+    assert torch.equal(few.params["opacities"].detach()[~faded], before["params.opacities"][~faded])
+    assert all(torch.equal(after[name], value) for name, value in before.items() if name != "params.opacities")
+    assert all(value.grad is None and value.grad_fn is None for value in after.values())
+    assert few.params["opacities"].requires_grad
+
+
+def test_a_track_knows_its_rows():
+    actors = actors_of(van(), car(), count=3)
+    assert actors.of_track("car").tolist() == [False] * 3 + [True] * 3
+    assert actors.of_track("another") is None
+
+
+@pytest.mark.parametrize(("corrected", "tolerance"), [("steadily", 1e-4), ("anyhow", 0.05)])
+@pytest.mark.parametrize("time", [1.0, 1.6, 2.9])
+def test_in_its_pieces_an_actor_is_where_it_is_in_the_model(time, corrected, tolerance):
+    """A piece's motion goes through the corrected annotations: as the model's does where corrections change steadily,
+    and within centimetres where they leap by 0.1 rad from annotation to annotation."""
+    actors = actors_of(tilted(van()), car(), settings=ActorSettings(sh_degree=0))
+    if corrected == "steadily":
+        with torch.no_grad():
+            for track, own in zip(actors.timeline.tracks, actors.timeline.owned, strict=True):
+                times = torch.from_numpy(track.motion.times).float()
+                actors.shared["translation"][own] = times[:, None] * torch.tensor([0.1, -0.1, 0.0])
+                actors.shared["yaw"][own] = 0.15
+    together, pieces = actors.at(time), actors.pieces(time)
+    assert list(pieces) == ["van", "car"]
+    for i, piece in enumerate(pieces.values()):
+        (pose,) = piece.motion.poses(np.array([time]))
+        own = together[actors.params["owner"] == i]
+        if not piece.motion.present(np.array([time]))[0]:
+            assert not own.opacities.any() and piece.gaussians.opacities.all(), "a piece is whole, present or not"
+            continue
+        means = piece.gaussians.means.double().numpy() @ pose[:3, :3].T + pose[:3, 3]
+        np.testing.assert_allclose(means, own.means.detach(), atol=tolerance)
+        torch.testing.assert_close(piece.gaussians.scales, own.scales.detach())
+        torch.testing.assert_close(piece.gaussians.opacities, own.opacities.detach())
+        torch.testing.assert_close(piece.gaussians.sh, own.sh.detach())
+
+
+@pytest.mark.parametrize("cap_max", [10, 100])
+def test_densification_is_held_to_the_cap_however_many_there_are(cap_max):
+    assert actors_of(van(), count=30, settings=ActorSettings(cap_max=cap_max)).cap_max == cap_max

@@ -1,0 +1,312 @@
+"""Cameras that expose each in their own way: what is learned of it, what it is worth, and what keeps it."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.rig_drives import RIG, recorder_of, rig_drive
+from helpers.trainings import (
+    CHECKPOINT_AT,
+    CPU,
+    ITERATIONS,
+    PROVENANCE,
+    EndedError,
+    EndingViews,
+    mean_psnr,
+    parser_record,
+    recorded_views,
+    same_parameters,
+    settings_of,
+    trained,
+    untrained,
+)
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from drivesplat.model.build import definitions, rebuild_model
+from drivesplat.model.exposure import Exposures
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.settings.config import load
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
+from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
+from drivesplat.training.first_exposure import first_gains, log_gains
+from drivesplat.training.losses import loss_terms
+from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
+from drivesplat.training.views import Guides, TrainingView, load_views, view_of
+from drivesplat.workflow.stages import stage_settings
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+AFFINE = ExposureSettings(kind="affine", sigma_gain=0.2, sigma_offset=0.05, learning_rate=0.1)
+GAINS = torch.tensor([1.25, 1.1, 0.8])
+OFFSET = 0.03
+
+
+def rig_views(count: int = 6) -> list[TrainingView]:
+    """What two cameras record by turns of the same cloud: FRONT as it is, BACK with other gains and an offset."""
+    views = []
+    for i, seen in enumerate(recorded_views(count)):
+        camera, pixels = "FRONT", seen.pixels
+        if i % 2:
+            camera, pixels = "BACK", (seen.target() * 0.7 * GAINS + OFFSET).mul(255.0).round().to(torch.uint8)
+        else:
+            pixels = (seen.target() * 0.7 * 255.0).round().to(torch.uint8)
+        views.append(TrainingView(dataclasses.replace(seen.view, camera=camera), pixels))
+    return views
+
+
+def exposed(settings: TrainSettings) -> SplatModel:
+    """An untrained model that learns how BACK exposes."""
+    model = untrained(settings)
+    return SplatModel(list(model.parts), None, exposure=exposures_of("BACK", settings=settings.exposure))
+
+
+def exposures_of(*cameras: str, settings: ExposureSettings) -> Exposures:
+    """Of cameras that are found to be as the reference."""
+    return Exposures({camera: torch.ones(3) for camera in cameras}, settings)
+
+
+def of(camera: str, views: list[TrainingView]) -> list[TrainingView]:
+    return [view for view in views if view.view.camera == camera]
+
+
+def test_a_camera_shows_gains_and_offsets_and_the_reference_does_not():
+    exposures = exposures_of("BACK", settings=AFFINE)
+    image = torch.rand(4, 5, 3)
+    torch.testing.assert_close(exposures.shown(image, "BACK"), image)
+    with torch.no_grad():
+        exposures.params["BACK"][0], exposures.params["BACK"][1] = GAINS.log() / 0.2, OFFSET / 0.05
+    torch.testing.assert_close(exposures.shown(image, "BACK"), image * GAINS + OFFSET)
+    for camera in ("FRONT", None):
+        assert exposures.shown(image, camera) is image
+    figures = exposures.figures()
+    assert figures["BACK/gain_blue"] == pytest.approx(0.8) and figures["BACK/offset_red"] == pytest.approx(OFFSET)
+    assert len(figures) == 6
+    found = Exposures({"BACK": GAINS}, AFFINE)
+    torch.testing.assert_close(found.shown(image, "BACK"), image * GAINS)
+    assert not found.penalty("BACK").any(), "what was found is free"
+
+
+def test_the_penalty_is_the_weighted_mean_square_of_the_camera_that_is_seen():
+    exposures = exposures_of("BACK", "LEFT", settings=ExposureSettings(weight=0.4))
+    with torch.no_grad():
+        exposures.params["BACK"][0] = 0.3
+    assert float(exposures.penalty("BACK").detach()) == pytest.approx(0.4 * 0.5 * 0.09)
+    assert float(exposures.penalty("LEFT").detach()) == 0.0
+    assert exposures.penalty("FRONT") is None and exposures.penalty(None) is None
+    assert exposures_of("BACK", settings=ExposureSettings(weight=0.0)).penalty("BACK") is None
+
+
+def test_the_picture_is_exposed_after_the_sky_and_the_splats_are_not():
+    settings = settings_of(exposure=AFFINE)
+    model = exposed(settings)
+    model.sky = untrained(settings, sky=True).sky
+    with torch.no_grad():
+        model.exposure.params["BACK"][0] = math.log(2.0) / 0.2
+    front, back = (model.render(dataclasses.replace(rig_views()[0].view, camera=c)) for c in ("FRONT", "BACK"))
+    torch.testing.assert_close(back.image, 2.0 * front.image)
+    torch.testing.assert_close(back.splats, front.splats)
+    assert not torch.equal(front.image, front.splats)
+
+
+def test_only_the_camera_that_is_seen_pays_and_learns():
+    views, settings = rig_views(), settings_of(exposure=AFFINE)
+    for camera, pays in (("FRONT", False), ("BACK", True)):
+        model = exposed(settings)
+        view = of(camera, views)[0]
+        terms = loss_terms(model.render(view.view), view, model, settings)
+        assert ("exposure" in terms) == pays
+        sum(terms.values()).backward()
+        assert (model.exposure.params["BACK"].grad is not None) == pays
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> dict[str, SplatModel]:
+    """The same drive of two cameras, learned with and without exposures."""
+    common = {"iterations": 240, "checkpoint_every": 1000, "log_every": 100, "image_every": 1000}
+    folder, models = tmp_path_factory.mktemp("learned"), {}
+    for kind, exposure in (("none", ExposureSettings()), ("affine", AFFINE)):
+        settings = settings_of(**common, exposure=exposure)
+        model = exposed(settings) if kind == "affine" else untrained(settings)
+        models[kind], _ = trained(folder / kind, settings, rig_views(), model=model)
+    return models
+
+
+def test_gains_of_a_camera_are_recovered(learned):
+    """What is learned is what leads from the reference's colours to the camera's."""
+    figures = learned["affine"].exposure.figures()
+    gains = [figures[f"BACK/gain_{channel}"] for channel in ("red", "green", "blue")]
+    np.testing.assert_allclose(gains, GAINS, rtol=0.1)
+    assert abs(figures["BACK/offset_green"] - OFFSET) < 0.03
+
+
+def test_both_cameras_profit(learned):
+    for camera, gain in (("BACK", 1.5), ("FRONT", 1.5)):
+        views = of(camera, rig_views())
+        assert mean_psnr(learned["affine"], views) > mean_psnr(learned["none"], views) + gain
+
+
+def test_a_new_way_is_shown_as_the_reference_shows_it(learned):
+    view = rig_views()[1].view
+    plain, front, back = (
+        learned["affine"].render(dataclasses.replace(view, camera=camera)).image for camera in (None, "FRONT", "BACK")
+    )
+    assert torch.equal(plain, front) and not torch.allclose(plain, back, atol=0.01)
+
+
+def test_a_checkpoint_holds_exposures(learned):
+    model = learned["affine"]
+    settings = settings_of(exposure=AFFINE)
+    rebuilt = rebuild_model(model.state_dict(), definitions(model), "none", settings)
+    assert rebuilt.exposure.figures() == model.exposure.figures()
+    view = of("BACK", rig_views())[0].view
+    torch.testing.assert_close(rebuilt.render(view).image, model.render(view).image)
+    plain = rebuild_model(learned["none"].state_dict(), definitions(learned["none"]), "none", settings)
+    assert plain.exposure is None
+
+
+def test_a_resumed_training_of_exposures_is_the_same_training(tmp_path):
+    settings = settings_of(exposure=AFFINE)
+    whole, summary = trained(tmp_path / "whole", settings, rig_views(), model=exposed(settings))
+    with pytest.raises(EndedError):
+        trained(tmp_path / "it", settings, EndingViews(rig_views(), CHECKPOINT_AT + 8), model=exposed(settings))
+    resumed, again = trained(tmp_path / "it", settings, rig_views(), model=exposed(settings))
+    assert again.resumed_at == [CHECKPOINT_AT] and again.iterations == ITERATIONS
+    assert same_parameters(resumed, whole)
+    assert summary.of_cameras == again.of_cameras and summary.of_cameras["exposure/BACK/gain_red"] != 1.0
+    board = EventAccumulator(str(tmp_path / "whole/tensorboard"))
+    board.Reload()
+    assert set(summary.of_cameras) < set(board.Tags()["scalars"])
+    assert board.Scalars("exposure/BACK/gain_red")[-1].value == pytest.approx(
+        summary.of_cameras["exposure/BACK/gain_red"]
+    )
+
+
+def test_exposures_learn_once_there_is_a_scene_and_ever_more_slowly():
+    settings = settings_of(iterations=100, exposure=AFFINE)
+    model = exposed(settings)
+    optimizers = make_optimizers(model)
+    rates = []
+    for step in (0, 9, 10, 50, 100):
+        schedule(model, optimizers, step, settings)
+        rates.append(optimizers.beside_parts["exposure"]["BACK"].param_groups[0]["lr"])
+    assert rates == pytest.approx([0.0, 0.0, 0.1 * 0.01**0.1, 0.01, 0.001])
+
+
+# ---- what is known before
+
+
+def test_gains_of_a_rig_are_found_from_colours_of_shared_surfaces():
+    """The second camera shares surfaces with the first, the third with the second alone, the fourth with none."""
+    rng = np.random.default_rng(0)
+    true = np.log([[1.0, 1.0, 1.0], [1.3, 1.1, 0.8], [0.7, 1.2, 1.5], [2.0, 2.0, 2.0]])
+    shades = rng.uniform(-2.0, -0.5, (900, 3)) + true[:, None] + rng.normal(0.0, 0.05, (4, 900, 3))
+    shades[1, rng.random(900) < 0.2] += 1.5  # in some places something else stands before the surface
+    for camera, (first, last) in enumerate(((0, 400), (300, 700), (600, 800), (800, 900))):
+        shades[camera, :first], shades[camera, last:] = np.nan, np.nan
+    found = log_gains(shades)
+    np.testing.assert_allclose(found[:3], true[:3], atol=0.06)
+    assert not found[3].any()
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory) -> TrainingInputs:
+    """A drive by FRONT and BACK of the demo's rig, whose BACK takes in other light; nothing is held out."""
+    folder = tmp_path_factory.mktemp("rig")
+    scene = rig_drive(folder, ["CAM_FRONT", "CAM_BACK"], exposures={"CAM_BACK": (1.4, 1.1, 0.75)})
+    holdout, images = HoldoutSettings(every_nth=0, last_block=0), ImageSettings()
+    settings = LidarSeedSettings(max_points=20_000, far_points=2_000)
+    seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0))
+    return TrainingInputs(parser_dict(scene, seed, ParserJob(holdout=holdout, images=images)), folder, [], [])
+
+
+def test_gains_of_the_demos_rig_are_found_before_the_training(rig):
+    """Images are gamma encoded: a gain of light becomes its 2.2th root."""
+    views = load_views(rig.parser, Guides({}, {}, {}), CPU)
+    found = first_gains(rig.parser, views, ["CAM_BACK"], "CAM_FRONT")
+    np.testing.assert_allclose(found["CAM_BACK"], np.power([1.4, 1.1, 0.75], 1 / 2.2), rtol=0.03)
+    hidden = [dataclasses.replace(v, own_car=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]
+    np.testing.assert_array_equal(first_gains(rig.parser, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
+
+
+def test_a_training_begins_with_what_was_found_and_its_checkpoint_holds_it(rig, tmp_path):
+    train = settings_of(iterations=4, checkpoint_every=10, pixels_per_gaussian=0, exposure=AFFINE)
+    job = TrainJob(parts=("background",), sky="none", train=train, random_seed=0, reference_camera="CAM_FRONT")
+    files = TrainingFiles(tmp_path / "it/checkpoint.pt", tmp_path / "it/train.json")
+    run_training(rig, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
+    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    told = json.loads(files.summary.read_text())["of_cameras"]
+    figures = {f"exposure/{name}": value for name, value in model.exposure.figures().items()}
+    assert told == pytest.approx(figures) and told["exposure/CAM_BACK/gain_red"] > 1.1
+    assert model.exposure.first["CAM_BACK"][0] == pytest.approx(1.4 ** (1 / 2.2), rel=0.03)
+    assert not model.exposure.first["CAM_BACK"].requires_grad
+
+
+# ---- which cameras
+
+
+def inputs_of(folder: Path, cameras: list[int]) -> TrainingInputs:
+    """Images by FRONT, BACK and LEFT, as `cameras` numbers them; the third is held out."""
+    record = parser_record(folder, recorded_views(5))
+    record |= {"camera_names": ["FRONT", "BACK", "LEFT"], "camera_indices": np.array(cameras)}
+    return TrainingInputs(record, folder, [], [])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "reference", "expected"),
+    [
+        ([0, 1, 2, 0, 1], "FRONT", ("BACK",)),
+        ([0, 1, 2, 2, 1], "FRONT", ("BACK", "LEFT")),
+        ([0, 1, 2, 2, 1], "BACK", ("FRONT", "LEFT")),
+        ([0, 0, 0, 0, 0], "FRONT", ()),
+        ([0, 1, 2, 2, 1], None, ()),
+    ],
+)
+def test_all_cameras_with_training_images_are_exposed_but_the_reference(tmp_path, cameras, reference, expected):
+    job = TrainJob(parts=("background",), sky="none", train=TrainSettings(), random_seed=0, reference_camera=reference)
+    assert inputs_of(tmp_path, cameras).exposed(job) == expected
+
+
+def test_a_view_knows_its_camera(tmp_path):
+    record = inputs_of(tmp_path, [0, 1, 2, 0, 1]).parser
+    assert [view_of(record, i, CPU).camera for i in range(5)] == ["FRONT", "BACK", "LEFT", "FRONT", "BACK"]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "kind", "expected"),
+    [
+        (["CAM_FRONT", "CAM_BACK"], "affine", "CAM_BACK"),
+        (["CAM_FRONT", "CAM_BACK"], "none", None),
+        (["CAM_BACK"], "affine", None),
+    ],
+)
+def test_the_camera_that_is_measured_is_the_reference(cameras, kind, expected):
+    values = {"cameras": cameras, "eval_camera": "CAM_BACK", "train": {"exposure": {"kind": kind}}}
+    job = TrainJob.model_validate_json(stage_settings(load(values), "train", "0061", "vanilla"))
+    assert job.reference_camera == expected
+
+
+# ---- the demo world's cameras
+
+
+def test_cameras_of_a_synthetic_rig_take_in_as_much_light_as_they_are_told_to():
+    """Where neither is clipped, encoded with a gamma of 2.2 the light is what the gains say."""
+    gains = (1.4, 1.0, 0.6)
+    plain, other = (recorder_of(exposures=e) for e in ({}, {"CAM_BACK": gains}))
+    before, after = (recorder.image(RIG["CAM_BACK"], 0).astype(float) for recorder in (plain, other))
+    clear = (before > 30) & (before < 190)
+    for channel, gain in enumerate(gains):
+        ratio = after[..., channel][clear[..., channel]] / before[..., channel][clear[..., channel]]
+        assert np.median(ratio**2.2) == pytest.approx(gain, rel=0.02)
+    front = RIG["CAM_FRONT"]
+    np.testing.assert_array_equal(plain.image(front, 0), other.image(front, 0))

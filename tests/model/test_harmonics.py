@@ -1,0 +1,86 @@
+"""Spherical harmonics that turn with an object, against scipy's evaluated along directions in the object's frame."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import about_z
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
+
+from drivesplat.model.harmonics import rotated, rotation_of_harmonics
+
+ROTATIONS = Rotation.random(5, random_state=0).as_matrix()
+COUNTS = [1, 4, 9, 16]
+"""Coefficients of the degrees 0 to 3."""
+
+
+def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
+    """Real spherical harmonics (n, k) along unit directions (n, 3), in 3DGS' order and signs: of order m the real
+    (m > 0) or imaginary (m < 0) part of the complex one with the Condon-Shortley phase."""
+    polar, azimuth = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
+    columns = []
+    for degree in range(int(np.sqrt(coefficients))):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), polar, azimuth)
+            part = value.imag if order < 0 else value.real
+            columns.append(part * (np.sqrt(2.0) if order else 1.0))
+    return np.stack(columns, axis=1)
+
+
+def random_directions(count: int = 200) -> np.ndarray:
+    directions = np.random.default_rng(1).normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def maps(rotations: np.ndarray, coefficients: int) -> np.ndarray:
+    return rotation_of_harmonics(torch.from_numpy(rotations), coefficients).numpy()
+
+
+@pytest.mark.parametrize("coefficients", COUNTS)
+def test_turned_coefficients_give_along_d_what_the_objects_give_along_d_in_its_frame(coefficients):
+    directions, sh = random_directions(), np.random.default_rng(2).normal(size=(coefficients, 3))
+    for rotation, turned in zip(ROTATIONS, maps(ROTATIONS, coefficients) @ sh, strict=True):
+        in_object = basis(directions @ rotation, coefficients) @ sh  # rows are R^T d
+        np.testing.assert_allclose(basis(directions, coefficients) @ turned, in_object, atol=1e-5)
+
+
+@pytest.mark.parametrize("coefficients", COUNTS)
+def test_a_turn_after_a_turn_is_the_product_of_their_maps(coefficients):
+    first, second = ROTATIONS[:2]
+    composed = maps((second @ first)[None], coefficients)[0]
+    of_first, of_second = maps(ROTATIONS[:2], coefficients)
+    np.testing.assert_allclose(composed, of_second @ of_first, atol=1e-6)
+
+
+def test_degrees_do_not_mix_and_lose_nothing():
+    """Not even by rounding: a degree that is not shown as yet must have no gradient that Adam could enlarge."""
+    degrees = np.sqrt(np.arange(16)).astype(int)
+    apart = degrees[:, None] != degrees[None]
+    for turning in maps(ROTATIONS, 16):
+        assert not turning[apart].any()
+        np.testing.assert_allclose(turning @ turning.T, np.eye(16), atol=1e-6)
+        assert turning[0, 0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("coefficients", [4, 9])
+def test_few_degrees_turn_as_they_do_among_many(coefficients):
+    among_all = maps(ROTATIONS, 16)[:, :coefficients, :coefficients]
+    np.testing.assert_allclose(maps(ROTATIONS, coefficients), among_all, atol=1e-6)
+
+
+def test_without_a_turn_nothing_changes():
+    np.testing.assert_allclose(maps(np.eye(3)[None], 16)[0], np.eye(16), atol=1e-6)
+
+
+def test_a_quarter_turn_takes_what_is_red_in_front_to_the_left():
+    """An object that is bright along its x axis, turned to face the world's y axis, in single precision."""
+    bright_along_x = torch.tensor([0.0, 0.0, 0.0, -1.0])[None, :, None].repeat(1, 1, 3)
+    turned = rotated(bright_along_x, torch.from_numpy(about_z(np.pi / 2)))
+    assert turned.dtype == torch.float32
+    seen = basis(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]), 4) @ turned[0, :, 0].numpy()
+    np.testing.assert_allclose(seen, [0.4886025, -0.4886025, 0.0], atol=1e-5)
+
+
+def test_one_colour_for_all_directions_is_left_as_it_is():
+    sh = torch.rand(3, 1, 3)
+    assert rotated(sh, torch.from_numpy(ROTATIONS[0])) is sh

@@ -1,0 +1,457 @@
+"""Cameras, Gaussians from seed points, composition over a sky, and a model saved and rebuilt."""
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import actor_record, actors_of, looking_at, motion_through, round_gaussians, track_of
+from scipy.spatial.transform import Rotation
+from torch import nn
+
+from drivesplat.errors import ResultError
+from drivesplat.model.actors import Actors
+from drivesplat.model.background import Background
+from drivesplat.model.build import Beginnings, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
+from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.part import Part
+from drivesplat.model.sky import ConstantSky, CubemapSky
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.model.view import View
+from drivesplat.scene.images import pixel_rays
+from drivesplat.settings.actors import ActorSettings
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training import checkpoint
+
+SH_C0 = 0.5 / np.sqrt(np.pi)
+SKY_COLOR = np.array([0.2, 0.4, 0.8])
+
+
+def a_view(width: int = 24, height: int = 16) -> View:
+    """A camera turned and moved, with its principal point off the middle."""
+    camera_to_world = torch.eye(4)
+    camera_to_world[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.1, -0.2, 0.05]).as_matrix())
+    camera_to_world[:3, 3] = torch.tensor([0.4, -0.3, -1.0])
+    intrinsics = torch.tensor([[20.0, 0.0, 11.3], [0.0, 22.0, 8.9], [0.0, 0.0, 1.0]])
+    return View(intrinsics, camera_to_world, width, height, time=0.5)
+
+
+def seed_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Positions before the camera of `a_view`, and colours in [0, 1]."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform([-2, -1.5, 2], [2, 1.5, 6], (count, 3)), rng.uniform(0, 1, (count, 3))
+
+
+def parser_record(count: int) -> dict[str, Any]:
+    positions, colors = seed_points(count)
+    return {
+        "points": positions.astype(np.float32),
+        "points_rgb": (colors * 255).astype(np.uint8),
+        "scene_scale": 3.0,
+        "image_sizes": np.array([[100, 50], [100, 50], [40, 30]]),
+        "splits": {"train": np.array([0, 2]), "interpolation": np.array([1])},
+    }
+
+
+def beginnings(parser: dict[str, Any], *actors: dict[str, Any]) -> Beginnings:
+    return Beginnings(parser, list(actors), SKY_COLOR)
+
+
+def shaken(model: nn.Module) -> nn.Module:
+    """The model with every learned parameter moved, as after a training."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for value in (value for value in model.parameters() if value.requires_grad):
+            value += 0.2 * torch.randn(value.shape, generator=generator)
+    return model
+
+
+def test_rays_of_a_view_are_those_of_its_pixels():
+    view = a_view()
+    expected = pixel_rays((view.width, view.height), view.K.double().numpy(), view.camera_to_world.double().numpy())
+    np.testing.assert_allclose(view.rays().numpy(), expected, atol=1e-6)
+
+
+def test_a_gaussian_shows_where_its_ray_points():
+    """Rays and rasterizer share one pixel convention."""
+    view = a_view()
+    row, column = 5, 17
+    at = view.camera_to_world[:3, 3] + 4.0 * view.rays()[row, column]
+    params = Background.from_points(
+        at[None].numpy(), np.ones((1, 3)), GaussianSettings(sh_degree=0, init_opacity=0.5), 1.0
+    ).params
+    params["scales"].data.fill_(np.log(0.02))
+    alpha = SplatModel([Background(dict(params), GaussianSettings(), 1.0)], None).render(view, 0).alpha.detach()
+    assert torch.equal((alpha == alpha.max()).nonzero(), torch.tensor([[row, column]]))
+    assert float(alpha.max()) == pytest.approx(0.5, abs=1e-4)
+
+
+def test_viewmat_undoes_camera_to_world():
+    view = a_view()
+    torch.testing.assert_close(view.viewmat @ view.camera_to_world, torch.eye(4), atol=1e-6, rtol=0)
+
+
+def test_seed_gaussians_have_the_points_places_and_colours():
+    positions, colors = seed_points(50)
+    gaussians = Background.from_points(positions, colors, GaussianSettings(sh_degree=2), 1.0).at(0.0)
+    np.testing.assert_allclose(gaussians.means.detach(), positions, atol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0].detach(), colors, atol=1e-6)
+    assert gaussians.sh.shape == (50, 9, 3) and (gaussians.sh[:, 1:] == 0).all()
+
+
+@pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9])
+def test_seed_gaussians_have_the_opacity_set(opacity):
+    settings = GaussianSettings(init_opacity=opacity)
+    opacities = Background.from_points(*seed_points(10), settings, 1.0).at(0.0).opacities
+    torch.testing.assert_close(opacities.detach(), torch.full((10,), opacity))
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.3])
+def test_seed_gaussians_are_round_and_as_large_as_their_neighbours_are_far(factor):
+    positions, colors = seed_points(60)
+    gaussians = Background.from_points(positions, colors, GaussianSettings(init_scale=factor), 1.0).at(0.0)
+    distances = np.sort(np.linalg.norm(positions[:, None] - positions[None], axis=-1), axis=1)[:, 1:4]
+    expected = factor * np.sqrt((distances**2).mean(axis=1))
+    np.testing.assert_allclose(gaussians.scales.detach(), expected[:, None].repeat(3, axis=1), rtol=1e-5)
+    np.testing.assert_array_equal(gaussians.quats.detach(), np.tile([1.0, 0.0, 0.0, 0.0], (60, 1)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_points_are_gaussians_too(count):
+    positions = np.arange(3.0 * count).reshape(count, 3)
+    gaussians = Background.from_points(positions, np.full((count, 3), 0.5), GaussianSettings(), 1.0).at(0.0)
+    assert len(gaussians) == count
+    assert torch.isfinite(gaussians.scales).all() and (gaussians.scales > 0).all()
+
+
+def test_points_at_one_place_have_a_size():
+    gaussians = Background.from_points(np.ones((5, 3)), np.full((5, 3), 0.5), GaussianSettings(), 1.0).at(0.0)
+    assert torch.isfinite(torch.log(gaussians.scales)).all()
+
+
+def test_positions_learn_in_proportion_to_the_scene():
+    part = Background.from_points(*seed_points(5), GaussianSettings(lr_means=1e-4), 7.0)
+    assert part.learning_rates()["means"] == pytest.approx(7e-4)
+    assert part.learning_rates().keys() >= set(part.params)
+
+
+@pytest.mark.parametrize("sky", [ConstantSky, CubemapSky])
+def test_the_sky_shows_through_what_the_gaussians_leave(sky):
+    part = Background.from_points(*seed_points(40), GaussianSettings(init_scale=0.3, init_opacity=0.5), 1.0)
+    color = torch.tensor([0.3, 0.6, 0.9])
+    behind = sky(color, 1e-2) if sky is ConstantSky else shaken(sky(4, color, 1e-2))
+    view = a_view()
+    with torch.no_grad():
+        without = SplatModel([part], None).render(view, 0)
+        picture = SplatModel([part], behind).render(view, 0, with_depth=True)
+    assert float(without.alpha.max()) > 0.5 and float(without.alpha.min()) < 0.1
+    expected = without.image + (1.0 - without.alpha)[..., None] * behind.colors(view.rays())
+    torch.testing.assert_close(picture.image, expected)
+    torch.testing.assert_close(picture.alpha, without.alpha)
+    assert picture.depth.shape == picture.alpha.shape and without.depth is None
+
+
+def test_given_rays_stand_in_for_the_views_own():
+    model = SplatModel([Background.from_points(*seed_points(10), GaussianSettings(), 1.0)], shaken_cubemap())
+    view = a_view()
+    torch.testing.assert_close(model.render(view, 0, rays=view.rays()).image, model.render(view, 0).image)
+    mirrored = model.render(view, 0, rays=-view.rays()).image
+    assert not torch.allclose(mirrored, model.render(view, 0).image)
+
+
+def shaken_cubemap() -> CubemapSky:
+    return shaken(CubemapSky(4, torch.full((3,), 0.5), 1e-2))
+
+
+class Riding(Part):
+    """Gaussians that move along x at one metre a second."""
+
+    name = "riding"
+
+    def __init__(self, still: Background):
+        super().__init__()
+        self.params = still.params
+        self._still = still
+
+    def at(self, time: float) -> Gaussians:
+        still = self._still.at(time)
+        shift = torch.tensor([time, 0.0, 0.0])
+        return Gaussians.of(still.means + shift, still.quats, still.scales, still.opacities, still.sh)
+
+    def learning_rates(self) -> dict[str, float]:
+        return self._still.learning_rates()
+
+    def definition(self) -> dict[str, Any]:
+        return {}
+
+
+def test_a_model_shows_all_its_parts_at_the_views_time():
+    first = Background.from_points(*seed_points(20, seed=1), GaussianSettings(), 1.0)
+    second = Background.from_points(*seed_points(15, seed=2), GaussianSettings(), 1.0)
+    moved = {name: value.detach().clone() for name, value in second.params.items()}
+    moved["means"][:, 0] += a_view().time
+    both = {name: torch.cat([first.params[name].detach(), moved[name]]) for name in moved}
+    model = SplatModel([first, Riding(second)], None)
+    expected = SplatModel([Background(both, GaussianSettings(), 1.0)], None).render(a_view(), 0)
+    assert len(model) == 35
+    torch.testing.assert_close(model.render(a_view(), 0).image, expected.image)
+
+
+def test_concatenate_keeps_order_and_every_field():
+    a, b = (Background.from_points(*seed_points(n, seed=n), GaussianSettings(sh_degree=1), 1.0).at(0.0) for n in (3, 4))
+    joined = concatenate([a, b])
+    assert len(joined) == 7
+    for field in fields(Gaussians):
+        torch.testing.assert_close(getattr(joined, field.name)[:3], getattr(a, field.name))
+        torch.testing.assert_close(getattr(joined, field.name)[3:], getattr(b, field.name))
+
+
+@pytest.mark.parametrize("degrees", [(0, 2), (2, 0), (1, 3), (1, 1)])
+def test_sets_with_fewer_coefficients_keep_their_colours_among_richer_ones(degrees):
+    parts = [
+        shaken(Background.from_points(*seed_points(n, seed=n), GaussianSettings(sh_degree=degree), 1.0))
+        for n, degree in zip((3, 4), degrees, strict=True)
+    ]
+    joined = concatenate([part.at(0.0) for part in parts])
+    assert joined.sh_degree == max(degrees)
+    directions = Rotation.random(20, random_state=0).as_matrix()[:, 0]
+    for part, rows in zip(parts, (slice(0, 3), slice(3, 7)), strict=True):
+        alone = part.at(0.0).sh
+        assert torch.equal(joined.sh[rows, : alone.shape[1]], alone) and not joined.sh[rows, alone.shape[1] :].any()
+    lookers = [looking_at([0.0, 0.0, 4.0], [0.0, 0.0, 4.0] + 9.0 * d) for d in directions[:3]]
+    for view in lookers:
+        alone = SplatModel([parts[1]], None).render(view).image
+        model = SplatModel(parts, None)
+        seen = model.render(view, gaussians=model.gaussians_at(0.0)[3:]).image
+        torch.testing.assert_close(seen, alone)
+
+
+def test_concatenating_one_set_copies_nothing():
+    one = Background.from_points(*seed_points(3), GaussianSettings(), 1.0).at(0.0)
+    assert concatenate([one]) is one
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2])
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("sky", ["none", "mask", "cubemap"])
+def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, sh_degree):
+    settings = TrainSettings(
+        antialiased=antialiased, sky_resolution=4, gaussians=GaussianSettings(sh_degree=sh_degree, init_scale=0.5)
+    )
+    model = shaken(build_model(beginnings(parser_record(40)), ("background",), sky, settings))
+    rebuilt = rebuild_model(model.state_dict(), definitions(model), sky, settings)
+    picture, again = (m.render(a_view(), sh_degree, with_depth=True) for m in (model, rebuilt))
+    assert float(picture.alpha.detach().max()) > 0.3
+    assert torch.equal(again.image, picture.image) and torch.equal(again.depth, picture.depth)
+    assert rebuilt.parts[0].learning_rates() == model.parts[0].learning_rates()
+
+
+def a_track(name: str = "it", start: float = 0.0) -> ActorTrack:
+    """Half a second a box, from 3 m before the camera of `a_view` on."""
+    times = start + 0.5 * np.arange(4)
+    return track_of(motion_through(times, [[0.5 * i, -0.2, 3.0 + i] for i in range(4)], 0.4 * times), name)
+
+
+def street(antialiased: bool = False) -> SplatModel:
+    """Background, two actors, more background; of which the second actor comes at 1 second."""
+    first, second = (Background.from_points(*seed_points(n), GaussianSettings(), 1.0) for n in (12, 5))
+    return SplatModel([first, actors_of(a_track(), a_track("later", 1.0), count=4), second], None, antialiased)
+
+
+def test_rows_say_which_gaussians_are_each_parts():
+    model = street()
+    together = model.gaussians_at(0.7)
+    assert model.rows == [slice(0, 12), slice(12, 20), slice(20, 25)]
+    for part, rows in zip(model.parts, model.rows, strict=True):
+        assert torch.equal(together[rows].means, part.at(0.7).means)
+    assert model.moving().tolist() == [False] * 12 + [True] * 8 + [False] * 5
+    assert model.of_track("later").tolist() == [False] * 16 + [True] * 4 + [False] * 5
+
+
+def test_gaussians_are_those_of_the_moment_whose_tensors_become_anothers():
+    model = street()
+    early, late = (model.moments(time) for time in (0.3, 1.6))
+    lying = [[values.clone() for values in moment] for moment in early]
+    for time, moments in ((0.3, early), (1.6, late)):
+        for places, moment in zip(lying, moments, strict=True):
+            for place, values in zip(places, moment, strict=True):
+                place.copy_(values)
+        found, expected = model.gaussians_in(lying), model.gaussians_at(time)
+        assert all(torch.equal(getattr(found, f.name), getattr(expected, f.name)) for f in fields(found))
+    assert not torch.equal(model.gaussians_at(0.3).means, model.gaussians_at(1.6).means)
+
+
+def test_a_part_that_cannot_say_a_time_in_tensors_leaves_its_model_without_moments():
+    still = Background.from_points(*seed_points(3), GaussianSettings(), 1.0)
+    assert SplatModel([still], None).moments(0.5) == [()]
+    assert SplatModel([still, Riding(still)], None).moments(0.5) is None
+
+
+def test_two_pieces_of_one_name_are_refused():
+    """Two parts of one name, and a track that is called like a part."""
+    still = Background.from_points(*seed_points(3), GaussianSettings(), 1.0)
+    for other in (still, actors_of(a_track("it"), a_track("background"))):
+        with pytest.raises(ResultError, match=r"'background'.*train it again"):
+            SplatModel([still, other], None).pieces(0.0)
+    assert list(SplatModel([still, actors_of(a_track("it"))], None).pieces(0.0)) == ["background", "it"]
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_what_moves_is_as_opaque_by_itself_as_it_is_rendered_alone(antialiased):
+    """Whatever stands before or behind it in the picture."""
+    model = street(antialiased)
+    model.parts[1].params["scales"].data -= 2.0  # small enough for antialiasing to matter
+    picture = model.render(a_view())
+    found = model.objects_alpha(picture, a_view())
+    alone = SplatModel([model.parts[1]], None, antialiased).render(a_view()).alpha
+    torch.testing.assert_close(found, alone)
+    assert float(found.detach().max()) > 0.05 and float((picture.alpha - found).detach().abs().max()) > 0.1
+
+
+def test_nothing_is_said_of_what_moves_where_nothing_does():
+    still = SplatModel([round_gaussians([[0.0, 0.0, 4.0]])], None)
+    assert still.objects_alpha(still.render(a_view()), a_view()) is None
+
+
+@pytest.mark.parametrize("sky", ["none", "cubemap"])
+def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
+    """Places, colours and presence at many times; learning rates and penalties, too. Of a training, in whose course
+    Gaussians came and went."""
+    settings = TrainSettings(sky_resolution=4, actors=ActorSettings(sh_degree=2, fourier=3, cap_max=50))
+    records = [actor_record(a_track(), 10), actor_record(a_track("later", 1.0), 7)]
+    parts = ("background", "actors")
+    model = shaken(build_model(beginnings(parser_record(20), *records), parts, sky, settings))
+    for value in model.parts[1].params.values():
+        value.data = value.data[3:]
+    checkpoint.save(tmp_path / "a.pt", {"model": model.state_dict(), "parts": definitions(model)})
+    content = checkpoint.load(tmp_path / "a.pt", "train")
+    rebuilt = rebuild_model(content["model"], content["parts"], sky, settings)
+    assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
+    for time in (-0.2, 0.0, 0.61, 1.0, 1.8, 2.7, 5.0):
+        ours, again = model.gaussians_at(time), rebuilt.gaussians_at(time)
+        assert all(torch.equal(getattr(ours, f.name), getattr(again, f.name)) for f in fields(Gaussians))
+    for part, again in zip(model.parts, rebuilt.parts, strict=True):
+        assert again.learning_rates() == part.learning_rates() and again.extent == part.extent
+        assert again.penalties().keys() == part.penalties().keys()
+        assert all(torch.equal(value, part.penalties()[name]) for name, value in again.penalties().items())
+    assert [value.requires_grad for value in rebuilt.parameters()] == [v.requires_grad for v in model.parameters()]
+
+
+def test_actors_start_from_their_records():
+    records = [actor_record(a_track(), 10, seed=1), actor_record(a_track("later", 1.0), 7, seed=2)]
+    model = build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
+    actors = model.parts[1]
+    assert actors.params["owner"].tolist() == [0] * 10 + [1] * 7
+    np.testing.assert_array_equal(actors.params["means"].detach(), np.concatenate([r["points"] for r in records]))
+    colors = np.concatenate([r["points_rgb"] for r in records]) / 255.0
+    np.testing.assert_allclose(0.5 + SH_C0 * actors.harmonics(actors.moment(0.3))[:, 0].detach(), colors, atol=1e-5)
+    at = np.linspace(-0.5, 3.0, 15)
+    for track, expected in zip(actors.timeline.tracks, (a_track(), a_track("later", 1.0)), strict=True):
+        assert track.id == expected.id
+        np.testing.assert_array_equal(track.motion.poses(at), expected.motion.poses(at))
+        np.testing.assert_array_equal(track.motion.present(at), expected.motion.present(at))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "changes", "expected"),
+    [
+        pytest.param(1000, {}, 50, id="the pixels in its box decide: 1000 / 20"),
+        pytest.param(100, {}, 8, id="never less than the least"),
+        pytest.param(1000, {"pixels_per_gaussian": 0.0}, 300, id="no limit by pixels"),
+    ],
+)
+def test_an_actors_gaussians_are_capped_by_its_training_pixels(pixels, changes, expected):
+    settings = TrainSettings(**{"pixels_per_gaussian": 20.0, "actors": ActorSettings(least=8, cap_max=300), **changes})
+    assert actor_cap(actor_record(a_track(), pixels=pixels), settings) == expected
+
+
+def test_each_actor_starts_with_no_more_points_than_its_cap():
+    """A twentieth of 400 and of 2000 pixels; together they may never have more than both."""
+    records = [actor_record(a_track(), 60, pixels=400), actor_record(a_track("later", 1.0), 60, pixels=2000)]
+    settings = TrainSettings(pixels_per_gaussian=20.0, actors=ActorSettings(least=8))
+    (actors,) = build_model(beginnings(parser_record(20), *records), ("actors",), "none", settings).parts
+    assert actors.params["owner"].tolist() == [0] * 20 + [1] * 60 and actors.cap_max == 120
+    kept = {tuple(row) for row in actors.params["means"].detach()[:20].numpy()}
+    assert len(kept & {tuple(row) for row in records[0]["points"]}) == 20
+    colors = dict(zip(map(tuple, records[0]["points"]), records[0]["points_rgb"], strict=True))
+    own = 255.0 * (0.5 + SH_C0 * actors.harmonics(actors.moment(0.0))[:20, 0].detach().numpy())
+    np.testing.assert_allclose(
+        own, [colors[tuple(row)] for row in actors.params["means"].detach()[:20].numpy()], atol=0.01
+    )
+
+
+def with_cap(cap_max: int, counts: list[int]) -> Actors:
+    """The actors of a model whose seeds have so many points each."""
+    records = [actor_record(a_track(str(i)), count, seed=i, pixels=100_000) for i, count in enumerate(counts)]
+    settings = TrainSettings(actors=ActorSettings(cap_max=cap_max))
+    return build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", settings).parts[1]
+
+
+@pytest.mark.parametrize(
+    ("cap_max", "counts", "expected"),
+    [
+        pytest.param(400, [100] * 4, [100] * 4, id="no more than the cap: all"),
+        pytest.param(40, [100] * 4, [10] * 4, id="equals share alike"),
+        pytest.param(68, [104, 204, 404], [4 + 8, 4 + 16, 4 + 32], id="four each, and 56 of 700 beyond them"),
+        pytest.param(20, [2, 3, 100], [2, 3, 15], id="who has fewer than four keeps them"),
+        pytest.param(1, [100, 3, 100], [4, 3, 4], id="four each where the cap has no room for them"),
+    ],
+)
+def test_actors_share_a_cap_in_proportion_to_their_seeds(cap_max, counts, expected):
+    actors = with_cap(cap_max, counts)
+    assert torch.bincount(actors.params["owner"], minlength=len(counts)).tolist() == expected
+    assert actors.cap_max == cap_max
+
+
+def test_a_cap_that_divides_unevenly_is_used_up_fairly():
+    counts = torch.bincount(with_cap(50, [100] * 4).params["owner"])
+    assert counts.sum() == 50 and set(counts.tolist()) == {12, 13}
+
+
+def test_seeds_are_thinned_to_points_of_their_own_the_same_every_time():
+    actors, again = (with_cap(60, [100, 200]) for _ in range(2))
+    assert torch.equal(actors.params["means"], again.params["means"])
+    for i, count in enumerate((100, 200)):
+        own = actors.params["means"].detach()[actors.params["owner"] == i].numpy()
+        points = {tuple(row) for row in actor_record(a_track(), count, seed=i)["points"]}
+        assert len({tuple(row) for row in own} & points) == len(own) > 20
+
+
+@pytest.mark.parametrize("records", [[], [actor_record(track_of(motion_through([0.0], [[0.0, 0.0, 0.0]])), 0)]])
+def test_where_nothing_moves_a_street_is_its_background(records):
+    model = build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
+    assert [part.name for part in model.parts] == ["background"] and not model.moving().any()
+
+
+@pytest.mark.parametrize(("sky", "kind"), [("none", type(None)), ("mask", ConstantSky), ("cubemap", CubemapSky)])
+def test_the_sky_setting_names_the_sky(sky, kind):
+    model = build_model(beginnings(parser_record(5)), ("background",), sky, TrainSettings(sky_resolution=4))
+    assert isinstance(model.sky, kind)
+    if model.sky is not None:
+        np.testing.assert_allclose(model.sky.colors(a_view().rays())[3, 4].detach(), SKY_COLOR, atol=1e-5)
+
+
+def test_a_model_starts_with_no_more_points_than_its_cap():
+    record = parser_record(300)
+    model = build_model(beginnings(record), ("background",), "none", TrainSettings(cap_max=120))
+    means = model.parts[0].params["means"].detach().numpy()
+    assert len(model) == 120
+    rows = {tuple(row) for row in record["points"]}
+    assert len({tuple(row) for row in means} & rows) == 120
+
+
+@pytest.mark.parametrize(
+    ("cap_max", "pixels_per_gaussian", "expected"),
+    [
+        pytest.param(1000, 20.0, 310, id="the training pixels decide: (100 x 50 + 40 x 30) / 20"),
+        pytest.param(200, 20.0, 200, id="cap_max decides"),
+        pytest.param(1000, 0.0, 1000, id="no limit by pixels"),
+        pytest.param(1000, 1e6, 1, id="never less than one"),
+    ],
+)
+def test_gaussians_are_capped_by_the_training_pixels(cap_max, pixels_per_gaussian, expected):
+    settings = TrainSettings(cap_max=cap_max, pixels_per_gaussian=pixels_per_gaussian)
+    assert gaussian_cap(parser_record(5), settings) == expected

@@ -1,0 +1,140 @@
+"""What annotations say of several actors at once: presence, poses, weights, and the time series of their colours."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import about_z, motion_through, track_of
+from scipy.spatial.transform import Rotation
+
+from drivesplat.model import timeline as timeline_module
+from drivesplat.model.timeline import ActorTrack, Timeline
+from drivesplat.training import checkpoint
+
+CPU = torch.device("cpu")
+
+
+def a_van() -> ActorTrack:
+    """There from 1 to 3 seconds; it turns a radian a second."""
+    times = np.linspace(1.0, 3.0, 5)
+    return track_of(motion_through(times, times[:, None] * [4.0, 1.0, 0.0], times), "van", (5.0, 2.0, 2.2))
+
+
+def a_car() -> ActorTrack:
+    """There from 0 to 1 second and again from 2.5 to 4."""
+    times = np.array([0.0, 0.5, 1.0, 2.5, 3.0, 3.5, 4.0])
+    places = np.random.default_rng(0).uniform(-9, 9, (7, 3))
+    return track_of(motion_through(times, places, 0.1 * times, runs=((0, 2), (3, 6))), "car")
+
+
+def timeline(terms: int = 5) -> Timeline:
+    return Timeline([a_van(), a_car()], terms)
+
+
+@pytest.mark.parametrize(
+    ("time", "present"), [(0.5, [False, True]), (0.8, [True, True]), (2.0, [True, False]), (9.0, [False, False])]
+)
+def test_actors_come_and_go(time, present):
+    assert timeline().at(time, CPU).present.tolist() == present
+
+
+@pytest.mark.parametrize("time", [1.0, 1.1, 2.5, 3.1])
+def test_those_present_are_where_their_motions_say(time):
+    moment = timeline().at(time, CPU)
+    for i, track in enumerate((a_van(), a_car())):
+        (pose,) = track.motion.poses(np.array([time]))
+        np.testing.assert_allclose(moment.translations[i], pose[:3, 3], rtol=1e-6)
+        rotation = Rotation.from_quat(moment.quats[i].numpy(), scalar_first=True).as_matrix()
+        np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
+    turned = Rotation.from_quat(moment.quats[0].numpy(), scalar_first=True).as_matrix()
+    np.testing.assert_allclose(turned, about_z(time), atol=1e-6)
+
+
+@pytest.mark.parametrize("time", [0.9, 2.6])
+def test_every_actors_weights_stand_with_its_own_annotations(time):
+    moment = timeline().at(time, CPU)
+    assert timeline().owned == [slice(0, 5), slice(5, 12)]
+    assert timeline().of_actors.tolist() == [[True] * 5 + [False] * 7, [False] * 5 + [True] * 7]
+    np.testing.assert_allclose(moment.weights[:5], a_van().motion.weights(np.array([time]))[0], atol=1e-6)
+    np.testing.assert_allclose(moment.weights[5:], a_car().motion.weights(np.array([time]))[0], atol=1e-6)
+
+
+def test_annotations_of_an_absent_actor_weigh_nothing():
+    weights = timeline().at(2.0, CPU).weights
+    assert weights[:5].any() and not weights[5:].any()
+
+
+@pytest.mark.parametrize(
+    ("time", "progress"),
+    [(1.0, [0.0, 0.25]), (1.5, [0.25, 0.375]), (3.1, [1.0, 0.775]), (0.8, [0.0, 0.2]), (9.0, [1.0, 1.0])],
+)
+def test_the_series_runs_from_the_first_to_the_last_annotation_and_stops_there(time, progress):
+    """Of absent actors, too: their colours of a time are asked for when they are placed elsewhere, or written out."""
+    expected = [[np.cos(np.pi * i * t) for i in range(5)] for t in progress]
+    np.testing.assert_allclose(timeline().at(time, CPU).series, expected, atol=1e-6)
+
+
+def test_of_a_single_annotation_the_series_stands_at_its_start():
+    one = Timeline([track_of(motion_through([2.0], [[0.0, 0.0, 0.0]]))], 3)
+    for time in (1.8, 2.0, 2.2):
+        np.testing.assert_allclose(one.at(time, CPU).series[0], np.ones(3), atol=1e-6)
+
+
+def test_neighbours_follow_one_another_within_a_run():
+    """The van's five annotations; the car's three and four, with a gap between that no three reach over."""
+    triples = [[0, 1, 2], [1, 2, 3], [2, 3, 4], [5, 6, 7], [8, 9, 10], [9, 10, 11]]
+    assert timeline().neighbours.tolist() == triples
+
+
+def test_two_annotations_have_no_neighbours():
+    assert Timeline([track_of(motion_through([0.0, 1.0], np.zeros((2, 3))))], 1).neighbours.shape == (0, 3)
+
+
+def test_a_track_survives_a_checkpoint(tmp_path):
+    checkpoint.save(tmp_path / "a.pt", {"track": a_car().plain()})
+    again = ActorTrack.from_plain(checkpoint.load(tmp_path / "a.pt", "train")["track"])
+    assert (again.id, again.motion.runs, again.motion.reach) == ("car", ((0, 2), (3, 6)), 0.25)
+    np.testing.assert_array_equal(again.size, a_car().size)
+    at = np.linspace(-0.5, 4.5, 33)
+    np.testing.assert_array_equal(again.motion.poses(at), a_car().motion.poses(at))
+    np.testing.assert_array_equal(again.motion.present(at), a_car().motion.present(at))
+
+
+def test_a_moment_is_computed_once():
+    times = timeline()
+    assert times.at(1.5, CPU) is times.at(1.5, CPU) and times.at(1.5, CPU) is not times.at(1.6, CPU)
+
+
+def test_moments_found_together_are_those_found_one_by_one():
+    seconds = np.linspace(-2.0, 6.0, 41)
+    together, one_by_one = timeline(), timeline()
+    together.prepare([*seconds, *seconds[:3]], CPU)
+    known = [*together._known.values()]
+    assert len(known) == 41 and sum(bool(moment.present.any()) for moment in known) > 10
+    for time, moment in zip(seconds, known, strict=True):
+        assert together.at(time, CPU) is moment
+        for name, value in one_by_one.at(time, CPU)._asdict().items():
+            torch.testing.assert_close(getattr(moment, name), value)
+
+
+def test_of_too_many_moments_the_first_go(monkeypatch):
+    monkeypatch.setattr(timeline_module, "REMEMBERED", 3)
+    times = timeline()
+    times.prepare([0.1, 0.2, 0.3, 0.4, 0.5], CPU)
+    assert [time for time, _ in times._known] == [0.3, 0.4, 0.5]
+    times.at(0.1, CPU)
+    assert [time for time, _ in times._known] == [0.4, 0.5, 0.1]
+
+
+def test_the_moments_of_all_images_of_six_cameras_are_kept():
+    """At 12 Hz for 20 s, each camera at times of its own, once more through all of them."""
+    times, seconds = timeline(), np.arange(6 * 12 * 20) / 72.0
+    first = [times.at(time, CPU) for time in seconds]
+    assert all(times.at(time, CPU) is moment for time, moment in zip(seconds, first, strict=True))
+
+
+def test_a_moment_of_30_actors_takes_a_few_kilobytes():
+    """Each with 40 annotations, all the key frames of a drive: so many times are kept that it matters."""
+    annotated = motion_through(0.5 * np.arange(40), np.zeros((40, 3)))
+    moment = Timeline([track_of(annotated, str(i)) for i in range(30)], 5).at(1.7, CPU)
+    assert [tuple(value.shape) for value in moment] == [(30, 4), (30, 3), (30,), (30 * len(annotated.times),), (30, 5)]
+    assert sum(value.untyped_storage().nbytes() for value in moment) < 10_000

@@ -1,0 +1,256 @@
+"""Poses from images alone: synthetic matches of drives whose truth is known; and drives that do not tell them."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from helpers.hand_made_views import FRONT, HEADINGS, Drive, Seen, drive_of, error_at, views, write_database
+from scipy.spatial.transform import Rotation
+
+from drivesplat.errors import DatasetError
+from drivesplat.io.storage import canonical_json
+from drivesplat.poses.from_images import aligned
+from drivesplat.poses.refine import made_by_matches
+from drivesplat.poses.refinement import Refinement
+from drivesplat.poses.rig import RigImages
+from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.scene.scene import Scene, Sweep
+from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob
+
+pytestmark = pytest.mark.usefixtures("quiet")
+LIDAR = rigid(np.eye(3), np.array([0.9, 0.0, 1.8]))
+RAYS = {"ray_spacing": [0.33, 1.33], "own_car_radius": 2.5}
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.FATAL
+    yield
+    pycolmap.logging.minloglevel = before
+
+
+def curve(seconds: float) -> np.ndarray:
+    """The true pose (4, 4) at 8 m/s on a circle with a radius of 100 m."""
+    heading = 0.08 * seconds
+    place = 100.0 * np.array([np.sin(heading), 1.0 - np.cos(heading), 0.0])
+    return rigid(Rotation.from_euler("z", heading).as_matrix(), place)
+
+
+def nowhere(way):
+    """The error that makes every recorded pose the identity."""
+    return lambda seconds: inverse(way(seconds))
+
+
+def points_along(way, count: int = 700, seconds: float = 12.0) -> np.ndarray:
+    """Points (n, 3) on both sides of a way, and before its end."""
+    rng = np.random.default_rng(0)
+    side = np.where(rng.uniform(size=count) < 0.5, -1.0, 1.0) * rng.uniform(5.0, 18.0, count)
+    beside = np.stack([np.zeros(count), side, rng.uniform(0.0, 8.0, count)], axis=1)
+    return np.stack([apply(way(t), p[None])[0] for t, p in zip(rng.uniform(-1.0, seconds, count), beside, strict=True)])
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    drive: Drive
+    images: RigImages
+    database: Path
+    start: pycolmap.Reconstruction
+
+    def made(self, threads: int = 1, lidar: bool = True, **settings) -> Refinement:
+        return made_by_matches(self.images, self.start, self.database, job_of(lidar, **settings), threads)
+
+
+def job_of(lidar: bool = True, **settings) -> RefinePosesJob:
+    fields = {"refine_poses": {"start": "images", **settings}, "random_seed": 0, "lidar": RAYS if lidar else None}
+    return RefinePosesJob.model_validate(fields)
+
+
+def case_of(
+    folder: Path, way=curve, error=None, key_frames: int = 10, points=None, shows=None, noise=0.0, stretch=None,
+    cameras=FRONT,
+) -> Case:  # fmt: skip
+    """A drive of cameras and LiDAR, by default with no recorded poses. `shows`: which of the points image i may show.
+    `stretch`: a factor on what LiDAR measures, by key frame."""
+    drive = drive_of(key_frames, cameras, way, error or nowhere(way))
+    points = points_along(way) if points is None else points
+    scene = dataclasses.replace(drive.scene, sweeps=sweeps_of(folder, drive.scene, way, error, points, stretch))
+    drive = Drive(scene, drive.truth)
+    images = RigImages.of(scene, range(len(scene.frames)))
+    seen = views(drive, images, points, noise)
+    for i, view in enumerate(seen if shows else ()):
+        kept = shows(i, view.points)
+        seen[i] = Seen(view.points[kept], view.pixels[kept])
+    start = write_database(folder / "features.db", images, seen, job_of())
+    return Case(drive, images, folder / "features.db", start)
+
+
+def sweeps_of(folder: Path, scene: Scene, way, error, points, stretch) -> tuple[Sweep, ...]:
+    """A sweep a key frame that meets all points, its pose as recorded."""
+    sweeps = []
+    for i, time in enumerate(scene.key_frame_timestamps):
+        pose, path = way(time * 1e-6), folder / f"{i}.pcd.bin"
+        returns = np.zeros((len(points), 5), dtype=np.float32)
+        returns[:, :3] = apply(inverse(pose @ LIDAR), points) * (stretch(i) if stretch else 1.0)
+        returns.tofile(path)
+        recorded = pose @ (error or nowhere(way))(time * 1e-6)
+        sweeps.append(Sweep(str(path), int(time), recorded @ LIDAR, True, i, str(i)))
+    return tuple(sweeps)
+
+
+def poses_of(refined: Refinement) -> np.ndarray:
+    return np.stack([frame.ego_to_world for frame in refined.scene.frames])
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """How far two drives (n, 4, 4) lie apart at most, in metres and degrees."""
+    change = inverse(a) @ b
+    turns = Rotation.from_matrix(change[:, :3, :3]).magnitude()
+    return float(np.linalg.norm(change[:, :3, 3], axis=1).max()), float(np.degrees(turns).max())
+
+
+@pytest.fixture(scope="module")
+def unlocated(tmp_path_factory) -> Case:
+    return case_of(tmp_path_factory.mktemp("unlocated"))
+
+
+@pytest.fixture(scope="module")
+def unlocated_made(unlocated) -> Refinement:
+    return unlocated.made()
+
+
+def test_a_drive_without_recorded_poses_is_recovered_in_metres(unlocated, unlocated_made):
+    """All recorded poses are the identity: the first image keeps it, LiDAR gives the scale."""
+    truth = unlocated.drive.truth
+    assert apart(inverse(truth[0]) @ truth, poses_of(unlocated_made))[0] < 0.02
+    assert apart(inverse(truth[0]) @ truth, poses_of(unlocated_made))[1] < 0.005
+    assert unlocated_made.scene.poses == "images"
+    np.testing.assert_allclose(poses_of(unlocated_made)[0], np.eye(4), atol=0.01)
+
+
+def test_what_was_done_is_told(unlocated_made):
+    record = unlocated_made.record
+    told = record["placement"]
+    assert (record["start"], record["refined"], record["kept_because"]) == ("images", True, None)
+    assert told["images_placed"] == 10 and told["models"] == [10] and told["camera"] == "CAM_FRONT"
+    assert told["scale_from"] == "LiDAR" and told["aligned_to"] == "first image"
+    assert 1.0 <= told["scale_drift"] < 1.001 and told["scale"] > 0
+    assert record["trial"] is record["shift_m"] is record["turn_deg"] is None and canonical_json(record)
+
+
+def test_its_points_may_join_the_seed(unlocated, unlocated_made):
+    """They lie where the truth has them, as seen from the first image."""
+    truth = apply(inverse(unlocated.drive.truth[0]), points_along(curve))
+    found = unlocated_made.points["points"]
+    assert len(found) > 200 and set(unlocated_made.points["seen_by"]) == set(range(10))
+    assert np.median(np.linalg.norm(found[:, None] - truth, axis=2).min(axis=1)) < 0.04
+
+
+def test_lidar_follows(unlocated, unlocated_made):
+    """A sweep lies where the car was at its time, between two images, or a little after the last one."""
+    first = unlocated.drive.truth[0]
+    for sweep in unlocated_made.scene.sweeps:
+        expected = inverse(first) @ curve(sweep.timestamp * 1e-6) @ LIDAR
+        assert apart(expected[None], sweep.sensor_to_world[None])[0] < 0.05
+
+
+def test_two_runs_agree_whatever_the_threads(unlocated, unlocated_made):
+    for threads in (1, 2):
+        again = unlocated.made(threads)
+        np.testing.assert_allclose(poses_of(again), poses_of(unlocated_made), atol=1e-9 if threads == 1 else 1e-3)
+
+
+def test_other_cameras_follow_the_one_that_gets_farthest(tmp_path):
+    case = case_of(tmp_path, cameras=tuple(HEADINGS), key_frames=6)
+    made = case.made()
+    truth = case.drive.truth
+    origin = poses_of(made)[0] @ inverse(truth[0])
+    assert made.record["placement"]["images_placed"] == 6 and made.record["images"] == 36
+    assert apart(origin @ truth, poses_of(made))[0] < 0.02
+    for before, after in zip(case.drive.scene.frames, made.scene.frames, strict=True):
+        mounts = [inverse(frame.ego_to_world) @ frame.camera_to_world for frame in (before, after)]
+        np.testing.assert_allclose(mounts[1], mounts[0], atol=1e-9)
+
+
+def test_recorded_poses_that_move_are_what_it_is_aligned_to(tmp_path):
+    """They are noisy, as nuScenes' are, and nothing but their mean enters."""
+    case = case_of(tmp_path, error=error_at, noise=0.1)
+    made, truth = case.made(), case.drive.truth
+    place, turn = apart(truth, poses_of(made))
+    assert place < 0.3 and turn < 1.0 and made.record["placement"]["aligned_to"] == "recorded poses"
+    best = aligned(truth, poses_of(made), PriorSettings())
+    assert apart(truth, best)[0] < 0.05 and apart(truth, best)[1] < 0.1
+    told = [made.record[key]["median"] for key in ("shift_m", "turn_deg")]
+    recorded = np.stack([frame.ego_to_world for frame in case.drive.scene.frames])
+    change = inverse(recorded) @ poses_of(made)
+    angles = np.degrees(Rotation.from_matrix(change[:, :3, :3]).magnitude())
+    assert told == pytest.approx([np.median(np.linalg.norm(change[:, :3, 3], axis=1)), np.median(angles)], rel=1e-3)
+
+
+def test_without_lidar_recorded_positions_give_the_scale(tmp_path):
+    case = case_of(tmp_path, error=lambda seconds: np.eye(4))
+    made = case.made(lidar=False)
+    assert made.record["placement"]["scale_from"] == "recorded positions"
+    assert apart(case.drive.truth, poses_of(made))[0] < 0.05
+
+
+def test_without_either_there_is_no_scale(unlocated):
+    with pytest.raises(DatasetError, match=r"scene made: images alone give no poses in metres: .*start: recorded"):
+        unlocated.made(lidar=False)
+
+
+def stands(seconds: float) -> np.ndarray:
+    return np.eye(4)
+
+
+def turns_on_the_spot(seconds: float) -> np.ndarray:
+    """About the front camera, which stays where it is."""
+    camera = rigid(np.eye(3), np.array([1.6, 0.0, 1.5]))
+    return camera @ rigid(Rotation.from_euler("z", 0.1 * seconds).as_matrix(), np.zeros(3)) @ inverse(camera)
+
+
+@pytest.mark.parametrize("way", [stands, turns_on_the_spot])
+def test_a_car_that_does_not_get_on_is_told_so(tmp_path, way):
+    case = case_of(tmp_path, way, noise=0.3, points=points_along(curve, 400, 5.0))
+    with pytest.raises(DatasetError, match=r"scene made: .*far enough apart, as where the car stands.*start: recorded"):
+        case.made()
+
+
+def test_drives_that_come_apart_are_told_with_their_parts(tmp_path):
+    """Images before the sixth see other points than those after it."""
+    case = case_of(tmp_path, shows=lambda i, points: points % 2 == (i > 5), points=points_along(curve, 1400))
+    with pytest.raises(DatasetError, match=r"CAM_FRONT.* 2 models \(6, 4 images\), so that 6 of 10 key frames.*0\.7; "):
+        case.made()
+    assert case.made(limits={"min_images": 0.6}).record["placement"]["models"] == [6, 4]
+
+
+def test_images_that_were_not_placed_follow_their_neighbours(tmp_path):
+    case = case_of(tmp_path, shows=lambda i, points: np.full(len(points), i not in (4, 5)))
+    made = case.made()
+    assert made.record["placement"]["images_placed"] == 8
+    assert [item["points"] for item in made.record["corrections"]][4:6] == [0, 0]
+    poses = poses_of(made)
+    headings = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    np.testing.assert_allclose(np.diff(headings)[3:6], np.degrees(0.04), atol=0.01)
+    thirds = poses[3, :3, 3] + np.array([[1 / 3], [2 / 3]]) * (poses[6, :3, 3] - poses[3, :3, 3])
+    np.testing.assert_allclose(poses[4:6, :3, 3], thirds, atol=1e-6)
+
+
+def test_a_scale_that_drifts_is_followed_up_to_a_limit(tmp_path):
+    """LiDAR finds all things 4 % farther off at every key frame, as if the images' scale shrank."""
+    case = case_of(tmp_path, stretch=lambda i: 1.04**i)
+    with pytest.raises(DatasetError, match=r"by LiDAR their scale changes by a factor of 1\.\d\d .*drift.*recorded"):
+        case.made(limits={"max_scale_drift": 1.1})
+    made = case.made(limits={"max_scale_drift": 2.0})
+    assert 1.15 < made.record["placement"]["scale_drift"] < 1.45
+
+
+def test_an_image_that_was_misplaced_follows_its_neighbours(tmp_path):
+    """By LiDAR the last one is at half its distance: it does not count, and the adjustment brings it home."""
+    case = case_of(tmp_path, stretch=lambda i: 0.5 if i == 9 else 1.0)
+    made, truth = case.made(), case.drive.truth
+    assert made.record["placement"]["images_placed"] == 9 and made.record["placement"]["models"] == [10]
+    assert apart(inverse(truth[0]) @ truth, poses_of(made))[0] < 0.15
+    with pytest.raises(DatasetError, match=r"by LiDAR 1 of 10 images are misplaced \(min_images\), .*start: recorded"):
+        case.made(limits={"min_images": 0.95})

@@ -1,0 +1,157 @@
+"""triangulated.pkl: which points become seeds, and where their colours come from."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, TRAINING, scene_at
+from helpers.tiny_world import CAMERA_AT, World, cast
+from PIL import Image
+
+from drivesplat.errors import ResultError
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.poses.observations import Observations
+from drivesplat.poses.triangulated import (
+    LEAST_VIEWS,
+    SHARP_PIXELS,
+    mean_over_views,
+    no_points,
+    read_triangulated,
+    seen_in,
+    triangulated_record,
+)
+from drivesplat.preprocess.lidar_seed import seed_points, triangulated_points
+from drivesplat.scene.scene import Scene, read_scene
+from drivesplat.settings.lidar_seed import SeedJob
+
+
+def job(holdout=HELD_OUT, **settings) -> SeedJob:
+    few = {"far_points": 0, "voxel_size": 10.0, **settings}
+    values = {"lidar_seed": few, "holdout": holdout, "images": {"width": None}, "random_seed": 0}
+    return SeedJob.model_validate(values)
+
+
+def record_of(points: np.ndarray, seen_by: list[list[int]]) -> dict[str, np.ndarray]:
+    """Points (p, 3) and which frames of the scene see each."""
+    return {
+        "points": np.asarray(points, dtype=float),
+        "seen_by": np.array([frame for frames in seen_by for frame in frames], dtype=np.int64),
+        "seen_point": np.repeat(np.arange(len(points)), [len(frames) for frames in seen_by]),
+    }
+
+
+def key_frame(scene: Scene, index: int) -> int:
+    """Which of the scene's frames is that key frame."""
+    return next(i for i, frame in enumerate(scene.frames) if frame.is_key_frame and frame.sample_index == index)
+
+
+def frames_of(scene: Scene, *indices: int) -> list[int]:
+    return [key_frame(scene, index) for index in indices]
+
+
+def wall(*along: float) -> np.ndarray:
+    """Points on the wall to the left of the tiny drive, on stripes' middles."""
+    return np.array([[x, 8.0, 2.0] for x in along])
+
+
+def test_the_record_keeps_sharp_points_and_says_which_frames_see_them():
+    """Of four points one is blurred, one lies behind a camera, and one nobody sees."""
+    seen = Observations(
+        image=np.array([0, 1, 0, 2, 1, 2]),
+        point=np.array([0, 0, 1, 1, 3, 3]),
+        error=np.array([0.5, 1.5, SHARP_PIXELS, SHARP_PIXELS + 0.1, 0.1, np.inf]),
+        positions=np.arange(12.0).reshape(4, 3),
+        numbers=np.array([7, 8, 9, 11]),
+    )
+    record = triangulated_record((10, 20, 30), seen)
+    np.testing.assert_array_equal(record["points"], [[0.0, 1.0, 2.0]])
+    assert record["seen_by"].tolist() == [10, 20] and record["seen_point"].tolist() == [0, 0]
+    sharper = dataclasses.replace(seen, error=np.array([0.5, 1.5, 0.2, 0.2, 0.1, 0.3]))
+    record = triangulated_record((10, 20, 30), sharper)
+    np.testing.assert_array_equal(record["points"], seen.positions[[0, 1, 3]])
+    assert record["seen_by"].tolist() == [10, 20, 10, 30, 20, 30]
+    assert record["seen_point"].tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_points_count_where_enough_of_the_images_see_them():
+    record = record_of(np.zeros((3, 3)), [[0, 4], [0, 5, 6], [4, 6]])
+    assert LEAST_VIEWS == 2
+    assert seen_in(record, np.array([0, 4, 5])).tolist() == [True, True, False]
+    means = mean_over_views(record, np.array([0, 4, 5]), np.array([10.0, 0, 0, 0, 20.0, 40.0, 1e9]))
+    np.testing.assert_allclose(means, [15.0, 25.0, 20.0])
+    assert seen_in(no_points(), np.array([0])).tolist() == []
+
+
+def test_only_points_of_two_training_images_become_seeds(tiny_scene):
+    points = wall(17.0, 19.0, 21.0, 23.0)
+    seen_by = [frames_of(tiny_scene, *at) for at in ((0, 1), (1, 2), (2, 6), (3, 4, 6))]
+    chosen, times = triangulated_points(tiny_scene, job(), record_of(points, seen_by))
+    np.testing.assert_array_equal(chosen, points[[0, 3]])
+    moments = {i: tiny_scene.frames[key_frame(tiny_scene, i)].timestamp for i in range(10)}
+    np.testing.assert_allclose(times, [(moments[0] + moments[1]) / 2, (moments[3] + moments[4]) / 2])
+    seed = seed_points(tiny_scene, job(), triangulated=record_of(points, seen_by))
+    assert seed.note["triangulated"] == 2
+    for point, expected in zip(points, (True, False, False, True), strict=True):
+        assert (np.abs(seed.positions - point).max(axis=1) < 1e-4).any() == expected
+
+
+def test_another_hold_out_chooses_others(tiny_scene):
+    record = record_of(wall(19.0), [frames_of(tiny_scene, 2, 6)])
+    assert seed_points(tiny_scene, job(NOTHING_HELD_OUT), triangulated=record).note["triangulated"] == 1
+    assert seed_points(tiny_scene, job(), triangulated=record).note["triangulated"] == 0
+    none = {"every_nth": 0, "last_block": 4}
+    late = record_of(wall(40.0), [frames_of(tiny_scene, 6, 7, 8, 9)])
+    assert seed_points(tiny_scene, job(none), triangulated=late).note["triangulated"] == 0
+
+
+def test_without_them_the_seed_is_as_it_was(tiny_scene):
+    plain, none = (seed_points(tiny_scene, job(voxel_size=0.5), triangulated=record) for record in (None, no_points()))
+    np.testing.assert_array_equal(plain.positions, none.positions)
+    np.testing.assert_array_equal(plain.colors, none.colors)
+    assert plain.note == none.note and plain.note["triangulated"] == 0 < plain.note["lidar"]
+
+
+def test_their_colours_are_those_of_training_images(tiny_root, tmp_path):
+    """With held-out images painted over, no seed shows the paint."""
+    scene = scene_at(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+    held_out = [i for i in range(10) if i not in TRAINING]
+    for index in held_out:
+        frame = scene.frames[key_frame(scene, index)]
+        Image.new("RGB", (frame.width, frame.height), (255, 0, 255)).save(frame.image_path)
+    along = np.arange(15.0, 30.0, 2.0)
+    record = record_of(wall(*along), [frames_of(scene, 1, 2, 3)] * len(along))
+    seed = seed_points(scene, job(), triangulated=record)
+    assert seed.note["triangulated"] == len(along)
+    own = np.array([np.abs(seed.positions - point).max(axis=1).argmin() for point in record["points"]])
+    empty = World(things=[])
+    truth = [cast(empty, CAMERA_AT, (point - CAMERA_AT)[None], 0.0)[1][0] for point in record["points"]]
+    assert np.abs(seed.colors[own].astype(float) - truth).max() < 40
+
+
+@pytest.mark.parametrize(
+    "content", [b"no pickle", {"points": np.zeros((1, 3))}, [1, 2]], ids=["no pickle", "keys lack", "no record"]
+)
+def test_a_broken_file_is_named_with_its_rule(tmp_path, content):
+    path = tmp_path / "triangulated.pkl"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        write_plain_pickle(path, content)
+    with pytest.raises(ResultError, match=r"triangulated.pkl: .*the rule 'refine_poses' rebuilds it"):
+        read_triangulated(path)
+
+
+def test_what_is_written_is_read(tmp_path):
+    record = record_of(wall(1.0, 2.0), [[0, 1], [1, 2]])
+    write_plain_pickle(tmp_path / "triangulated.pkl", {**record, "provenance": {}})
+    again = read_triangulated(tmp_path / "triangulated.pkl")
+    assert all(np.array_equal(again[key], record[key]) for key in record)
+
+
+@pytest.mark.parametrize(("name", "rule"), [("scene.json", "extract"), ("scene_refined.json", "refine_poses")])
+@pytest.mark.parametrize("content", ["{", '{"schema": 0}'])
+def test_a_broken_scene_is_named_with_the_rule_that_made_it(tmp_path, name, rule, content):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ResultError, match=rf"{name}: .*the rule '{rule}' rebuilds it"):
+        read_scene(tmp_path / name)

@@ -1,0 +1,482 @@
+"""What becomes an actor and where its Gaussians start: LiDAR in its own frame, coloured by training images alone."""
+
+import dataclasses
+import pickle
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.small_drives import (
+    HELD_OUT,
+    NOTHING_HELD_OUT,
+    TRAINING,
+    Speeding,
+    drive,
+    scene_at,
+    seconds_of,
+    shows,
+)
+from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
+from PIL import Image
+
+from drivesplat.errors import ResultError
+from drivesplat.io.storage import write_plain_pickle
+from drivesplat.preprocess.actor_seed import actors_record
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.actor_record import motion_of, read_actors
+from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
+from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.extract import SceneSource
+
+CAR = World().things[0]
+"""It drives ahead of the own car: 4 x 2 x 1.6 m, its rear 4.8 m from the camera at first."""
+ONCOMING = Thing("vehicle.car", (4.4, 1.8, 1.5), (32.0, 3.5, 0.75), (-3.0, 0.0), heading=np.pi, color=(90, 200, 90))
+FLOOR = 0.1
+
+
+def job(holdout=HELD_OUT, width=None, random_seed=0, radius=2.5, **settings) -> ActorSeedJob:
+    """Without random points, unless told otherwise."""
+    return ActorSeedJob.model_validate(
+        {
+            "actors": {"min_points": 0, **settings},
+            "holdout": holdout,
+            "images": {"width": width},
+            "own_car_radius": radius,
+            "random_seed": random_seed,
+        }
+    )
+
+
+def actors_of(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> list[dict[str, Any]]:
+    return actors_record(scene, settings, own_car)["actors"]
+
+
+def the_actor(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
+    (actor,) = actors_of(scene, settings, own_car)
+    return actor
+
+
+def assert_same(a: dict[str, Any], b: dict[str, Any]) -> None:
+    assert pickle.dumps(a) == pickle.dumps(b)
+
+
+@pytest.fixture
+def root(tiny_root, tmp_path) -> Path:
+    """A copy of the tiny drive that a test may damage."""
+    return Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+
+
+def returns_of(world: World, thing: Thing, key_frames, margin=0.1, radius=2.5) -> np.ndarray:
+    """The LiDAR returns (n, 3) of the key frames that lie in a thing's box, in its frame; from the drive's geometry."""
+    gathered = []
+    for seconds in (0.5 * index for index in key_frames):
+        sensor = cast_lidar(world, seconds)[:, :3].astype(float)
+        sensor = sensor[np.hypot(sensor[:, 0], sensor[:, 1]) > radius]
+        offsets = sensor + world.ego_at(seconds) + LIDAR_AT - thing.at(seconds)
+        turn = np.array(
+            [[np.cos(thing.heading), np.sin(thing.heading)], [-np.sin(thing.heading), np.cos(thing.heading)]]
+        )
+        offsets[:, :2] = offsets[:, :2] @ turn.T
+        half = np.array(thing.size) / 2
+        inside = (np.abs(offsets[:, :2]) < half[:2] + margin).all(axis=1) & (offsets[:, 2] < half[2] + margin)
+        gathered.append(offsets[inside & (offsets[:, 2] > FLOOR - half[2])])
+    return np.concatenate(gathered)
+
+
+@pytest.mark.parametrize("radius", [2.5, 6.3])
+def test_the_returns_of_training_sweeps_in_its_box_lie_in_its_own_frame_and_no_others_do(tiny_scene, radius):
+    """The whole rule at once: own car, road and held-out sweeps are out. The car ahead is 5.6 m from the LiDAR, so that
+    a radius of 6.3 m cuts it."""
+    actor = the_actor(tiny_scene, job(radius=radius))
+    expected = returns_of(World(), CAR, TRAINING, radius=radius)
+    assert 30 < len(expected) < len(returns_of(World(), CAR, range(10), radius=radius))
+    assert actor["category"] == "vehicle.car" and actor["size"].tolist() == [4.0, 2.0, 1.6]
+    assert actor["lidar_points"] == len(actor["points"]) == len(actor["points_rgb"])
+    np.testing.assert_allclose(actor["points"], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("thing", "seen", "hidden"), [(CAR, (0, -1), (0, 1)), (ONCOMING, (1, 1), (1, -1))])
+def test_gathered_points_lie_on_the_faces_that_the_lidar_sees(tmp_path, thing, seen, hidden):
+    """However far it has moved between. A car ahead shows its rear and not its front (x), one that comes by on the left
+    its left and not its right (y)."""
+    actor = the_actor(drive(tmp_path, thing), job(NOTHING_HELD_OUT))
+    half = np.array(thing.size) / 2
+    points = actor["points"].astype(float)
+    assert len(points) > 100
+    outside = np.abs(points) - half
+    np.testing.assert_allclose(outside.max(axis=1), 0.0, atol=0.01)
+    on_face = [np.abs(points[:, axis] - sign * half[axis]) < 0.01 for axis, sign in (seen, hidden)]
+    assert on_face[0].mean() > 0.25 and on_face[1].mean() < 0.03, "but for edges"
+    assert points[:, 2].min() > FLOOR - half[2]
+
+
+@pytest.mark.parametrize("margin", [0.0, 1.0])
+def test_a_margin_grows_the_box_at_its_sides_and_leaves_the_road_out(tiny_scene, margin):
+    actor = the_actor(tiny_scene, job(box_margin=margin))
+    np.testing.assert_allclose(actor["points"], returns_of(World(), CAR, TRAINING, margin=margin), atol=1e-4)
+    assert actor["points"][:, 2].min() > FLOOR - 0.8
+
+
+def test_sweeps_that_are_missing_or_corrupt_give_nothing(root):
+    scene = scene_at(root)
+    (root / "samples/LIDAR_TOP/0001__0001.pcd.bin").unlink()
+    (root / "samples/LIDAR_TOP/0001__0003.pcd.bin").write_bytes(b"no sweep")
+    np.testing.assert_allclose(the_actor(scene, job())["points"], returns_of(World(), CAR, (0, 4, 5, 7)), atol=1e-4)
+
+
+def test_few_lidar_points_are_filled_up_with_random_ones_in_the_box(tiny_scene):
+    lidar = the_actor(tiny_scene, job())["points"]
+    actor = the_actor(tiny_scene, job(min_points=len(lidar) + 1, random_points=4000))
+    assert (actor["lidar_points"], len(actor["points"])) == (len(lidar), 4000)
+    np.testing.assert_array_equal(actor["points"][: len(lidar)], lidar)
+    share = actor["points"][len(lidar) :] / actor["size"] + 0.5
+    assert share.min() >= 0.0 and share.max() <= 1.0
+    for axis in range(3):
+        np.testing.assert_allclose(np.quantile(share[:, axis], [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.04)
+    assert np.abs(np.corrcoef(share.T)[[0, 0, 1], [1, 2, 2]]).max() < 0.06
+
+
+@pytest.mark.parametrize(("less", "count"), [(0, None), (1, 4000)])
+def test_enough_lidar_points_are_left_alone(tiny_scene, less, count):
+    lidar = len(returns_of(World(), CAR, TRAINING))
+    actor = the_actor(tiny_scene, job(min_points=lidar + less, random_points=4000))
+    assert len(actor["points"]) == (count or lidar)
+
+
+def test_random_points_stay_under_the_most_there_may_be(tiny_scene):
+    actor = the_actor(tiny_scene, job(min_points=10**6, random_points=4000, max_points=1000))
+    assert len(actor["points"]) == 1000 and 0 < actor["lidar_points"] < 1000
+
+
+def test_too_many_points_are_thinned_at_random(tiny_scene):
+    whole = returns_of(World(), CAR, TRAINING).round(3)
+    actor = the_actor(tiny_scene, job(max_points=100))
+    assert actor["lidar_points"] == len(actor["points"]) == 100
+    numbers = [int(np.abs(whole - point).max(axis=1).argmin()) for point in actor["points"]]
+    np.testing.assert_allclose(actor["points"], whole[numbers], atol=2e-3)
+    assert len(set(numbers)) == 100 and max(numbers) > len(whole) / 2 > 100
+
+
+def test_without_any_lidar_an_actor_starts_at_random(root):
+    shutil.rmtree(root / "samples" / "LIDAR_TOP")
+    actor = the_actor(scene_at(root), job(min_points=1, random_points=300))
+    assert (actor["lidar_points"], len(actor["points"])) == (0, 300)
+
+
+PARKED = Thing("vehicle.car", (4.0, 1.8, 1.5), (12.0, -4.0, 0.75))
+BEHIND = Thing("vehicle.car", (4.0, 1.8, 1.5), (-12.0, 0.0, 0.75), (4.0, 0.0))
+FAR = Thing("vehicle.car", (4.0, 1.8, 1.5), (35.0, 0.0, 0.75), (4.0, 0.0))
+HIDDEN = Thing("vehicle.car", (4.0, 1.8, 1.5), (17.0, 0.0, 0.75), (4.0, 0.0))
+HIDING = Thing("vehicle.truck", (4.0, 2.4, 2.6), (9.0, 0.0, 1.3), (4.0, 0.0))
+HELD_OUT_ALONE = Thing("vehicle.car", (4.0, 1.8, 1.5), (9.0, -3.5, 0.75), (4.0, 0.0), seen=range(8, 10))
+HELD_OUT_AND_TRAINING = dataclasses.replace(HELD_OUT_ALONE, seen=range(7, 10))
+
+
+@pytest.mark.parametrize(
+    ("things", "expected"),
+    [
+        ([CAR], 1),
+        ([PARKED], 0),
+        ([BEHIND], 0),
+        ([FAR], 0),
+        ([HIDING], 1),
+        ([HIDDEN], 1),
+        ([HIDING, HIDDEN], 1),
+        ([HELD_OUT_ALONE], 0),
+        ([HELD_OUT_AND_TRAINING], 1),
+        ([], 0),
+    ],
+    ids=["ahead", "parked", "behind", "far", "hiding", "not hidden", "hidden", "held out", "partly held out", "none"],
+)
+def test_an_actor_is_a_vehicle_that_moves_and_that_a_training_image_sees(tmp_path, caplog, things, expected):
+    scene = drive(tmp_path, *(things or [World().things[3]]), width=192, height=108)
+    caplog.set_level("INFO")
+    record = actors_record(scene, job())
+    assert len(record["actors"]) == expected
+    moving = [track.id for track in scene.tracks if track.category.startswith("vehicle.") and things != [PARKED]]
+    left_out = set(moving) - {actor["id"] for actor in record["actors"]}
+    assert all(any(track in line for line in caplog.messages if "no training image sees" in line) for track in left_out)
+
+
+def test_what_fills_too_few_pixels_at_one_size_is_seen_at_another(tmp_path):
+    scene = drive(tmp_path, FAR, width=384, height=216)
+    assert len(actors_of(scene, job())) == 1
+    assert len(actors_of(scene, job(width=96))) == 0
+
+
+RIDERS = [
+    Thing(category, (1.8, 0.7, 1.6), (9.0, y, 0.8), (3.0, 0.0))
+    for category, y in (
+        ("vehicle.bicycle", -3.0), ("vehicle.motorcycle", -1.0), ("human.pedestrian.adult", 1.0),
+        ("vehicle.bus.rigid", 3.0), ("animal", 4.0), ("movable_object.pushable_pullable", 5.0),
+    )
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, {"bicycle", "motorcycle", "rigid"}),
+        ({"cycles": False}, {"rigid"}),
+        ({"humans": True}, {"bicycle", "motorcycle", "rigid", "adult"}),
+        ({"cycles": False, "humans": True}, {"rigid", "adult"}),
+    ],
+)
+def test_settings_say_whether_cycles_and_people_become_actors(tmp_path, settings, expected):
+    found = actors_of(drive(tmp_path, *RIDERS), job(**settings))
+    assert {actor["category"].split(".")[-1] for actor in found} == expected and len(found) == len(expected)
+
+
+def painted(scene: Scene, color_of) -> None:
+    """Paints every image of a scene over: `color_of` gives an image (h, w, 3) for a frame. PNG within: lossless."""
+    for frame in scene.frames:
+        image = np.broadcast_to(np.asarray(color_of(frame), dtype=np.uint8), (frame.height, frame.width, 3))
+        Image.fromarray(np.ascontiguousarray(image)).save(frame.image_path, format="PNG")
+
+
+def pixels_of(world: World, thing: Thing, frame: Frame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows (n, 2) of points (n, 3) in a thing's frame, which is the world's but for its place, as a frame
+    shows them, and their distances (n,) from the camera."""
+    seconds = seconds_of(frame.timestamp)
+    away = points + thing.at(seconds) - world.ego_at(seconds) - CAMERA_AT
+    in_camera = np.stack([-away[:, 1], -away[:, 2], away[:, 0]], axis=1) / away[:, :1]
+    return np.floor((in_camera @ world.intrinsics.T)[:, :2] + 0.5).astype(int), np.linalg.norm(away, axis=1)
+
+
+def inside(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Whether pixels (n, 2) lie in an image, and in its mask (h, w)."""
+    there = (pixels >= 0).all(axis=1) & (pixels < mask.shape[::-1]).all(axis=1)
+    there[there] = mask[pixels[there, 1], pixels[there, 0]]
+    return there
+
+
+NEARING = dataclasses.replace(CAR, velocity=(3.0, 0.0))
+"""The own car gains a metre a second on it."""
+
+
+@pytest.mark.parametrize("thing", [CAR, NEARING], ids=["away", "near"])
+def test_a_point_has_the_colour_of_the_nearest_training_image_in_which_its_pixel_is_the_actors(tmp_path, thing):
+    """Every image has a grey of its own."""
+    world, scene = World(things=[thing]), drive(tmp_path, thing)
+    painted(scene, lambda frame: (2 * scene.frames.index(frame) + 10,) * 3)
+    actor = the_actor(scene, job(min_points=10**6, random_points=2000))
+    points, expected = actor["points"].astype(float), np.full(2000, -1)
+    best = np.full(2000, np.inf)
+    groups = frame_groups(scene, job().holdout)
+    for number, (frame, group) in enumerate(zip(scene.frames, groups, strict=True)):
+        pixels, distances = pixels_of(world, thing, frame, points)
+        better = inside(pixels, shows(world, frame, thing)) & (distances < best) & (group == "train")
+        best[better], expected[better] = distances[better], 2 * number + 10
+    shown = expected >= 0
+    assert shown.sum() > 1000 and len(np.unique(expected)) > 1
+    np.testing.assert_array_equal(actor["points_rgb"][shown], np.repeat(expected[shown, None], 3, axis=1))
+    np.testing.assert_array_equal(actor["points_rgb"][~shown], round(expected[shown].mean()))
+
+
+def test_colours_are_those_of_the_cars_surface(tmp_path):
+    """Up to JPEG, pixel size and the stripes' edges: the drive's geometry says what colour each point has."""
+    actor = the_actor(drive(tmp_path, *World().things, width=384, height=216), job())
+    stripes = 0.75 + 0.25 * np.sign(np.sin(5.0 * actor["points"].sum(axis=1)))
+    off = np.abs(actor["points_rgb"] - np.array(CAR.color) * stripes[:, None]).max(axis=1)
+    assert (off < 25).mean() > 0.85
+
+
+SPEEDING = Speeding("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0), gain=(1.0, 0.0))
+
+
+def test_what_stands_nearer_lends_no_colour(tmp_path):
+    """A walker hides the same part of the car in every image. Images are red where the walker's box is seen, else blue:
+    what lies behind the walker has the others' colour."""
+    walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (5.5, 0.3, 0.95), (4.2, 0.0))
+    scene, world = drive(tmp_path, walker, CAR), World(things=[walker, CAR])
+    masks = {frame.token: shows(world, frame, walker) for frame in scene.frames}
+    painted(scene, lambda frame: np.where(masks[frame.token][..., None], (255, 0, 0), (0, 0, 255)))
+    actor = the_actor(scene, job(min_points=10**6, random_points=2000))
+    assert actor["category"] == "vehicle.car"
+    pixels, _ = pixels_of(world, CAR, scene.frames[0], actor["points"].astype(float))
+    assert inside(pixels, masks[scene.frames[0].token]).sum() > 100
+    np.testing.assert_array_equal(actor["points_rgb"], np.broadcast_to([0, 0, 255], (2000, 3)))
+
+
+LEFT_HALF = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
+WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+
+
+def test_the_own_cars_body_lends_no_colour_and_hides(tmp_path):
+    scene = drive(tmp_path, CAR)
+    painted(scene, lambda frame: np.where(np.arange(96)[:, None] <= 48, (255, 0, 0), (0, 0, 255)))
+    colors = the_actor(scene, job(), OwnCar({"CAM_FRONT": (LEFT_HALF,)}))["points_rgb"]
+    assert {tuple(color) for color in colors} == {(0, 0, 255)}
+    assert {tuple(color) for color in the_actor(scene, job())["points_rgb"]} == {(0, 0, 255), (255, 0, 0)}
+    assert actors_of(scene, job(), OwnCar({"CAM_FRONT": (WHOLE,)})) == []
+
+
+def test_an_actor_that_is_seen_but_shows_no_point_is_grey(tmp_path):
+    """Its only points lie left of what the own car's body leaves of it."""
+    scene = drive(tmp_path, dataclasses.replace(CAR, position=(8.5, 0.0, 0.8)))
+    outline = ((0.0, 0.0), (0.52, 0.0), (0.52, 1.0), (0.0, 1.0))
+    left = [
+        dataclasses.replace(sweep, path=_left_half(Path(sweep.path), tmp_path / f"left{number}.bin"))
+        for number, sweep in enumerate(scene.sweeps)
+    ]
+    actor = the_actor(dataclasses.replace(scene, sweeps=tuple(left)), job(), OwnCar({"CAM_FRONT": (outline,)}))
+    assert len(actor["points"]) > 50
+    assert {tuple(color) for color in actor["points_rgb"]} == {(127, 127, 127)}
+
+
+def _left_half(path: Path, copy: Path) -> str:
+    returns = np.fromfile(path, dtype=np.float32).reshape(-1, 5)
+    returns[returns[:, 1] > 0.0].tofile(copy)
+    return str(copy)
+
+
+def test_held_out_images_and_sweeps_contribute_nothing(root):
+    """Held-out images become magenta and held-out sweeps garbage in the car's box: not a bit changes."""
+    scene, settings = scene_at(root), job(width=64, min_points=10**6, random_points=1000, humans=True)
+    before = actors_record(scene, settings)
+    assert len(before["actors"]) == 2
+    random, changed = np.random.default_rng(0), 0
+    for frame, group in zip(scene.frames, frame_groups(scene, settings.holdout), strict=True):
+        if group != "train":
+            Image.new("RGB", (frame.width, frame.height), (255, 0, 255)).save(frame.image_path)
+            changed += 1
+    for sweep, group in zip(scene.sweeps, sweep_groups(scene, settings.holdout), strict=True):
+        if group != "train":
+            near = random.uniform([5.6, -1.0, -1.5, 0, 0], [9.6, 1.0, -0.3, 0, 0], (500, 5))
+            near.astype(np.float32).tofile(sweep.path)
+            changed += 1
+    assert changed == 4 + 3 + 4, "images at 2, 6, 8, 9, between 2-3, 6-7, 8-9; four sweeps"
+    assert_same(actors_record(scene_at(root), settings), before)
+    nothing = settings.model_copy(update={"holdout": job(NOTHING_HELD_OUT).holdout})
+    assert len(actors_record(scene_at(root), nothing)["actors"][0]["points"]) > 1500, "the garbage lies in its box"
+
+
+@pytest.mark.parametrize("what", ["image", "sweep"])
+def test_training_images_and_sweeps_do_contribute(root, what):
+    scene = scene_at(root)
+    before = the_actor(scene, job())
+    if what == "image":
+        Image.new("RGB", (96, 54), (255, 0, 255)).save(scene.frames[0].image_path)
+    else:
+        Path(scene.sweeps[0].path).write_bytes(Path(scene.sweeps[3].path).read_bytes())
+    after = the_actor(scene_at(root), job())
+    key = {"image": "points_rgb", "sweep": "points"}[what]
+    assert before[key].tobytes() != after[key].tobytes()
+
+
+def test_equal_random_seeds_give_equal_actors_and_others_do_not(tiny_scene):
+    settings = {"min_points": 10**6, "random_points": 1000}
+    first, again, other = (actors_record(tiny_scene, job(random_seed=seed, **settings)) for seed in (0, 0, 1))
+    assert_same(first, again)
+    assert first["actors"][0]["points"].tobytes() != other["actors"][0]["points"].tobytes()
+
+
+def test_actors_come_by_id_each_with_random_points_of_its_own_whatever_else_becomes_one(tmp_path):
+    twins = [dataclasses.replace(CAR, position=(9.0, y, 0.8)) for y in (-2.0, 2.0)]
+    walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (8.0, 0.0, 0.95), (4.2, 0.0))
+    scene = drive(tmp_path, *twins, walker)
+    renamed = [dataclasses.replace(track, id=name) for track, name in zip(scene.tracks, "cab", strict=True)]
+    scene = dataclasses.replace(scene, tracks=tuple(renamed), sweeps=())
+    settings = {"min_points": 1, "random_points": 500}
+    alone, all_three = actors_of(scene, job(**settings)), actors_of(scene, job(humans=True, **settings))
+    assert [actor["id"] for actor in alone] == ["a", "c"] and [actor["id"] for actor in all_three] == ["a", "b", "c"]
+    assert alone[0]["points"].tobytes() != alone[1]["points"].tobytes()
+    for one, same in zip(alone, all_three[::2], strict=True):
+        np.testing.assert_array_equal(one["points"], same["points"])
+
+
+def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
+    """A track with a gap. Seconds count from the first image, 35 ms before the first key frame."""
+    scene = drive(tmp_path, SPEEDING)
+    (track,) = scene.tracks
+    kept = [0, 1, 2, 5, 6, 7, 8, 9]
+    track = dataclasses.replace(
+        track, timestamps=track.timestamps[kept], sample_indices=track.sample_indices[kept],
+        object_to_world=track.object_to_world[kept], visibility=track.visibility[kept],
+    )  # fmt: skip
+    scene = dataclasses.replace(scene, tracks=(track,))
+    record = actors_record(scene, job())
+    (actor,) = record["actors"]
+    assert actor["id"] == track.id
+    np.testing.assert_allclose(actor["times"], 0.035 + 0.5 * np.array(kept), atol=1e-9)
+    np.testing.assert_allclose(actor["object_to_world"][:, 0, 3], [SPEEDING.at(0.5 * i)[0] for i in kept], atol=1e-6)
+    assert (actor["runs"], actor["reach"]) == ([[0, 2], [3, 7]], 0.25)
+    at = np.linspace(-0.5, 6.0, 40)
+    motion, expected = motion_of(actor), Motion.of_track(scene, track)
+    np.testing.assert_array_equal(motion.poses(at), expected.poses(at))
+    np.testing.assert_array_equal(motion.present(at), expected.present(at))
+
+
+def test_the_record_is_plain_and_reads_as_it_was_written(tiny_scene, tmp_path):
+    record = {**actors_record(tiny_scene, job()), "provenance": {"stages": {}}}
+    write_plain_pickle(tmp_path / "actors.pkl", record)
+    read = read_actors(tmp_path / "actors.pkl")
+    assert_same(read, record)
+    assert read.keys() == {"actors", "provenance"}
+    (actor,) = read["actors"]
+    kinds = {name: (value.dtype, value.ndim) for name, value in actor.items() if isinstance(value, np.ndarray)}
+    assert kinds == {
+        "size": (np.float64, 1), "times": (np.float64, 1), "object_to_world": (np.float64, 3),
+        "points": (np.float32, 2), "points_rgb": (np.uint8, 2),
+    }  # fmt: skip
+
+
+def test_a_drive_in_which_nothing_moves_has_no_actors_and_a_record_of_them(tmp_path):
+    write_plain_pickle(tmp_path / "actors.pkl", {**actors_record(drive(tmp_path, PARKED), job()), "provenance": {}})
+    assert read_actors(tmp_path / "actors.pkl")["actors"] == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [None, b"", b"text", [], {}, {"actors": []},
+     *({"actors": actors, "provenance": {}} for actors in (None, ["x"], [{"id": "x"}]))],
+    ids=str,
+)  # fmt: skip
+def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
+    path = tmp_path / "actors.pkl"
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else pickle.dumps(content))
+    with pytest.raises(ResultError, match=r"actors\.pkl: .*the rule 'actors' rebuilds it"):
+        read_actors(path)
+
+
+def test_20_actors_in_40_images_are_gathered_and_coloured_within_10_seconds(tiny_scene, tmp_path):
+    random = np.random.default_rng(0)
+    Image.fromarray(random.integers(0, 256, (360, 640, 3), dtype=np.uint8)).save(tmp_path / "noise.jpg")
+    car = next(track for track in tiny_scene.tracks if track.category == "vehicle.car")
+    frames = [
+        dataclasses.replace(tiny_scene.frames[i % 18], image_path=str(tmp_path / "noise.jpg"), width=640, height=360)
+        for i in range(40)
+    ]
+    scaled = np.diag([640 / 96, 640 / 96, 1.0])
+    frames = [dataclasses.replace(frame, intrinsics=scaled @ frame.intrinsics) for frame in frames]
+    shifts = [
+        np.array([[0, 0, 0, 3.0 * (i // 5)], [0, 0, 0, 3.0 * (i % 5) - 6.0], [0] * 4, [0] * 4]) for i in range(20)
+    ]
+    tracks = [
+        dataclasses.replace(car, id=str(i), object_to_world=car.object_to_world + shift)
+        for i, shift in enumerate(shifts)
+    ]
+    scene = dataclasses.replace(tiny_scene, frames=tuple(frames), tracks=tuple(tracks))
+    began = time.monotonic()
+    found = actors_of(scene, job(NOTHING_HELD_OUT, min_points=10**6, random_points=20_000))
+    assert time.monotonic() - began < 10.0
+    assert len(found) >= 5 and all(len(actor["points"]) == 20_000 for actor in found)
+
+
+def test_of_the_real_scene_the_vehicles_that_move_in_sight_become_actors(real_scene_root):
+    source = SceneSource(
+        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
+        sweeps=False, on_missing="stop",
+    )  # fmt: skip
+    found = actors_of(extract_scene(source, real_scene_root), job({}, min_points=2000))
+    assert 4 <= len(found) <= 7 and all(actor["category"].startswith("vehicle.") for actor in found)
+    for actor in found:
+        assert len(actor["points"]) == 8000 and actor["lidar_points"] < 100, "all but one of its sweeps are missing"
+        assert len(np.unique(actor["points_rgb"], axis=0)) > 50

@@ -1,0 +1,290 @@
+"""Where the recording car's own body is seen: as the user says, or as images show it that stay alike on the way."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.rig_drives import KEY_FRAMES, rig_drive, true_body
+from PIL import Image
+
+from drivesplat.errors import ResultError
+from drivesplat.io.storage import write_json
+from drivesplat.preprocess import ego_mask as own_car_search
+from drivesplat.preprocess.ego_mask import Drive, ends, found_in, known, outlines_of, own_car_record
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.ego_mask import OwnCar, enclosed, read_own_car
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups
+from drivesplat.settings.config import load
+from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
+from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.workflow.stages import stage_settings
+
+CAMERAS = ("CAM_BACK", "CAM_BACK_RIGHT", "CAM_FRONT")
+SIZE = (160, 90)
+NOTHING_HELD_OUT = HoldoutSettings(every_nth=0, last_block=0)
+LOOKING = OwnCarSearch(cameras=CAMERAS, holdout=NOTHING_HELD_OUT, own_car_radius=2.5)
+JOB = OwnCarJob(polygons={}, search=LOOKING)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory) -> Scene:
+    """A drive of 14 key frames, 50 m, in which CAM_BACK sees the own car's rear."""
+    return rig_drive(tmp_path_factory.mktemp("seen"), CAMERAS, own_car=True)
+
+
+@pytest.fixture(scope="module")
+def unseen(tmp_path_factory) -> Scene:
+    """The same drive by a car that no camera sees."""
+    return rig_drive(tmp_path_factory.mktemp("unseen"), CAMERAS)
+
+
+def painted(scene: Scene, folder: Path, paint: Callable[[np.ndarray, int], np.ndarray]) -> Scene:
+    """A scene whose images of CAM_BACK have gone through `paint`, told which of them each is."""
+    frames, number = [], 0
+    for frame in scene.frames:
+        if frame.camera == "CAM_BACK":
+            path = folder / f"{number}.png"
+            pixels = paint(np.asarray(Image.open(frame.image_path)).astype(float), number)
+            Image.fromarray(np.clip(pixels + 0.5, 0, 255).astype(np.uint8)).save(path)
+            frame, number = dataclasses.replace(frame, image_path=str(path)), number + 1
+        frames.append(frame)
+    return dataclasses.replace(scene, frames=tuple(frames))
+
+
+def body_in(scene: Scene, camera: str = "CAM_BACK", search: OwnCarSearch = LOOKING) -> np.ndarray:
+    """The pixels (h, w) bool that are taken for the own car's body."""
+    outlines, _, why = known(scene, camera, OwnCarJob(polygons={}, search=search))
+    assert (why is None) == bool(outlines)
+    return enclosed(outlines, SIZE)
+
+
+def why_not(scene: Scene, camera: str = "CAM_BACK") -> str:
+    outlines, source, why = known(scene, camera, JOB)
+    assert (outlines, source) == ((), None)
+    return why
+
+
+def assert_is_the_body(found: np.ndarray) -> None:
+    true = true_body("CAM_BACK")
+    assert 0.04 < true.mean() < 0.08
+    assert (found & true).sum() > 0.9 * true.sum()
+    assert (found & true).sum() > 0.75 * (found | true).sum()
+
+
+# ---- what is found
+
+
+def test_the_body_is_found_where_it_is_and_nowhere_else(seen):
+    assert_is_the_body(body_in(seen))
+    for camera in CAMERAS[1:]:
+        assert not true_body(camera).any() and not body_in(seen, camera).any()
+
+
+def test_a_car_that_no_camera_sees_is_not_found(unseen):
+    assert [known(unseen, camera, JOB)[:2] for camera in CAMERAS] == [((), None)] * 3
+
+
+def test_a_body_under_changing_light_is_found(seen, tmp_path):
+    """The light on the body, and on nothing else, goes up and down by a quarter."""
+    body, light = true_body("CAM_BACK")[..., None], np.random.default_rng(0).uniform(0.75, 1.25, KEY_FRAMES)
+    lit = painted(seen, tmp_path, lambda pixels, number: np.where(body, 0.8 * light[number] * pixels, pixels))
+    assert_is_the_body(body_in(lit))
+
+
+def test_held_out_images_and_sweeps_contribute_nothing(seen, tmp_path):
+    """What is held out becomes noise, and garbage on the body: not a pixel changes. Two training sweeps are missing, so
+    that held-out ones are the nearest to their images, by when the car has driven on for 4 m."""
+    search = LOOKING.model_copy(update={"holdout": HoldoutSettings(every_nth=6, offset=3, last_block=0)})
+    groups = frame_groups(seen, search.holdout)
+    held_out = {f.sample_index for f, group in zip(seen.frames, groups, strict=True) if group != "train"}
+    assert held_out == {3, 9}
+    sweeps = [sweep for sweep in seen.sweeps if sweep.sample_index not in (4, 10)]
+    before = body_in(dataclasses.replace(seen, sweeps=tuple(sweeps)), search=search)
+    assert before.any()
+    on_body = np.random.default_rng(0).uniform((-3, -5.2, -4.1, 1, 1), (3, -4.7, -3.8, 1, 1), (900, 5))
+    on_body.astype(np.float32).tofile(tmp_path / "garbage.bin")
+    sweeps = [
+        dataclasses.replace(sweep, path=str(tmp_path / "garbage.bin")) if sweep.sample_index in held_out else sweep
+        for sweep in sweeps
+    ]
+    noise = np.random.default_rng(0).uniform(0, 255, (90, 160, 3))
+    spoilt = painted(seen, tmp_path, lambda pixels, number: noise if number in held_out else pixels)
+    np.testing.assert_array_equal(body_in(dataclasses.replace(spoilt, sweeps=tuple(sweeps)), search=search), before)
+    assert (body_in(dataclasses.replace(seen, sweeps=tuple(sweeps))) != before).any(), "training sweeps do contribute"
+
+
+# ---- what is refused
+
+
+def test_a_car_that_stands_is_refused(tmp_path):
+    assert why_not(rig_drive(tmp_path, ["CAM_BACK"], own_car=True, ego="stands")).startswith("the car hardly moves")
+
+
+def test_few_images_are_refused(seen):
+    few = dataclasses.replace(seen, frames=tuple(frame for frame in seen.frames if frame.sample_index < 9))
+    assert "9 images" in why_not(few)
+
+
+def test_a_car_that_waits_is_judged_by_the_images_of_its_way(seen):
+    """Thirty more images at a standstill, of a camera that sees all the world unmoved."""
+    waited = [frame for frame in seen.frames if frame.camera == "CAM_BACK" and frame.sample_index == 5]
+    more = [dataclasses.replace(waited[0], timestamp=waited[0].timestamp + i) for i in range(1, 31)]
+    scene = dataclasses.replace(seen, frames=(*seen.frames, *more))
+    assert len(Drive.of(scene, "CAM_BACK", LOOKING).frames) == KEY_FRAMES
+    np.testing.assert_array_equal(body_in(scene), body_in(seen))
+
+
+def test_without_lidar_nothing_tells_an_even_road_from_a_body(seen):
+    assert why_not(dataclasses.replace(seen, sweeps=())).startswith("LiDAR tells of 0 images")
+
+
+def test_an_even_road_that_lidar_meets_is_no_body(unseen, tmp_path):
+    """The road near the camera becomes one grey, up to a line that stays where it is."""
+    even = painted(unseen, tmp_path, lambda pixels, _: np.where(np.arange(90)[:, None, None] > 75, 90.0, pixels))
+    assert why_not(even) == "LiDAR meets something all along the edge of the images"
+
+
+def without_returns_below(scene: Scene, folder: Path) -> Scene:
+    """A scene whose LiDAR misses the road near the car, as it does a wet one."""
+    sweeps = []
+    for number, sweep in enumerate(scene.sweeps):
+        returns = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, 5)
+        path = folder / f"dry{number}.bin"
+        returns[np.hypot(returns[:, 0], returns[:, 1]) > 9.0].tofile(path)
+        sweeps.append(dataclasses.replace(sweep, path=str(path)))
+    return dataclasses.replace(scene, sweeps=tuple(sweeps))
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_what_is_black_or_blown_out_is_no_body(unseen, tmp_path, level):
+    """The same in a grey that can be seen to stay is taken for one."""
+    missed = without_returns_below(unseen, tmp_path)
+    for grey in (level, 120):
+        (folder := tmp_path / str(grey)).mkdir()
+        edge = np.arange(90)[:, None, None] > 80
+        scene = painted(missed, folder, lambda p, _, grey=grey, edge=edge: np.where(edge, float(grey), p))
+        assert body_in(scene).any() == (grey == 120)
+
+
+def test_by_night_nothing_is_told(seen, tmp_path):
+    dark = painted(seen, tmp_path, lambda pixels, _: 0.05 * pixels)
+    assert "too little to tell" in why_not(dark)
+
+
+def test_what_reaches_above_the_horizon_is_cut_there(unseen, tmp_path):
+    """A pane of dirt over the right edge of the image, sky included, where LiDAR meets nothing."""
+    missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
+    dirty = painted(missed, tmp_path, lambda p, _: np.where(np.arange(160)[None, :, None] > 150, 120.0, p))
+    found = body_in(dirty)
+    assert found[60:, 152:].all() and not found[:40].any()
+
+
+def _empty(sweep, folder: Path):
+    path = folder / "far.bin"
+    np.array([[0.0, 0.0, 90.0, 1.0, 1.0]], dtype=np.float32).tofile(path)
+    return dataclasses.replace(sweep, path=str(path))
+
+
+def test_most_of_an_image_is_no_body(unseen, tmp_path):
+    missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
+    even = painted(missed, tmp_path, lambda p, _: np.where(np.arange(90)[:, None, None] > 60, 120.0, p))
+    assert "more than a body fills" in why_not(even)
+
+
+def test_what_varies_ever_more_has_no_end(unseen):
+    """A body ends at once; a road grows more varied with distance."""
+    drive = Drive.of(unseen, "CAM_BACK", LOOKING)
+    rows = np.arange(90.0)[:, None].repeat(160, axis=1)
+    lower = rows >= 70
+    assert ends(lower, np.where(lower, 4.0, 20.0), drive)
+    assert not ends(lower, 4.0 + 0.5 * (89.0 - rows), drive)
+
+
+# ---- what is told
+
+
+def test_the_users_outline_wins_and_other_cameras_are_looked_at(seen):
+    outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0))
+    job = OwnCarJob(polygons={"CAM_BACK": outline}, search=LOOKING.model_copy(update={"cameras": ("CAM_FRONT",)}))
+    cameras = own_car_record(seen, job)["cameras"]
+    assert (cameras["CAM_BACK"]["source"], cameras["CAM_BACK"]["outlines"]) == ("polygons", (outline,))
+    assert cameras["CAM_BACK"]["share"] == pytest.approx(0.05, abs=0.002) and cameras["CAM_BACK"]["why_null"] is None
+    assert cameras["CAM_FRONT"]["why_null"] and "not looked for" in cameras["CAM_BACK_RIGHT"]["why_null"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "outlined", "searched"),
+    [
+        ("none", [], None),
+        ("polygons", ["CAM_BACK"], None),
+        ("auto", ["CAM_BACK"], ("CAM_BACK_RIGHT",)),
+        ("auto_measured", ["CAM_BACK"], ("CAM_FRONT", "CAM_BACK_RIGHT")),
+    ],
+)
+def test_a_setting_says_where_it_is_looked_for(kind, outlined, searched):
+    """CAM_FRONT is measured; of CAM_BACK an outline is given."""
+    masks = {"own_car": kind, "own_car_polygons": {"CAM_BACK": [[0, 1], [1, 1], [0.5, 0.9]]}}
+    values = {"cameras": ["CAM_FRONT", "CAM_BACK", "CAM_BACK_RIGHT"], "masks": masks}
+    job = OwnCarJob.model_validate_json(stage_settings(load(values), "own_car", "0061"))
+    assert list(job.polygons) == outlined
+    assert (job.search.cameras if job.search else None) == searched
+
+
+def test_the_camera_that_is_measured_is_spared_by_default():
+    """So that figures hang on no guess; where it is the only one, on no setting of the search either."""
+    default = load({})
+    assert default.masks.own_car == "auto"
+    assert stage_settings(default, "own_car", "0061") == '{"polygons":{},"search":null}'
+
+
+def test_a_record_returns_as_it_was_written(seen, tmp_path):
+    record = own_car_record(seen, JOB)
+    write_json(tmp_path / "own_car.json", {**record, "provenance": {"stages": {}}})
+    own_car, provenance = read_own_car(tmp_path / "own_car.json")
+    assert provenance == {"stages": {}} and own_car.source == {"CAM_BACK": "images"}
+    np.testing.assert_array_equal(own_car.pixels("CAM_BACK", SIZE), body_in(seen))
+    assert own_car.pixels("CAM_FRONT", SIZE).shape == (90, 160) and not own_car.pixels("CAM_FRONT", SIZE).any()
+
+
+@pytest.mark.parametrize(
+    "content", [None, "", "[]", "{}", '{"cameras": {"A": {}}, "provenance": {}}', '{"cameras": {}}']
+)
+def test_a_foreign_record_is_named_with_its_rule(tmp_path, content):
+    if content is not None:
+        (tmp_path / "own_car.json").write_text(content)
+    with pytest.raises(ResultError, match=r"own_car\.json.*'own_car'"):
+        read_own_car(tmp_path / "own_car.json")
+
+
+@pytest.mark.parametrize("size", [(160, 90), (400, 225), (1600, 900)])
+def test_outlines_enclose_what_they_were_drawn_around_at_any_size(size):
+    y, x = np.mgrid[:90, :160]
+    mask = (y > 70 + 0.002 * (x - 80) ** 2) | ((x < 20) & (y > 40))
+    drawn = OwnCar({"A": outlines_of(mask)}).pixels("A", size)
+    rows, columns = (np.arange(n) * m // n for n, m in ((size[1], 90), (size[0], 160)))
+    expected = mask[rows][:, columns]
+    assert (drawn != expected).mean() < 0.015
+    assert drawn[-1, expected[-1]].mean() > 0.97 and drawn[expected[:, 0], 0].mean() > 0.97, "up to the image's edge"
+
+
+def test_of_two_bodies_each_has_its_outline():
+    mask = np.zeros((90, 160), dtype=bool)
+    mask[80:, :30] = mask[80:, 130:] = True
+    assert len(outlines_of(mask)) == 2
+
+
+def test_the_front_camera_of_a_real_drive_sees_no_body(real_scene_root, monkeypatch):
+    """Even if LiDAR had met nothing in any image: its road varies far too much to be taken for a body."""
+    source = SceneSource(
+        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
+        sweeps=False, on_missing="stop",
+    )  # fmt: skip
+    drive = Drive.of(extract_scene(source, real_scene_root), "CAM_FRONT", LOOKING)
+    assert found_in(drive)[1].startswith("LiDAR tells of ")
+    nothing = np.zeros((drive.size[1], drive.size[0]), dtype=bool)
+    monkeypatch.setattr(own_car_search, "lidar_images", lambda drive: [nothing] * len(drive.compared))
+    assert len(drive.compared) > 30 and found_in(drive) == ((), "nothing stays as it is that could be the own car")

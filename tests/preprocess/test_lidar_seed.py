@@ -1,0 +1,532 @@
+"""Where the Gaussians start: static LiDAR points and far points, coloured by training images alone."""
+
+import dataclasses
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.tiny_world import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from drivesplat.errors import DatasetError
+from drivesplat.io.point_cloud import PointCloud
+from drivesplat.lidar.coloring import ColorView, color_by_visibility
+from drivesplat.lidar.sweeps import outside_boxes, read_sweep, thin, without_own_car
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.far_points import far_points, uncovered
+from drivesplat.preprocess.lidar_seed import color_view, lidar_points, seed_points
+from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.images import project
+from drivesplat.scene.regions import fill, hull_of
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.splits import frame_groups, sweep_groups
+from drivesplat.scene.tracks import Box, box_at, tracks_that_move
+from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_seed import SeedJob
+
+HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}
+"""Of the tiny drive's 10 key frames: 2, 6; 8, 9."""
+NOTHING_HELD_OUT = {"every_nth": 0, "last_block": 0}
+
+
+def job(holdout=HELD_OUT, width=None, random_seed=0, **settings) -> SeedJob:
+    return SeedJob.model_validate(
+        {
+            "lidar_seed": {"far_points": 200, **settings},
+            "holdout": holdout,
+            "images": {"width": width},
+            "random_seed": random_seed,
+        }
+    )
+
+
+@pytest.fixture
+def root(tiny_root, tmp_path) -> Path:
+    """A copy of the tiny drive that a test may damage."""
+    return Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+
+
+def scene_at(root: Path) -> Scene:
+    source = SceneSource(
+        dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None, cameras=("CAM_FRONT",),
+        sweeps=True, on_missing="stop",
+    )  # fmt: skip
+    return extract_scene(source, root)
+
+
+def returns_at(seconds: float) -> np.ndarray:
+    """All LiDAR returns (n, 3) of the tiny drive at a time, in its world, those of the own car included."""
+    return cast_lidar(World(), seconds)[:, :3].astype(float) + World().ego_at(seconds) + LIDAR_AT
+
+
+def within(points: np.ndarray, category: str, seconds: float, margin: float) -> np.ndarray:
+    """Which points (n, 3) lie in the thing's box, grown by a margin: things of the tiny drive stand square."""
+    (thing,) = [thing for thing in World().things if thing.category == category]
+    return (np.abs(points - thing.at(seconds)) < np.array(thing.size) / 2 + margin).all(axis=1)
+
+
+def rows(points: np.ndarray) -> set[tuple]:
+    return {tuple(row) for row in np.round(points, 3)}
+
+
+def test_static_returns_of_training_sweeps_stay_and_no_others(tiny_scene):
+    """The whole rule at once, computed from the drive's geometry: own car, moving boxes and held-out sweeps are out."""
+    points, times, missing = lidar_points(tiny_scene, job(voxel_size=0.0))
+    assert missing == 0
+    for index in range(10):
+        seconds = 0.5 * index
+        found = points[times == START_US + index * 500_000]
+        if index in (2, 6, 8, 9):
+            assert len(found) == 0
+            continue
+        everything = returns_at(seconds)
+        kept = np.hypot(*(everything - World().ego_at(seconds) - [0.9, 0.0, 0.0])[:, :2].T) > 2.5
+        for mover in ("vehicle.car", "human.pedestrian.adult"):
+            in_box = within(everything, mover, seconds, 0.2)
+            assert in_box.any() or seconds > 2.0, "the case must hold returns from the moving object"
+            kept &= ~in_box
+        assert within(everything[kept], "vehicle.truck", seconds, 0.05).any()
+        assert rows(found) == rows(everything[kept])
+
+
+def test_a_larger_margin_takes_more_around_moving_objects(tiny_scene):
+    none, wide = (lidar_points(tiny_scene, job(voxel_size=0.0, box_margin=margin))[0] for margin in (0.0, 2.0))
+    assert rows(wide) < rows(none)
+
+
+def test_returns_of_the_own_car_are_those_near_the_sensor_horizontally():
+    points = np.array([[0.5, 0.3, -0.4], [2.6, 0.0, 0.0], [1.8, 1.8, 5.0], [1.7, 1.7, 0.0], [0.0, 0.0, 9.0]])
+    np.testing.assert_array_equal(without_own_car(points, 2.5), points[[1, 2]])
+    np.testing.assert_array_equal(without_own_car(points[:2], 0.0), points[:2])
+
+
+def test_own_car_returns_are_there_unless_they_are_taken_out(tiny_scene):
+    settings = {"voxel_size": 0.0, "box_margin": 0.0}
+    with_car, _, _ = lidar_points(tiny_scene, job(own_car_radius=0.0, **settings))
+    without, _, _ = lidar_points(tiny_scene, job(own_car_radius=2.5, **settings))
+    assert len(with_car) - len(without) == 2 * 6, "two own-car returns in each of six training sweeps"
+
+
+def turned_box(angle: float) -> Box:
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    return Box("it", "vehicle.car", np.array([4.0, 2.0, 1.5]), rigid(turn, np.array([10.0, 5.0, 1.0])), 5.0, 4)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.2, 1.0])
+def test_points_outside_a_turned_box_are_told_by_its_own_axes(margin):
+    box = turned_box(0.7)
+    offsets = np.random.default_rng(0).uniform(-5.0, 5.0, (2000, 3))
+    points = offsets + box.object_to_world[:3, 3]
+    x = offsets @ np.array([np.cos(0.7), np.sin(0.7), 0.0])
+    y = offsets @ np.array([-np.sin(0.7), np.cos(0.7), 0.0])
+    inside = (abs(x) < 2.0 + margin) & (abs(y) < 1.0 + margin) & (abs(offsets[:, 2]) < 0.75 + margin)
+    assert 0 < inside.sum() < 2000
+    np.testing.assert_array_equal(outside_boxes(points, [box], margin), ~inside)
+    assert outside_boxes(points, [], margin).all()
+
+
+def test_a_track_that_moves_later_leaves_no_points_while_it_stands(tiny_scene):
+    (truck,) = [track for track in tiny_scene.tracks if track.category == "vehicle.truck"]
+    poses = truck.object_to_world.copy()
+    poses[6:, 0, 3] += 3.0 * np.arange(1, 5)
+    later = dataclasses.replace(truck, object_to_world=poses)
+    stays, leaves = (dataclasses.replace(tiny_scene, tracks=(track,)) for track in (truck, later))
+    assert not box_at(later, START_US, 500_000.0).moves
+    assert tracks_that_move(leaves) == [later] and tracks_that_move(stays) == []
+    on_truck = [
+        within(points[times == START_US], "vehicle.truck", 0.0, 0.1).sum()
+        for points, times, _ in (lidar_points(scene, job(voxel_size=0.0)) for scene in (stays, leaves))
+    ]
+    assert on_truck[0] > 20 and on_truck[1] == 0
+
+
+@pytest.mark.parametrize("voxel", [0.1, 0.5, 3.0])
+def test_thinning_keeps_the_first_point_of_every_occupied_voxel(voxel):
+    points = np.random.default_rng(1).normal(0.0, 3.0, (3000, 3))
+    first: dict[tuple, int] = {}
+    for i, cell in enumerate(map(tuple, np.floor(points / voxel).astype(int))):
+        first.setdefault(cell, i)
+    assert thin(points, voxel).tolist() == sorted(first.values())
+
+
+def test_thinning_by_0_keeps_all_and_takes_no_points_at_all():
+    assert thin(np.zeros((3, 3)), 0.0).tolist() == [0, 1, 2]
+    assert len(thin(np.empty((0, 3)), 0.1)) == len(thin(np.empty((0, 3)), 0.0)) == 0
+
+
+def test_thinning_holds_over_the_range_of_a_long_drive():
+    points = np.array([[-2000.0, -2000.0, -50.0], [-2000.0, -2000.0, -49.95], [2000.0, 2000.0, 50.0]])
+    assert thin(points, 0.1).tolist() in ([0, 1, 2], [0, 2])
+    assert thin(points[[0, 0, 2, 2]], 0.01).tolist() == [0, 2]
+
+
+K = np.array([[50.0, 0.0, 40.0], [0.0, 50.0, 30.0], [0.0, 0.0, 1.0]])
+
+
+def view(color, timestamp: int, at=(0.0, 0.0, 0.0), size=(80, 60)) -> ColorView:
+    """A camera that looks along world z (x right, y down), all of whose pixels have one colour."""
+    pixels = np.broadcast_to(np.array(color, dtype=np.uint8), (size[1], size[0], 3)).copy()
+    usable = np.ones((size[1], size[0]), dtype=bool)
+    return ColorView(pixels, K, rigid(np.eye(3), -np.array(at, dtype=float)), timestamp, usable)
+
+
+def full_size(small: ColorView) -> ColorView:
+    """The view with the focal length of a camera of 640 x 360 pixels."""
+    wide = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 180.0], [0.0, 0.0, 1.0]])
+    return dataclasses.replace(small, intrinsics=wide)
+
+
+RED, BLUE = (255, 0, 0), (0, 0, 255)
+
+
+@pytest.mark.parametrize(("moment", "color"), [(-50, RED), (0, RED), (40, RED), (60, BLUE), (100, BLUE), (900, BLUE)])
+@pytest.mark.parametrize("flip", [False, True])
+def test_a_point_takes_the_colour_of_the_view_nearest_in_time(moment, color, flip):
+    views = [view(RED, 0), view(BLUE, 100)]
+    colors, seen = color_by_visibility(
+        np.array([[0.0, 0.0, 10.0]]), np.array([float(moment)]), views[:: -1 if flip else 1]
+    )
+    assert tuple(colors[0]) == color and seen[0] == 2
+
+
+def test_a_view_in_which_the_point_is_hidden_does_not_colour_it():
+    """Seen from the left the occluder stands before the point; from the right it stands beside it."""
+    left, right = view(RED, 0), view(BLUE, 100, at=(4.0, 0.0, 0.0))
+    points = np.array([[0.0, 0.0, 10.0], [0.0, 0.0, 5.0]])
+    colors, seen = color_by_visibility(points, np.array([0.0, 0.0]), [left, right])
+    assert tuple(colors[0]) == BLUE and tuple(colors[1]) == RED
+    assert seen.tolist() == [1, 2]
+
+
+def test_without_the_occluder_the_nearer_view_colours_it():
+    left, right = view(RED, 0), view(BLUE, 100, at=(4.0, 0.0, 0.0))
+    colors, seen = color_by_visibility(np.array([[0.0, 0.0, 10.0]]), np.zeros(1), [left, right])
+    assert tuple(colors[0]) == RED and seen[0] == 2
+
+
+def test_points_of_one_surface_do_not_hide_each_other():
+    """A wall that recedes at 45 degrees, and ground near the camera: neighbours in a cell differ a little in depth."""
+    along, across = (grid.ravel() for grid in np.meshgrid(np.linspace(-4.0, 4.0, 200), np.linspace(-1.0, 1.0, 20)))
+    wall = np.stack([along, across, 20.0 + along], axis=1)
+    ground = np.stack([along / 2.0, np.full_like(along, 1.5), 9.0 + 4.0 * across], axis=1)
+    for surface in (wall, ground):
+        _, seen = color_by_visibility(surface, np.zeros(len(surface)), [full_size(view(RED, 0, size=(640, 360)))])
+        assert seen.all()
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0, -10.0), (9.0, 0.0, 10.0), (0.0, 7.0, 10.0), (0.0, 0.0, 0.1)])
+def test_a_point_behind_or_beside_the_image_is_not_seen(point):
+    _, seen = color_by_visibility(np.array([point]), np.zeros(1), [view(RED, 0)])
+    assert seen.tolist() == [0]
+
+
+def test_a_point_takes_the_pixel_it_lies_in():
+    source = view(RED, 0)
+    source.pixels[...] = np.random.default_rng(0).integers(0, 256, source.pixels.shape)
+    columns, rows_ = np.array([0, 79, 40, 13]), np.array([0, 59, 30, 57])
+    depth = np.array([4.0, 9.0, 7.0, 30.0])
+    points = np.stack([(columns + 0.3 - 40.0) / 50.0, (rows_ + 0.8 - 30.0) / 50.0, np.ones(4)], axis=1) * depth[:, None]
+    colors, _ = color_by_visibility(points, np.zeros(4), [source])
+    np.testing.assert_array_equal(colors, source.pixels[rows_, columns])
+
+
+def test_pixels_that_are_not_usable_colour_nothing():
+    unusable = view(RED, 0)
+    unusable.usable[:, :41] = False
+    points = np.array([[0.0, 0.0, 10.0], [2.0, 0.0, 10.0]])
+    colors, seen = color_by_visibility(points, np.zeros(2), [unusable, view(BLUE, 100)])
+    assert [tuple(c) for c in colors] == [BLUE, RED] and seen.tolist() == [1, 2]
+
+
+def test_no_points_and_no_views_are_no_error():
+    colors, seen = color_by_visibility(np.empty((0, 3)), np.empty(0), [view(RED, 0)])
+    assert colors.shape == (0, 3) and seen.shape == (0,)
+    assert color_by_visibility(np.ones((2, 3)), np.zeros(2), [])[1].tolist() == [0, 0]
+
+
+def test_pixels_of_moving_objects_are_not_usable_and_those_of_parked_ones_are(tiny_scene):
+    frame = tiny_scene.frames[0]
+    source = color_view(tiny_scene, frame, ImageSettings(width=192))
+    assert source.pixels.shape == (108, 192, 3)
+    for thing in World().things:
+        track = next(t for t in tiny_scene.tracks if t.category == thing.category)
+        box = box_at(track, frame.timestamp, 500_000.0)
+        mask = fill(hull_of(box, inverse(frame.camera_to_world), source.intrinsics), (192, 108))
+        assert mask.sum() > 50
+        if thing.category in ("vehicle.car", "human.pedestrian.adult"):
+            assert not source.usable[mask].any()
+        else:
+            assert source.usable[mask].any()
+
+
+def far_view(seed: int = 0) -> ColorView:
+    """A camera 1.5 m above the ground that looks along world x; 60 x 44 pixels, no multiple of a coverage cell."""
+    source = view(RED, 0, size=(60, 44))
+    pixels = np.random.default_rng(seed).integers(0, 256, source.pixels.shape).astype(np.uint8)
+    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    pose = rigid(forward, np.array([100.0, 20.0, 4.5]))
+    return dataclasses.replace(source, pixels=pixels, world_to_camera=inverse(pose))
+
+
+GROUND = 3.0
+
+
+def some_far_points(count: int, covered: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    candidates = uncovered(far_view(), covered)
+    return far_points(far_view(), GROUND, candidates, count, (3.0, 300.0), np.random.default_rng(seed))
+
+
+def test_far_points_lie_along_distinct_pixels_between_the_depths_and_have_their_colours():
+    positions, colors = some_far_points(500, np.empty((0, 3)))
+    pixels, depth = project(positions, far_view().world_to_camera, K)
+    assert positions.shape == (500, 3)
+    columns, rows_ = np.floor(pixels).astype(int).T
+    np.testing.assert_allclose(pixels - np.floor(pixels), 0.5, atol=1e-6)
+    assert len(set(zip(columns, rows_, strict=True))) == 500
+    np.testing.assert_array_equal(colors, far_view().pixels[rows_, columns])
+    above = positions[:, 2] > GROUND + 1e-6
+    assert (depth[above] >= 3.0 - 1e-9).all() and (depth <= 300.0 + 1e-6).all()
+
+
+def test_far_points_are_log_uniform_in_depth_above_the_horizon():
+    positions, _ = some_far_points(2640, np.empty((0, 3)))
+    pixels, depth = project(positions, far_view().world_to_camera, K)
+    sky = np.log(depth[pixels[:, 1] < 30.0])
+    quartiles = np.quantile(sky, [0.25, 0.5, 0.75])
+    expected = np.log(3.0) + np.array([0.25, 0.5, 0.75]) * np.log(100.0)
+    np.testing.assert_allclose(quartiles, expected, atol=0.2)
+
+
+def test_far_points_never_lie_under_the_ground():
+    positions, _ = some_far_points(2640, np.empty((0, 3)))
+    assert len(positions) == 60 * 44
+    assert positions[:, 2].min() > GROUND - 1e-6
+    assert (np.abs(positions[:, 2] - GROUND) < 1e-6).any(), "some rays must meet the ground for this to mean anything"
+
+
+def test_far_points_leave_out_the_cells_that_are_covered():
+    """Cells are 8 x 8 pixels. Covered: the first, one in the middle, and the cut ones at the right and lower edges."""
+    cells = [(0, 0), (3, 2), (7, 5)]
+    rays = np.array([[(8 * x + 1.2 - 40.0) / 50.0, (8 * y + 1.7 - 30.0) / 50.0, 1.0] for x, y in cells])
+    in_camera = 12.0 * rays
+    behind = np.array([[0.0, 0.0, -5.0], [400.0, 0.0, 5.0]])
+    pose = inverse(far_view().world_to_camera)
+    covered = np.concatenate([in_camera, behind]) @ pose[:3, :3].T + pose[:3, 3]
+    positions, _ = some_far_points(60 * 44, covered)
+    pixels, _ = project(positions, far_view().world_to_camera, K)
+    used = {(int(x) // 8, int(y) // 8) for x, y in pixels}
+    assert used == {(x, y) for x in range(8) for y in range(6)} - set(cells)
+    assert len(positions) == 60 * 44 - 64 - 64 - 4 * 4
+
+
+def test_no_free_pixel_gives_no_far_points():
+    everywhere = far_view()
+    unusable = dataclasses.replace(everywhere, usable=np.zeros_like(everywhere.usable))
+    candidates = uncovered(unusable, np.empty((0, 3)))
+    positions, colors = far_points(unusable, GROUND, candidates, 10, (3.0, 300.0), np.random.default_rng(0))
+    assert positions.shape == (0, 3) and colors.shape == (0, 3)
+
+
+def assert_same_seed(a: PointCloud, b: PointCloud) -> None:
+    np.testing.assert_array_equal(a.positions, b.positions)
+    np.testing.assert_array_equal(a.colors, b.colors)
+    assert a.note == b.note
+
+
+def test_held_out_images_and_sweeps_contribute_nothing(root):
+    """Held-out images become magenta and held-out sweeps garbage: not a bit of the seed changes."""
+    scene, settings = scene_at(root), job(width=64)
+    before = seed_points(scene, settings)
+    random = np.random.default_rng(0)
+    changed = 0
+    for frame, group in zip(scene.frames, frame_groups(scene, settings.holdout), strict=True):
+        if group != "train":
+            Image.new("RGB", (frame.width, frame.height), (255, 0, 255)).save(frame.image_path)
+            changed += 1
+    for sweep, group in zip(scene.sweeps, sweep_groups(scene, settings.holdout), strict=True):
+        if group != "train":
+            random.uniform(-30.0, 30.0, (500, 5)).astype(np.float32).tofile(sweep.path)
+            changed += 1
+    assert changed == 4 + 3 + 4, "images at 2, 6, 8, 9, between 2-3, 6-7, 8-9; four sweeps"
+    assert_same_seed(seed_points(scene_at(root), settings), before)
+
+
+@pytest.mark.parametrize("what", ["image", "sweep"])
+def test_training_images_and_sweeps_do_contribute(root, what):
+    scene = scene_at(root)
+    before = seed_points(scene, job())
+    if what == "image":
+        Image.new("RGB", (96, 54), (255, 0, 255)).save(scene.frames[0].image_path)
+    else:
+        np.random.default_rng(0).uniform(-30.0, 30.0, (500, 5)).astype(np.float32).tofile(scene.sweeps[0].path)
+    after = seed_points(scene_at(root), job())
+    assert rows(np.column_stack([before.positions, before.colors])) != rows(
+        np.column_stack([after.positions, after.colors])
+    )
+
+
+def test_every_seed_point_is_seen_by_a_training_image(tiny_scene):
+    seed = seed_points(tiny_scene, job())
+    groups = frame_groups(tiny_scene, job().holdout)
+    seen = np.zeros(len(seed.positions), dtype=bool)
+    for frame, group in zip(tiny_scene.frames, groups, strict=True):
+        if group == "train":
+            in_camera = (seed.positions - frame.camera_to_world[:3, 3]) @ frame.camera_to_world[:3, :3]
+            x, y = (0.62 * 96 * in_camera[:, :2] / in_camera[:, 2:]).T
+            seen |= (in_camera[:, 2] > 0) & (np.abs(x) <= 48.01) & (np.abs(y) <= 27.01)
+    assert seen.all()
+
+
+def test_colours_of_the_seed_are_those_of_the_surfaces(tiny_scene):
+    """Static LiDAR points take the colour that the drive's geometry gives them, up to JPEG and pixel size."""
+    seed = seed_points(tiny_scene, job(far_points=0))
+    assert len(seed.positions) == seed.note["lidar"] > 200
+    rays = seed.positions.astype(float) - CAMERA_AT
+    world = dataclasses.replace(World(), things=[t for t in World().things if t.velocity == (0.0, 0.0)])
+    distance, true = cast(world, CAMERA_AT, rays, 0.0)
+    plain = np.abs(distance - 1.0) < 0.01  # seen from the first camera: the colour there is the surface's
+    close = np.abs(seed.colors[plain].astype(float) - true[plain]).max(axis=1) < 40
+    assert plain.sum() > 50
+    assert close.mean() > 0.7
+
+
+@pytest.mark.parametrize("limit", [100, 250])
+def test_points_are_thinned_to_the_limit_at_random(tiny_scene, limit):
+    whole = seed_points(tiny_scene, job(far_points=0))
+    thinned = seed_points(tiny_scene, job(far_points=0, max_points=limit))
+    assert len(whole.positions) > 250
+    assert len(thinned.positions) == thinned.note["lidar"] == limit
+    assert rows(thinned.positions) < rows(whole.positions)
+
+
+def test_the_seed_is_lidar_then_far_points_as_its_note_says(tiny_scene):
+    seed = seed_points(tiny_scene, job())
+    lidar, far = seed.note["lidar"], seed.note["far"]
+    assert lidar > 0 and far == 200 and len(seed.positions) == lidar + far
+    assert seed.note["points_file"] == 0 and seed.note["lidar_missing"] == 0 and seed.note["extra_points"] is None
+    assert seed.positions.dtype == np.float32 and seed.colors.dtype == np.uint8
+    assert np.isfinite(seed.positions).all()
+    assert seed.positions[lidar:, 2].min() > -1e-3, "the tiny drive's ground is at z = 0"
+
+
+def test_no_far_points_where_none_are_wanted(tiny_scene):
+    assert seed_points(tiny_scene, job(far_points=0)).note["far"] == 0
+
+
+def test_equal_seeds_of_randomness_give_equal_seeds_and_others_do_not(tiny_scene):
+    assert_same_seed(seed_points(tiny_scene, job()), seed_points(tiny_scene, job()))
+    other = seed_points(tiny_scene, job(random_seed=1))
+    assert not np.array_equal(other.positions, seed_points(tiny_scene, job()).positions)
+
+
+def write_cloud(path: Path, positions: np.ndarray) -> None:
+    vertices = np.array([tuple(p) for p in positions], dtype=[(name, "f8") for name in "xyz"])
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
+
+
+def test_points_of_a_file_are_moved_from_the_global_frame_and_coloured(tiny_scene, tmp_path):
+    """Points on the truck's side, and one that no image sees."""
+    (truck,) = [thing for thing in World().things if thing.category == "vehicle.truck"]
+    side = np.array(truck.position) + [[dx, truck.size[1] / 2, dz] for dx in (-1.0, 0.0, 1.0) for dz in (-0.5, 0.5)]
+    unseen = np.array([[-50.0, 0.0, 1.0]])
+    write_cloud(tmp_path / "extra.ply", np.concatenate([side, unseen]) + tiny_scene.origin)
+    settings = job(points_file=str(tmp_path / "extra.ply"), far_points=0)
+    seed = seed_points(tiny_scene, settings)
+    assert (seed.note["points_file"], seed.note["extra_points"]) == (6, "extra.ply")
+    np.testing.assert_allclose(seed.positions[-6:], side, atol=1e-4)
+    red, _, blue = seed.colors[-6:].astype(int).T
+    assert (blue > red + 30).all(), "the truck is the only blue thing below the sky"
+    assert seed_points(tiny_scene, job(far_points=0)).note["points_file"] == 0
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no PLY", b"ply\nformat ascii 1.0\nelement vertex 1\n"])
+def test_an_unreadable_points_file_is_named_with_its_setting(tiny_scene, tmp_path, content):
+    path = tmp_path / "extra.ply"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"lidar_seed\.points_file.*extra\.ply"):
+        seed_points(tiny_scene, job(points_file=str(path)))
+
+
+def test_a_scene_without_lidar_stops_unless_told_to_go_on(tiny_scene):
+    scene = dataclasses.replace(tiny_scene, sweeps=())
+    with pytest.raises(DatasetError, match=r"0001.*lidar_seed\.on_missing: warn"):
+        seed_points(scene, job())
+    seed = seed_points(scene, job(on_missing="warn"))
+    assert (seed.note["lidar"], seed.note["far"]) == (0, 200)
+
+
+def test_a_hold_out_that_takes_all_key_frames_is_named(tiny_scene):
+    everything = job().model_copy(update={"holdout": HoldoutSettings(last_block=10)})
+    with pytest.raises(DatasetError, match=r"0001.*none of its 10 key frames.*holdout\.last_block"):
+        seed_points(tiny_scene, everything)
+
+
+def test_nothing_to_start_from_is_an_error_that_says_so(tiny_scene):
+    scene = dataclasses.replace(tiny_scene, sweeps=())
+    with pytest.raises(DatasetError, match=r"0001.*no seed points.*far_points"):
+        seed_points(scene, job(on_missing="warn", far_points=0))
+
+
+def test_sweeps_that_are_all_missing_leave_far_points_and_their_count(root):
+    scene = scene_at(root)
+    shutil.rmtree(root / "samples" / "LIDAR_TOP")
+    seed = seed_points(scene, job(on_missing="warn"))
+    assert (seed.note["lidar"], seed.note["lidar_missing"], seed.note["far"]) == (0, 10, 200)
+
+
+def test_returns_that_are_not_finite_are_left_out(root):
+    sweep = scene_at(root).sweeps[0]
+    returns = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, 5)
+    returns[3, 0], returns[7, 2] = np.nan, np.inf
+    returns.tofile(sweep.path)
+    expected = np.delete(returns, [3, 7], axis=0)[:, :3]
+    np.testing.assert_array_equal(read_sweep(sweep), expected.astype(np.float64))
+
+
+def test_1_4_million_points_are_thinned_and_coloured_over_30_views_within_half_a_minute():
+    random = np.random.default_rng(0)
+    points = random.uniform([-60.0, -3.0, 0.0], [60.0, 3.0, 150.0], (1_400_000, 3))
+    views = [full_size(view((i, i, i), 500 * i, at=(0.0, 0.0, 3.0 * i), size=(640, 360))) for i in range(30)]
+    began = time.monotonic()
+    kept = points[thin(points, 0.1)]
+    _, seen = color_by_visibility(kept, np.zeros(len(kept)), views)
+    assert time.monotonic() - began < 30.0
+    assert len(kept) > 1_000_000 and seen.any()
+
+
+def test_the_real_scene_is_seeded_from_the_one_sweep_there_is_and_from_points_of_a_file(real_scene_root):
+    source = SceneSource(
+        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
+        sweeps=False, on_missing="stop",
+    )  # fmt: skip
+    scene = extract_scene(source, real_scene_root)
+    with pytest.raises(DatasetError, match=r"LIDAR_TOP.*on_missing"):
+        seed_points(scene, job(holdout={}))
+    cloud = str(real_scene_root / "sfm_points_global.ply")
+    seed = seed_points(scene, job(holdout={}, on_missing="warn", points_file=cloud))
+    assert (seed.note["lidar_missing"], seed.note["extra_points"]) == (38, "sfm_points_global.ply")
+    assert 1_000 < seed.note["points_file"] <= 2_403
+    assert seed.note["lidar"] > 1_000
+
+
+def test_the_own_cars_body_lends_no_colour(root):
+    """The left half of every image is the own car's body, and red: no seed point is, near or far, nor lies there."""
+    scene = scene_at(root)
+    for frame in scene.frames:
+        pixels = np.full((54, 96, 3), (0, 0, 255), dtype=np.uint8)
+        pixels[:, :49] = (255, 0, 0)
+        Image.fromarray(pixels).save(frame.image_path, quality=100, subsampling=0)
+    half = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
+    red = {}
+    for name, seen in (("whole", {}), ("half", {"CAM_FRONT": (half,)})):
+        cloud = seed_points(scene, job(), OwnCar(seen))
+        red[name] = int((cloud.colors[:, 0] > 150).sum())
+        assert len(cloud.positions) > 200 and cloud.note["far"] > 100
+    assert red["whole"] > 100 and red["half"] == 0

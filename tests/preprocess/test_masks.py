@@ -1,0 +1,368 @@
+"""masks/: an image of labels and one of sky for every image, from boxes and a heuristic or from the user's own."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
+from PIL import Image
+
+from drivesplat.errors import DatasetError, ResultError
+from drivesplat.lidar.sweeps import read_sweep
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.masks import (
+    NO_SKY,
+    UNLABELLED,
+    make_masks,
+    mask_name,
+    read_classes,
+    read_labels,
+    read_masks_record,
+    read_sky_mask,
+)
+from drivesplat.preprocess.sky_mask import sky_mask
+from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.images import project, read_image
+from drivesplat.scene.regions import LABELS, label_image, region_mask
+from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.masks import MaskJob
+
+SIZE = (96, 54)
+
+
+WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+
+
+def seen_in_front(outline: tuple) -> OwnCar:
+    """The own car within an outline of CAM_FRONT's images."""
+    return OwnCar({"CAM_FRONT": (outline,)}, {"CAM_FRONT": "polygons"})
+
+
+def job(width=None, **masks) -> MaskJob:
+    return MaskJob.model_validate({"masks": masks, "holdout": {}, "images": {"width": width}})
+
+
+@pytest.fixture(scope="module")
+def made(tiny_scene, tmp_path_factory) -> tuple[Path, dict]:
+    """The tiny drive's masks with default settings, and their record."""
+    folder = tmp_path_factory.mktemp("masks")
+    return folder, make_masks(tiny_scene, job(), folder)
+
+
+def true_sky(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """The pixels (h, w) whose rays hit nothing of the tiny drive."""
+    focal = 0.62 * size[0]
+    x, y = np.meshgrid(np.arange(size[0]) + 0.5 - size[0] / 2, np.arange(size[1]) + 0.5 - size[1] / 2)
+    rays = np.stack([x / focal, y / focal, np.ones_like(x)], axis=-1).reshape(-1, 3) @ CAMERA_TO_EGO.T
+    seconds = (frame.timestamp - START_US) * 1e-6
+    distance, _ = cast(World(), World().ego_at(seconds) + CAMERA_AT, rays, seconds)
+    return ~np.isfinite(distance).reshape(size[1], size[0])
+
+
+def test_every_image_gets_its_labels_and_its_sky(tiny_scene, made):
+    folder, record = made
+    expected = {f"{kind}/CAM_FRONT/{f.timestamp}.png" for kind in ("regions", "sky") for f in tiny_scene.frames}
+    assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == expected
+    assert (record["images"], record["regions"], record["sky"]) == (19, "boxes", "heuristic")
+    assert record["labels"] == LABELS
+
+
+def test_labels_return_as_they_were_made(tiny_scene, made):
+    for frame in tiny_scene.frames[::5]:
+        labels = read_labels(made[0], "CAM_FRONT", frame.timestamp, SIZE)
+        np.testing.assert_array_equal(labels, label_image(tiny_scene, frame, SIZE))
+
+
+def test_masks_have_the_size_at_which_images_are_used(tiny_scene, tmp_path):
+    scene = dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:1])
+    make_masks(scene, job(width=48), tmp_path)
+    for kind in ("regions", "sky"):
+        with Image.open(tmp_path / mask_name(kind, "CAM_FRONT", scene.frames[0].timestamp)) as image:
+            assert image.size == (48, 27)
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return (a & b).sum() / (a | b).sum()
+
+
+@pytest.mark.parametrize("index", [0, 5, 9, 18])
+def test_the_sky_of_the_tiny_drive_is_found(tiny_scene, made, index):
+    frame = tiny_scene.frames[index]
+    found, true = read_sky_mask(made[0], "CAM_FRONT", frame.timestamp, SIZE), true_sky(frame, SIZE)
+    assert true.mean() > 0.2
+    assert iou(found, true) > 0.8
+
+
+def test_the_record_says_how_much_of_the_images_is_sky(tiny_scene, made):
+    true = np.mean([true_sky(frame, SIZE).mean() for frame in tiny_scene.frames])
+    assert made[1]["sky_share"] == pytest.approx(true, abs=0.1)
+
+
+def test_no_sky_lies_where_lidar_returns(tiny_scene, made):
+    for frame in tiny_scene.frames[::2]:
+        sweep = min(tiny_scene.sweeps, key=lambda s: abs(s.timestamp - frame.timestamp))
+        at, depth = project(apply(sweep.sensor_to_world, read_sweep(sweep)), inverse(frame.camera_to_world), K)
+        inside = (depth > 1.0) & (at >= 0).all(axis=1) & (at < SIZE).all(axis=1)
+        columns, rows = at[inside].astype(int).T
+        assert len(rows) > 100
+        assert not read_sky_mask(made[0], "CAM_FRONT", frame.timestamp, SIZE)[rows, columns].any()
+
+
+K = np.array([[0.62 * 96, 0.0, 48.0], [0.0, 0.62 * 96, 27.0], [0.0, 0.0, 1.0]])
+"""The tiny drive's camera, continuous convention."""
+
+
+def test_a_return_in_what_looks_like_sky_takes_its_surroundings_from_the_sky(tiny_scene):
+    frame = tiny_scene.frames[0]
+    pixels = np.full((54, 96, 3), (150, 190, 240), dtype=np.uint8)
+    at = frame.camera_to_world @ [0.0, -8.0, 30.0, 1.0]
+    without = sky_mask(pixels, K, frame.camera_to_world, None)
+    with_it = sky_mask(pixels, K, frame.camera_to_world, at[None, :3])
+    row, column = int(27.0 - 0.62 * 96 * 8.0 / 30.0), 48
+    assert without[row, column] and not with_it[row, column]
+    assert with_it[0, 10] and with_it[0, 85] and 0 < (without & ~with_it).sum() < 60
+
+
+@pytest.mark.parametrize(
+    ("color", "is_sky"),
+    [
+        ((150, 190, 240), True),
+        ((235, 235, 235), True),
+        ((200, 200, 190), True),
+        ((40, 45, 60), False),
+        ((160, 120, 80), False),
+        ((130, 120, 110), False),
+    ],
+    ids=["blue", "overcast", "bright haze", "night", "brick", "concrete"],
+)
+def test_sky_is_bright_or_blue_and_never_below_the_horizon(tiny_scene, color, is_sky):
+    pixels = np.full((54, 96, 3), color, dtype=np.uint8)
+    mask = sky_mask(pixels, K, tiny_scene.frames[0].camera_to_world, None)
+    assert mask.any() == is_sky and mask[:20, 1:-1].all() == is_sky
+    assert not mask[27:].any()
+
+
+@pytest.mark.parametrize("width", [96, 640, 1600])
+def test_a_clear_sky_reaches_into_the_corners_of_the_image(tiny_scene, width):
+    height = width * 9 // 16
+    pixels = np.full((height, width, 3), (150, 190, 240), dtype=np.uint8)
+    k = np.diag([width / 96, width / 96, 1.0]) @ K
+    assert sky_mask(pixels, k, tiny_scene.frames[0].camera_to_world, None)[: height // 3].all()
+
+
+def test_a_bright_patch_that_does_not_reach_the_top_is_no_sky(tiny_scene):
+    pixels = np.full((54, 96, 3), (90, 80, 70), dtype=np.uint8)
+    pixels[8:18, 30:60] = (150, 190, 240)
+    assert not sky_mask(pixels, K, tiny_scene.frames[0].camera_to_world, None).any()
+
+
+def test_masks_are_made_without_lidar(tiny_scene, tmp_path):
+    scene = dataclasses.replace(tiny_scene, sweeps=(), frames=tiny_scene.frames[:2])
+    assert make_masks(scene, job(), tmp_path)["images"] == 2
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut"])
+def test_masks_are_made_though_a_lidar_file_is_bad(tiny_root, tmp_path, damage):
+    """`lidar_seed.on_missing` decides whether a run may go on without it; masks are only the better for LiDAR."""
+    root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+    scene = extracted(root)
+    path = Path(scene.sweeps[0].path)
+    path.unlink() if damage == "missing" else path.write_bytes(path.read_bytes()[:-7])
+    assert make_masks(scene, job(), tmp_path / "masks")["images"] == len(scene.frames)
+
+
+def test_the_sky_of_a_training_image_is_told_by_no_held_out_sweep(tiny_scene, tmp_path):
+    """There is one sweep, that of key frame 2, with a return in the middle of every image's sky. It is 465 ms from the
+    image of key frame 3, and 285 from the one before its own."""
+    frames = [tiny_scene.frames[i] for i in (3, 4, 6)]
+    at = np.concatenate([[f.camera_to_world @ [0.0, -8.0, 30.0, 1.0]] for f in frames])
+    sweep = tiny_scene.sweeps[2]
+    returns = np.zeros((len(frames), 5), dtype=np.float32)
+    returns[:, :3] = (at @ inverse(sweep.sensor_to_world).T)[:, :3]
+    returns.tofile(tmp_path / "one.pcd.bin")
+    only = dataclasses.replace(sweep, path=str(tmp_path / "one.pcd.bin"))
+    scene = dataclasses.replace(tiny_scene, frames=tuple(frames), sweeps=(only,))
+    row, column = int(27.0 - 0.62 * 96 * 8.0 / 30.0), 48
+    for every_nth, open_sky in ((0, [False, False, False]), (8, [True, False, True])):
+        holdout = {"every_nth": every_nth, "offset": 2, "last_block": 0}
+        make_masks(scene, MaskJob.model_validate({"masks": {}, "holdout": holdout, "images": {}}), tmp_path)
+        skies = [read_sky_mask(tmp_path, f.camera, f.timestamp, SIZE) for f in frames]
+        assert [sky[row, column] for sky in skies] == open_sky
+
+
+def extracted(root: Path) -> Scene:
+    source = SceneSource(
+        dataset="tiny", reader="nuscenes", version="v1.0-mini", scene="0001", frames=(0, 2), cameras=("CAM_FRONT",),
+        sweeps=False, on_missing="stop",
+    )  # fmt: skip
+    return extract_scene(source, root)
+
+
+def users_masks(scene: Scene, folder: Path, of: np.ndarray) -> Path:
+    """One mask for all images, under the names a user gives: {camera}/{image name}.png."""
+    for frame in scene.frames:
+        path = folder / frame.camera / f"{Path(frame.image_path).stem}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(of).save(path)
+    return folder
+
+
+@pytest.fixture
+def two_images(tiny_scene) -> Scene:
+    return dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:2])
+
+
+def test_the_users_own_masks_are_used(two_images, tmp_path):
+    labels = np.random.default_rng(0).integers(0, 10, (54, 96)).astype(np.uint8)
+    sky = np.where(labels > 4, 255, 0).astype(np.uint8)
+    settings = job(
+        regions_folder=str(users_masks(two_images, tmp_path / "mine", labels)),
+        sky_folder=str(users_masks(two_images, tmp_path / "sky", sky)),
+    )
+    record = make_masks(two_images, settings, tmp_path / "masks")
+    assert (record["regions"], record["sky"]) == ("masks", "masks")
+    sky[labels == LABELS["own_car"]] = 0
+    assert record["sky_share"] == pytest.approx((sky > 0).mean())
+    assert record["own_car"] == {"CAM_FRONT": "masks"}
+    for frame in two_images.frames:
+        np.testing.assert_array_equal(read_labels(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), labels)
+        np.testing.assert_array_equal(read_sky_mask(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), sky > 0)
+
+
+@pytest.mark.parametrize(
+    ("light", "sky", "known"),
+    [(1.0, None, True), (0.2, None, False), (1.0, 0, True)],
+    ids=["day", "night", "the user's, without sky"],
+)
+def test_where_no_sky_is_found_none_is_known_unless_the_user_says_so(two_images, tmp_path, caplog, light, sky, known):
+    dimmed = []
+    for frame in two_images.frames:
+        path = tmp_path / "images" / Path(frame.image_path).name
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray((light * read_image(frame.image_path)).astype(np.uint8)).save(path, quality=95)
+        dimmed.append(dataclasses.replace(frame, image_path=str(path)))
+    scene = dataclasses.replace(two_images, frames=tuple(dimmed))
+    mine = None if sky is None else str(users_masks(scene, tmp_path / "mine", np.full((54, 96), sky, np.uint8)))
+    record = make_masks(scene, job(sky_folder=mine), tmp_path / "masks")
+    assert record["sky_known"] is known
+    assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
+
+
+def test_the_users_masks_at_another_size_are_brought_to_that_of_the_images(two_images, tmp_path):
+    labels = np.random.default_rng(0).integers(0, 10, (54, 96)).astype(np.uint8)
+    large = np.kron(labels, np.ones((3, 3), dtype=np.uint8))
+    settings = job(regions_folder=str(users_masks(two_images, tmp_path / "mine", large)))
+    make_masks(two_images, settings, tmp_path / "masks")
+    made = read_labels(tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
+    np.testing.assert_array_equal(made, labels)
+
+
+@pytest.mark.parametrize("kind", ["regions_folder", "sky_folder"])
+@pytest.mark.parametrize("damage", ["missing", "corrupt"])
+def test_a_users_mask_that_is_bad_is_named(two_images, tmp_path, kind, damage):
+    folder = users_masks(two_images, tmp_path / "mine", np.zeros((54, 96), dtype=np.uint8))
+    path = folder / "CAM_FRONT" / f"{Path(two_images.frames[1].image_path).stem}.png"
+    path.unlink() if damage == "missing" else path.write_bytes(b"no image")
+    with pytest.raises(DatasetError) as failure:
+        make_masks(two_images, job(**{kind: str(folder)}), tmp_path / "masks")
+    assert str(path) in str(failure.value)
+
+
+@pytest.mark.parametrize("label", [10, 255])
+def test_a_label_that_there_is_none_is_refused_naming_setting_and_file(two_images, tmp_path, label):
+    labels = np.zeros((54, 96), dtype=np.uint8)
+    labels[3, 4] = label
+    folder = users_masks(two_images, tmp_path / "mine", labels)
+    with pytest.raises(DatasetError) as failure:
+        make_masks(two_images, job(regions_folder=str(folder)), tmp_path / "masks")
+    stem = Path(two_images.frames[0].image_path).stem
+    for part in ("masks.regions_folder", f"{stem}.png", str(label)):
+        assert part in str(failure.value)
+
+
+def test_the_own_cars_outline_is_left_out_of_every_region(two_images, tmp_path):
+    """The lower right quarter of the image, in fractions of its width and height; one pixel of rounding."""
+    outline = ((0.5, 0.5), (1.0, 0.5), (1.0, 1.0), (0.5, 1.0))
+    own_car = OwnCar({"CAM_FRONT": (outline,), "CAM_BACK": (WHOLE,)}, {"CAM_FRONT": "polygons", "CAM_BACK": "images"})
+    assert make_masks(two_images, job(), tmp_path, own_car)["own_car"] == {"CAM_FRONT": "polygons"}
+    for frame in two_images.frames:
+        labels = read_labels(tmp_path, "CAM_FRONT", frame.timestamp, SIZE)
+        everything = region_mask(labels, "all")
+        assert not everything[28:, 49:].any()
+        assert everything[:26].all() and everything[:, :47].all()
+        own = labels == LABELS["own_car"]
+        for region in ("static", "vehicle", "moving_vehicle", "parked_vehicle", "moving_human"):
+            assert not (region_mask(labels, region) & own).any()
+        outside = ~own
+        np.testing.assert_array_equal(labels[outside], label_image(two_images, frame, SIZE)[outside])
+
+
+def test_the_own_cars_outline_is_left_out_of_the_users_masks_too(two_images, tmp_path):
+    folder = users_masks(two_images, tmp_path / "mine", np.full((54, 96), LABELS["moving_car"], dtype=np.uint8))
+    outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0))
+    make_masks(two_images, job(regions_folder=str(folder)), tmp_path / "masks", seen_in_front(outline))
+    labels = read_labels(tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
+    assert set(np.unique(labels)) == {LABELS["moving_car"], LABELS["own_car"]}
+    assert (labels[50:] == LABELS["own_car"]).all() and (labels[:47] == LABELS["moving_car"]).all()
+
+
+def test_the_own_car_is_no_sky_and_of_no_class(two_images, tmp_path):
+    """The user's masks say that all is sky, and of class 3."""
+    full = users_masks(two_images, tmp_path / "full", np.full((54, 96), 255, dtype=np.uint8))
+    classes = users_masks(two_images, tmp_path / "classes", np.full((54, 96), 3, dtype=np.uint8))
+    settings = job(sky_folder=str(full), semantic_folder=str(classes))
+    outline = ((0.0, 0.5), (1.0, 0.5), (1.0, 1.0), (0.0, 1.0))
+    record = make_masks(two_images, settings, tmp_path / "masks", seen_in_front(outline))
+    assert (record["semantic_classes"], record["sky_share"]) == (4, 0.5)
+    at = (tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
+    sky, found = read_sky_mask(*at), read_classes(*at)
+    assert sky[:27].all() and not sky[27:].any()
+    assert (found[:27] == 3).all() and (found[27:] == UNLABELLED).all()
+
+
+def test_a_drive_that_shows_no_own_car_says_so(made):
+    assert made[1]["own_car"] == {}
+
+
+@pytest.mark.parametrize("kind", ["sky", "regions"])
+@pytest.mark.parametrize("damage", ["missing", "cut", "foreign"])
+def test_a_mask_that_is_bad_is_named_with_the_rule_that_makes_it(two_images, tmp_path, kind, damage):
+    make_masks(two_images, job(), tmp_path)
+    timestamp = two_images.frames[1].timestamp
+    path = tmp_path / mask_name(kind, "CAM_FRONT", timestamp)
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:50] if damage == "cut" else b"no image")
+    read = read_sky_mask if kind == "sky" else read_labels
+    with pytest.raises(ResultError, match=rf"{timestamp}\.png.*'masks'"):
+        read(tmp_path, "CAM_FRONT", timestamp, SIZE)
+    assert read(tmp_path, "CAM_FRONT", two_images.frames[0].timestamp, SIZE).shape == (54, 96)
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"images": 3}', '{"regions"'])
+def test_a_record_of_masks_that_is_bad_is_named_with_its_rule(tmp_path, content):
+    if content is not None:
+        (tmp_path / "masks.json").write_text(content)
+    with pytest.raises(ResultError, match=r"masks\.json.*'masks'"):
+        read_masks_record(tmp_path)
+
+
+def test_a_record_of_masks_is_read(made, tmp_path):
+    (tmp_path / "masks.json").write_text(json.dumps(made[1]))
+    assert read_masks_record(tmp_path) == made[1]
+
+
+def test_an_image_that_is_gone_is_named(tiny_root, tmp_path):
+    root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+    scene = extracted(root)
+    assert read_image(scene.frames[1].image_path).shape == (54, 96, 3)
+    Path(scene.frames[1].image_path).unlink()
+    with pytest.raises(DatasetError) as failure:
+        make_masks(scene, job(), tmp_path / "masks")
+    assert scene.frames[1].image_path in str(failure.value)

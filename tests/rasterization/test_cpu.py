@@ -1,0 +1,342 @@
+"""The CPU rasterizer against the reference, which test_rasterize.py holds to closed forms."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from gsplat import DefaultStrategy
+from helpers.random_gaussians import Scene, random_scene
+
+from drivesplat.kernels.numba import tiles
+from drivesplat.rasterization import Rendering, rasterize
+
+AGREEMENT = 1e-5
+"""Greatest error allowed in float64, over the tensor's greatest value."""
+INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
+
+
+def render(scene: Scene, backend: str = "cpu", **options) -> Rendering:
+    return rasterize(**{f.name: getattr(scene, f.name) for f in fields(scene)}, backend=backend, **options)
+
+
+def with_harmonics(scene: Scene, seed: int, degree: int) -> Scene:
+    """The scene with coefficients that make some colours negative, which are shown as 0."""
+    shape = (len(scene.means), (degree + 1) ** 2, 3)
+    return replace(scene, colors=0.5 * torch.from_numpy(np.random.default_rng(seed).normal(size=shape)))
+
+
+def seen_and_gradients(scene: Scene, backend: str, **options) -> dict[str, torch.Tensor]:
+    """Image, alpha, depth and radii, and the gradients of a fixed random weighting of the first three."""
+    inputs = {name: getattr(scene, name).detach().clone().requires_grad_() for name in INPUTS}
+    rendering = render(replace(scene, **inputs), backend, **options)
+    rendering.info["means2d"].retain_grad()
+    seen = {"image": rendering.image, "alpha": rendering.alpha}
+    if rendering.depth is not None:
+        seen["depth"] = rendering.depth
+    generator = torch.Generator().manual_seed(1)
+    weights = [torch.rand(v.shape, generator=generator, dtype=torch.float64).to(v) for v in seen.values()]
+    torch.autograd.backward(list(seen.values()), weights)
+    gradients = {f"gradient of {name}": value.grad for name, value in inputs.items()}
+    gradients["gradient of means2d"] = rendering.info["means2d"].grad
+    return {
+        "radii": rendering.info["radii"].double(),
+        **{name: value.detach() for name, value in {**seen, **gradients}.items()},
+    }
+
+
+def disagreements(scene: Scene, bound: float = AGREEMENT, **options) -> dict[str, float]:
+    """What differs from the reference by more than `bound`, and by how much."""
+    expected = seen_and_gradients(scene, "reference", **options)
+    found = seen_and_gradients(scene, "cpu", **options)
+    errors = {}
+    for name, truth in expected.items():
+        assert found[name].shape == truth.shape and found[name].dtype == truth.dtype, name
+        error = float((found[name] - truth).abs().max()) if truth.numel() else 0.0
+        limit = bound * float(truth.abs().max()) if truth.numel() else 0.0
+        if not error <= limit:
+            errors[name] = error
+    return errors
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_of_each_degree_agree_in_several_cameras(degree, antialiased):
+    scene = with_harmonics(random_scene(degree, n=70, width=39, height=22, cameras=2), degree, degree)
+    scene.means[:6, 2] *= -1.0
+    assert not disagreements(scene, sh_degree=degree, antialiased=antialiased, with_depth=True)
+
+
+def test_lower_degrees_of_more_coefficients_agree():
+    scene = with_harmonics(random_scene(3, n=40, width=24, height=20), 3, degree=3)
+    assert not disagreements(scene, sh_degree=1)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("with_depth", [False, True])
+@pytest.mark.parametrize("channels", [1, 3, 7])
+def test_any_number_of_channels_agrees(channels, with_depth, antialiased):
+    scene = random_scene(channels, n=60, width=37, height=21)
+    scene.colors = torch.from_numpy(np.random.default_rng(channels).normal(size=(60, channels)))
+    assert not disagreements(scene, with_depth=with_depth, antialiased=antialiased)
+
+
+@pytest.mark.parametrize("seed", [20, 21, 22])
+@pytest.mark.parametrize(("width", "height"), [(5, 3), (16, 32), (17, 50)])
+def test_every_image_size_agrees(seed, width, height):
+    assert not disagreements(random_scene(seed, n=50, width=width, height=height), with_depth=True)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_extreme_gaussians_agree(antialiased):
+    """Points, giants, needles and sheets; a zero quaternion; faint and opaque; beside, behind and at the camera."""
+    scene = random_scene(30, n=64, width=40, height=30)
+    s = scene.scales
+    s[:8], s[8:16], s[16:24, 1:], s[24:32, 0], s[32] = 1e-6, 30.0, 1e-3, 1e-3, 0.0
+    s[16:24, 0] = 3.0
+    scene.quats[33] = 0.0
+    scene.opacities[34:38] = torch.tensor([0.0, 1.001 / 255.0, 0.999 / 255.0, 1.0])
+    scene.means[40:46] = torch.tensor(
+        [[50.0, 0.0, 3.0], [0.0, -80.0, 2.0], [0.0, 0.0, 0.005], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.1, 0.012]]
+    )
+    assert not disagreements(scene, antialiased=antialiased, with_depth=True)
+
+
+def test_of_equal_depths_the_first_is_in_front():
+    """As gsplat's stable sort has it; the reference's sort is not stable, so it gets depths a hair apart."""
+    scene = random_scene(31, n=60, width=30, height=30)
+    scene.viewmats = torch.eye(4, dtype=torch.float64)[None]
+    scene.means[:, 2] = 4.0
+    found = render(scene).image
+    scene.means[:, 2] += 1e-12 * torch.arange(60, dtype=torch.float64)
+    torch.testing.assert_close(found, render(scene, "reference").image, rtol=0.0, atol=1e-8)
+
+
+def test_rays_that_end_agree():
+    """Opaque Gaussians in many layers: most lists are left before their end."""
+    scene = random_scene(32, n=400, width=33, height=20)
+    scene.opacities[:] = torch.linspace(0.6, 1.0, 400)
+    assert not disagreements(scene, with_depth=True)
+
+
+def test_skew_and_off_centre_intrinsics_agree():
+    scene = random_scene(33, n=50, width=30, height=20)
+    scene.Ks[:, 0, 1], scene.Ks[:, 0, 2] = 0.7, 3.0
+    assert not disagreements(scene)
+
+
+def test_images_in_several_windows_of_tiles_are_the_same(monkeypatch):
+    scene = random_scene(34, n=80, width=70, height=40)
+    whole = seen_and_gradients(scene, "cpu")
+    monkeypatch.setattr(tiles, "BUDGET", 40)
+    splats = tiles.front_to_back(*_projected(scene))
+    windows = list(tiles.tile_lists(splats, *tiles.grid(70, 40)))
+    assert len(windows) > 2
+    assert all(len(w.ranks) <= 40 for w in windows)
+    for name, value in seen_and_gradients(scene, "cpu").items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=1e-14)
+
+
+def _projected(scene: Scene) -> list[np.ndarray]:
+    info = render(scene).info
+    names = ("means2d", "depths", "conics", "opacities", "radii")
+    return [*(info[name][0].numpy() for name in names), scene.colors.numpy()]
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_no_gaussian_in_view_is_zeros_and_zero_gradients(n):
+    scene = random_scene(35, n=1, width=20, height=18, cameras=2)
+    scene.means[:, 2] = -5.0
+    scene = replace(scene, **{name: getattr(scene, name)[:n] for name in INPUTS[:-1]})
+    found = seen_and_gradients(with_harmonics(scene, 0, 2), "cpu", sh_degree=2, with_depth=True, antialiased=True)
+    assert found["image"].shape == (2, 18, 20, 3)
+    assert found["gradient of means"].shape == (n, 3)
+    assert all((value == 0).all() for value in found.values())
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_float32_agrees_but_for_gaussians_at_the_cut_off(antialiased):
+    scene = with_harmonics(random_scene(36, n=300, width=64, height=48, cameras=2), 36, degree=3)
+    expected = seen_and_gradients(scene, "reference", sh_degree=3, antialiased=antialiased)
+    found = seen_and_gradients(scene.float(), "cpu", sh_degree=3, antialiased=antialiased)
+    for name, truth in expected.items():
+        if name != "radii":
+            assert found[name].dtype == torch.float32
+            error = (found[name] - truth).abs().flatten() / truth.abs().max()
+            assert float(error.quantile(0.99)) < 1e-4 and float(error.max()) < 1e-2, name
+
+
+def test_a_black_colour_can_brighten():
+    """Its harmonics come to exactly 0, the end of the range in which gradients pass."""
+    scene = random_scene(37, n=10, width=20, height=20)
+    scene.colors = torch.full((10, 1, 3), -1.0, dtype=torch.float64) * np.sqrt(np.pi)
+    gradient = seen_and_gradients(scene, "cpu", sh_degree=0)["gradient of colors"]
+    assert (gradient > 0).any()
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_are_those_of_finite_differences(antialiased):
+    scene = random_scene(8, n=5, width=8, height=6)
+    scene.scales = 2.0 * scene.scales + 0.5
+    scene = with_harmonics(scene, 9, degree=1)
+    inputs = [getattr(scene, name).clone().requires_grad_() for name in INPUTS]
+
+    def seen(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        rendering = render(
+            replace(scene, **dict(zip(INPUTS, values, strict=True))),
+            sh_degree=1, antialiased=antialiased, with_depth=True,
+        )  # fmt: skip
+        return rendering.image, rendering.alpha, rendering.depth
+
+    assert float(seen(*inputs)[1].detach().mean()) > 0.1
+    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+def test_more_coefficients_than_there_are_is_an_error_and_no_stray_read():
+    scene = with_harmonics(random_scene(38, n=5, width=8, height=8), 0, degree=1)
+    with pytest.raises(ValueError, match=r"degree 2 from 4 coefficients"):
+        render(scene, sh_degree=2)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_same_bits_come_back_every_time_and_from_any_number_of_threads(count):
+    scene = with_harmonics(random_scene(39, n=5000, width=90, height=70), 39, degree=2).float()
+    scene.scales = scene.scales * 0.3
+    with threads(1):
+        expected = seen_and_gradients(scene, "cpu", sh_degree=2, with_depth=True)
+    with threads(count):
+        for _ in range(2):
+            found = seen_and_gradients(scene, "cpu", sh_degree=2, with_depth=True)
+            assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_the_cpu_is_what_cpu_tensors_take():
+    scene = random_scene(40, n=30, width=20, height=20)
+    chosen = rasterize(**{f.name: getattr(scene, f.name) for f in fields(scene)})
+    assert torch.equal(chosen.image, render(scene, "cpu").image)
+    assert not torch.equal(chosen.image, render(scene, "reference").image), "which differ in their last bits"
+
+
+def test_info_says_what_the_references_says():
+    scene = random_scene(41, n=40, width=32, height=24, cameras=2)
+    expected, found = (render(scene, backend, antialiased=True).info for backend in ("reference", "cpu"))
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(found[name], value, check_dtype=True)
+        else:
+            assert found[name] == value
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_info_feeds_gsplats_default_strategy(absgrad):
+    scene = random_scene(12, n=20, width=32, height=24).float()
+    scene.means[3, 2] = -4.0
+    params = {name: torch.nn.Parameter(getattr(scene, name)) for name in INPUTS[:4]}
+    rendering = render(replace(scene, **params), absgrad=absgrad)
+    strategy = DefaultStrategy(refine_stop_iter=1000, absgrad=absgrad)
+    state = strategy.initialize_state()
+    strategy.step_pre_backward(params, {}, state, 1, rendering.info)
+    rendering.image.square().sum().backward()
+    strategy.step_post_backward(params, {}, state, 1, rendering.info)
+    seen = (rendering.info["radii"][0] > 0).all(dim=-1)
+    assert not seen[3] and seen.sum() > 10
+    means2d = rendering.info["means2d"]
+    in_screen = (means2d.absgrad if absgrad else means2d.grad)[0] * torch.tensor([16.0, 12.0])
+    torch.testing.assert_close(state["grad2d"], in_screen.norm(dim=-1) * seen)
+    assert (state["grad2d"][seen] > 0).sum() > 10
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_absolute_gradients_are_sums_over_pixels_of_absolute_gradients(antialiased):
+    scene = random_scene(42, n=6, width=20, height=18, cameras=2)
+    scene.means.requires_grad_()
+
+    def rendering_and_loss(backend: str, absgrad: bool) -> tuple[Rendering, torch.Tensor]:
+        rendering = render(scene, backend, antialiased=antialiased, absgrad=absgrad)
+        return rendering, rendering.image.square().sum(dim=-1)
+
+    reference, losses = rendering_and_loss("reference", False)
+    expected = torch.zeros_like(reference.info["means2d"])
+    for loss in losses.flatten():
+        expected += torch.autograd.grad(loss, reference.info["means2d"], retain_graph=True)[0].abs()
+    found, losses = rendering_and_loss("cpu", True)
+    losses.sum().backward()
+    assert expected.max() > 0
+    torch.testing.assert_close(found.info["means2d"].absgrad, expected)
+
+
+def test_it_renders_from_several_threads_at_once():
+    scene = with_harmonics(random_scene(43, n=500, width=64, height=48), 43, degree=1)
+    expected = seen_and_gradients(scene, "cpu", sh_degree=1)
+    found: list[dict[str, torch.Tensor]] = []
+
+    def work() -> None:
+        with threads(2):
+            found.extend(seen_and_gradients(scene, "cpu", sh_degree=1) for _ in range(3))
+
+    workers = [threading.Thread(target=work) for _ in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(timeout=60)
+    assert len(found) == 9
+    assert all(torch.equal(value, seen[name]) for seen in found for name, value in expected.items())
+
+
+def _image_in_child(scene: Scene, connection) -> None:
+    torch.set_num_threads(2)
+    connection.send(render(scene).image.numpy())
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_it_renders_in_a_process_forked_after_it_has_rendered():
+    scene = random_scene(44, n=500, width=64, height=48)
+    with threads(2):
+        expected = render(scene).image.numpy()
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    child = context.Process(target=_image_in_child, args=(scene, there))
+    child.start()
+    try:
+        assert here.poll(60), "the forked process hangs or has died"
+        np.testing.assert_array_equal(here.recv(), expected)
+    finally:
+        child.kill()
+        child.join()
+
+
+def test_it_works_where_numba_cannot_write_its_cache():
+    """A read-only installation and home: compiled anew in each process."""
+    script = """
+import numpy as np
+from numba.core import caching
+
+def unwritable(self):
+    raise OSError("read-only")
+
+for locator in (caching._CacheLocator, *caching._CacheLocator.__subclasses__()):
+    locator.ensure_cache_path = unwritable
+from drivesplat.kernels.numba.tiles import _sorted_by
+print(_sorted_by(np.arange(3, dtype=np.int32), np.array([2, 0, 1], np.uint32)).tolist())
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "[1, 2, 0]", done.stderr

@@ -1,0 +1,317 @@
+"""nuScenes mini from a local server into a dataroot: whole, gone on with, checked, and left alone where it is there."""
+
+import logging
+import multiprocessing
+import os
+import shutil
+import signal
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+from helpers import REPOSITORY
+from helpers.archive_server import Site, packed, served
+from helpers.tiny_world import World, write_world
+
+from drivesplat.errors import ConfigError, DatasetError
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.readers.nuscenes.download import fetch as fetching
+from drivesplat.readers.nuscenes.download import nuscenes_mini, progress
+from drivesplat.readers.nuscenes.download.destination import download_job, is_there
+from drivesplat.readers.nuscenes.download.fetch import fetch
+from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
+from drivesplat.readers.nuscenes.download.progress import Progress
+from drivesplat.settings.config import load
+from drivesplat.settings.extract import SceneSource
+from drivesplat.workflow.plan import Plan
+
+CONTENT = bytes(range(256)) * 4000
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> Path:
+    return write_world(tmp_path_factory.mktemp("world"), World(key_frames=3, sweeps_between=0))
+
+
+@pytest.fixture(scope="module")
+def archive(world) -> bytes:
+    return packed(world)
+
+
+@pytest.fixture
+def site(archive):
+    with served(Site(archive)) as made:
+        yield made
+
+
+@pytest.fixture
+def plain():
+    """A site whose file is no archive, where nothing looks into it."""
+    with served(Site(CONTENT)) as made:
+        yield made
+
+
+@pytest.fixture(autouse=True)
+def no_pause(monkeypatch):
+    monkeypatch.setattr(fetching, "PAUSE_S", 0.0)
+    monkeypatch.setattr(fetching, "NEWS", 100_000)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def refused(what: str, *words: str, call) -> str:
+    with pytest.raises((DatasetError, ConfigError)) as refusal:
+        call()
+    message = str(refusal.value)
+    assert what in message and all(word in message for word in words) and "\n" not in message, message
+    return message
+
+
+def test_a_good_archive_becomes_the_dataset_and_nothing_else_is_left(site, world, tmp_path):
+    root = tmp_path / "data/nuscenes/v1.0-mini"
+    download(site.job(root))
+    assert files(root) == files(world)
+    assert [path.name for path in root.parent.iterdir()] == [root.name]
+    source = SceneSource(
+        dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0001", frames=None,
+        cameras=("CAM_FRONT",), sweeps=False, on_missing="stop",
+    )  # fmt: skip
+    assert len(extract_scene(source, root).frames) == 3
+
+
+def test_an_empty_folder_and_a_link_to_one_are_filled(site, world, tmp_path):
+    (tmp_path / "large disk/mini").mkdir(parents=True)
+    (tmp_path / "mini").symlink_to(tmp_path / "large disk/mini")
+    download(site.job(tmp_path / "mini"))
+    assert (tmp_path / "mini").is_symlink() and files(tmp_path / "large disk/mini") == files(world)
+
+
+def test_what_is_there_already_is_left_alone_and_nothing_is_fetched(site, tmp_path, capsys):
+    download(site.job(tmp_path / "mini"))
+    (tmp_path / "mini/mine.txt").write_text("mine")
+    site.asked.clear()
+    download(site.job(tmp_path / "mini"))
+    assert "already: nothing to do" in capsys.readouterr().err
+    assert site.asked == [] and (tmp_path / "mini/mine.txt").read_text() == "mine"
+
+
+def test_where_another_run_was_faster_nothing_is_fetched(site, tmp_path, monkeypatch):
+    looks = [False, True]
+    monkeypatch.setattr(nuscenes_mini, "is_there", lambda _: looks.pop(0))
+    download(site.job(tmp_path / "mini"))
+    assert site.asked == [] and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("part_only", [False, True])
+def test_other_data_are_not_touched(site, world, tmp_path, part_only):
+    root = tmp_path / "mini"
+    if part_only:
+        shutil.copytree(world, root)
+        (root / "v1.0-mini/sample.json").unlink()
+    else:
+        root.mkdir()
+        (root / "thesis.tex").write_text("years of work")
+    before = files(root)
+    refused(str(root), "datasets.nuscenes.dataroot", call=lambda: download(site.job(root)))
+    assert files(root) == before and site.asked == []
+
+
+def test_terms_that_are_not_accepted_fetch_nothing(site, tmp_path):
+    job = site.job(tmp_path / "mini").model_copy(update={"accept_nuscenes_terms": False})
+    refused("accept_nuscenes_terms: true", "https://www.nuscenes.org/terms-of-use", call=lambda: download(job))
+    assert site.asked == [] and list(tmp_path.iterdir()) == []
+
+
+def test_terms_accepted_as_snakemake_does_not_read_it_are_a_line_that_says_how_to():
+    refused("accept_nuscenes_terms", "write True", call=lambda: load({"accept_nuscenes_terms": "true"}))
+
+
+def test_an_archive_that_is_kept_needs_no_network_the_next_time(site, world, tmp_path):
+    job = site.job(tmp_path / "mini", keep_archive=True)
+    download(job)
+    assert [path.name for path in work_folder(job).iterdir()] == ["v1.0-mini.tgz"]
+    shutil.rmtree(tmp_path / "mini")
+    site.asked.clear()
+    download(job)
+    assert site.asked == [] and files(tmp_path / "mini") == files(world)
+
+
+def test_a_connection_that_breaks_off_is_gone_on_with(plain, tmp_path):
+    plain.cut_after = [300_000, 200_000]
+    fetch(plain.settings(attempts=1), tmp_path / "file")
+    assert plain.ranges_asked == [None, "bytes=300000-", "bytes=500000-"]
+    assert plain.asked[1]["If-Range"] == '"first"'
+    assert (tmp_path / "file").read_bytes() == CONTENT and list(tmp_path.iterdir()) == [tmp_path / "file"]
+
+
+def broken_off(site: Site, path: Path, at: int = 400_000) -> None:
+    """A call that ends with so many bytes."""
+    site.cut_after = [at, 0]
+    message = refused("kept: run again", f"{at:,} of", call=lambda: fetch(site.settings(attempts=1), path))
+    assert site.address in message
+    assert fetching.part_of(path).read_bytes() == site.content[:at] and not path.exists()
+    site.asked.clear()
+
+
+def test_the_next_call_goes_on_where_the_last_one_broke_off(plain, tmp_path):
+    broken_off(plain, tmp_path / "file")
+    fetch(plain.settings(), tmp_path / "file")
+    assert plain.ranges_asked == ["bytes=400000-"]
+    assert (tmp_path / "file").read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("tag", [None, 'W/"first"'])
+def test_a_file_that_nothing_tells_from_a_later_one_is_fetched_anew(plain, tmp_path, tag):
+    plain.tag, plain.cut_after = tag, [400_000]
+    fetch(plain.settings(), tmp_path / "file")
+    assert plain.ranges_asked == [None, None] and (tmp_path / "file").read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("kind", ["no ranges", "another tag", "another address"])
+def test_where_it_cannot_go_on_it_starts_over(plain, tmp_path, kind):
+    broken_off(plain, tmp_path / "file")
+    settings = plain.settings()
+    match kind:
+        case "no ranges":
+            plain.ranges = False
+        case "another tag":
+            plain.tag, plain.content = '"second"', CONTENT[::-1]
+            settings = plain.settings()
+        case "another address":
+            settings = plain.settings(url=plain.address + "?key=2")
+    fetch(settings, tmp_path / "file")
+    assert (tmp_path / "file").read_bytes() == plain.content and len(plain.asked) == 1
+    assert ("Range" in plain.asked[0]) == (kind in ("no ranges", "another tag"))
+
+
+def test_a_date_marks_a_file_where_there_is_no_tag(plain, tmp_path):
+    plain.tag, plain.date = None, "Wed, 21 Oct 2015 07:28:00 GMT"
+    broken_off(plain, tmp_path / "file")
+    fetch(plain.settings(), tmp_path / "file")
+    assert plain.asked[0]["If-Range"] == plain.date and (tmp_path / "file").read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("kind", ["another part", "part of another file", "no such part"])
+def test_bytes_that_nobody_asked_for_are_not_glued_on(plain, tmp_path, kind):
+    broken_off(plain, tmp_path / "file")
+    plain.wrong_range, plain.range_error = kind == "another part", kind == "no such part"
+    if kind == "part of another file":
+        plain.tag, plain.content, plain.heeds_conditions = '"second"', CONTENT[::-1], False
+    fetch(plain.settings(attempts=2), tmp_path / "file")
+    assert plain.ranges_asked == ["bytes=400000-", None] and (tmp_path / "file").read_bytes() == plain.content
+
+
+def test_a_file_that_came_whole_but_was_not_checked_yet_is_not_fetched_again(plain, tmp_path):
+    fetching.part_of(tmp_path / "file").write_bytes(CONTENT)
+    fetch(plain.settings(), tmp_path / "file")
+    assert plain.asked == [] and (tmp_path / "file").read_bytes() == CONTENT
+
+
+def test_a_part_that_is_too_long_starts_over(plain, tmp_path):
+    fetching.part_of(tmp_path / "file").write_bytes(CONTENT + b"more")
+    fetch(plain.settings(), tmp_path / "file")
+    assert plain.ranges_asked == [None] and (tmp_path / "file").read_bytes() == CONTENT
+
+
+def test_a_checksum_of_null_is_a_warning_and_the_size_counts(site, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        download(site.job(tmp_path / "mini", sha256=None))
+    assert "size alone is checked" in caplog.text and is_there(site.job(tmp_path / "mini"))
+
+
+def in_a_process(call, *arguments) -> multiprocessing.Process:
+    process = multiprocessing.get_context("fork").Process(target=call, args=arguments)
+    process.start()
+    return process
+
+
+def wait_for(condition) -> None:
+    until = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def kill(process: multiprocessing.Process) -> None:
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+
+
+def test_a_run_killed_while_fetching_is_gone_on_with(site, world, tmp_path):
+    job, part = site.job(tmp_path / "mini"), tmp_path / "mini.download/v1.0-mini.tgz.part"
+    site.silent_after = len(site.content) // 2
+    process = in_a_process(download, job)
+    wait_for(lambda: fetching.size_of(part) == site.silent_after)
+    kill(process)
+    site.silent_after = None
+    download(job)
+    assert site.ranges_asked == [None, f"bytes={len(site.content) // 2}-"] and files(tmp_path / "mini") == files(world)
+
+
+def test_a_file_that_has_moved_is_gone_on_with_where_it_is(plain, tmp_path):
+    plain.cut_after = [400_000]
+    moved = plain.settings(url=plain.address.replace("v1.0-mini.tgz", "moved"))
+    fetch(moved, tmp_path / "file")
+    assert plain.ranges_asked == [None, "bytes=400000-"] and (tmp_path / "file").read_bytes() == CONTENT
+
+
+def test_a_proxy_in_the_environment_is_taken(plain, tmp_path, monkeypatch):
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(urllib.request, "_opener", None)  # it remembers the proxies of its first use
+    monkeypatch.setenv("http_proxy", plain.address.removesuffix("/v1.0-mini.tgz"))
+    fetch(plain.settings(url="http://nuscenes.invalid/v1.0-mini.tgz"), tmp_path / "file")
+    assert (tmp_path / "file").read_bytes() == CONTENT
+
+
+def slow_download(job) -> None:
+    nuscenes_mini.unpack = lambda *_: time.sleep(60)
+    download(job)
+
+
+def test_a_run_killed_while_unpacking_unpacks_again_without_fetching(site, world, tmp_path):
+    job = site.job(tmp_path / "mini")
+    process = in_a_process(slow_download, job)
+    wait_for((work_folder(job) / "v1.0-mini.tgz").is_file)
+    refused("another run is downloading", call=lambda: download(job))
+    kill(process)
+    assert not (tmp_path / "mini").exists()
+    (work_folder(job) / "unpacked/v1.0-mini").mkdir(parents=True)
+    (work_folder(job) / "unpacked/v1.0-mini/half").write_text("half")
+    site.asked.clear()
+    download(job)
+    assert site.asked == [] and files(tmp_path / "mini") == files(world)
+
+
+def test_progress_is_told_now_and_then(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    Progress("download", 4_000_000_000, 1_000_000_000).add(1_000_000_000)
+    assert "download: 50 % of 4.00 GB, " in capsys.readouterr().err
+    told = Progress("download", 4_000_000_000, 1_000_000_000)
+    told.add(1_000_000_000)
+    assert told.line(100.0) == "download: 50 % of 4.00 GB, 10.0 MB/s, 3 min left"
+
+
+def test_the_first_recorded_dataset_of_the_mini_split_is_filled():
+    datasets = {
+        "made": {"dataroot": "a", "scenes": ["made"], "world": {}},
+        "full": {"dataroot": "b", "version": "v1.0-trainval", "scenes": ["0001"]},
+        "small": {"dataroot": "~/c", "scenes": ["0061"]},
+    }
+    assert (download_job(load({"datasets": datasets})).dataset, download_job(load({})).dataset) == ("small", "nuscenes")
+    del datasets["small"]
+    with pytest.raises(ConfigError, match=r"v1\.0-mini"):
+        download_job(load({"datasets": datasets}))
+
+
+def test_asking_for_the_data_is_not_refused_for_want_of_them_and_a_scene_names_the_way_to_them(tmp_path):
+    plan = Plan({"datasets": {"nuscenes": {"dataroot": str(tmp_path / "nowhere")}}}, str(REPOSITORY))
+    plan.refuse_absent_data(["download_nuscenes_mini"])
+    for targets in (["results/0103/metrics.json"], ["download_nuscenes_mini", "metrics"], []):
+        with pytest.raises(DatasetError, match="snakemake --cores 1 download_nuscenes_mini"):
+            plan.refuse_absent_data(targets)
+    refused("accept_nuscenes_terms", call=lambda: plan.refuse_download(["download_nuscenes_mini"]))
+    plan.refuse_download(["metrics"])

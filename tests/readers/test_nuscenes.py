@@ -1,0 +1,553 @@
+"""nuScenes tables into a Scene: poses and boxes against the tiny drive's geometry, and every fault named."""
+
+import json
+import logging
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, KEY_FRAME_US, LIDAR_AT, ORIGIN, START_US, World, write_world
+from pyquaternion import Quaternion
+
+from drivesplat.errors import DatasetError
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.readers.nuscenes.layout import TABLES, find_root, table_files
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.lidar_seed import SeedJob
+
+
+def source(**changes) -> SceneSource:
+    plain = {
+        "dataset": "tiny", "reader": "nuscenes", "version": "v1.0-mini", "scene": "0001", "frames": None,
+        "cameras": ("CAM_FRONT",), "sweeps": False, "on_missing": "stop",
+    }  # fmt: skip
+    return SceneSource(**{**plain, **changes})
+
+
+@pytest.fixture
+def root(tiny_root, tmp_path) -> Path:
+    """A copy of the tiny drive that a test may damage."""
+    return Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
+
+
+def edit(root: Path, table: str, change: Callable[[list[dict]], list[dict] | None]) -> None:
+    """Changes the records of a table in place, or replaces them by what `change` returns."""
+    path = root / "v1.0-mini" / f"{table}.json"
+    records = json.loads(path.read_text())
+    path.write_text(json.dumps(change(records) or records))
+
+
+def record(records: list[dict], token: str) -> dict:
+    return next(r for r in records if r["token"] == token)
+
+
+def seconds(timestamp: int) -> float:
+    return (timestamp - START_US) * 1e-6
+
+
+def pose_of(translation, rotation) -> np.ndarray:
+    pose = Quaternion(rotation).transformation_matrix
+    pose[:3, 3] = translation
+    return pose
+
+
+def test_key_frames_images_stand_where_the_tiny_drives_camera_was(tiny_root):
+    scene = extract_scene(source(), tiny_root)
+    assert [frame.sample_index for frame in scene.frames] == list(range(10))
+    for i, frame in enumerate(scene.frames):
+        assert frame.timestamp == START_US + i * KEY_FRAME_US - 35_000
+        expected = World().ego_at(seconds(frame.timestamp))
+        np.testing.assert_allclose(frame.ego_to_world[:3, 3], expected, atol=1e-6)
+        np.testing.assert_allclose(frame.camera_to_world[:3, 3], expected + CAMERA_AT, atol=1e-6)
+        np.testing.assert_allclose(frame.camera_to_world[:3, :3], CAMERA_TO_EGO, atol=1e-9)
+        np.testing.assert_array_equal(frame.intrinsics, World().intrinsics)
+        assert (frame.width, frame.height, frame.camera, frame.is_key_frame) == (96, 54, "CAM_FRONT", True)
+        assert Path(frame.image_path).is_file()
+
+
+def test_lidar_sweeps_stand_where_the_tiny_drives_lidar_was(tiny_root):
+    scene = extract_scene(source(), tiny_root)
+    assert [sweep.timestamp for sweep in scene.sweeps] == [START_US + i * KEY_FRAME_US for i in range(10)]
+    for sweep in scene.sweeps:
+        expected = World().ego_at(seconds(sweep.timestamp)) + LIDAR_AT
+        np.testing.assert_allclose(sweep.sensor_to_world[:3, 3], expected, atol=1e-6)
+        assert sweep.is_key_frame and Path(sweep.path).is_file()
+
+
+def test_names_and_times_of_the_scene_are_those_of_the_tables(tiny_root):
+    scene = extract_scene(source(), tiny_root)
+    assert (scene.name, scene.dataset, scene.version, scene.poses) == ("0001", "tiny", "v1.0-mini", "nuscenes")
+    assert (scene.description, scene.key_frame_range, scene.missing_images) == ("tiny", None, 0)
+    np.testing.assert_array_equal(scene.key_frame_timestamps, START_US + KEY_FRAME_US * np.arange(10))
+    assert scene.key_frame_interval == KEY_FRAME_US
+
+
+def test_the_origin_is_the_first_ego_position(root):
+    scene = extract_scene(source(), root)
+    np.testing.assert_array_equal(scene.origin, ORIGIN)
+    edit(root, "ego_pose", lambda poses: record(poses, "0001 LIDAR_TOP 0").update(translation=[1.5, -2.5, 3.5]))
+    np.testing.assert_array_equal(extract_scene(source(), root).origin, [1.5, -2.5, 3.5])
+
+
+def test_every_image_and_sweep_takes_its_own_ego_pose_and_calibration(root):
+    random = np.random.default_rng(3)
+    expected = {}
+
+    def scatter(poses):
+        for pose in poses:
+            rotation, translation = Quaternion(random.normal(size=4)).unit, ORIGIN + random.normal(0, 20, 3)
+            pose.update(rotation=list(rotation), translation=translation.tolist())
+            expected[pose["token"]] = pose_of(translation, rotation)
+
+    def turn(sensors):
+        for sensor in sensors:
+            rotation, translation = Quaternion(random.normal(size=4)).unit, random.normal(size=3)
+            sensor.update(rotation=list(rotation), translation=translation.tolist())
+            expected[sensor["token"]] = pose_of(translation, rotation)
+
+    edit(root, "ego_pose", scatter)
+    edit(root, "calibrated_sensor", turn)
+    scene = extract_scene(source(sweeps=True), root)
+    shift = np.eye(4)
+    shift[:3, 3] = -expected["0001 LIDAR_TOP 0"][:3, 3]
+    assert len(scene.frames) == 19 and len(scene.sweeps) == 10
+    for frame in scene.frames:
+        np.testing.assert_allclose(frame.ego_to_world, shift @ expected[frame.token], atol=1e-9)
+        global_pose = expected[frame.token] @ expected["calibrated CAM_FRONT"]
+        np.testing.assert_allclose(frame.camera_to_world, shift @ global_pose, atol=1e-9)
+    for sweep in scene.sweeps:
+        global_pose = expected[sweep.token] @ expected["calibrated LIDAR_TOP"]
+        np.testing.assert_allclose(sweep.sensor_to_world, shift @ global_pose, atol=1e-9)
+
+
+def test_sweeps_adds_the_images_between_key_frames_with_their_own_poses(tiny_root):
+    scene = extract_scene(source(sweeps=True), tiny_root)
+    assert [frame.is_key_frame for frame in scene.frames] == [True, False] * 9 + [True]
+    for i, frame in enumerate(scene.frames):
+        assert frame.timestamp == START_US + i * KEY_FRAME_US // 2 - 35_000
+        expected = World().ego_at(seconds(frame.timestamp)) + CAMERA_AT
+        np.testing.assert_allclose(frame.camera_to_world[:3, 3], expected, atol=1e-6)
+        assert ("sweeps" in frame.image_path) == (not frame.is_key_frame)
+
+
+def test_an_image_between_key_frames_counts_to_the_nearest_key_frame(tmp_path):
+    scene = extract_scene(source(sweeps=True), write_world(tmp_path, World(key_frames=3, sweeps_between=5)))
+    for frame in scene.frames:
+        nearest = round((frame.timestamp - START_US) / KEY_FRAME_US)
+        assert frame.sample_index == nearest
+
+
+def test_a_frame_range_keeps_those_key_frames_counted_from_0(tiny_root):
+    scene = extract_scene(source(frames=(3, 7), sweeps=True), tiny_root)
+    whole = extract_scene(source(sweeps=True), tiny_root)
+    assert scene.key_frame_range == [3, 7]
+    np.testing.assert_array_equal(scene.key_frame_timestamps, whole.key_frame_timestamps[3:7])
+    assert [f.token for f in scene.frames] == [f.token for f in whole.frames[6:13]]
+    assert [f.sample_index for f in scene.frames if f.is_key_frame] == [0, 1, 2, 3]
+    assert [s.token for s in scene.sweeps] == [s.token for s in whole.sweeps[3:7]]
+    np.testing.assert_allclose(scene.origin, ORIGIN + World().ego_at(1.5))
+    for track in scene.tracks:
+        np.testing.assert_array_equal(track.sample_indices, np.arange(4))
+        np.testing.assert_array_equal(track.timestamps, scene.key_frame_timestamps)
+
+
+@pytest.mark.parametrize("frames", [(10, 12), (50, 60)])
+def test_a_frame_range_beyond_the_scene_is_refused(tiny_root, frames):
+    with pytest.raises(DatasetError, match=r"0001.*10"):
+        extract_scene(source(frames=frames), tiny_root)
+
+
+def test_an_unknown_scene_is_refused_with_those_there_are(tmp_path):
+    root = write_world(tmp_path, World(scenes=("0001", "0007"), key_frames=2))
+    with pytest.raises(DatasetError, match=r"0061.*0001, 0007"):
+        extract_scene(source(scene="0061"), root)
+    assert extract_scene(source(scene="0007"), root).frames[0].token.startswith("0007")
+
+
+def test_a_camera_that_is_not_there_is_refused_with_the_sensors_there_are(tiny_root):
+    with pytest.raises(DatasetError, match=r"CAM_BACK.*CAM_FRONT"):
+        extract_scene(source(cameras=("CAM_FRONT", "CAM_BACK")), tiny_root)
+
+
+def test_boxes_are_length_width_height_though_the_tables_say_width_length_height(tiny_root):
+    scene = extract_scene(source(), tiny_root)
+    sizes = {track.category: track.size.tolist() for track in scene.tracks}
+    assert sizes == {thing.category: list(thing.size) for thing in World().things}
+
+
+def test_tracks_are_the_things_of_the_tiny_drive(tiny_root):
+    scene = extract_scene(source(), tiny_root)
+    things = {thing.category: thing for thing in World().things}
+    assert len(scene.tracks) == len(things)
+    for track in scene.tracks:
+        np.testing.assert_array_equal(track.timestamps, scene.key_frame_timestamps)
+        np.testing.assert_array_equal(track.sample_indices, np.arange(10))
+        np.testing.assert_array_equal(track.visibility, np.full(10, 4))
+        expected = [things[track.category].at(seconds(time)) for time in track.timestamps]
+        np.testing.assert_allclose(track.object_to_world[:, :3, 3], expected, atol=1e-9)
+
+
+def test_a_box_turned_to_the_left_points_to_the_left(root):
+    """An object's x axis is its front; a rotation about z by 90 degrees turns it from x to y."""
+    half = np.sqrt(0.5)
+    edit(root, "sample_annotation", lambda boxes: [{**box, "rotation": [half, 0.0, 0.0, half]} for box in boxes])
+    for track in extract_scene(source(), root).tracks:
+        np.testing.assert_allclose(track.object_to_world[0, :3, 0], [0.0, 1.0, 0.0], atol=1e-9)
+
+
+def test_a_track_with_one_box_is_kept(root):
+    def keep_one(boxes):
+        return [box for box in boxes if "annotation 0 " not in box["token"] or box["token"].endswith(" 4")]
+
+    edit(root, "sample_annotation", keep_one)
+    edit(
+        root,
+        "instance",
+        lambda instances: instances[0].update(
+            first_annotation_token="0001 annotation 0 4", last_annotation_token="0001 annotation 0 4", nbr_annotations=1
+        ),
+    )
+    edit(root, "sample_annotation", lambda boxes: record(boxes, "0001 annotation 0 4").update(prev="", next=""))
+    (track,) = [t for t in extract_scene(source(), root).tracks if t.category == "vehicle.car"]
+    assert track.sample_indices.tolist() == [4]
+    (car,) = [thing for thing in World().things if thing.category == "vehicle.car"]
+    np.testing.assert_allclose(track.object_to_world[0, :3, 3], car.at(4 * KEY_FRAME_US * 1e-6), atol=1e-9)
+
+
+@pytest.mark.parametrize("token", ["1", "2", "3", "4"])
+def test_visibility_is_the_tables_level(root, token):
+    edit(root, "sample_annotation", lambda boxes: [{**box, "visibility_token": token} for box in boxes])
+    assert {int(v) for track in extract_scene(source(), root).tracks for v in track.visibility} == {int(token)}
+
+
+def test_visibility_that_the_tables_do_not_say_is_0(root):
+    edit(root, "sample_annotation", lambda boxes: [{**box, "visibility_token": ""} for box in boxes])
+    assert {int(v) for track in extract_scene(source(), root).tracks for v in track.visibility} == {0}
+
+
+def test_the_dataroot_may_be_the_root_its_table_folder_or_the_folder_around_it(root):
+    assert find_root(str(root), "v1.0-mini") == root
+    assert find_root(str(root / "v1.0-mini"), "v1.0-mini") == root
+    around = root.parent / "around"
+    around.mkdir()
+    root.rename(around / "v1.0-mini")
+    assert find_root(str(around), "v1.0-mini") == around / "v1.0-mini"
+
+
+def test_the_dataroot_may_start_with_a_tilde(root, monkeypatch):
+    monkeypatch.setenv("HOME", str(root.parent))
+    assert find_root("~/nuscenes", "v1.0-mini") == root
+
+
+def refused(dataroot: Path, version: str = "v1.0-mini") -> str:
+    with pytest.raises(DatasetError) as failure:
+        find_root(str(dataroot), version)
+    message = str(failure.value)
+    assert "\n" not in message
+    assert version in message and str(dataroot) in message
+    return message
+
+
+def test_a_missing_dataroot_is_told_with_where_and_how_to_get_it(tmp_path):
+    assert "nuscenes.org" in refused(tmp_path / "absent")
+
+
+def test_an_empty_dataroot_is_told_with_where_and_how_to_get_it(tmp_path):
+    assert "nuscenes.org" in refused(tmp_path)
+
+
+def test_another_version_is_told_with_the_one_that_is_there(tiny_root):
+    message = refused(tiny_root, "v1.0-trainval")
+    assert "v1.0-mini" in message and "version" in message
+
+
+def test_the_parent_of_a_folder_of_another_name_is_not_taken(root):
+    """`dataroot` with a typo must not silently find the dataset beside it."""
+    (root / "maps-of-mine").mkdir()
+    refused(root / "maps-of-mine")
+
+
+@pytest.mark.parametrize("table", ["ego_pose", "sample_annotation"])
+def test_an_incomplete_dataset_is_told_with_the_tables_that_are_missing(root, table):
+    (root / "v1.0-mini" / f"{table}.json").unlink()
+    with pytest.raises(DatasetError, match=rf"{table}\.json.*nuscenes\.org"):
+        table_files(root, "v1.0-mini")
+
+
+def test_the_table_files_are_all_tables_of_the_version(root):
+    assert {file.stem for file in table_files(root, "v1.0-mini")} == set(TABLES)
+    assert {file.stem for file in (root / "v1.0-mini").iterdir()} == set(TABLES)
+
+
+@pytest.mark.parametrize("content", ["", "[{", "nothing"])
+def test_a_damaged_table_is_told_without_a_traceback(root, content):
+    (root / "v1.0-mini" / "sample_data.json").write_text(content)
+    with pytest.raises(DatasetError, match=str(root)):
+        extract_scene(source(), root)
+
+
+def image_of(root: Path, index: int) -> Path:
+    return root / "samples" / "CAM_FRONT" / f"0001__{2 * index:04}.jpg"
+
+
+def remove(path: Path) -> None:
+    path.unlink()
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def scramble(path: Path) -> None:
+    path.write_bytes(b"no image at all" * 30)
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def shrink(path: Path) -> None:
+    from PIL import Image
+
+    Image.new("RGB", (48, 27)).save(path)
+
+
+FAULTS = [remove, truncate, scramble, empty, shrink]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_image_stops_the_extraction_naming_key_frame_token_and_path(root, fault):
+    fault(image_of(root, 3))
+    with pytest.raises(DatasetError) as failure:
+        extract_scene(source(), root)
+    for part in ("key frame 3", "0001 CAM_FRONT 6", str(image_of(root, 3)), "on_missing"):
+        assert part in str(failure.value)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_image_is_left_out_and_counted_where_told_to_go_on(root, fault, caplog):
+    fault(image_of(root, 3))
+    fault(image_of(root, 5))
+    with caplog.at_level(logging.WARNING):
+        scene = extract_scene(source(on_missing="warn"), root)
+    assert scene.missing_images == 2
+    assert [frame.sample_index for frame in scene.frames] == [0, 1, 2, 4, 6, 7, 8, 9]
+    assert len(scene.key_frame_timestamps) == 10
+    assert str(image_of(root, 3)) in caplog.text and "0001 CAM_FRONT 10" in caplog.text
+
+
+def test_no_image_left_is_an_error_even_where_told_to_go_on(root):
+    shutil.rmtree(root / "samples" / "CAM_FRONT")
+    with pytest.raises(DatasetError, match=r"0001.*10 images"):
+        extract_scene(source(on_missing="warn"), root)
+
+
+def sweep_of(root: Path, index: int) -> Path:
+    return root / "samples" / "LIDAR_TOP" / f"0001__{index:04}.pcd.bin"
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def seed_job(on_missing: str) -> SeedJob:
+    return SeedJob.model_validate(
+        {
+            "lidar_seed": {"on_missing": on_missing, "far_points": 100},
+            "holdout": {},
+            "images": {},
+            "random_seed": 0,
+        }
+    )
+
+
+@pytest.mark.parametrize("fault", [remove, empty, cut_off])
+def test_a_bad_lidar_file_stops_the_seeding_naming_key_frame_token_and_path(root, fault):
+    fault(sweep_of(root, 3))
+    scene = extract_scene(source(), root)
+    with pytest.raises(DatasetError) as failure:
+        seed_points(scene, seed_job("stop"))
+    for part in ("key frame 3", "0001 LIDAR_TOP 3", str(sweep_of(root, 3)), "on_missing"):
+        assert part in str(failure.value)
+
+
+@pytest.mark.parametrize("fault", [remove, empty, cut_off])
+def test_a_bad_lidar_file_is_counted_where_told_to_go_on(root, fault, caplog):
+    for index in (0, 3):
+        fault(sweep_of(root, index))
+    scene = extract_scene(source(), root)
+    with caplog.at_level(logging.WARNING):
+        points = seed_points(scene, seed_job("warn"))
+    assert points.note["lidar_missing"] == 2
+    assert points.note["lidar"] > 0
+    assert str(sweep_of(root, 0)) in caplog.text and "left out" in caplog.text
+    assert "restore it" not in caplog.text, "what has been decided is not asked again"
+
+
+def refusal(root: Path, **changes) -> str:
+    with pytest.raises(DatasetError) as failure:
+        extract_scene(source(**changes), root)
+    return str(failure.value)
+
+
+@pytest.mark.parametrize("sensor", ["CAM_FRONT", "LIDAR_TOP"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"translation": [float("nan"), 0.0, 0.0]},
+        {"translation": [0.0, float("inf"), 0.0]},
+        {"translation": [0.0, 0.0]},
+        {"rotation": [float("nan"), 0.0, 0.0, 0.0]},
+        {"rotation": [0.9, 0.0, 0.0, 0.0]},
+        {"rotation": [0.0, 0.0, 0.0, 0.0]},
+        {"rotation": [1.0, 0.1, 0.0, 0.0]},
+        {"rotation": [1.0, 0.0, 0.0]},
+    ],
+    ids=str,
+)
+def test_a_pose_that_is_not_finite_or_no_rotation_is_refused_naming_it(root, sensor, change):
+    edit(root, "ego_pose", lambda poses: record(poses, f"0001 {sensor} 2").update(change))
+    assert f"ego_pose 0001 {sensor} 2" in refusal(root, sweeps=True)
+
+
+def test_a_quaternion_of_nearly_unit_length_is_taken(root):
+    """The tables round: lengths are off by up to 1e-4 or so."""
+    edit(root, "ego_pose", lambda poses: [{**pose, "rotation": [1.0002, 0.0, 0.0, 0.0]} for pose in poses])
+    scene = extract_scene(source(), root)
+    np.testing.assert_allclose(scene.frames[0].ego_to_world[:3, :3], np.eye(3), atol=1e-9)
+
+
+def test_a_bad_calibration_is_refused_naming_it(root):
+    edit(
+        root,
+        "calibrated_sensor",
+        lambda sensors: record(sensors, "calibrated CAM_FRONT").update(rotation=[2.0, 0.0, 0.0, 0.0]),
+    )
+    assert "calibrated_sensor calibrated CAM_FRONT" in refusal(root)
+
+
+@pytest.mark.parametrize(
+    "change", [{"translation": [float("nan"), 0.0, 0.0]}, {"rotation": [0.5, 0.0, 0.0, 0.0]}], ids=str
+)
+def test_a_bad_box_pose_is_refused_naming_it(root, change):
+    edit(root, "sample_annotation", lambda boxes: record(boxes, "0001 annotation 1 4").update(change))
+    assert "sample_annotation 0001 annotation 1 4" in refusal(root)
+
+
+@pytest.mark.parametrize("size", [[0.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, float("nan")]])
+def test_boxes_without_a_finite_positive_size_are_refused_naming_the_instance(root, size):
+    def flatten(boxes):
+        return [{**box, "size": size} if box["instance_token"] == "0001 instance 1" else box for box in boxes]
+
+    edit(root, "sample_annotation", flatten)
+    assert "instance 0001 instance 1" in refusal(root)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [],
+        [[0.0, 0.0, 0.0], [0.0, 60.0, 27.0], [0.0, 0.0, 1.0]],
+        [[60.0, 0.0, 48.0], [0.0, 0.0, 27.0], [0.0, 0.0, 1.0]],
+        [[60.0, 0.0, 48.0], [0.0, -60.0, 27.0], [0.0, 0.0, 1.0]],
+        [[60.0, 0.0, 48.0], [0.0, 60.0, 27.0], [0.0, 0.0, 0.0]],
+        [[60.0, 0.0, float("nan")], [0.0, 60.0, 27.0], [0.0, 0.0, 1.0]],
+        [[60.0, 0.0], [0.0, 60.0]],
+        [[60.0, 0.0, 48.0], [0.0, 60.0], [0.0, 0.0, 1.0]],
+        [[60.0, 0.0, 48.0], [60.0, 0.0, 27.0], [0.0, 0.0, 1.0]],
+        [[60.0, 60.0, 48.0], [60.0, 60.0, 27.0], [0.0, 0.0, 1.0]],
+    ],
+    ids=str,
+)
+def test_singular_intrinsics_are_refused_naming_the_sensor(root, matrix):
+    edit(root, "calibrated_sensor", lambda s: record(s, "calibrated CAM_FRONT").update(camera_intrinsic=matrix))
+    assert "calibrated_sensor calibrated CAM_FRONT" in refusal(root)
+
+
+@pytest.mark.parametrize("size", [(0, 54), (96, 0), (-96, 54)])
+def test_an_image_without_a_size_is_refused_naming_it(root, size):
+    edit(root, "sample_data", lambda data: record(data, "0001 CAM_FRONT 4").update(width=size[0], height=size[1]))
+    assert "sample_data 0001 CAM_FRONT 4" in refusal(root)
+
+
+@pytest.mark.parametrize("delay", [-KEY_FRAME_US, -2 * KEY_FRAME_US, -START_US])
+def test_key_frames_out_of_order_are_refused_naming_the_sample(root, delay):
+    edit(root, "sample", lambda samples: samples[4].update(timestamp=samples[4]["timestamp"] + delay))
+    assert "sample 0001 sample 4" in refusal(root)
+
+
+@pytest.mark.parametrize("sensor", ["CAM_FRONT", "LIDAR_TOP"])
+@pytest.mark.parametrize("sweeps", [False, True])
+def test_a_sensors_records_out_of_order_are_refused_naming_one(root, sensor, sweeps):
+    token = f"0001 {sensor} {4 if sensor == 'LIDAR_TOP' else 8}"
+    edit(root, "sample_data", lambda data: record(data, token).update(timestamp=START_US - 10 * KEY_FRAME_US))
+    assert f"sample_data {token}" in refusal(root, sweeps=sweeps)
+
+
+def test_an_image_between_key_frames_out_of_order_is_refused_naming_it(root):
+    edit(root, "sample_data", lambda data: record(data, "0001 CAM_FRONT 5").update(timestamp=START_US))
+    assert "sample_data 0001 CAM_FRONT 5" in refusal(root, sweeps=True)
+
+
+def test_a_chain_of_images_that_ends_early_is_refused_naming_its_end(root):
+    edit(root, "sample_data", lambda data: record(data, "0001 CAM_FRONT 5").update(next=""))
+    assert "sample_data 0001 CAM_FRONT 5" in refusal(root, sweeps=True)
+
+
+@pytest.mark.parametrize(
+    ("table", "token", "key"),
+    [
+        ("sample_data", "0001 CAM_FRONT 4", "ego_pose_token"),
+        ("sample_data", "0001 CAM_FRONT 4", "next"),
+        ("sample", "0001 sample 4", "next"),
+    ],
+)
+def test_a_token_that_leads_nowhere_is_refused_naming_it(root, table, token, key):
+    edit(root, table, lambda records: record(records, token).update({key: "nowhere"}))
+    assert "nowhere" in refusal(root, sweeps=True)
+
+
+@pytest.fixture(scope="module")
+def real_scene(real_scene_root) -> Scene:
+    return extract_scene(source(dataset="nuscenes", scene="0061"), real_scene_root)
+
+
+def test_the_real_scene_has_its_frames_tracks_and_sweeps(real_scene):
+    assert len(real_scene.frames) == len(real_scene.sweeps) == len(real_scene.key_frame_timestamps) == 39
+    assert len(real_scene.tracks) == 239
+    assert sum(len(track.timestamps) for track in real_scene.tracks) == 3408
+    assert real_scene.key_frame_interval == pytest.approx(500_000, rel=0.02)
+    assert sum(Path(sweep.path).is_file() for sweep in real_scene.sweeps) == 1
+
+
+def test_the_real_scenes_images_have_poses_of_their_own(real_scene, real_scene_root):
+    """Against the tables themselves: camera pose = ego pose of the image's own record x calibration."""
+    read = {
+        table: {r["token"]: r for r in json.loads((real_scene_root / "v1.0-mini" / f"{table}.json").read_text())}
+        for table in ("sample_data", "ego_pose", "calibrated_sensor")
+    }
+    first = next(f for f in real_scene.sweeps)
+    origin = read["ego_pose"][read["sample_data"][first.token]["ego_pose_token"]]["translation"]
+    np.testing.assert_allclose(real_scene.origin, origin)
+    apart = []
+    for frame, sweep in zip(real_scene.frames, real_scene.sweeps, strict=True):
+        expected = camera_pose(read, frame)
+        expected[:3, 3] -= origin
+        np.testing.assert_allclose(frame.camera_to_world, expected, atol=1e-6)
+        lidar = read["ego_pose"][read["sample_data"][sweep.token]["ego_pose_token"]]["translation"]
+        apart.append(np.linalg.norm(frame.ego_to_world[:3, 3] + origin - lidar))
+    assert len({tuple(frame.camera_to_world[:3, 3]) for frame in real_scene.frames}) == 39
+    assert np.median(apart) > 0.1, "camera and LiDAR fire at different times, so their ego poses differ"
+
+
+def camera_pose(tables: dict, frame: Frame) -> np.ndarray:
+    data = tables["sample_data"][frame.token]
+    ego, sensor = (
+        tables["ego_pose"][data["ego_pose_token"]],
+        tables["calibrated_sensor"][data["calibrated_sensor_token"]],
+    )
+    return pose_of(ego["translation"], ego["rotation"]) @ pose_of(sensor["translation"], sensor["rotation"])

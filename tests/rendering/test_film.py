@@ -1,0 +1,415 @@
+"""Films: what an independent reader finds in them, the cameras told beside them, and every way that ffmpeg can fail."""
+
+import dataclasses
+import gc
+import json
+import os
+import re
+import resource
+import subprocess
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made_street import checkpoint_of
+
+from drivesplat.errors import DatasetError, ResultError
+from drivesplat.io import video
+from drivesplat.io.video import Footage, read_footage, write_video
+from drivesplat.model.background import Background
+from drivesplat.model.sky import ConstantSky
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
+from drivesplat.rendering.film import Shot, render_film
+from drivesplat.rendering.frames import film_frame
+from drivesplat.rendering.trajectory import film_path
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.render import FilmJob, TrajectorySettings
+from drivesplat.settings.train import TrainSettings
+
+WIDTH, HEIGHT, FPS = 160, 120, 30
+SIZE = (WIDTH, HEIGHT)
+CORNERS = {"red": (200, 30, 40), "green": (20, 180, 60), "blue": (30, 40, 220), "white": (250, 250, 250)}
+"""The colours of the quarters: top left, top right, bottom left, bottom right."""
+
+
+def quarters() -> np.ndarray:
+    frame = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for i, color in enumerate(CORNERS.values()):
+        rows, columns = divmod(i, 2)
+        frame[rows * HEIGHT // 2 :, columns * WIDTH // 2 :] = color
+    return frame
+
+
+def in_quarters(picture: np.ndarray) -> np.ndarray:
+    """The values in the middles of the quarters, in the order of `CORNERS`."""
+    return np.stack([picture[h, w] for h in (HEIGHT // 4, 3 * HEIGHT // 4) for w in (WIDTH // 4, 3 * WIDTH // 4)])
+
+
+def noise(count: int) -> Iterator[np.ndarray]:
+    """Frames that cannot be compressed."""
+    rng = np.random.default_rng(0)
+    return (rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(count))
+
+
+def decoded(path: Path) -> tuple[dict[str, Any], np.ndarray]:
+    """What imageio-ffmpeg reads: its notes, and the frames (n, h, w, 3)."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    notes = next(reader)
+    width, height = notes["size"]
+    return notes, np.stack([np.frombuffer(data, np.uint8).reshape(height, width, 3) for data in reader])
+
+
+@pytest.fixture
+def fake_ffmpeg(tmp_path, monkeypatch):
+    """Puts a shell script in ffmpeg's place; in it $FFMPEG is the real one and $out the file to write."""
+
+    def install(script: str) -> None:
+        executable = tmp_path / "fake" / "ffmpeg"
+        executable.parent.mkdir()
+        find_output = 'for word; do case "$word" in file:*) out="${word#file:}";; esac; done'
+        real = imageio_ffmpeg.get_ffmpeg_exe()
+        executable.write_text(f'#!/bin/bash\nFFMPEG="{real}"\n{find_output}\n{script}\n')
+        executable.chmod(0o755)
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(executable))
+
+    return install
+
+
+@pytest.fixture
+def started(monkeypatch) -> list[subprocess.Popen]:
+    """Every process that the test starts."""
+    imageio_ffmpeg.get_ffmpeg_exe()  # tries ffmpeg once per process, which is none of the test's business
+    processes, popen = [], subprocess.Popen
+
+    def remembered(*args, **kwargs):
+        processes.append(popen(*args, **kwargs))
+        return processes[-1]
+
+    monkeypatch.setattr(video.subprocess, "Popen", remembered)
+    return processes
+
+
+def assert_nothing_left(folder: Path, started: list[subprocess.Popen]) -> None:
+    """No file, whole or half, and no process."""
+    assert not list(folder.iterdir())
+    for process in started:
+        assert process.returncode is not None
+        with pytest.raises(ProcessLookupError):
+            os.kill(process.pid, 0)
+
+
+def failure(folder: Path, frames: Iterator[np.ndarray], crf: int = 18) -> str:
+    """How the film `street.mp4` fails, in one line that names it."""
+    with pytest.raises(ResultError) as error:
+        write_video(folder / "street.mp4", frames, SIZE, FPS, crf)
+    message = str(error.value)
+    assert str(folder / "street.mp4") in message and "\n" not in message
+    return message
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Where films go."""
+    path = tmp_path / "films"
+    path.mkdir()
+    return path
+
+
+@pytest.mark.parametrize(("count", "fps"), [(1, 30), (2, 30), (31, 24), (45, 7), (60, 240)])
+def test_a_film_has_every_frame_and_lasts_as_long(folder, count, fps):
+    path = folder / "street.mp4"
+    write_video(path, noise(count), SIZE, fps, 30)
+    notes, frames = decoded(path)
+    assert notes["size"] == SIZE and notes["fps"] == fps and notes["codec"].startswith("h264")
+    assert len(frames) == count
+    assert notes["duration"] == pytest.approx(count / fps, abs=0.006)  # ffmpeg prints hundredths of a second
+    assert read_footage(path) == Footage(count, *SIZE, float(fps))
+    assert list(folder.iterdir()) == [path]
+
+
+def test_colours_and_orientation_come_back(folder):
+    write_video(folder / "street.mp4", iter([quarters()] * 3), SIZE, FPS, 10)
+    notes, frames = decoded(folder / "street.mp4")
+    assert notes["pix_fmt"].replace(" ", "").startswith("yuv420p(tv,bt709,")  # matrix, primaries and curve alike
+    for frame in frames:
+        np.testing.assert_allclose(in_quarters(frame), list(CORNERS.values()), atol=5)
+
+
+def test_brightness_is_that_of_bt709(folder):
+    """ITU-R BT.709 in the narrow range: what a player assumes, whatever the tags say."""
+    path = folder / "street.mp4"
+    write_video(path, iter([quarters()]), SIZE, FPS, 10)
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-f", "rawvideo", "-"]
+    raw = subprocess.run(command, capture_output=True, check=True).stdout
+    luma = np.frombuffer(raw[: WIDTH * HEIGHT], np.uint8).reshape(HEIGHT, WIDTH)
+    expected = 16 + 219 * np.array(list(CORNERS.values())) / 255 @ [0.2126, 0.7152, 0.0722]
+    np.testing.assert_allclose(in_quarters(luma), expected, atol=2)
+
+
+def test_a_film_can_be_played_before_it_is_loaded(folder):
+    write_video(folder / "street.mp4", noise(5), SIZE, FPS, 18)
+    content = (folder / "street.mp4").read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+
+
+def test_a_lower_crf_is_nearer_and_larger(folder):
+    size, error = [], []
+    for crf in (5, 40):
+        path = folder / f"{crf}.mp4"
+        write_video(path, noise(5), SIZE, FPS, crf)
+        size.append(path.stat().st_size)
+        error.append(np.abs(decoded(path)[1] - np.stack([*noise(5)]).astype(float)).mean())
+    assert size[0] > size[1] and error[0] < error[1]
+
+
+def test_memory_does_not_grow_with_the_length_of_a_film(folder):
+    alive, most = weakref.WeakSet(), 0
+
+    class Frame(np.ndarray):
+        """An array that knows itself by identity, so that it can be counted."""
+
+        __hash__ = object.__hash__
+
+    def frames() -> Iterator[np.ndarray]:
+        nonlocal most
+        for i in range(200):
+            frame = np.full((HEIGHT, WIDTH, 3), i, np.uint8).view(Frame)
+            alive.add(frame)
+            most = max(most, len(alive))
+            yield frame
+
+    write_video(folder / "street.mp4", frames(), SIZE, FPS, 40)
+    gc.collect()
+    assert 1 <= most <= 3 and len(alive) == 0
+
+
+def test_an_earlier_film_is_replaced_only_by_a_whole_one(folder):
+    path = folder / "street.mp4"
+    write_video(path, noise(3), SIZE, FPS, 18)
+    before = path.read_bytes()
+
+    def broken() -> Iterator[np.ndarray]:
+        yield from noise(2)
+        raise ResultError("no more")
+
+    with pytest.raises(ResultError, match="no more"):
+        write_video(path, broken(), SIZE, FPS, 18)
+    assert path.read_bytes() == before and list(folder.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [RuntimeError("lost"), KeyboardInterrupt()])
+@pytest.mark.parametrize("count", [0, 40])
+def test_frames_that_fail_leave_no_process_and_no_file(folder, started, error, count):
+    def broken() -> Iterator[np.ndarray]:
+        yield from noise(count)
+        raise error
+
+    with pytest.raises(type(error)) as raised:
+        write_video(folder / "street.mp4", broken(), SIZE, FPS, 18)
+    assert raised.value is error and len(started) == 1
+    assert_nothing_left(folder, started)
+
+
+def test_a_frame_of_another_size_is_refused(folder, started):
+    with pytest.raises(ValueError, match="film of 160x120"):
+        write_video(folder / "street.mp4", iter([np.zeros((WIDTH, HEIGHT, 3), np.uint8)]), SIZE, FPS, 18)
+    assert_nothing_left(folder, started)
+
+
+def test_a_missing_ffmpeg_is_told(folder, monkeypatch):
+    def missing() -> str:
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", missing)
+    message = failure(folder, noise(3))
+    assert "ffmpeg" in message and "No ffmpeg exe could be found" in message and "make setup" in message
+    assert_nothing_left(folder, [])
+
+
+@pytest.mark.parametrize("content", [None, "no program", ""])
+def test_an_ffmpeg_that_is_none_is_told(folder, tmp_path, monkeypatch, content):
+    named = tmp_path / "named"
+    if content is not None:
+        named.write_text(content)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(named))
+    assert re.search("ffmpeg.*cannot be started.*IMAGEIO_FFMPEG_EXE", failure(folder, noise(3)))
+    assert_nothing_left(folder, [])
+
+
+@pytest.mark.parametrize(
+    ("script", "told"),
+    [
+        ("echo 'Unknown encoder libx264' >&2; exit 8", "exit status 8: Unknown encoder libx264"),
+        ("cat >/dev/null; printf 'one\\n\\ntwo\\nthree\\nfour\\n' >&2; exit 1", "exit status 1: two; three; four"),
+        ("head -c 100000 >/dev/null; echo half >\"$out\"; exit 0", "took no more than"),
+        ("head -c 100000 >/dev/null; kill -KILL $$", "ended by SIGKILL: it said nothing"),
+        ("exec <&-; exec sleep 60", "took no more than"),
+        ("head -c 1000000 /dev/zero | tr '\\0' x >&2; exit 3", "exit status 3: xxx"),
+    ],
+    ids=["at once", "at the end", "midway with success", "killed", "closes its input", "wordy"],
+)  # fmt: skip
+def test_an_ffmpeg_that_dies_is_told_with_its_last_words(folder, started, fake_ffmpeg, monkeypatch, script, told):
+    monkeypatch.setattr(video, "PATIENCE", 1.0)
+    fake_ffmpeg(script)
+    message = failure(folder, noise(40))
+    assert "ffmpeg" in message and told in message and len(message) < 1200
+    assert_nothing_left(folder, started)
+
+
+@pytest.mark.parametrize(
+    ("script", "told"), [("exec sleep 60", "took no more"), ("cat >/dev/null; exec sleep 60 </dev/null", "an end")]
+)
+def test_an_ffmpeg_that_hangs_is_not_waited_for_for_ever(folder, started, fake_ffmpeg, monkeypatch, script, told):
+    monkeypatch.setattr(video, "PATIENCE", 0.5)
+    fake_ffmpeg(script)
+    assert told in failure(folder, noise(40))
+    assert_nothing_left(folder, started)
+
+
+@pytest.mark.parametrize(
+    ("script", "found"),
+    [
+        ("cat >/dev/null", "0 frames of 0x0"),
+        ('cat >/dev/null; echo nothing >"$out"', "0 frames of 0x0"),
+        ('"$FFMPEG" "$@"; head -c 40000 "$out" >"$out.cut"; mv "$out.cut" "$out"', "frames of 160x120"),
+        (f'(head -c {7 * WIDTH * HEIGHT * 3}; cat >/dev/null) | "$FFMPEG" "$@"', "7 frames of 160x120 at 30 fps"),
+        ('"$FFMPEG" "${@/#30/15}"', "20 frames of 160x120 at 15 fps"),
+        ('"$FFMPEG" "${@/#160x120/120x160}"', "20 frames of 120x160 at 30 fps"),
+    ],
+    ids=["no file", "no film", "truncated", "frames lost", "other rate", "other size"],
+)  # fmt: skip
+def test_a_film_that_is_not_what_was_given_is_found_out(folder, started, fake_ffmpeg, script, found):
+    fake_ffmpeg(script)
+    given, wrote = failure(folder, noise(20)).split(" and wrote ")
+    assert given.endswith("20 frames of 160x120 at 30 fps")
+    assert found in wrote and not wrote.startswith("20 frames of 160x120 at 30 fps")
+    assert_nothing_left(folder, started)
+
+
+def test_a_full_disk_is_told(folder, started):
+    """A limit on the size of files stands for the full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        message = failure(folder, noise(60), crf=0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "ffmpeg" in message and "free disk space" in message
+    assert_nothing_left(folder, started)
+
+
+def test_a_folder_that_is_a_file_is_told(tmp_path):
+    (tmp_path / "films").write_text("")
+    assert "cannot be written" in failure(tmp_path / "films", noise(3))
+
+
+BALL = np.array([30.0, 1.0, 1.5])
+"""Where the models of these tests have their one white Gaussian: world coordinates, ahead of the tiny drive."""
+
+
+def a_checkpoint(**changes: Any) -> dict[str, Any]:
+    """What a training leaves: one white ball in the dark."""
+    settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1, init_opacity=0.9))
+    part = Background.from_points(BALL[None].astype(np.float32), np.ones((1, 3)), settings.gaussians, 1.0)
+    part.params["scales"].data.fill_(np.log(0.4))
+    content = checkpoint_of(SplatModel([part], None), settings)
+    return {**content, "model": {**content["model"], **changes}}
+
+
+def a_job(**changes: Any) -> FilmJob:
+    values = {
+        "camera": "CAM_FRONT", "trajectory": TrajectorySettings(), "fps": 10, "width": WIDTH, "height": HEIGHT,
+        "horizontal_fov": None, "crf": 5,
+    }  # fmt: skip
+    return FilmJob(**(values | changes))
+
+
+def filmed(scene: Scene, path: Path, job: FilmJob) -> dict[str, Any]:
+    return render_film(scene, a_checkpoint(), job, DeviceSettings(kind="cpu"), path)
+
+
+def middle_of_light(frame: np.ndarray) -> np.ndarray:
+    """The centre of a frame's brightness in continuous pixels (x, y)."""
+    brightness = np.clip(frame.astype(float).mean(axis=2) - 20.0, 0.0, None)
+    y, x = np.mgrid[: frame.shape[0], : frame.shape[1]] + 0.5
+    return np.array([(x * brightness).sum(), (y * brightness).sum()]) / brightness.sum()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"trajectory": TrajectorySettings(lateral=2.0, vertical=0.5)},
+        {"trajectory": TrajectorySettings(yaw=-8.0), "horizontal_fov": 50.0},
+    ],
+    ids=["recorded", "aside", "turned"],
+)
+def test_the_cameras_told_beside_a_film_are_those_that_it_was_filmed_with(folder, tiny_scene, changes):
+    """The ball is where pinhole, K and pose of the record put it, in every frame."""
+    record = json.loads(json.dumps(filmed(tiny_scene, folder / "street.mp4", a_job(**changes))))
+    _, frames = decoded(folder / "street.mp4")
+    assert len(frames) == record["frames"] == len(record["camera_to_world"])
+    for frame, camera_to_world in zip(frames, record["camera_to_world"], strict=True):
+        x, y, z, _ = np.linalg.inv(camera_to_world) @ [*BALL, 1.0]
+        expected = np.array(record["K"]) @ [x / z, y / z, 1.0]
+        np.testing.assert_allclose(middle_of_light(frame), expected[:2], atol=0.3)
+
+
+def test_a_film_lasts_as_long_as_the_drive_and_its_record_says_what_it_is(folder, tiny_scene):
+    offset = TrajectorySettings(lateral=2.0)
+    record = filmed(tiny_scene, folder / "street.mp4", a_job(trajectory=offset))
+    times = [frame.timestamp for frame in tiny_scene.frames]
+    assert (max(times) - min(times)) == 4_500_000
+    notes, _ = decoded(folder / "street.mp4")
+    assert notes["duration"] == pytest.approx(4.5 + 1 / 10, abs=0.01)
+    plain = {key: record[key] for key in ("schema", "camera", "fps", "width", "height", "frames", "duration_s")}
+    assert plain == {
+        "schema": 1, "camera": "CAM_FRONT", "fps": 10, "width": WIDTH, "height": HEIGHT, "frames": 46, "duration_s": 4.6
+    }  # fmt: skip
+    assert record["timestamps"] == [min(times) + 100_000 * k for k in range(46)]
+    assert record["origin"] == tiny_scene.origin.tolist()
+    assert record["offset"] == {"lateral": 2.0, "vertical": 0.0, "yaw": 0.0}
+    assert record["bytes"] == (folder / "street.mp4").stat().st_size
+    assert record["render_seconds"] > 0
+
+
+def test_a_model_is_asked_for_the_time_since_the_first_image_of_any_camera(tiny_scene):
+    earlier = dataclasses.replace(tiny_scene.frames[0], camera="CAM_BACK", timestamp=tiny_scene.frames[0].timestamp - 7)
+    scene = dataclasses.replace(tiny_scene, frames=(*tiny_scene.frames, earlier))
+    shot = Shot(scene, film_path(scene, "CAM_FRONT", 2, TrajectorySettings()), a_job(fps=2), SIZE)
+    times = [view.time for view in shot.views(torch.device("cpu"))]
+    np.testing.assert_allclose(times, 7e-6 + 0.5 * np.arange(10), atol=1e-9)
+
+
+def test_colours_are_rounded_to_the_nearest_byte_and_those_beyond_white_are_white():
+    """A ball brighter than white before a sky of 0.2, 1 / 3 and 0.78."""
+    settings = GaussianSettings(sh_degree=0, init_opacity=0.999)
+    part = Background.from_points(np.array([[0.0, 0.0, 5.0]]), np.full((1, 3), 9.0), settings, 1.0)
+    part.params["scales"].data.fill_(np.log(0.5))
+    model = SplatModel([part], ConstantSky(torch.tensor([0.2, 1 / 3, 0.78]), 1e-2))
+    K = torch.tensor([[80.0, 0.0, 80.0], [0.0, 80.0, 60.0], [0.0, 0.0, 1.0]])
+    frame = film_frame(model, View(K, torch.eye(4), *SIZE, time=0.0))
+    assert frame.shape == (HEIGHT, WIDTH, 3) and frame.dtype == np.uint8
+    assert frame[5, 5].tolist() == [51, 85, 199]
+    assert frame[60, 80].tolist() == [255, 255, 255]
+
+
+def test_a_film_of_no_numbers_is_refused(folder, started, tiny_scene):
+    checkpoint = a_checkpoint(**{"parts.0.params.sh0": torch.full((1, 1, 3), torch.nan)})
+    with pytest.raises(ResultError, match=r"no numbers.*checkpoint\.pt"):
+        render_film(tiny_scene, checkpoint, a_job(), DeviceSettings(kind="cpu"), folder / "street.mp4")
+    assert_nothing_left(folder, started)
+
+
+def test_a_camera_that_the_scene_lacks_is_told_before_anything_is_made(folder, tiny_scene):
+    with pytest.raises(DatasetError, match="CAM_BACK"):
+        filmed(tiny_scene, folder / "street.mp4", a_job(camera="CAM_BACK"))
+    assert not list(folder.iterdir())

@@ -1,0 +1,110 @@
+"""The film of a model's parts: everything, what stands still, and what moves."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.hand_made_street import Reels, a_format, checkpoint_of, street_actors, street_model, street_scene, views_of
+
+from drivesplat.io.prefetch import THREADS
+from drivesplat.io.video import read_footage
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.rendering.film import BACKDROP, render_film, render_parts
+from drivesplat.rendering.frames import film_frame
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.render import FilmJob, TrajectorySettings
+
+CPU = DeviceSettings(kind="cpu")
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene) -> Scene:
+    return street_scene(tiny_scene)
+
+
+@pytest.fixture
+def reels(monkeypatch) -> Reels:
+    made = Reels()
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", made)
+    return made
+
+
+def parts_film(scene: Scene, folder: Path, checkpoint: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    return render_parts(scene, checkpoint, a_format(**changes), CPU, folder / "parts.mp4")
+
+
+def test_everything_what_stands_still_and_what_moves_stand_side_by_side(scene, tmp_path, reels):
+    """Each third is what a model of these parts alone shows; what moves stands before grey instead of the sky."""
+    whole = street_model()
+    still, actors = street_model(whole.parts[0]), SplatModel([street_actors()], None).requires_grad_(False)
+    record = parts_film(scene, tmp_path, checkpoint_of(whole))
+    views = views_of(record, scene)
+    assert (record["shows"], len(reels["parts"])) == (["all", "still", "moving"], len(views))
+    for picture, view in zip(reels["parts"], views, strict=True):
+        everything, without, alone = np.split(picture, 3, axis=1)
+        np.testing.assert_array_equal(everything, film_frame(whole, view))
+        np.testing.assert_array_equal(without, film_frame(still, view))
+        shown = actors.render(view)
+        expected = shown.splats + BACKDROP * (1 - shown.alpha[..., None])
+        np.testing.assert_allclose(alone, 255 * expected.clamp(max=1.0), atol=0.51)
+    before_grey = (np.split(reels["parts"], 3, axis=2)[2] == round(255 * BACKDROP)).all(axis=-1)
+    assert 0.3 < before_grey.mean() < 0.9
+
+
+def test_everything_is_what_the_ordinary_film_shows(scene, tmp_path, reels):
+    checkpoint, size = checkpoint_of(street_model()), {"width": 20, "height": 10}
+    record = parts_film(scene, tmp_path, checkpoint)
+    job = FilmJob(**a_format(**size).model_dump(), trajectory=TrajectorySettings())
+    ordinary = render_film(scene, checkpoint, job, CPU, tmp_path / "original.mp4")
+    np.testing.assert_array_equal(np.split(reels["parts"], 3, axis=2)[0], reels["original"])
+    assert record.keys() - {"shows"} == ordinary.keys() - {"offset"}
+    cameras = ("K", "width", "height", "timestamps", "camera_to_world")
+    assert [record[key] for key in cameras] == [ordinary[key] for key in cameras]
+
+
+@pytest.mark.parametrize(
+    ("asked", "tile"), [((64, 36), (20, 10)), ((1920, 1080), (640, 360)), ((100, 50), (32, 16)), ((16, 16), (4, 4))]
+)
+def test_each_is_a_third_as_wide_in_even_pixels(asked, tile):
+    """H.264 wants even sizes; the aspect is kept as far as that goes."""
+    assert a_format(width=asked[0], height=asked[1]).tile(3) == tile
+
+
+def test_a_film_of_parts_has_a_frame_for_each_camera(scene, tmp_path):
+    record = parts_film(scene, tmp_path, checkpoint_of(street_model()), width=70, height=38)
+    footage = read_footage(tmp_path / "parts.mp4")
+    assert (footage.frames, footage.fps) == (record["frames"], 4.0) == (19, 4.0)
+    assert (footage.width, footage.height) == (66, 10) == (3 * record["width"], record["height"])
+    assert record["bytes"] == (tmp_path / "parts.mp4").stat().st_size
+    assert json.loads(json.dumps(record)) == record
+
+
+def test_where_nothing_moves_the_third_picture_is_plain_grey(scene, tmp_path, reels):
+    still = street_model(street_model().parts[0])
+    record = parts_film(scene, tmp_path, checkpoint_of(still))
+    for frame in reels["parts"]:
+        everything, standing, moving = np.split(frame, 3, axis=1)
+        assert (everything == standing).all() and (moving == round(255 * BACKDROP)).all()
+    assert record["frames"] == len(reels["parts"])
+
+
+def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, tmp_path, monkeypatch):
+    rendered = []
+    monkeypatch.setattr(
+        "drivesplat.rendering.film.film_frame", lambda *_: rendered.append(1) or np.zeros((10, 20, 3), np.uint8)
+    )
+
+    def encoder(path, frames, size, fps, crf, threads):
+        frames = iter(frames)
+        next(frames)
+        time.sleep(0.05)
+        assert 2 <= len(rendered) <= 2 * (1 + THREADS + 1)
+        assert len([*frames]) > 2 * THREADS
+        path.write_bytes(b"")
+
+    monkeypatch.setattr("drivesplat.rendering.film.write_video", encoder)
+    parts_film(scene, tmp_path, checkpoint_of(street_model()))

@@ -1,0 +1,386 @@
+"""The report across scenes: rows and means of what is current and comparable; the rest is named, never mixed in."""
+
+import copy
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, stages, told
+
+from drivesplat.report.console import console_table
+from drivesplat.report.gaps import gap_report, in_words, write_csv
+
+VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
+VANILLA_B = method(group(26.0, None, 22.0, lpips=0.1), group(23.0), gaussians=3000, seconds=80.0)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a metrics.json where the workflow does, and returns its path."""
+
+    def write_metrics(record: dict | str, scene: str | None = None) -> str:
+        path = tmp_path / (scene or record["scene"]) / "metrics.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(record if isinstance(record, str) else json.dumps(record))
+        return str(path)
+
+    return write_metrics
+
+
+def test_a_row_holds_both_groups_figures_of_a_scene_and_method(write):
+    report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061"), NO_LOGS)
+    assert report["rows"] == [
+        {
+            "scene": "0061", "dataset": "nuscenes", "method": "vanilla",
+            "interpolation_static": 24.0, "interpolation_vehicle": 19.0, "interpolation_moving_vehicle": 17.0,
+            "interpolation_gap_db": 7.0, "interpolation_lpips": 0.3,
+            "extrapolation_static": 22.0, "extrapolation_vehicle": 14.0, "extrapolation_moving_vehicle": 14.0,
+            "extrapolation_gap_db": 8.0, "extrapolation_lpips": None,
+            "gaussians": 1000, "train_seconds": 60.0, "shown": None,
+        }
+    ]  # fmt: skip
+    assert report["left_out"] == report["missing"] == [] and report["partial"] is False
+    assert report["schema"] == 2 and report["protocols"] == {"0061": PROTOCOL}
+
+
+def test_a_region_that_is_null_is_null_in_its_row(write):
+    (row,) = gap_report([write(metrics("0103", {"vanilla": VANILLA_B}))], expecting("0103"), NO_LOGS)["rows"]
+    assert (row["interpolation_vehicle"], row["interpolation_moving_vehicle"]) == (22.0, None)
+    assert row["extrapolation_vehicle"] is row["extrapolation_moving_vehicle"] is row["extrapolation_gap_db"] is None
+
+
+def test_a_group_without_a_single_image_is_null_in_its_row(write):
+    nothing = {**dict.fromkeys(group(1.0)), "gap_db": None}
+    record = metrics("0061", {"vanilla": method(nothing, group(22.0, 14.0))})
+    (row,) = gap_report([write(record)], expecting("0061"), NO_LOGS)["rows"]
+    assert row["interpolation_static"] is row["interpolation_gap_db"] is row["interpolation_lpips"] is None
+    assert row["extrapolation_static"] == 22.0
+
+
+def test_identical_images_are_null_and_not_infinite(write):
+    same = {**group(24.0, 17.0), "static": region(None), "gap_db": None}
+    (row,) = gap_report([write(metrics("0061", {"vanilla": method(same, same)}))], expecting("0061"), NO_LOGS)["rows"]
+    assert row["interpolation_static"] is None
+
+
+def test_every_scene_and_method_has_a_row_in_order(write):
+    both = {"vanilla": VANILLA_A, "street": VANILLA_B}
+    paths = [write(metrics("0103", both)), write(metrics("0061", both))]
+    report = gap_report(paths, expecting("0061", "0103", methods=("vanilla", "street")), NO_LOGS)
+    assert [(row["scene"], row["method"]) for row in report["rows"]] == [
+        ("0103", "vanilla"), ("0103", "street"), ("0061", "vanilla"), ("0061", "street"),
+    ]  # fmt: skip
+
+
+def test_means_are_over_scenes_by_method_and_ignore_null(write):
+    paths = [
+        write(metrics("0061", {"vanilla": VANILLA_A, "street": VANILLA_B})),
+        write(metrics("0103", {"vanilla": VANILLA_B, "street": VANILLA_B})),
+    ]
+    means = gap_report(paths, expecting("0061", "0103", methods=("vanilla", "street")), NO_LOGS)["means"]
+    assert [mean["method"] for mean in means] == ["vanilla", "street"]
+    vanilla, street = ({name: found and found["mean"] for name, found in mean["figures"].items()} for mean in means)
+    assert vanilla["interpolation_static"] == 25.0
+    assert vanilla["interpolation_moving_vehicle"] == 17.0, "of the one scene where something moves"
+    assert vanilla["interpolation_gap_db"] == 7.0, "where nothing moves the gap is that of parked vehicles"
+    assert vanilla["extrapolation_vehicle"] == 14.0
+    assert vanilla["interpolation_lpips"] == pytest.approx(0.2)
+    assert vanilla["extrapolation_lpips"] is None
+    assert (vanilla["gaussians"], vanilla["train_seconds"]) == (2000, 70.0)
+    assert street["extrapolation_moving_vehicle"] is None
+    assert means[0]["figures"]["interpolation_gap_db"]["scenes"] == 1
+
+
+def left_out(report: dict[str, Any], scene: str) -> str:
+    (why,) = [item["why"] for item in report["left_out"] if item["scene"] == scene]
+    assert "\n" not in why
+    return why
+
+
+def test_a_result_of_other_settings_is_left_out_and_named_with_the_difference(write):
+    stale = metrics("0103", {"vanilla": VANILLA_B}, stages(iterations=7000))
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A})), write(stale)]
+    report = gap_report(paths, expecting("0061", "0103"), NO_LOGS)
+    assert [row["scene"] for row in report["rows"]] == ["0061"]
+    assert report["means"][0]["figures"]["interpolation_static"]["mean"] == 24.0, "what is left out counts in no mean"
+    assert all(word in left_out(report, "0103") for word in ("vanilla/train", "train.iterations", "7000", "30000"))
+    assert report["missing"] == []
+
+
+def test_a_result_of_other_code_is_left_out_and_named_with_the_stage(write):
+    report = gap_report(
+        [write(metrics("0061", {"vanilla": VANILLA_A}, stages(code="old")))], expecting("0061"), NO_LOGS
+    )
+    assert report["rows"] == []
+    assert "vanilla/train: other code" in left_out(report, "0061")
+
+
+def test_a_result_without_a_configured_method_is_left_out_and_says_so(write):
+    report = gap_report(
+        [write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061", methods=("vanilla", "street")), NO_LOGS
+    )
+    assert report["rows"] == []
+    assert "street/train" in left_out(report, "0061")
+
+
+def test_a_result_of_a_scene_that_is_not_configured_is_left_out(write):
+    report = gap_report([write(metrics("0103", {"vanilla": VANILLA_A}))], expecting("0061"), NO_LOGS)
+    assert report["rows"] == []
+    assert "config" in left_out(report, "0103")
+    assert [item["scene"] for item in report["missing"]] == ["0061"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("width", 320),
+        ("height", 200),
+        ("cameras", ["CAM_FRONT", "CAM_BACK"]),
+        ("eval_camera", "CAM_BACK"),
+        ("sweeps", True),
+        ("holdout", {"every_nth": 8, "offset": 4, "last_block": 0}),
+        ("poses", "refined"),
+        ("regions", "masks"),
+    ],
+)
+def test_a_result_of_another_protocol_is_left_out_and_named_with_the_difference(write, key, value):
+    paths = [
+        write(metrics("0061", {"vanilla": VANILLA_A})),
+        write(metrics("0103", {"vanilla": VANILLA_A}, **{key: value})),
+        write(metrics("0553", {"vanilla": VANILLA_A})),
+    ]
+    report = gap_report(paths, expecting("0061", "0103", "0553"), NO_LOGS)
+    assert [row["scene"] for row in report["rows"]] == ["0061", "0553"]
+    assert key in left_out(report, "0103") and "0061" in left_out(report, "0103")
+
+
+def test_what_differs_from_scene_to_scene_by_nature_is_no_other_protocol(write):
+    held_out = {"interpolation": [4, 12], "extrapolation": [36, 37]}
+    other = metrics("0103", {"vanilla": VANILLA_A}, held_out_frames=held_out, train_images=30, lidar_missing=2)
+    report = gap_report(
+        [write(metrics("0061", {"vanilla": VANILLA_A})), write(other)], expecting("0061", "0103"), NO_LOGS
+    )
+    assert len(report["rows"]) == 2 and report["left_out"] == []
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_scene_that_kept_its_poses_stands_beside_those_with_refined_ones(write, order):
+    """All were to be refined, and one was refused: that is the scene's nature, not another protocol."""
+    made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
+    results = {"0061": ("refined", made), "0103": ("nuscenes", made)}
+    paths = [write(metrics(scene, {"vanilla": VANILLA_A}, stages, poses=poses))
+             for scene, (poses, stages) in list(results.items())[::order]]  # fmt: skip
+    report = gap_report(paths, told({"0061": made, "0103": made}), NO_LOGS)
+    assert {row["scene"] for row in report["rows"]} == {"0061", "0103"} and report["left_out"] == []
+
+
+def test_a_scene_whose_poses_come_from_images_alone_does_not(write):
+    made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
+    paths = [
+        write(metrics(scene, {"vanilla": VANILLA_A}, made, poses=poses))
+        for scene, poses in (("0061", "refined"), ("0103", "images"))
+    ]
+    report = gap_report(paths, told({"0061": made, "0103": made}), NO_LOGS)
+    assert "poses" in left_out(report, "0103")
+
+
+def test_a_scene_that_was_never_to_be_refined_does_not(write):
+    made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A}, made, poses="refined")),
+             write(metrics("0103", {"vanilla": VANILLA_A}))]  # fmt: skip
+    report = gap_report(paths, told({"0061": made, "0103": stages()}), NO_LOGS)
+    (left_out,) = report["left_out"]
+    assert left_out["scene"] == "0103" and "poses" in left_out["why"]
+
+
+def test_a_stale_result_sets_no_protocol_for_the_others(write):
+    stale = metrics("0061", {"vanilla": VANILLA_A}, stages(iterations=7000), width=320)
+    paths = [write(stale), write(metrics("0103", {"vanilla": VANILLA_A}))]
+    report = gap_report(paths, expecting("0061", "0103"), NO_LOGS)
+    assert [row["scene"] for row in report["rows"]] == ["0103"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_result_is_left_out_and_named_with_file_and_rule(write, share):
+    text = json.dumps(metrics("0103", {"vanilla": VANILLA_A}))
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A})), write(text[: int(share * len(text))], "0103")]
+    report = gap_report(paths, expecting("0061", "0103"), NO_LOGS)
+    assert [row["scene"] for row in report["rows"]] == ["0061"]
+    assert "0103/metrics.json" in left_out(report, "0103") and "'scene_metrics'" in left_out(report, "0103")
+    assert report["missing"] == []
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        {},
+        [],
+        "text",
+        {"scene": "0103"},
+        {**metrics("0103", {"vanilla": VANILLA_A}), "provenance": {}},
+        {**metrics("0103", {"vanilla": VANILLA_A}), "protocol": {}},
+        {key: value for key, value in metrics("0103", {"vanilla": VANILLA_A}).items() if key != "methods"},
+        metrics("0103", {"vanilla": {}}),
+    ],
+    ids=range(8),
+)
+def test_a_foreign_result_is_left_out_and_named_with_file_and_rule(write, foreign):
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A})), write(json.dumps(foreign), "0103")]
+    report = gap_report(paths, expecting("0061", "0103"), NO_LOGS)
+    assert [row["scene"] for row in report["rows"]] == ["0061"]
+    assert "0103/metrics.json" in left_out(report, "0103") and "'scene_metrics'" in left_out(report, "0103")
+
+
+def test_configured_scenes_without_a_result_are_listed(write):
+    report = gap_report([write(metrics("0103", {"vanilla": VANILLA_A}))], expecting("0061", "0103", "0553"), NO_LOGS)
+    assert [item["scene"] for item in report["missing"]] == ["0061", "0553"]
+    assert all(item["why"] for item in report["missing"])
+
+
+def test_a_report_of_nothing_still_comes_out(tmp_path):
+    report = gap_report([], expecting("0061"), NO_LOGS)
+    assert report["rows"] == report["means"] == [] and [item["scene"] for item in report["missing"]] == ["0061"]
+    write_csv(tmp_path / "gap_report.csv", report)
+    assert len((tmp_path / "gap_report.csv").read_text().splitlines()) == 1
+    assert "0061" in console_table(report)
+
+
+@pytest.fixture
+def report(write) -> dict[str, Any]:
+    """Two measured scenes, one stale, one missing."""
+    paths = [
+        write(metrics("0061", {"vanilla": VANILLA_A})),
+        write(metrics("0103", {"vanilla": VANILLA_B})),
+        write(metrics("0553", {"vanilla": VANILLA_B}, stages(iterations=7000))),
+    ]
+    return gap_report(paths, expecting("0061", "0103", "0553", "0655"), NO_LOGS)
+
+
+def test_a_report_is_json_without_nan(report):
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
+    before = copy.deepcopy(report)
+    write_csv(tmp_path / "gap_report.csv", report)
+    with open(Path(tmp_path / "gap_report.csv"), newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    figures = ("static", "vehicle", "moving_vehicle", "gap_db", "lpips")
+    assert list(rows[0]) == [
+        "scene", "dataset", "method",
+        *(f"interpolation_{name}" for name in figures), *(f"extrapolation_{name}" for name in figures),
+        "gaussians", "train_seconds",
+    ]  # fmt: skip
+    assert [row["scene"] for row in rows] == ["0061", "0103"]
+    assert float(rows[0]["interpolation_gap_db"]) == 7.0
+    assert rows[1]["extrapolation_vehicle"] == rows[0]["extrapolation_lpips"] == ""
+    assert report == before
+
+
+def test_the_console_table_can_be_read(report):
+    lines = console_table(report).splitlines()
+    header = next(i for i, line in enumerate(lines) if "scene" in line and "method" in line)
+    table = lines[header : header + 4]
+    assert len({len(line) for line in table}) == 1, "columns line up"
+    assert max(map(len, table)) <= 120
+    first, second, mean = (line.split() for line in table[1:])
+    assert first == ["0061", "vanilla", "24.00", "19.00", "17.00", "7.00", "22.00", "14.00", "14.00", "8.00"]
+    assert second == ["0103", "vanilla", "26.00", "22.00", "-", "4.00", "23.00", "-", "-", "-"]
+    assert mean[:3] == ["mean", "vanilla", "25.00"]
+    assert any("interp" in word for word in table[0].split()) and any("extrap" in word for word in table[0].split())
+    notes = "\n".join(lines[header + 4 :])
+    assert "0553" in notes and "train.iterations" in notes and "0655" in notes
+    assert "None" not in "\n".join(table)
+
+
+# ---- what it comes to
+
+
+def many(write, gaps: dict[str, tuple[float, float | None]], nothing_moves: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The report of scenes with gaps of vanilla and street between training frames (None: not measured)."""
+    paths = []
+    for scene, own in gaps.items():
+        measured = {
+            name: method(
+                group(25.0, None, 25.0 - gap) if scene in nothing_moves else group(25.0, 25.0 - gap), group(20.0)
+            )
+            for name, gap in zip(("vanilla", "street"), own, strict=True)
+            if gap is not None
+        }
+        paths.append(write(metrics(scene, measured, stages(("vanilla", "street")))))
+    return gap_report(paths, expecting(*gaps, methods=("vanilla", "street")), NO_LOGS)
+
+
+def test_a_mean_has_an_interval_of_scenes_drawn_anew(write):
+    """For scenes as different as these the interval is near the normal one: 1.96 standard errors to either side."""
+    gaps = {f"{i:04}": (5.0 + 0.5 * i, 1.0) for i in range(10)}
+    vanilla, street = (mean["figures"]["interpolation_gap_db"] for mean in many(write, gaps)["means"])
+    error = np.std([5.0 + 0.5 * i for i in range(10)]) / np.sqrt(10)
+    assert vanilla["mean"] == pytest.approx(7.25) and vanilla["scenes"] == 10
+    assert vanilla["low"] == pytest.approx(7.25 - 1.96 * error, abs=0.1)
+    assert vanilla["high"] == pytest.approx(7.25 + 1.96 * error, abs=0.1)
+    assert street["low"] == street["mean"] == street["high"] == pytest.approx(1.0)
+
+
+def test_one_scene_has_no_interval(write):
+    (mean, _) = many(write, {"0061": (7.0, 2.0)})["means"]
+    assert mean["figures"]["interpolation_gap_db"] == {"mean": 7.0, "low": None, "high": None, "scenes": 1}
+
+
+def test_a_method_closes_a_fraction_of_the_references_gap_where_vehicles_move(write):
+    gaps = {"0061": (8.0, 2.0), "0103": (4.0, 2.0), "0553": (1.0, 1.0), "0655": (9.0, None)}
+    report = many(write, gaps, nothing_moves=("0553",))
+    (street,) = report["gap_closed"]
+    assert street["method"] == "street" and street["extrapolation"] is None
+    assert street["interpolation"]["fraction"] == pytest.approx(1.0 - 4.0 / 12.0)
+    assert street["interpolation"]["scenes"] == 2
+    assert street["interpolation"]["low"] == pytest.approx(0.5)
+    assert street["interpolation"]["high"] == pytest.approx(0.75)
+    (line,) = [line for line in in_words(report) if line.startswith("street, between")]
+    assert "2.0 (2.0 to 2.0) dB, 2 scenes" in line and "67% (50% to 75%) of that of vanilla" in line
+
+
+def test_a_gap_that_is_not_there_cannot_be_closed(write):
+    assert many(write, {"0061": (-1.0, 2.0), "0103": (0.5, 2.0)})["gap_closed"] == []
+
+
+def test_without_a_reference_nothing_is_closed(write):
+    path = write(metrics("0061", {"vanilla": VANILLA_A}))
+    assert gap_report([path], told({"0061": stages()}, reference=None), NO_LOGS)["gap_closed"] == []
+
+
+# ---- why a scene is missing
+
+
+def log(folder: Path, name: str, *lines: str) -> None:
+    path = folder / "0103" / f"{name}.log"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"2026-11-21 23:32:06,793 {line}\n" for line in lines))
+
+
+ERROR = "ERROR drivesplat.workflow.job: "
+BEGINS, ENDS = (f"INFO drivesplat.workflow.job: extract 0103 {word}" for word in ("begins", "ends"))
+
+
+@pytest.mark.parametrize(
+    ("logs", "why"),
+    [
+        ({}, "not measured"),
+        ({"extract": (BEGINS, ENDS)}, "not measured"),
+        ({"extract": (BEGINS, "ERROR drivesplat.workflow.job: extract 0103: image n015.jpg is broken")},
+         "extract: image n015.jpg is broken"),
+        ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS,)}, "vanilla/train was ended in the middle"),
+        ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS, f"{ERROR}vanilla/train 0103: no memory")},
+         "vanilla/train: no memory"),
+    ],
+)  # fmt: skip
+def test_a_missing_scene_says_what_its_logs_say(tmp_path, write, logs, why):
+    for name, lines in logs.items():
+        log(tmp_path / "logs", name, *lines)
+    report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061", "0103"), tmp_path / "logs")
+    (missing,) = report["missing"]
+    assert missing["scene"] == "0103" and missing["why"].startswith(why)
+    assert report["partial"] is True

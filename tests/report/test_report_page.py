@@ -1,0 +1,174 @@
+"""gap_report.html: what stands in it, and that it needs a browser and nothing else."""
+
+import base64
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.chromium import CHROMIUM, chromium
+from helpers.reports import NO_LOGS, expecting, group, method, metrics, stages
+from PIL import Image
+
+from drivesplat.errors import ResultError
+from drivesplat.io.storage import write_json
+from drivesplat.report.gaps import gap_report
+from drivesplat.report.html import report_page
+from drivesplat.report.looks import WIDEST, apart_at, data_address, looks_of, picture_of
+from drivesplat.report.plot import gap_plot
+from drivesplat.scene.images import write_png
+from drivesplat.settings.report import PICTURES
+
+METHODS = ("vanilla", "street")
+GAPS = {"0061": (7.5, 1.0), "0103": (4.0, 1.5), "0553": (10.5, 2.0), "0655": (None, None)}
+"""Of vanilla and street between training frames; where it is None there is no vehicle."""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> Path:
+    """A results folder of four scenes; a fifth is configured, and failed."""
+    folder = tmp_path_factory.mktemp("results")
+    for scene, gaps in GAPS.items():
+        measured = {}
+        for name, gap in zip(METHODS, gaps, strict=True):
+            measured[name] = method(group(25.0, None if gap is None else 25.0 - gap), group(20.0))
+            measured[name]["shown"] = {"group": "interpolation", "key_frame": 12}
+            for number, picture in enumerate(PICTURES.values()):
+                paint(folder / scene / name / picture, 40 * number)
+            (folder / scene / name / "original.mp4").touch()
+        write_json(folder / scene / "metrics.json", metrics(scene, measured, stages(METHODS)))
+    log = folder / "logs/1100/street/train.log"
+    log.parent.mkdir(parents=True)
+    log.write_text(
+        "2026-11-21 23:32:06,793 ERROR drivesplat.workflow.job: street/train 1100: <b>no memory</b> & more\n"
+    )
+    return folder
+
+
+def paint(path: Path, shade: int, size: tuple[int, int] = (160, 90)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (shade, 200, 255 - shade)).save(path)
+
+
+def made(results: Path) -> dict[str, Any]:
+    paths = [str(results / scene / "metrics.json") for scene in GAPS]
+    return gap_report(paths, expecting(*GAPS, "1100", methods=METHODS), results / "logs")
+
+
+def page_of(results: Path) -> str:
+    files = [file for scene in GAPS for file in sorted((results / scene).rglob("*.*")) if file.parent.name in METHODS]
+    return report_page(made(results), looks_of(files, results))
+
+
+def test_a_page_needs_nothing_from_elsewhere(results):
+    page = page_of(results)
+    assert "default-src 'none'" in page and "<script src" not in page and '<link rel="stylesheet' not in page
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert len(addresses) > 20
+    assert {address.partition(":")[0] for address in addresses if ":" in address} == {"data"}
+    assert set(re.findall(r"https?://[^\s\"<]*", page)) <= NAMESPACES, "addresses that name, and are not fetched"
+
+
+NAMESPACES = {
+    "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink", "http://purl.org/dc/elements/1.1/",
+    "http://creativecommons.org/ns#", "http://www.w3.org/1999/02/22-rdf-syntax-ns#", "http://purl.org/dc/dcmitype/StillImage",
+}  # fmt: skip
+
+
+def test_a_page_names_what_is_not_in_the_table_and_why(results):
+    page = page_of(results)
+    assert "Partial: 4 of 5 configured scenes" in page
+    assert "<b>1100</b>: street/train: &lt;b&gt;no memory&lt;/b&gt; &amp; more" in page
+    whole = {**made(results), "partial": False, "missing": []}
+    assert "Partial" not in report_page(whole, {}) and "Not in the table" not in report_page(whole, {})
+
+
+def test_a_page_has_the_pictures_and_links_of_its_methods(results):
+    page = page_of(results)
+    assert page.count("data:image/jpeg") == len(GAPS) * len(METHODS) * len(PICTURES)
+    assert 'href="0061/vanilla/original.mp4"' in page and "key frame 12, held out between training frames" in page
+    bare = report_page(made(results), {})
+    assert "data:image/jpeg" not in bare and ".mp4" not in bare and 'id="scene-0061"' in bare
+
+
+def test_a_page_is_the_same_when_it_is_made_again(results):
+    assert page_of(results) == page_of(results)
+
+
+def test_a_report_of_nothing_is_a_page(tmp_path):
+    page = report_page(gap_report([], expecting("0061"), NO_LOGS), {})
+    assert "Nothing has been measured yet" in page and "<b>0061</b>: not measured" in page and "<svg" not in page
+
+
+def test_pictures_are_reduced_to_what_a_page_can_bear(tmp_path):
+    paint(tmp_path / "wide.png", 100, (2000, 500))
+    paint(tmp_path / "small.png", 100, (160, 90))
+    sizes = []
+    for name in ("wide", "small"):
+        address = data_address(tmp_path / f"{name}.png")
+        picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
+        sizes.append(picture.size)
+        np.testing.assert_allclose(np.asarray(picture)[5, 5], [100, 200, 155], atol=4)
+    assert sizes == [(WIDEST, WIDEST // 4), (160, 90)]
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture"])
+def test_a_broken_picture_is_named(tmp_path, content):
+    (tmp_path / "broken.png").write_bytes(content)
+    with pytest.raises(ResultError, match=r"broken\.png is no readable picture"):
+        data_address(tmp_path / "broken.png")
+
+
+def test_a_slider_begins_where_its_pictures_differ(tmp_path):
+    with_car, without = np.full((60, 200, 3), 90, dtype=np.uint8), np.full((60, 200, 3), 90, dtype=np.uint8)
+    with_car[20:40, 30:50] = 200
+    for name, pixels in (("with", with_car), ("without", without)):
+        write_png(tmp_path / f"{name}.png", pixels)
+    shown, gone = (picture_of(tmp_path / f"{name}.png") for name in ("with", "without"))
+    assert apart_at(shown, gone) == pytest.approx(0.2, abs=0.01)
+    assert apart_at(shown, shown) == 0.5
+
+
+def test_what_there_is_to_see_is_sorted_by_scene_and_method(tmp_path):
+    names = ("0061/street/edits/remove.mp4", "0061/street/ghost_panel.png", "0103/vanilla/viewer.html")
+    looks = looks_of([tmp_path / name for name in names], tmp_path)
+    assert set(looks) == {("0061", "street"), ("0103", "vanilla")}
+    assert looks["0061", "street"].pictures == {"panel": tmp_path / "0061/street/ghost_panel.png"}
+    assert looks["0061", "street"].links == ["0061/street/edits/remove.mp4"]
+    assert looks["0103", "vanilla"].links == ["0103/vanilla/viewer.html"]
+
+
+def test_the_plot_has_a_dot_for_every_scene_in_which_vehicles_move(results):
+    drawing = gap_plot(made(results))
+    assert drawing.startswith("<svg") and "between training frames" in drawing
+    assert "beyond the last training frame" not in drawing, "nothing moves there"
+    assert all(f">{name}<" in drawing for name in METHODS)
+    dots = [re.findall(rf"<use [^>]*fill: {color}", drawing) for color in ("#0072b2", "#d55e00")]
+    assert [len(of_method) for of_method in dots] == [3, 3]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+def test_a_browser_sorts_and_slides_and_fetches_nothing(results, tmp_path):
+    file = tmp_path / "gap_report.html"
+    file.write_text(page_of(results), encoding="utf-8")
+    cells = "[...document.querySelectorAll('tbody tr')].map((row) => row.cells[5].dataset.value)"
+    head = "document.querySelectorAll('th[data-column]')[5]"
+    with chromium(tmp_path / "profile") as tab:
+        tab.open(file, 1300, 900)
+        gaps = [gap for pair in GAPS.values() for gap in pair]
+        assert [float(value) if value else None for value in tab.run(cells)] == gaps
+        for order, reverse in (("ascending", False), ("descending", True)):
+            tab.run(f"{head}.querySelector('button').click()")
+            there = sorted((gap for gap in gaps if gap is not None), reverse=reverse)
+            found = [float(value) if value else None for value in tab.run(cells)]
+            assert found == [*there, None, None], "those without a figure come last"
+            assert tab.run(f"{head}.getAttribute('aria-sort')") == order
+        slide = "s = document.querySelector('.compare input'), s.value = 20, s.dispatchEvent(new Event('input'))"
+        over = "getComputedStyle(document.querySelector('.compare .over')).clipPath"
+        before = tab.run(over)
+        tab.run(slide)
+        assert "50%" in before and "20%" in tab.run(over)
+        assert tab.complaints == []
+        assert [address for address in tab.requests if not address.startswith("data:")] == [file.as_uri()]

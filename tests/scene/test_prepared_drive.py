@@ -1,0 +1,96 @@
+"""A recorded drive as the stages behind training see it: images, labels and splits by one number."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import recording_of, round_gaussians, write_labels
+from PIL import Image
+
+from drivesplat.errors import ResultError
+from drivesplat.evaluation.evaluate import evaluate_groups
+from drivesplat.io.storage import write_json, write_plain_pickle
+from drivesplat.model.sky import ConstantSky
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.regions import LABELS, label_image
+from drivesplat.scene.scene import write_scene
+
+GREY = (0.45, 0.5, 0.4)
+
+
+@pytest.fixture(scope="module")
+def labels() -> np.ndarray:
+    """Label images at half the recorded width: a moving car over static pixels over the own car's body."""
+    labels = np.full((27, 48), LABELS["static"], dtype=np.uint8)
+    labels[:, 30:44], labels[20:] = LABELS["moving_car"], LABELS["own_car"]
+    return labels
+
+
+@pytest.fixture(scope="module")
+def masks(labels, tiny_scene, tmp_path_factory):
+    folder = write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
+    known = {"regions": "boxes", "own_car": {}, "sky_known": True, "semantic_classes": 0}
+    write_json(folder / "masks.json", {**known, "provenance": {"made": "masks"}})
+    return folder
+
+
+@pytest.mark.parametrize("width", [None, 48])
+def test_an_image_is_the_recorded_one_at_the_size_of_training(tiny_scene, width):
+    recording = recording_of(tiny_scene, width=width)
+    with Image.open(tiny_scene.frames[3].image_path) as recorded:
+        whole = np.asarray(recorded.convert("RGB")) / 255.0
+    image = recording.image(3)
+    assert recording.size(3) == ((width or 96), (width or 96) * 9 // 16)
+    if width is None:
+        np.testing.assert_array_equal(image, whole)
+    else:
+        blocks = whole.reshape(27, 2, 48, 2, 3).mean(axis=(1, 3))
+        assert image.shape == blocks.shape and np.abs(image - blocks).mean() < 0.01
+
+
+def test_labels_are_those_of_the_masks_where_there_are_some_and_else_of_the_boxes(tiny_scene, masks, labels):
+    given, bare = recording_of(tiny_scene, masks, 48), recording_of(tiny_scene, width=48)
+    np.testing.assert_array_equal(given.labels(4), labels)
+    np.testing.assert_array_equal(given.own_car(4), labels == LABELS["own_car"])
+    np.testing.assert_array_equal(bare.labels(4), label_image(tiny_scene, tiny_scene.frames[4], (48, 27)))
+    assert not bare.own_car(4).any()
+
+
+def test_every_image_has_the_split_it_was_given(tiny_scene):
+    """Key frames are the even images; those between fall to no group next to one that is held out."""
+    recording = recording_of(tiny_scene, every_nth=4, offset=2, last_block=2)
+    splits = [recording.split(index) for index in range(len(tiny_scene.frames))]
+    assert splits[::2] == [*["train", "train", "interpolation", "train"] * 2, *["extrapolation"] * 2]
+    assert set(splits[1::2]) <= {"train", "excluded"}
+
+
+def test_a_recording_is_read_with_the_provenance_of_its_three_files(tiny_scene, masks, labels, tmp_path):
+    record = {**recording_of(tiny_scene, width=48).parser, "provenance": {"made": "parser"}}
+    write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance={"made": "scene"}))
+    write_plain_pickle(tmp_path / "parser.pkl", record)
+    paths = (tmp_path / "scene.json", tmp_path / "parser.pkl", masks / "masks.json")
+    recording, provenances = read_recording(*paths)
+    assert provenances == [{"made": "scene"}, {"made": "parser"}, {"made": "masks"}]
+    assert recording.frame(2).token == tiny_scene.frames[2].token and recording.size(2) == (48, 27)
+    np.testing.assert_array_equal(recording.labels(2), labels)
+    (tmp_path / "masks.json").write_text("[]")
+    with pytest.raises(ResultError, match=r"masks\.json.*masks"):
+        read_recording(*paths[:2], tmp_path / "masks.json")
+
+
+def test_held_out_groups_are_measured_over_the_regions_of_the_labels(tiny_scene, masks, labels):
+    """A constant colour against the recorded images: its PSNR follows from their pixels."""
+    recording = recording_of(tiny_scene, masks, 48, every_nth=4, offset=2, last_block=2)
+    model = SplatModel([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2)).requires_grad_(False)
+    groups = evaluate_groups(model, recording, "CAM_FRONT", None, torch.device("cpu"))
+    json.dumps(groups, allow_nan=False)
+    assert not any("depth" in group for group in groups.values()), "of no image does LiDAR tell anything"
+    for group, key_frames in (("interpolation", (2, 6)), ("extrapolation", (8, 9))):
+        images = np.stack([recording.image(2 * key_frame) for key_frame in key_frames])
+        for region, mask in (("static", labels == LABELS["static"]), ("all", labels != LABELS["own_car"])):
+            error = ((images - GREY) ** 2)[:, mask].mean()
+            assert groups[group][region]["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-4)
+            assert groups[group][region]["pixels"] == 2 * mask.sum()

@@ -1,0 +1,334 @@
+"""Boxes in images: polygons, hulls and labels against geometry computed another way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World, cast, write_world
+from scipy.spatial import ConvexHull
+
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.scene.regions import LABELS, REGIONS, fill, hull_of, is_dynamic, label_image, region_mask
+from drivesplat.scene.rigid import rigid
+from drivesplat.scene.scene import Frame, Scene, Track
+from drivesplat.scene.tracks import Box
+from drivesplat.settings.extract import SceneSource
+
+SIZE = (384, 216)
+"""Four times the size of the tiny drive's images."""
+K = np.array([[200.0, 0.0, 160.0], [0.0, 210.0, 90.0], [0.0, 0.0, 1.0]])
+"""A camera of 320 x 180 pixels, continuous convention."""
+
+
+def crossings_are_odd(polygon: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Point in polygon by the crossing number (Shimrat 1962), pixel by pixel."""
+    inside = np.zeros((size[1], size[0]), dtype=bool)
+    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, 1, axis=0), strict=True):
+        if ay != by:
+            inside ^= ((ay > y) != (by > y)) & (x < (bx - ax) * (y - ay) / (by - ay) + ax)
+    return inside
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize(("middle", "spread"), [((24, 16), 10), ((0, 0), 15), ((48, 30), 20), ((24, 16), 200)])
+def test_fill_takes_the_pixels_whose_centres_lie_in_the_polygon(seed, middle, spread):
+    points = np.random.default_rng(seed).normal(middle, spread, (8, 2))
+    polygon = points[ConvexHull(points).vertices]
+    for outline in (polygon, polygon[::-1]):
+        np.testing.assert_array_equal(fill(outline, (48, 32)), crossings_are_odd(polygon, (48, 32)))
+
+
+def test_fill_of_a_rectangle_counts_pixel_centres():
+    mask = fill(np.array([[2.5, 1.0], [5.4, 1.0], [5.4, 3.0], [2.5, 3.0]]), (10, 6))
+    assert np.argwhere(mask).tolist() == [[y, x] for y in (1, 2) for x in (2, 3, 4)]
+
+
+@pytest.mark.parametrize("shift", [(-100, 0), (100, 0), (0, -100), (0, 100)])
+def test_a_polygon_outside_the_image_fills_nothing(shift):
+    assert not fill(np.array([[2.0, 1.0], [8.0, 1.0], [5.0, 5.0]]) + shift, (20, 10)).any()
+
+
+def test_a_polygon_around_the_image_fills_it():
+    assert fill(np.array([[-1e6, -1e6], [1e6, -1e6], [1e6, 1e6], [-1e6, 1e6]]), (20, 10)).all()
+
+
+def box(position, size=(4.0, 2.0, 1.5), angle=0.0, category="vehicle.car") -> Box:
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    return Box("it", category, np.array(size), rigid(turn, np.array(position, dtype=float)), 0.0, 4)
+
+
+def surface(it: Box, steps: int = 41) -> np.ndarray:
+    """Points all over the box's surface, edges and corners included, in world coordinates."""
+    u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.5, 0.5, steps), np.linspace(-0.5, 0.5, steps)))
+    sides = [
+        np.roll(np.stack([np.full_like(u, s), u, v], axis=1), axis, axis=1) for s in (-0.5, 0.5) for axis in range(3)
+    ]
+    return np.concatenate(sides) * it.size @ it.object_to_world[:3, :3].T + it.object_to_world[:3, 3]
+
+
+def seen(points: np.ndarray) -> np.ndarray:
+    """Pixels of the points (n, 3) in front of the near plane of a camera at the origin that looks along z."""
+    x, y, z = points[points[:, 2] >= 0.1].T
+    return np.stack([200.0 * x / z + 160.0, 210.0 * y / z + 90.0], axis=1)
+
+
+def area(polygon: np.ndarray) -> float:
+    x, y = polygon.astype(float).T
+    return abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.2, 2.9])
+@pytest.mark.parametrize("position", [(0, 0, 10), (3, 1, 8), (-5, -2, 40), (20, 0, 12)])
+def test_the_hull_of_a_box_in_front_is_that_of_its_corners(position, angle):
+    hull = hull_of(box(position, angle=angle), np.eye(4), K)
+    pixels = seen(surface(box(position, angle=angle)))
+    expected = ConvexHull(pixels)
+    assert area(hull) == pytest.approx(expected.volume, rel=1e-4)
+    np.testing.assert_allclose(
+        [hull.min(axis=0), hull.max(axis=0)], [pixels.min(axis=0), pixels.max(axis=0)], atol=0.01
+    )
+
+
+def test_the_hull_of_an_axis_aligned_box_is_known_in_closed_form():
+    """A box of 2 x 2 x 2 m, its near face 4 m away: the near face hides the far one."""
+    hull = hull_of(box((0, 0, 5), (2.0, 2.0, 2.0)), np.eye(4), K)
+    corners = {(160.0 + x, 90.0 + y) for x in (-50.0, 50.0) for y in (-52.5, 52.5)}
+    assert {tuple(np.round(p, 3)) for p in hull.astype(float)} == corners
+
+
+@pytest.mark.parametrize("position", [(0.0, 0.3, 1.0), (1.2, 0.0, 0.5), (0.0, 1.0, 0.0), (-1.0, 0.8, -0.4)])
+@pytest.mark.parametrize("angle", [0.0, 0.5])
+def test_a_box_that_straddles_the_camera_plane_is_clipped_at_the_near_plane(position, angle):
+    size = (1.6, 1.0, 3.0)
+    it = box(position, size, angle)
+    hull = hull_of(it, np.eye(4), K)
+    z = surface(it)[:, 2]
+    assert z.min() < 0.1 < z.max(), "the case must straddle the near plane"
+    visible = seen(surface(it, steps=301))
+    mask = fill(hull, (320, 180))
+    outside = fill_of_hull_of(visible)
+    assert mask.any()
+    assert not (outside & ~mask).any(), "everything in front of the near plane is inside"
+    assert (mask & ~outside).sum() <= 0.02 * mask.sum() + 4
+
+
+def fill_of_hull_of(pixels: np.ndarray) -> np.ndarray:
+    return crossings_are_odd(pixels[ConvexHull(pixels).vertices], (320, 180))
+
+
+@pytest.mark.parametrize("z", [-3.0, -0.7])
+def test_a_box_behind_the_near_plane_has_no_hull(z):
+    assert hull_of(box((0.0, 0.0, z), (1.0, 1.0, 1.5)), np.eye(4), K) is None
+
+
+def test_the_hull_moves_with_the_camera():
+    it = box((3.0, 1.0, 12.0), angle=0.3)
+    world_to_camera = rigid(np.eye(3), np.array([-1.0, 0.5, -2.0]))
+    moved = box((2.0, 1.5, 10.0), angle=0.3)
+    np.testing.assert_allclose(hull_of(it, world_to_camera, K), hull_of(moved, np.eye(4), K), atol=1e-2)
+
+
+def scene_of(world: World, folder) -> Scene:
+    source = SceneSource(
+        dataset="tiny", reader="nuscenes", version=world.version, scene="0001", frames=None, cameras=("CAM_FRONT",),
+        sweeps=True, on_missing="stop",
+    )  # fmt: skip
+    return extract_scene(source, write_world(folder, world))
+
+
+def seconds_of(frame: Frame) -> float:
+    return (frame.timestamp - START_US) * 1e-6
+
+
+def rays_of(frame: Frame, world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) and rays (h * w, 3) of the frame's camera in the drive, at SIZE, one a pixel centre."""
+    focal = 0.62 * SIZE[0]
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5 - SIZE[0] / 2, np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2)
+    rays = np.stack([x / focal, y / focal, np.ones_like(x)], axis=-1).reshape(-1, 3) @ CAMERA_TO_EGO.T
+    return world.ego_at(seconds_of(frame)) + CAMERA_AT, rays
+
+
+def cast_mask(frame: Frame, world: World, category: str, alone: bool = False) -> np.ndarray:
+    """The pixels (h, w) in which a thing of the world is what the camera sees; `alone`: were nothing before it."""
+    origin, rays = rays_of(frame, world)
+    mine = [thing for thing in world.things if thing.category == category]
+    others = [thing for thing in world.things if thing.category != category]
+    present = dataclasses.replace(world, things=mine if alone else world.things)
+    absent = dataclasses.replace(world, things=[] if alone else others)
+    with_it, _ = cast(present, origin, rays, seconds_of(frame))
+    without, _ = cast(absent, origin, rays, seconds_of(frame))
+    return (with_it < without).reshape(SIZE[1], SIZE[0])
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return (a & b).sum() / (a | b).sum()
+
+
+@pytest.mark.parametrize(
+    ("category", "label"),
+    [
+        ("vehicle.car", "moving_car"),
+        ("vehicle.truck", "parked_other_vehicle"),
+        ("human.pedestrian.adult", "moving_human"),
+    ],
+)
+@pytest.mark.parametrize("index", [0, 1, 4, 7])
+def test_labels_of_the_tiny_drive_lie_where_its_things_are_seen(tiny_scene, category, label, index):
+    frame = tiny_scene.frames[index]
+    seen_alone = cast_mask(frame, World(), category, alone=True)
+    labels = label_image(tiny_scene, frame, SIZE)
+    marked = labels == LABELS[label]
+    visible = cast_mask(frame, World(), category)
+    nearer_thing = (labels != LABELS["static"]) & ~marked
+    assert seen_alone.sum() > 200
+    assert (marked | nearer_thing)[visible].mean() > 0.98
+    assert iou(marked, seen_alone & ~nearer_thing) > 0.6
+
+
+def test_a_thing_in_an_image_between_key_frames_is_labelled_where_it_is_then(tiny_scene):
+    """Not where it is at the nearest key frame, 215 ms before."""
+    frame = next(f for f in tiny_scene.frames if not f.is_key_frame)
+    marked = label_image(tiny_scene, frame, SIZE) == LABELS["moving_car"]
+    now = cast_mask(frame, World(), "vehicle.car", alone=True)
+    then = cast_mask(
+        dataclasses.replace(frame, timestamp=frame.timestamp - 215_000), World(), "vehicle.car", alone=True
+    )
+    assert iou(marked, now) > iou(marked, then)
+
+
+def labels_at_start(things: list[Thing], tmp_path, size=SIZE) -> np.ndarray:
+    scene = scene_of(World(key_frames=2, things=things, sweeps_between=0), tmp_path)
+    return label_image(scene, scene.frames[0], size)
+
+
+def names(labels: np.ndarray) -> set[str]:
+    return {name for name, value in LABELS.items() if (labels == value).any()}
+
+
+CAR_AHEAD = Thing("vehicle.car", (4.0, 2.0, 1.6), (12.0, 0.0, 0.8))
+
+
+@pytest.mark.parametrize(
+    ("visibility", "expected"), [("1", "left_out"), ("2", "parked_car"), ("3", "parked_car"), ("4", "parked_car")]
+)
+def test_boxes_under_40_percent_visibility_are_left_out(tmp_path, visibility, expected):
+    things = [dataclasses.replace(CAR_AHEAD, visibility=visibility)]
+    assert names(labels_at_start(things, tmp_path)) == {"static", expected}
+
+
+def test_boxes_of_unknown_visibility_are_kept(tmp_path):
+    assert names(labels_at_start([dataclasses.replace(CAR_AHEAD, visibility="")], tmp_path)) == {"static", "parked_car"}
+
+
+@pytest.mark.parametrize(("distance", "expected"), [(79.5, "parked_other_vehicle"), (80.5, "left_out")])
+def test_boxes_beyond_80_metres_are_left_out(tmp_path, distance, expected):
+    """From the camera, 1.7 m before the car's origin less what the car drives in 35 ms, to the box's centre."""
+    camera_x = 1.7 - 0.035 * World().speed
+    truck = Thing("vehicle.truck", (8.0, 3.0, 4.0), (camera_x + distance, 0.0, CAMERA_AT[2]))
+    assert names(labels_at_start([truck], tmp_path)) == {"static", expected}
+
+
+def test_boxes_under_100_pixels_are_left_out(tmp_path):
+    scene = scene_of(World(key_frames=2, things=[CAR_AHEAD], sweeps_between=0), tmp_path)
+    seen_as = {}
+    for width in range(32, 97, 4):
+        labels = label_image(scene, scene.frames[0], (width, width * 9 // 16))
+        assert len(names(labels) - {"static"}) == 1
+        seen_as[int((labels > 0).sum())] = (names(labels) - {"static"}).pop()
+    assert min(seen_as) < 100 <= max(seen_as)
+    assert seen_as == {pixels: "left_out" if pixels < 100 else "parked_car" for pixels in seen_as}
+
+
+def test_a_box_of_exactly_100_pixels_is_kept(tmp_path):
+    scene = scene_of(World(key_frames=2, things=[CAR_AHEAD], sweeps_between=0), tmp_path)
+    sizes = ((width, height) for width in range(40, 80) for height in range(24, 48))
+    labelled = (label_image(scene, scene.frames[0], size) for size in sizes)
+    exactly = next(labels for labels in labelled if (labels > 0).sum() == 100)
+    assert names(exactly) == {"static", "parked_car"}
+
+
+def test_the_nearer_box_wins_whatever_the_order_of_tracks(tmp_path):
+    near = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8))
+    far = Thing("vehicle.truck", (6.0, 6.0, 4.0), (25.0, 0.0, 2.0))
+    scene = scene_of(World(key_frames=2, things=[near, far], sweeps_between=0), tmp_path)
+    for tracks in (scene.tracks, scene.tracks[::-1]):
+        labels = label_image(dataclasses.replace(scene, tracks=tracks), scene.frames[0], SIZE)
+        alone = label_image(dataclasses.replace(scene, tracks=only(scene, "vehicle.car")), scene.frames[0], SIZE)
+        both = label_image(dataclasses.replace(scene, tracks=only(scene, "vehicle.truck")), scene.frames[0], SIZE) > 0
+        assert (both & (alone > 0)).any() and (both & (alone == 0)).any(), "the boxes must overlap in the image"
+        np.testing.assert_array_equal(labels == LABELS["parked_car"], alone == LABELS["parked_car"])
+        np.testing.assert_array_equal(labels == LABELS["parked_other_vehicle"], both & (alone == 0))
+
+
+def only(scene: Scene, category: str) -> tuple[Track, ...]:
+    return tuple(track for track in scene.tracks if track.category == category)
+
+
+def test_a_left_out_box_hides_what_stands_behind_it(tmp_path):
+    hidden = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), visibility="1")
+    behind = Thing("vehicle.car", (4.0, 1.0, 1.0), (20.0, 0.0, 0.8))
+    assert names(labels_at_start([hidden, behind], tmp_path)) == {"static", "left_out"}
+
+
+@pytest.mark.parametrize(
+    ("category", "velocity", "expected"),
+    [
+        ("vehicle.car", 0.9, "parked_car"),
+        ("vehicle.car", 1.1, "moving_car"),
+        ("vehicle.bus.rigid", 0.0, "parked_other_vehicle"),
+        ("vehicle.bicycle", 3.0, "moving_other_vehicle"),
+        ("human.pedestrian.child", 0.2, "still_human"),
+        ("human.pedestrian.child", 0.4, "moving_human"),
+        ("animal", 2.0, "other"),
+        ("movable_object.barrier", 0.0, "static"),
+        ("movable_object.trafficcone", 3.0, "static"),
+        ("static_object.bicycle_rack", 0.0, "static"),
+    ],
+)
+def test_a_box_is_labelled_by_class_and_speed(tmp_path, category, velocity, expected):
+    thing = Thing(category, (2.0, 2.0, 1.6), (12.0, 0.0, 0.8), velocity=(velocity, 0.0))
+    assert names(labels_at_start([thing], tmp_path)) == {"static", expected}
+    assert is_dynamic(category) == (expected != "static")
+
+
+def test_no_box_in_the_image_leaves_it_static(tmp_path):
+    behind = Thing("vehicle.car", (4.0, 2.0, 1.6), (-12.0, 0.0, 0.8))
+    assert names(labels_at_start([behind], tmp_path)) == {"static"}
+
+
+def test_a_box_around_the_camera_fills_the_image(tmp_path):
+    around = Thing("vehicle.car", (2.0, 2.0, 3.0), (1.7, 0.0, 1.5))
+    assert names(labels_at_start([around], tmp_path)) == {"parked_car"}
+
+
+def masks_of(labels: np.ndarray) -> dict[str, np.ndarray]:
+    return {region: region_mask(labels, region) for region in REGIONS}
+
+
+def test_the_protocols_regions_are_there():
+    assert set(REGIONS) == {"all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human"}
+
+
+def test_regions_partition_as_the_protocol_says():
+    labels = np.arange(256, dtype=np.uint8).reshape(16, 16) % len(LABELS)
+    masks = masks_of(labels)
+    assert not (masks["static"] & masks["vehicle"]).any()
+    assert not (masks["static"] & masks["moving_human"]).any()
+    assert not (masks["vehicle"] & masks["moving_human"]).any()
+    assert not (masks["moving_vehicle"] & masks["parked_vehicle"]).any()
+    np.testing.assert_array_equal(masks["moving_vehicle"] | masks["parked_vehicle"], masks["vehicle"])
+    assert (masks["car"] <= masks["vehicle"]).all() and (masks["car"] != masks["vehicle"]).any()
+    left_out = labels == LABELS["left_out"]
+    assert masks["all"][left_out].all()
+    assert not any(mask[left_out].any() for region, mask in masks.items() if region != "all")
+    assert not any(mask[labels == LABELS["own_car"]].any() for mask in masks.values())
+    assert masks["all"][labels != LABELS["own_car"]].all()
+
+
+def test_regions_of_the_tiny_drive_cover_the_image_but_for_what_is_left_out_or_still(tiny_scene):
+    labels = label_image(tiny_scene, tiny_scene.frames[0], SIZE)
+    masks = masks_of(labels)
+    parts = masks["static"].astype(int) + masks["vehicle"] + masks["moving_human"] + (labels == LABELS["left_out"])
+    assert (parts == 1).all()
+    assert masks["all"].all()

@@ -1,0 +1,130 @@
+"""What a reader of the figures is told of a drive that stands, lies in the dark, or on which nothing moves."""
+
+import dataclasses
+import logging
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from helpers.small_drives import scene_at
+from helpers.tiny_world import World, write_world
+from PIL import Image
+
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.scene_warnings import cautions, luminance, moved, seconds_long, standing
+
+DAY = 0.4
+
+
+def at(scene: Scene, places: Callable[[float], tuple[float, float]], between: bool = True) -> Scene:
+    """The scene with its own car at `places` of seconds."""
+    frames = []
+    for frame in scene.frames:
+        pose = frame.ego_to_world.copy()
+        pose[:2, 3] = places(scene.seconds(frame.timestamp))
+        frames.append(dataclasses.replace(frame, ego_to_world=pose))
+    return dataclasses.replace(scene, frames=tuple(frame for frame in frames if between or frame.is_key_frame))
+
+
+WAYS = {
+    "drives on": (lambda s: (4.0 * s, 0.0), 18.0, 0.0),
+    "stands": (lambda s: (7.0, 3.0), 0.0, 4.5),
+    "stands, its pose creeping": (lambda s: (0.05 * np.sin(9 * s), 0.02 * s), 0.1, 4.5),
+    "creeps": (lambda s: (0.2 * s, 0.0), 0.9, 4.5),
+    "drives off late": (lambda s: (0.0, max(0.0, s - 3.0) * 4.0), 6.0, 3.0),
+    "there and back": (lambda s: (10.0 - 5.0 * abs(s - 2.0), 0.0), 12.5, 0.0),
+}
+"""Where the car is, how far it came, and for how long it stood; the tiny drive takes 4.5 s."""
+
+
+@pytest.mark.parametrize(("way", "metres", "stands"), WAYS.values(), ids=WAYS)
+@pytest.mark.parametrize("between", [True, False])
+def test_how_far_a_car_came_and_how_long_it_stood(tiny_scene, way, metres, stands, between):
+    scene = at(tiny_scene, way, between)
+    assert moved(scene) == pytest.approx(metres, abs=0.11 if metres else 1e-9)
+    assert standing(scene) == pytest.approx(stands) and seconds_long(scene) == pytest.approx(4.5)
+
+
+def test_of_a_single_image_nothing_is_far_or_long(tiny_scene):
+    scene = dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:1])
+    assert (moved(scene), standing(scene), seconds_long(scene)) == (0.0, 0.0, 0.0)
+
+
+def still(scene: Scene, *categories: str) -> Scene:
+    """The scene with tracks of some classes alone, all of which stand."""
+    tracks = (
+        dataclasses.replace(track, object_to_world=np.repeat(track.object_to_world[:1], len(track.timestamps), axis=0))
+        for track in scene.tracks
+        if track.category in categories
+    )
+    return dataclasses.replace(scene, tracks=tuple(tracks))
+
+
+STANDS, HALF, DARK, STILL, BARE = (
+    "the car hardly moves (0.0 m in 4.5 s): nothing can be triangulated",
+    "the car stands for 3.0 of 4.5 s",
+    "the images are dark (mean luminance 0.11)",
+    "no vehicle moves",
+    "nothing is annotated",
+)
+CASES = {
+    "an ordinary drive": (lambda scene: scene, DAY, []),
+    "standing": (lambda scene: at(scene, lambda s: (1.0, 2.0)), DAY, [STANDS]),
+    "standing for long": (lambda scene: at(scene, WAYS["drives off late"][0]), DAY, [HALF]),
+    "standing for a while": (lambda scene: at(scene, lambda s: (max(0.0, s - 1.5) * 4.0, 0.0)), DAY, []),
+    "night": (lambda scene: scene, 0.11, [DARK]),
+    "dusk": (lambda scene: scene, 0.21, []),
+    "parked cars alone": (lambda scene: still(scene, "vehicle.truck"), DAY, [STILL]),
+    "a car that stands and someone who walks": (
+        lambda scene: dataclasses.replace(
+            scene, tracks=tuple(t for t in scene.tracks if t.category != "vehicle.car")
+        ), DAY, [STILL],
+    ),
+    "cones alone": (lambda scene: still(scene, "movable_object.trafficcone"), DAY, [STILL]),
+    "the test split": (lambda scene: dataclasses.replace(scene, tracks=()), DAY, [BARE]),
+    "everything at once": (lambda scene: still(at(scene, lambda s: (0.0, 0.0)), "vehicle.car"), 0.11,
+                           [STANDS, DARK, STILL]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "brightness", "expected"), CASES.values(), ids=CASES)
+def test_each_circumstance_is_one_sentence_and_others_are_none(tiny_scene, change, brightness, expected):
+    found = cautions(change(tiny_scene), brightness)
+    assert [sentence[: len(start)] for sentence, start in zip(found, expected, strict=True)] == expected
+    assert not any("\n" in sentence for sentence in found)
+
+
+@pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (200, 100, 50)])
+def test_luminance_is_the_mean_luma_of_the_images(tiny_scene, tmp_path, color):
+    Image.new("RGB", (96, 54), color).save(tmp_path / "a.png")
+    frames = tuple(dataclasses.replace(frame, image_path=str(tmp_path / "a.png")) for frame in tiny_scene.frames)
+    expected = (0.2126 * color[0] + 0.7152 * color[1] + 0.0722 * color[2]) / 255
+    assert luminance(dataclasses.replace(tiny_scene, frames=frames)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_luminance_is_that_of_the_whole_drive(tiny_scene, tmp_path):
+    """Its second half in the dark; as many of its images are looked at as of the first."""
+    Image.new("RGB", (96, 54), (0, 0, 0)).save(tmp_path / "dark.png")
+    Image.new("RGB", (96, 54), (204, 204, 204)).save(tmp_path / "light.png")
+    paths = [str(tmp_path / ("light.png" if i < 9 else "dark.png")) for i in range(18)]
+    frames = (dataclasses.replace(f, image_path=p) for f, p in zip(tiny_scene.frames[:18], paths, strict=True))
+    assert luminance(dataclasses.replace(tiny_scene, frames=tuple(frames))) == pytest.approx(0.4, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("world", "expected"),
+    [
+        (World(key_frames=2), []),
+        (World(key_frames=2, speed=0.0), ["the car hardly moves"]),
+        (World(key_frames=2, light=0.2), ["the images are dark"]),
+        (World(key_frames=2, things=World().things[1:2]), ["no vehicle moves"]),
+    ],
+    ids=["ordinary", "stands", "dark", "nothing moves"],
+)
+def test_the_extraction_warns_in_a_line_each(tmp_path, caplog, world, expected):
+    with caplog.at_level(logging.WARNING, logger="drivesplat.preprocess.extract"):
+        scene_at(write_world(tmp_path, world))
+    messages = [record.getMessage() for record in caplog.records]
+    assert [message.startswith(f"scene 0001: {start}") for message, start in zip(messages, expected, strict=True)] == [
+        True for _ in expected
+    ]

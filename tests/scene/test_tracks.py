@@ -1,0 +1,201 @@
+"""Where an object is between its annotations: the measuring protocol's rules, against closed forms."""
+
+import numpy as np
+import pytest
+
+from drivesplat.scene.rigid import apply, interpolate, inverse, rigid
+from drivesplat.scene.scene import Track
+from drivesplat.scene.tracks import Box, box_at, boxes_at, moves_at_all
+
+INTERVAL = 500_000.0
+"""Microseconds between key frames."""
+START = 1_532_402_927_647_951
+
+
+def turned(angle: float) -> np.ndarray:
+    """A rotation about z, in closed form."""
+    return np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+
+
+def track(indices, positions, angles=None, category="vehicle.car", visibility=None) -> Track:
+    """An object seen at key frames `indices`, half a second apart."""
+    angles = np.zeros(len(indices)) if angles is None else angles
+    return Track(
+        "it", category, np.array([4.0, 2.0, 1.5]), START + np.array(indices) * 500_000, np.array(indices),
+        np.stack([rigid(turned(a), np.array(p, dtype=float)) for a, p in zip(angles, positions, strict=True)]),
+        np.array(visibility if visibility is not None else [4] * len(indices)),
+    )  # fmt: skip
+
+
+def at(seconds: float) -> int:
+    return START + round(seconds * 1e6)
+
+
+def assert_pose(pose: np.ndarray, angle: float, position) -> None:
+    np.testing.assert_allclose(pose[:3, :3], turned(angle), atol=1e-9)
+    np.testing.assert_allclose(pose[:3, 3], position, atol=1e-9)
+    np.testing.assert_array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("fraction", [-0.5, 0.0, 0.25, 0.5, 1.0, 1.5])
+def test_interpolation_is_linear_in_position_and_in_the_angle_about_the_shortest_axis(fraction):
+    start, end = rigid(turned(0.3), np.array([1.0, 2.0, 3.0])), rigid(turned(1.1), np.array([5.0, 0.0, 3.0]))
+    expected = [1.0 + 4.0 * fraction, 2.0 - 2.0 * fraction, 3.0]
+    assert_pose(interpolate(start, end, fraction), 0.3 + 0.8 * fraction, expected)
+
+
+def test_interpolation_turns_the_short_way():
+    start, end = rigid(turned(3.0), np.zeros(3)), rigid(turned(-3.0), np.zeros(3))
+    assert_pose(interpolate(start, end, 0.5), np.pi, np.zeros(3))
+
+
+def test_interpolation_about_a_tilted_axis_is_rodrigues_rotation():
+    axis, angle = np.array([1.0, 2.0, 2.0]) / 3.0, 1.2
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+
+    def rodrigues(a):
+        return np.eye(3) + np.sin(a) * k + (1.0 - np.cos(a)) * k @ k
+
+    base = turned(0.7)
+    start, end = rigid(base, np.zeros(3)), rigid(base @ rodrigues(angle), np.zeros(3))
+    np.testing.assert_allclose(interpolate(start, end, 0.25)[:3, :3], base @ rodrigues(angle / 4), atol=1e-9)
+
+
+def test_the_inverse_of_a_rigid_transform_undoes_it():
+    transforms = np.stack([rigid(turned(0.4), np.array([1.0, 2.0, 3.0])), rigid(turned(-2.0), np.array([9.0, 0, -1]))])
+    np.testing.assert_allclose(inverse(transforms) @ transforms, np.broadcast_to(np.eye(4), (2, 4, 4)), atol=1e-12)
+    points = np.array([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(apply(inverse(transforms[0]), apply(transforms[0], points)), points, atol=1e-12)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.1, 0.25, 0.4, 0.5])
+def test_between_key_frames_the_position_is_linear_and_the_rotation_slerps(seconds):
+    box = box_at(track([0, 1], [(0, 0, 0), (2.0, 1.0, 0.5)], [0.2, 0.8]), at(seconds), INTERVAL)
+    share = seconds / 0.5
+    assert_pose(box.object_to_world, 0.2 + 0.6 * share, [2.0 * share, 1.0 * share, 0.5 * share])
+
+
+def test_each_segment_uses_its_own_ends():
+    it = track([0, 1, 2], [(0, 0, 0), (1.0, 0, 0), (1.0, 4.0, 0)])
+    np.testing.assert_allclose(box_at(it, at(0.25), INTERVAL).object_to_world[:3, 3], [0.5, 0.0, 0.0])
+    np.testing.assert_allclose(box_at(it, at(0.75), INTERVAL).object_to_world[:3, 3], [1.0, 2.0, 0.0])
+    assert box_at(it, at(0.25), INTERVAL).speed == pytest.approx(2.0)
+    assert box_at(it, at(0.75), INTERVAL).speed == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize("beyond", [0.001, 0.1, 0.25])
+def test_up_to_half_an_interval_beyond_an_end_the_end_segments_motion_continues(beyond):
+    it = track([3, 4, 5], [(0, 0, 0), (1.0, 0, 0), (1.0, 2.0, 0)], [0.0, 0.1, 0.5])
+    after = box_at(it, at(2.5 + beyond), INTERVAL)
+    assert_pose(after.object_to_world, 0.5 + 0.8 * beyond, [1.0, 2.0 + 4.0 * beyond, 0.0])
+    before = box_at(it, at(1.5 - beyond), INTERVAL)
+    assert_pose(before.object_to_world, -0.2 * beyond, [-2.0 * beyond, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("beyond", [0.2501, 0.5, 10.0])
+def test_more_than_half_an_interval_beyond_an_end_it_is_absent(beyond):
+    for it in (track([3, 4, 5], [(0, 0, 0), (1.0, 0, 0), (1.0, 2.0, 0)]), track([3, 4, 5], [(0, 0, 0)] * 3)):
+        assert box_at(it, at(2.5 + beyond), INTERVAL) is None
+        assert box_at(it, at(1.5 - beyond), INTERVAL) is None
+
+
+@pytest.mark.parametrize("offset", [-0.25, -0.1, 0.0, 0.2, 0.25])
+def test_a_single_box_holds_still(offset):
+    box = box_at(track([2], [(5.0, 6.0, 7.0)], [0.4]), at(1.0 + offset), INTERVAL)
+    assert_pose(box.object_to_world, 0.4, [5.0, 6.0, 7.0])
+    assert box.speed == 0.0 and not box.moves
+
+
+@pytest.mark.parametrize("offset", [-0.251, 0.251])
+def test_a_single_box_is_absent_beyond_half_an_interval(offset):
+    assert box_at(track([2], [(5.0, 6.0, 7.0)]), at(1.0 + offset), INTERVAL) is None
+
+
+GAP = ([0, 1, 3, 4], [(0, 0, 0), (1.0, 0, 0), (30.0, 0, 0), (34.0, 0, 0)])
+"""Key frame 2 does not hold the object."""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "x"), [(0.5, 1.0), (0.7, 1.4), (0.75, 1.5), (1.25, 28.0), (1.3, 28.4), (1.5, 30.0), (1.75, 32.0)]
+)
+def test_before_a_gap_the_motion_continues_and_after_it_it_begins_anew(seconds, x):
+    np.testing.assert_allclose(box_at(track(*GAP), at(seconds), INTERVAL).object_to_world[:3, 3], [x, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("seconds", [0.76, 1.0, 1.24])
+def test_within_a_gap_it_is_absent(seconds):
+    assert box_at(track(*GAP), at(seconds), INTERVAL) is None
+
+
+def test_a_gap_leaves_a_lone_box_that_holds_still():
+    it = track([0, 1, 3], [(0, 0, 0), (1.0, 0, 0), (30.0, 0, 0)])
+    box = box_at(it, at(1.6), INTERVAL)
+    np.testing.assert_array_equal(box.object_to_world[:3, 3], [30.0, 0, 0])
+    assert box.speed == 0.0
+
+
+def test_speed_is_horizontal_and_that_of_the_segment():
+    it = track([0, 1], [(0, 0, 0), (1.5, 2.0, 7.0)])
+    for seconds in (-0.25, 0.0, 0.3, 0.5, 0.75):
+        assert box_at(it, at(seconds), INTERVAL).speed == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "visibility"), [(-0.2, 1), (0.0, 1), (0.24, 1), (0.26, 3), (0.6, 3), (0.9, 4), (1.2, 4)]
+)
+def test_visibility_is_that_of_the_nearer_annotation(seconds, visibility):
+    it = track([0, 1, 2], [(0, 0, 0)] * 3, visibility=[1, 3, 4])
+    assert box_at(it, at(seconds), INTERVAL).visibility == visibility
+
+
+@pytest.mark.parametrize(
+    ("category", "speed", "moves"),
+    [
+        ("vehicle.car", 0.9, False),
+        ("vehicle.car", 1.0, False),
+        ("vehicle.car", 1.01, True),
+        ("vehicle.bicycle", 0.9, False),
+        ("vehicle.truck", 5.0, True),
+        ("human.pedestrian.adult", 0.3, False),
+        ("human.pedestrian.adult", 0.31, True),
+        ("human.pedestrian.police_officer", 0.29, False),
+        ("animal", 5.0, False),
+        ("movable_object.trafficcone", 5.0, False),
+        ("static_object.bicycle_rack", 5.0, False),
+    ],
+)
+def test_vehicles_move_above_1_metre_a_second_and_people_above_0_3(category, speed, moves):
+    assert Box("it", category, np.ones(3), np.eye(4), speed, 4).moves is moves
+
+
+def test_a_box_moves_while_it_moves_and_a_track_that_ever_moves_does():
+    starts = track([0, 1, 2], [(0, 0, 0), (0.1, 0, 0), (3.1, 0, 0)])
+    assert not box_at(starts, at(0.25), INTERVAL).moves
+    assert box_at(starts, at(0.75), INTERVAL).moves
+    assert moves_at_all(starts)
+    assert not moves_at_all(track([0, 1, 2], [(0, 0, 0), (0.1, 0, 0), (0.2, 0, 0)]))
+    assert not moves_at_all(track([0], [(0, 0, 0)]))
+
+
+def test_a_jump_across_a_gap_is_no_motion():
+    assert not moves_at_all(track([0, 1, 3, 4], [(0, 0, 0), (0, 0, 0), (30.0, 0, 0), (30.0, 0, 0)]))
+
+
+def test_corners_are_half_the_size_from_the_centre_along_the_objects_axes():
+    box = Box("it", "vehicle.car", np.array([4.0, 2.0, 1.0]), rigid(turned(np.pi / 2), np.array([10.0, 0, 0])), 0.0, 4)
+    expected = {(10 + y, x, z) for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (-0.5, 0.5)}
+    assert {tuple(np.round(corner, 9)) for corner in box.corners} == expected
+
+
+def test_the_boxes_of_the_tiny_drive_are_where_its_things_are(tiny_scene):
+    from helpers.tiny_world import ORIGIN, START_US, World
+
+    seconds = 1.1
+    boxes = {box.category: box for box in boxes_at(tiny_scene, START_US + round(seconds * 1e6))}
+    for thing in World().things:
+        box = boxes[thing.category]
+        np.testing.assert_allclose(
+            box.object_to_world[:3, 3] + tiny_scene.origin, ORIGIN + thing.at(seconds), atol=1e-6
+        )
+        np.testing.assert_array_equal(box.size, thing.size)
+        assert box.speed == pytest.approx(np.hypot(*thing.velocity), abs=1e-6)

@@ -1,0 +1,446 @@
+"""The configuration: one source, errors in one line, and each stage told of its own settings only."""
+
+import json
+import math
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+from helpers import REPOSITORY
+
+from drivesplat.errors import ConfigError
+from drivesplat.settings.config import Config, for_scene, load, merged
+from drivesplat.settings.config_document import config_schema, config_yaml
+from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
+
+LOOKS = ("tracks", "film", "ghost_panel", "remove_actor", "export", "export_usd", "export_viewer")
+OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "tracks")
+STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "train", "evaluate", *LOOKS)
+
+
+def spelled(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> str:
+    """What a stage is told, of a film the one called `original`."""
+    config = values if isinstance(values, Config) else load(values)
+    film = "original" if stage == "film" else None
+    return stage_settings(config, stage, scene, None if stage in OF_SCENES else method, film)
+
+
+@pytest.fixture(scope="module")
+def defaults() -> dict[str, Any]:
+    """What Snakemake reads of config.yaml."""
+    return yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
+
+
+def test_config_yaml_is_what_the_settings_say():
+    text = (REPOSITORY / "config.yaml").read_text(encoding="utf-8")
+    assert text == config_yaml(), "config.yaml and drivesplat/settings have drifted apart: run `make config`"
+
+
+def test_config_schema_is_what_the_settings_say():
+    text = (REPOSITORY / "config.schema.json").read_text(encoding="utf-8")
+    assert text == config_schema(), "config.schema.json and drivesplat/settings have drifted apart: run `make config`"
+
+
+def test_config_yaml_holds_the_defaults(defaults):
+    assert load(defaults) == load({}) == Config()
+
+
+def test_config_yaml_has_lines_that_fit_a_screen():
+    assert max(map(len, config_yaml().splitlines())) <= 120
+
+
+STABLE_PATHS = (
+    *(f"datasets.nuscenes.{key}" for key in ("reader", "dataroot", "version", "scenes", "frames")),
+    *(f"methods.vanilla.{key}" for key in ("parts", "overrides")),
+    *(f"holdout.{key}" for key in ("every_nth", "offset", "last_block")),
+    *(f"lidar_seed.{key}" for key in ("on_missing", "points_file", "max_points")),
+    *(f"train.{key}" for key in ("iterations", "strategy", "cap_max")),
+    *(f"render.{key}" for key in ("fps", "width", "height")),
+    *("cameras", "sweeps", "sky", "device", "random_seed", "results_dir"),
+)
+
+
+@pytest.mark.parametrize("path", STABLE_PATHS)
+def test_the_stable_setting_paths_are_there(defaults, path):
+    node = defaults
+    for key in path.split("."):
+        assert key in node, f"the measuring protocol promises {path}"
+        node = node[key]
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("holdout.every_nth", 8), ("holdout.offset", 4), ("holdout.last_block", 4), ("device.min_free_gb", 8)],
+)
+def test_the_protocols_defaults_are_those_of_the_config(defaults, path, value):
+    node = defaults
+    for key in path.split("."):
+        node = node[key]
+    assert node == value
+
+
+def at(path: str, value: Any) -> dict[str, Any]:
+    """{a: {b: value}} of a path 'a.b'."""
+    for key in reversed(path.split(".")):
+        value = {key: value}
+    return value
+
+
+def refusal(values: dict[str, Any]) -> str:
+    with pytest.raises(ConfigError) as failure:
+        load(values)
+    return str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("trian", {"iterations": 3}, ["trian"]),
+        ("train.iteration", 3, ["train.iteration", "3"]),
+        ("train.mcmc.noise", 3, ["train.mcmc.noise", "3"]),
+        ("datasets.nuscenes.data_root", "x", ["datasets.nuscenes.data_root", "x"]),
+        ("train.iterations", 0, ["train.iterations", "0", "greater than or equal to 1"]),
+        ("train.iterations", 1.5, ["train.iterations", "1.5", "integer"]),
+        ("train.iterations", "many", ["train.iterations", "many"]),
+        ("train.cap_max", 10**9, ["train.cap_max", "1000000000", "less than or equal to 20000000"]),
+        ("train.strategy", "adc", ["train.strategy", "adc", "'mcmc' or 'default'"]),
+        ("train.ssim_weight", 1.5, ["train.ssim_weight", "1.5", "less than or equal to 1"]),
+        ("train.ssim_weight", math.nan, ["train.ssim_weight", "nan"]),
+        ("train.lr_sky", 0.0, ["train.lr_sky", "0.0", "greater than 0"]),
+        ("train.lr_sky", math.inf, ["train.lr_sky", "inf"]),
+        ("train.opacity_reg", math.inf, ["train.opacity_reg", "inf"]),
+        ("train", None, ["train", "None"]),
+        ("sky", "blue", ["sky", "blue", "'none', 'mask' or 'cubemap'"]),
+        ("holdout", {"every_nth": 4, "offset": 4}, ["holdout", "offset", "every_nth (4)"]),
+        ("lidar_seed.on_missing", "ignore", ["lidar_seed.on_missing", "ignore", "'stop' or 'warn'"]),
+        ("lidar_seed.far_depths", [3.0, -1.0], ["lidar_seed.far_depths", "-1.0", "greater than 0"]),
+        ("lidar_seed.far_depths", [3.0], ["lidar_seed.far_depths"]),
+        ("device", "gpu", ["device", "gpu", "'auto', 'any', 'cuda' or 'cpu'"]),
+        ("render.fps", 0, ["render.fps", "0", "greater than or equal to 1"]),
+        ("random_seed", -1, ["random_seed", "-1", "greater than or equal to 0"]),
+        ("results_dir", "", ["results_dir", "at least 1"]),
+        ("cameras", [], ["cameras", "at least 1"]),
+        ("images.width", 8, ["images.width", "8", "greater than or equal to 16"]),
+        ("methods.vanilla.parts", ["backgruond"], ["methods.vanilla.parts", "backgruond", "background"]),
+        ("methods.vanilla.parts", ["actors"], ["methods.vanilla.parts", "lacks 'background'", "add it"]),
+        ("methods.vanilla.parts", [], ["methods.vanilla.parts", "lacks 'background'"]),
+        ("methods.vanilla.parts", ["background", "actors", "background"], ["methods.vanilla.parts", "twice"]),
+        ("datasets.nuscenes.reader", "kitti", ["datasets.nuscenes.reader", "kitti", "nuscenes"]),
+        ("datasets.nuscenes.frames", {"0061": [5, 2]}, ["frames", "0061", "first < last"]),
+        ("datasets.nuscenes.frames", {"0061": [-1, 2]}, ["frames", "0061", "0 <= first"]),
+        ("datasets.nuscenes.frames", {"9999": [1, 2]}, ["frames", "9999", "scenes"]),
+        ("eval_camera", "CAM_BACK", ["eval_camera", "CAM_BACK", "CAM_FRONT"]),
+        ("datasets.nuscenes.scenes", ["0061", "0103", "0061"], ["datasets.nuscenes.scenes", "twice"]),
+        ("datasets.mine.scenes", ["0061"], ["0061", "nuscenes", "mine"]),
+        ("datasets.nuscenes.scenes", ["../0061"], ["scene", "../0061"]),
+        ("methods", {"my method": {}}, ["method", "my method", "letters"]),
+        ("methods", {"logs": {}}, ["method", "logs"]),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line_with_key_value_and_what_is_allowed(defaults, path, value, words):
+    """Over the whole of config.yaml, as Snakemake reads it: the message names the culprit and not the rest."""
+    message = refusal(merged(defaults, at(path, value)))
+    assert "\n" not in message
+    assert all(word in message for word in words), message
+    assert not message.startswith("'' is"), f"a key without a name: {message}"
+    assert "far_points" not in message, f"the whole config in a message: {message}"
+
+
+def test_several_faults_are_all_named():
+    message = refusal({"trian": 1, "train": {"iterations": 0}})
+    assert "trian" in message and "train.iterations" in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("text", "suggestion"),
+    [("[0061]", '"0061"'), ("[103]", '"0103"'), ("[0103]", '"0103"'), ('["0061", 1100]', '"1100"')],
+)
+def test_scene_numbers_without_quotes_are_told_to_be_quoted(text, suggestion):
+    """Bare YAML reads 0061 as octal, 49."""
+    message = refusal({"datasets": {"nuscenes": {"scenes": yaml.safe_load(text)}}})
+    assert "datasets.nuscenes.scenes" in message and "quotes" in message
+    assert suggestion in message and "\n" not in message
+
+
+def test_an_unknown_scene_is_refused_with_those_there_are():
+    config = load({"datasets": {"a": {"scenes": ["0061", "0103"]}, "b": {"scenes": ["x"]}}})
+    with pytest.raises(ConfigError, match=r"'9999'.*0061, 0103, x"):
+        config.dataset_of("9999")
+    with pytest.raises(ConfigError, match="9999"):
+        stage_settings(config, "extract", "9999")
+    assert (config.dataset_of("0103"), config.dataset_of("x"), config.scenes) == ("a", "b", ["0061", "0103", "x"])
+
+
+@pytest.mark.parametrize("kind", ["auto", "cuda", "cpu"])
+def test_device_has_a_short_form(kind):
+    assert load({"device": kind}) == load({"device": {"kind": kind}})
+    assert load({"device": kind}).device.kind == kind
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"device": "cpu"},
+        {"device": {"kind": "cuda", "min_free_gb": 1}},
+        {"images": {"width": 640}},
+        {"lidar_seed": {"points_file": "a.ply", "far_depths": [1, 2]}},
+        {"datasets": {"nuscenes": {"frames": {"0061": [0, 9]}, "overrides": {"sky": "none"}}}},
+        {"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 0.9], [1, 0.9], [1, 1]]}}},
+        {"methods": {"other": {"overrides": {"train": {"iterations": 9}}}}},
+        {"methods": {"other": {"parts": ["actors", "background"]}}},
+        {"ablation": {"without": {"x": {"parts": ["background"]}}}},
+    ],
+    ids=str,
+)
+def test_what_the_config_takes_its_schema_takes(defaults, values):
+    """Both see the same file: Snakemake validates against the schema once the config has been loaded."""
+    whole = merged(defaults, values)
+    load(whole)
+    jsonschema.validate(whole, json.loads(config_schema()))
+
+
+@pytest.mark.parametrize("text", ["train: {lr_sky: 1e-3}", 'train: {iterations: "9"}', "sweeps: 'yes'"])
+def test_text_for_a_number_is_taken_or_refused_by_config_and_schema_alike(defaults, text):
+    """YAML reads 1e-3, without a point, as text."""
+    whole = merged(defaults, yaml.safe_load(text))
+    by_schema = jsonschema.Draft202012Validator(json.loads(config_schema())).is_valid(whole)
+    try:
+        load(whole)
+    except ConfigError:
+        assert not by_schema
+    else:
+        assert by_schema
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"trian": {}},
+        {"train": {"iterations": 0}},
+        {"device": "gpu"},
+        {"sky": "blue"},
+        {"methods": {"other": {"parts": ["actors"]}}},
+        {"methods": {"other": {"parts": ["background", "background"]}}},
+        {"ablation": {"without": {"x": {"parts": ["actors"]}}}},
+    ],
+    ids=str,
+)
+def test_editors_see_by_the_schema_what_is_wrong(defaults, values):
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(merged(defaults, values), json.loads(config_schema()))
+
+
+def test_mappings_are_merged_key_by_key_and_the_rest_is_replaced():
+    base = {"a": {"b": 1, "c": {"d": 2}}, "e": [1, 2], "f": {"g": 1}}
+    over = {"a": {"c": {"x": 3}}, "e": [3], "f": None, "h": {"i": 1}}
+    assert merged(base, over) == {"a": {"b": 1, "c": {"d": 2, "x": 3}}, "e": [3], "f": None, "h": {"i": 1}}
+    assert base == {"a": {"b": 1, "c": {"d": 2}}, "e": [1, 2], "f": {"g": 1}}
+
+
+def told(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> dict[str, Any]:
+    return json.loads(spelled(values, stage, scene, method))
+
+
+def test_overrides_of_a_dataset_reach_the_stages_of_its_scenes_only():
+    values = {
+        "datasets": {
+            "small": {
+                "scenes": ["a"],
+                "overrides": {
+                    "images": {"width": 320},
+                    "train": {"mcmc": {"noise_lr": 7.0}},
+                    "cameras": ["CAM_FRONT", "X"],
+                },
+            },
+            "plain": {"scenes": ["b"]},
+        },
+        "images": {"width": 640},
+        "train": {"iterations": 99},
+    }
+    for stage in ("lidar_seed", "parser", "masks"):
+        assert told(values, stage, "a")["images"] == {"width": 320}
+        assert told(values, stage, "b")["images"] == {"width": 640}
+    train = told(values, "train", "a")["train"]
+    assert (train["mcmc"]["noise_lr"], train["iterations"]) == (7.0, 99)
+    assert train["mcmc"]["refine_every"] == Config().train.mcmc.refine_every
+    assert told(values, "train", "b")["train"]["mcmc"]["noise_lr"] == Config().train.mcmc.noise_lr
+    assert told(values, "extract", "a")["cameras"] == ["CAM_FRONT", "X"]
+    assert told(values, "evaluate", "b")["cameras"] == ["CAM_FRONT"]
+    assert told(values, "extract", "a")["dataset"] == "small"
+
+
+def test_overrides_of_a_method_reach_its_own_stages_only():
+    values = {"methods": {"vanilla": {}, "no_sky": {"overrides": {"sky": "none", "train": {"iterations": 5}}}}}
+    assert told(values, "train", method="no_sky")["sky"] == "none"
+    assert told(values, "train", method="no_sky")["train"]["iterations"] == 5
+    for stage in STAGES:
+        assert told(values, stage, method="vanilla") == told({}, stage)
+
+
+def test_a_methods_override_goes_over_the_datasets():
+    values = {
+        "datasets": {"nuscenes": {"overrides": {"sky": "mask", "train": {"iterations": 5, "lr_sky": 0.5}}}},
+        "methods": {"mine": {"overrides": {"train": {"iterations": 6}}}},
+    }
+    settings = told(values, "train", method="mine")
+    assert (settings["sky"], settings["train"]["iterations"], settings["train"]["lr_sky"]) == ("mask", 6, 0.5)
+
+
+def test_for_scene_without_a_method_leaves_methods_overrides_alone():
+    config = load({"methods": {"mine": {"overrides": {"sky": "none"}}}})
+    assert for_scene(config, "0061").sky == Config().sky
+    assert for_scene(config, "0061", "mine").sky == "none"
+
+
+@pytest.mark.parametrize(
+    ("where", "overrides", "words"),
+    [
+        ("methods.vanilla", {"train": {"iterations": 0}}, ["train.iterations", "0", "greater than or equal to 1"]),
+        ("methods.vanilla", {"train": {"iteration": 1}}, ["train.iteration", "1"]),
+        ("methods.vanilla", {"holdout": {"every_nth": 0}}, ["methods.vanilla.overrides.holdout", "sky, train"]),
+        ("datasets.nuscenes", {"images": {"widht": 9}}, ["images.widht", "9"]),
+        ("datasets.nuscenes", {"lpips": {"enabled": False}}, ["datasets.nuscenes.overrides.lpips", "cameras"]),
+        ("datasets.nuscenes", {"device": "gpu"}, ["device", "gpu", "'auto', 'any', 'cuda' or 'cpu'"]),
+        ("datasets.nuscenes", {"results_dir": "x"}, ["datasets.nuscenes.overrides.results_dir"]),
+        ("datasets.nuscenes", {"cameras": ["CAM_BACK"]}, ["eval_camera", "CAM_BACK"]),
+    ],
+)
+def test_a_bad_override_is_refused_when_the_config_is_loaded(defaults, where, overrides, words):
+    message = refusal(merged(defaults, at(f"{where}.overrides", overrides)))
+    assert "\n" not in message and f"{where}.overrides" in message
+    assert all(word in message for word in words), message
+    assert "far_points" not in message, f"the whole config in a message: {message}"
+
+
+def reversed_keys(value: Any) -> Any:
+    return {key: reversed_keys(value[key]) for key in reversed(value)} if isinstance(value, dict) else value
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stage_is_told(defaults, stage):
+    plain = spelled({}, stage)
+    for values in (defaults, reversed_keys(defaults), {"train": {"iterations": defaults["train"]["iterations"]}}):
+        assert spelled(values, stage) == plain
+    written_out = {"sky": defaults["sky"], "train": {"iterations": defaults["train"]["iterations"]}}
+    assert spelled(at("methods.vanilla.overrides", written_out), stage) == plain
+
+
+@pytest.mark.parametrize(
+    ("change", "readers"),
+    [
+        (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car evaluate"),
+        (
+            {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
+            "extract own_car evaluate tracks film ghost_panel remove_actor export_usd export_viewer",
+        ),
+        (at("sweeps", True), "extract evaluate"),
+        (at("images.width", 320), "lidar_seed parser masks actors lidar_depth evaluate"),
+        (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth free_space evaluate"),
+        (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth free_space evaluate"),
+        (at("holdout.last_block", 0), "lidar_seed parser masks actors lidar_depth free_space evaluate"),
+        (at("extract.on_missing", "warn"), "extract"),
+        (at("lidar_seed.on_missing", "warn"), "lidar_seed"),
+        (at("lidar_seed.sweeps", True), "extract lidar_seed"),
+        (at("lidar_seed.points_file", "a.ply"), "lidar_seed"),
+        (at("lidar_seed.voxel_size", 0.2), "lidar_seed"),
+        (at("lidar_seed.own_car_radius", 3), "lidar_seed actors lidar_depth free_space evaluate"),
+        (at("lidar_seed.box_margin", 0.3), "lidar_seed lidar_depth free_space evaluate"),
+        (at("actors.humans", True), "actors"),
+        (at("datasets.nuscenes.overrides", {"actors": {"max_points": 9}}), "actors"),
+        (at("masks.sky_folder", "sky"), "masks"),
+        (at("masks.own_car_polygons", {"CAM_FRONT": [[0, 0], [1, 1], [0, 1]]}), "own_car masks"),
+        (at("masks.own_car", "auto_measured"), "own_car masks"),
+        (at("lidar_depth.ray_spacing", [1, 1]), "lidar_depth evaluate"),
+        (at("free_space.voxel", 1), "free_space"),
+        (at("train.floaters.free_space", True), "train"),
+        (at("train.road.reach", 0.2), "train"),
+        (at("sky", "none"), "train"),
+        (at("train.iterations", 9), "train"),
+        (at("train.mcmc.noise_lr", 9), "train"),
+        (at("train.gaussians.sh_degree", 2), "train"),
+        (at("train.exposure.kind", "affine"), "train"),
+        (at("methods.vanilla.overrides", {"train": {"iterations": 9}}), "train"),
+        (at("methods.another.overrides", {"train": {"iterations": 9}}), ""),
+        (at("random_seed", 1), "lidar_seed actors train"),
+        (at("lpips.enabled", False), "evaluate"),
+        (at("lpips.timeout_s", 5), ""),
+        (at("render.fps", 60), "film"),
+        (at("render.width", 64), "film"),
+        (at("render.trajectories.original.lateral", 1.0), "film"),
+        (at("render.trajectories.aside", {"lateral": -1.0}), ""),
+        (at("subjects", {"0061": {"key_frame": 3}}), "ghost_panel remove_actor"),
+        (at("subjects", {"0103": {"key_frame": 3}}), ""),
+        (at("ghosts.clearance", 0.5), "ghost_panel remove_actor"),
+        (at("removal.margin", 0.5), "remove_actor"),
+        (at("export.usd_gaussians", 9), "export_usd"),
+        (at("export.viewer_gaussians", 9), "export_viewer"),
+        (at("device", "cpu"), ""),
+        (at("device.min_free_gb", 3), ""),
+        (at("results_dir", "elsewhere"), ""),
+        (at("datasets.nuscenes.dataroot", "/elsewhere"), ""),
+        (at("datasets.nuscenes.version", "v1.0-trainval"), "extract"),
+        (at("datasets.nuscenes.frames", {"0061": [0, 9]}), "extract"),
+        (at("datasets.nuscenes.frames", {"0103": [0, 9]}), ""),
+        (at("datasets.nuscenes.scenes", ["0061"]), ""),
+        (at("datasets.more.scenes", ["0001"]), ""),
+        (at("datasets.nuscenes.overrides", {"masks": {"sky_folder": "sky"}}), "masks"),
+    ],
+    ids=str,
+)
+def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, change, readers):
+    before, after = load(defaults), load(merged(defaults, with_methods_kept(change)))
+    assert {stage for stage in STAGES if spelled(before, stage) != spelled(after, stage)} == set(readers.split())
+
+
+def test_of_a_synthetic_world_the_evaluation_is_told_what_a_removal_takes(defaults):
+    """Only there is a street without the car to hold it to."""
+    before, after = load(defaults), load(merged(defaults, at("removal.margin", 0.5)))
+    changed = {stage for stage in STAGES if spelled(before, stage, "demo") != spelled(after, stage, "demo")}
+    assert changed == {"evaluate", "remove_actor"}
+    assert told(after, "evaluate", "demo")["removal"]["margin"] == 0.5
+    assert told(after, "evaluate", "0061")["removal"] is None
+
+
+def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has():
+    aside = {"render": {"trajectories": {"aside": {"lateral": 1.0}}}}
+    config = load({"datasets": {"a": {"scenes": ["a"], "overrides": aside}, "b": {"scenes": ["b"]}}})
+    assert json.loads(stage_settings(config, "film", "a", "vanilla", "aside"))["trajectory"]["lateral"] == 1.0
+    for scene, name in (("b", "aside"), ("a", "nowhere")):
+        with pytest.raises(ConfigError, match=f"scene {scene} has no film called '{name}'; there are: .*original"):
+            stage_settings(config, "film", scene, "vanilla", name)
+
+
+@pytest.mark.parametrize("where", ["render", "datasets.nuscenes.overrides.render"])
+def test_no_film_along_a_path_is_called_parts(defaults, where):
+    message = refusal(merged(defaults, at(f"{where}.trajectories.parts", {"lateral": 1.0})))
+    assert "trajectory" in message and "'parts'" in message and "\n" not in message
+
+
+def with_methods_kept(change: dict[str, Any]) -> dict[str, Any]:
+    """Whatever a change says of methods, `vanilla` is one of them."""
+    return merged({"methods": {"vanilla": {}}}, change)
+
+
+def test_no_stage_has_another_name():
+    with pytest.raises(ValueError, match="'trian'"):
+        stage_settings(load({}), "trian", "0061", "vanilla")
+
+
+def test_settings_cannot_be_changed_after_the_fact():
+    with pytest.raises(ValueError, match="frozen"):
+        load({}).train.iterations = 5
+
+
+def test_a_result_among_the_config_files_is_named_as_that(defaults):
+    """Snakemake takes a target that is there for one where `--` is missing before it."""
+    with pytest.raises(ConfigError, match=r"a result of this workflow is among the config files.*put -- before"):
+        load({**defaults, "methods": {"vanilla": {"interpolation": {}}}, "provenance": {"stages": {}}})
+
+
+def test_of_a_long_value_the_message_has_the_beginning():
+    with pytest.raises(ConfigError) as error:
+        load({"trian": {"iterations": list(range(1000))}})
+    assert "unknown key 'trian' (value {'iterations': [0, 1, 2, 3" in str(error.value) and "…)" in str(error.value)
+    assert len(str(error.value)) < 200

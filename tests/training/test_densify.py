@@ -1,0 +1,365 @@
+"""Densification on the CPU: the relocation formula, both strategies, and the cap."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gsplat import MCMCStrategy
+from gsplat.strategy import ops
+from helpers.densification import ALL, a_model, a_view, settings_of, train_step
+from helpers.hand_made import actors_of, motion_through, round_gaussians, track_of
+
+from drivesplat.kernels.numba.exploration import explore
+from drivesplat.model.actors import Actors
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.settings.actors import ActorSettings
+from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
+from drivesplat.settings.train import DefaultSettings, McmcSettings
+from drivesplat.training.densify import Densifier, few_at_first
+from drivesplat.training.optimizers import make_optimizers
+from drivesplat.training.strategies import relocation, torch_twins
+from drivesplat.training.trainer import Trainer
+
+BINOMS = MCMCStrategy().initialize_state()["binoms"]
+N_MAX = len(BINOMS)
+SIZES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
+"""Of a Gaussian's parameters."""
+
+
+def relocated(opacity: float, ratio: int, scale: float = 1.0) -> tuple[float, float]:
+    """`relocation` of one isotropic Gaussian."""
+    opacities, scales = relocation(torch.tensor([opacity]), torch.full((1, 3), scale), torch.tensor([ratio]), BINOMS)
+    assert scales[0, 0] == scales[0, 1] == scales[0, 2]
+    return float(opacities[0]), float(scales[0, 0])
+
+
+def equation_9(opacity: float, ratio: int) -> float:
+    """By how much the scale shrinks: Kheradmand et al. 2024, equation 9, term by term."""
+    new = 1.0 - (1.0 - opacity) ** (1.0 / ratio)
+    terms = [
+        math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
+        for i in range(1, ratio + 1)
+        for k in range(i)
+    ]
+    return opacity / math.fsum(terms)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 7, 20, N_MAX])
+@pytest.mark.parametrize("opacity", [0.02, 0.3, 0.9, 0.999])
+def test_copies_at_one_place_are_together_as_opaque_as_the_original(opacity, ratio):
+    new_opacity, _ = relocated(opacity, ratio)
+    assert 1.0 - (1.0 - new_opacity) ** ratio == pytest.approx(opacity, rel=5e-4)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 7, 20, N_MAX])
+@pytest.mark.parametrize("opacity", [0.02, 0.3, 0.9, 0.999])
+def test_copies_are_scaled_by_equation_9(opacity, ratio):
+    _, new_scale = relocated(opacity, ratio, scale=2.5)
+    assert new_scale == pytest.approx(2.5 * equation_9(opacity, ratio), rel=5e-4)
+
+
+def test_one_copy_is_the_original():
+    opacities, scales = torch.tensor([0.1, 0.5, 0.98]), torch.tensor([[1.0, 2.0, 3.0]] * 3)
+    new_opacities, new_scales = relocation(opacities, scales, torch.ones(3, dtype=torch.long), BINOMS)
+    torch.testing.assert_close(new_opacities, opacities)
+    torch.testing.assert_close(new_scales, scales)
+
+
+@pytest.mark.parametrize(("ratio", "taken_for"), [(0, 1), (N_MAX + 1, N_MAX), (10_000, N_MAX)])
+def test_ratios_beyond_the_table_are_held_at_its_ends(ratio, taken_for):
+    assert relocated(0.7, ratio) == relocated(0.7, taken_for)
+
+
+def test_every_gaussian_is_relocated_by_its_own_ratio():
+    opacities, ratios = torch.linspace(0.05, 0.95, 12), torch.arange(1, 13)
+    scales = torch.rand(12, 3, generator=torch.Generator().manual_seed(0)) + 0.1
+    _, new_scales = relocation(opacities, scales, ratios, BINOMS)
+    factors = [equation_9(float(o), int(n)) for o, n in zip(opacities, ratios, strict=True)]
+    torch.testing.assert_close(new_scales, scales * torch.tensor(factors)[:, None], rtol=1e-4, atol=0)
+
+
+def test_gsplats_own_functions_are_back_after_the_twins():
+    before = ops.compute_relocation, ops.quat_scale_to_covar_preci
+    with pytest.raises(ZeroDivisionError), torch_twins():
+        assert ops.compute_relocation is relocation
+        raise ZeroDivisionError
+    assert (ops.compute_relocation, ops.quat_scale_to_covar_preci) == before
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_exploration_on_a_cpu_is_gsplats(threads):
+    """Of more Gaussians than are a piece, of all sizes and opacities; their quaternions need not be of length 1."""
+    count, random = 5000, torch.Generator().manual_seed(0)
+    drawn = {name: torch.randn(count, *size, generator=random) for name, size in SIZES.items()}
+    drawn["opacities"] -= 5.0
+    moved, before = [], torch.get_num_threads()
+    torch.set_num_threads(threads)
+    for inject in (explore, lambda params, strength: ops.inject_noise_to_position(params, {}, {}, strength)):
+        params = torch.nn.ParameterDict({name: torch.nn.Parameter(values.clone()) for name, values in drawn.items()})
+        torch.manual_seed(3)
+        with torch_twins():
+            inject(params, 0.2)
+        moved.append(params["means"].detach() - drawn["means"])
+    torch.set_num_threads(before)
+    torch.testing.assert_close(*moved, atol=1e-5, rtol=1e-3)
+    assert moved[0].norm(dim=1).max() > 0.1 and params["means"].requires_grad
+
+
+def densified(strategy: str, steps: int, count: int = 100, size: float = 0.05, **changes: Any) -> list[int]:
+    """The number of Gaussians after every iteration."""
+    torch.manual_seed(0)
+    model, settings = a_model(count, size), settings_of(strategy, **changes)
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    counts = []
+    for step in range(steps):
+        train_step(model, densifier, step, optimizers)
+        counts.append(len(model))
+        assert {len(value) for value in model.parts[0].params.values()} == {counts[-1]}
+        assert all(
+            optimizers[name].param_groups[0]["params"][0] is value for name, value in model.parts[0].params.items()
+        )
+    return counts
+
+
+def test_mcmc_adds_a_twentieth_at_a_time_up_to_the_cap():
+    counts = densified("mcmc", 12, cap_max=118)
+    assert counts == [100, 100, 105, 105, 110, 110, 115, 115, 118, 118, 118, 118]
+
+
+def test_mcmc_grows_by_the_share_it_is_told():
+    counts = densified("mcmc", 8, cap_max=170, mcmc=McmcSettings(refine_every=2, growth=0.25))
+    assert counts == [100, 100, 125, 125, 156, 156, 170, 170]
+
+
+def test_there_are_few_at_first_in_time_to_become_all():
+    """A third more needs six times a twentieth, and another for what is rounded away."""
+    coarse = CoarseToFineSettings(share=0.75)
+    told = {"coarse_to_fine": coarse, "refine_stop": 0.8, "mcmc": McmcSettings(refine_every=20)}
+    assert few_at_first(1000, settings_of("mcmc", **told)) == (750, 800 - 7 * 20)
+    for left_alone in ({"mcmc": McmcSettings(growth=0.0)}, {"coarse_to_fine": CoarseToFineSettings(share=1.0)}):
+        assert few_at_first(1000, settings_of("mcmc", **{**told, **left_alone})) == (1000, 0)
+    assert few_at_first(1000, settings_of("default", **told)) == (1000, 0)
+
+
+def test_while_images_are_reduced_there_is_room_for_fewer():
+    model, settings = a_model(100), settings_of("mcmc", cap_max=200, mcmc=McmcSettings(refine_every=1, growth=0.5))
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    counts = []
+    for step, coarse in enumerate([True, True, True, False, False], start=2):
+        train_step(model, densifier, step, optimizers, coarse)
+        counts.append(len(model))
+    assert counts == [120, 120, 120, 180, 200]
+
+
+def test_mcmc_without_noise_or_growth_moves_dead_gaussians_onto_living_ones():
+    model, settings = a_model(), settings_of("mcmc", cap_max=100)
+    part = model.parts[0]
+    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
+    with torch.no_grad():
+        part.params["opacities"][:30] = -9.0
+    living = part.params["means"].detach()[30:].clone()
+    torch.manual_seed(0)
+    densifier.after_step(2, optimizers, {}, ALL)
+    assert len(model) == 100
+    moved = part.params["means"].detach()[:30]
+    assert ((moved[:, None] - living).abs().amax(dim=2).amin(dim=1) == 0).all()
+    assert (part.at(0.0).opacities > 0.005).all()
+
+
+def test_relocation_hardly_changes_what_is_seen():
+    """Copies of a Gaussian look like the one that was there, which the formula is made for."""
+    model, settings = a_model(size=0.12), settings_of("mcmc", cap_max=105)
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    with torch.no_grad():
+        before = model.render(a_view(), 0).image
+        torch.manual_seed(0)
+        densifier.after_step(2, optimizers, {}, ALL)
+        after = model.render(a_view(), 0).image
+    assert len(model) == 105
+    change = (after - before).abs()
+    assert float(change.max()) < 0.05 and float(change.mean()) < 0.002
+
+
+def test_mcmc_noise_moves_faint_gaussians_more_than_opaque_ones():
+    model, settings = a_model(size=0.2), settings_of("mcmc", cap_max=100, mcmc=McmcSettings(noise_lr=5e5))
+    part = model.parts[0]
+    with torch.no_grad():
+        part.params["opacities"][:50], part.params["opacities"][50:] = -5.2, 6.0
+    before = part.params["means"].detach().clone()
+    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
+    torch.manual_seed(0)
+    densifier.after_step(1, optimizers, {}, ALL)
+    moved = (part.params["means"].detach() - before).norm(dim=1)
+    assert float(moved[:50].mean()) > 1e-2 and float(moved[50:].max()) < 1e-6
+
+
+def test_the_default_strategy_grows_where_the_image_pulls():
+    counts = densified("default", 5, default=DefaultSettings(refine_every=2, grow_grad2d=1e-7, prune_opacity=1e-3))
+    assert counts[0] == counts[1] == 100
+    assert counts[2] > 150
+
+
+def test_the_default_strategy_grows_nothing_under_its_threshold():
+    counts = densified("default", 5, default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=1e-3))
+    assert counts == [100] * 5
+
+
+@pytest.mark.parametrize("size", [pytest.param(0.005, id="duplicated"), pytest.param(0.05, id="split")])
+@pytest.mark.parametrize("cap_max", [100, 117, 250])
+def test_the_default_strategy_never_exceeds_the_cap(cap_max, size):
+    greedy = DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3)
+    counts = densified("default", 9, size=size, cap_max=cap_max, default=greedy)
+    assert max(counts) <= cap_max
+    assert counts[-1] > 0.95 * cap_max, "it fills the cap, since all want to grow"
+
+
+def test_at_the_cap_the_default_strategy_prefers_the_largest_gradients():
+    model = a_model(size=0.005)
+    part, settings = model.parts[0], settings_of("default", cap_max=110)
+    densifier, (optimizers,) = Densifier(part, settings), make_optimizers(model).parts
+    strength = torch.from_numpy(np.random.default_rng(2).permutation(100)).float() + 1.0
+    centers = torch.zeros(1, 100, 2, requires_grad=True)
+    centers.grad = torch.stack([strength, torch.zeros(100)], dim=1)[None]
+    info = {
+        "means2d": centers, "radii": torch.ones(1, 100, 2, dtype=torch.int32), "width": 32, "height": 24,
+        "n_cameras": 1, "gaussian_ids": None,
+    }  # fmt: skip
+    before = part.params["means"].detach().clone()
+    densifier.after_step(2, optimizers, info, ALL)
+    assert len(part) == 110
+    copies = torch.cdist(part.params["means"].detach()[100:], before).argmin(dim=1)
+    assert set(copies.tolist()) == set(strength.topk(10).indices.tolist())
+
+
+def test_the_default_strategy_removes_what_is_too_faint():
+    model = a_model()
+    with torch.no_grad():
+        model.parts[0].params["opacities"][:25] = math.log(0.004 / 0.996)
+    settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1e3, prune_opacity=0.005))
+    densifier, (optimizers,) = Densifier(model.parts[0], settings), make_optimizers(model).parts
+    for optimizer in optimizers.values():
+        optimizer.param_groups[0]["lr"] = 0.0
+    for step in (1, 2):
+        train_step(model, densifier, step, optimizers)
+    assert len(model) == 75
+
+
+def test_the_default_strategy_resets_opacities_every_so_many_iterations():
+    model = a_model()
+    default = DefaultSettings(refine_every=1000, reset_every=3, prune_opacity=0.005)
+    densifier = Densifier(model.parts[0], settings_of("default", default=default))
+    (optimizers,) = make_optimizers(model).parts
+    brightest = []
+    for step in range(1, 4):
+        train_step(model, densifier, step, optimizers)
+        brightest.append(float(model.parts[0].at(0.0).opacities.detach().max()))
+    assert min(brightest[:2]) > 0.05
+    assert brightest[2] == pytest.approx(0.01, rel=1e-3), "twice prune_opacity, as in 3DGS"
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+@pytest.mark.parametrize(("start", "stop"), [(0.5, 1.0), (0.0, 0.002)])
+def test_nothing_is_densified_outside_its_span_of_iterations(strategy, start, stop):
+    counts = densified(
+        strategy, 8, refine_start=start, refine_stop=stop,
+        default=DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3),
+    )  # fmt: skip
+    assert counts == [100] * 8
+
+
+# ---- a model of several parts
+
+
+def two_cars(count: int = 40, size: float = 0.05) -> Actors:
+    """Two actors before the camera of `a_view`; each Gaussian's place within its box tells whose it is: those of the
+    first are all behind their box's middle, those of the second all before it."""
+    places = ([-1.0, 0.0, 4.0], [1.0, 0.0, 4.0])
+    tracks = [track_of(motion_through([0.0, 0.5], [p, p]), str(i), (2.0, 2.0, 2.0)) for i, p in enumerate(places)]
+    actors = actors_of(*tracks, count=count, settings=ActorSettings(cap_max=1000), shaken=False)
+    with torch.no_grad():
+        means = actors.params["means"]
+        means[:, 0] = (0.2 + means[:, 0].abs()) * (2.0 * actors.params["owner"] - 1.0)
+        actors.params["scales"].fill_(math.log(size))
+    return actors
+
+
+def owners_fit(actors: Actors) -> bool:
+    """Whether every Gaussian is where its owner's are."""
+    return torch.equal(actors.params["owner"], (actors.params["means"][:, 0] > 0).long())
+
+
+def test_mcmc_gives_what_it_adds_and_moves_the_owner_of_where_it_goes():
+    actors, settings = two_cars(), settings_of("mcmc")
+    densifier, (optimizers,) = Densifier(actors, settings), make_optimizers(SplatModel([actors], None)).parts
+    with torch.no_grad():
+        actors.params["opacities"][:36] = -9.0  # all but four of the first car's
+    torch.manual_seed(0)
+    densifier.after_step(2, optimizers, {}, ALL)
+    counts = actors.params["owner"].bincount().tolist()
+    assert sum(counts) == len(actors) == 84 and counts[1] > 60, "most of the dead went over to the second car"
+    assert owners_fit(actors)
+    assert actors.params["owner"].dtype == torch.int64 and not actors.params["owner"].requires_grad
+
+
+def screen_gradients(strengths: torch.Tensor) -> dict[str, Any]:
+    """What a rendering would tell of Gaussians that pull so strongly across the screen."""
+    centers = torch.zeros(1, len(strengths), 2, requires_grad=True)
+    centers.grad = torch.stack([strengths, torch.zeros(len(strengths))], dim=1)[None]
+    radii = torch.ones(1, len(strengths), 2, dtype=torch.int32)
+    return {"means2d": centers, "radii": radii, "width": 32, "height": 24, "n_cameras": 1, "gaussian_ids": None}
+
+
+@pytest.mark.parametrize("size", [pytest.param(0.005, id="duplicated"), pytest.param(0.1, id="split")])
+def test_the_default_strategy_gives_what_it_grows_its_parents_owner(size):
+    actors = two_cars(size=size)
+    growing = DefaultSettings(refine_every=2, grow_grad2d=1.0, prune_opacity=1e-3)
+    densifier = Densifier(actors, settings_of("default", default=growing))
+    (optimizers,) = make_optimizers(SplatModel([actors], None)).parts
+    strengths = torch.zeros(80)
+    strengths[30:50] = 1.0
+    with torch.no_grad():
+        actors.params["opacities"][:5] = -9.0
+    torch.manual_seed(0)
+    densifier.after_step(2, optimizers, screen_gradients(strengths), ALL)
+    assert actors.params["owner"].bincount().tolist() == [45, 50], "ten of each grew, and five of the first were pruned"
+    assert owners_fit(actors)
+
+
+@pytest.mark.parametrize("wanting", [[3, 17, 29], [30, 44, 69], [0, 28, 31, 32, 60]])
+def test_each_part_grows_by_the_gradients_of_its_own_rows(wanting):
+    """The part that grows first must not shift whose gradients the second one's are."""
+    model = SplatModel([round_gaussians(np.arange(90.0).reshape(30, 3), 0.001), two_cars(20, 0.001)], None)
+    settings = settings_of("default", default=DefaultSettings(refine_every=2, grow_grad2d=1.0, prune_opacity=1e-3))
+    trainer = Trainer.begin(model, [], settings, 0, torch.device("cpu"))
+    trainer.step = 2
+    strengths, nothing = torch.zeros(70), torch.zeros(24, 32, 3)
+    strengths[wanting] = 1.0
+    before, together = [len(part) for part in model.parts], model.gaussians_at(0.0)
+    trainer.densify(Picture(together, nothing, nothing, nothing[..., 0], None, screen_gradients(strengths)))
+    grown = [part.at(0.0)[count:] for part, count in zip(model.parts, before, strict=True)]
+    assert torch.equal(torch.cat([new.means for new in grown]), together.means[wanting])
+    assert len(grown[0]) == sum(row < 30 for row in wanting)
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_each_part_has_a_cap_of_its_own(strategy):
+    greedy = DefaultSettings(refine_every=2, grow_grad2d=1e-9, prune_opacity=1e-3)
+    settings = settings_of(strategy, cap_max=104, default=greedy)
+    actors = two_cars()
+    actors.cap_max = 82
+    model = SplatModel([a_model().parts[0], actors], None)
+    densifiers, optimizers = [Densifier(part, settings) for part in model.parts], make_optimizers(model).parts
+    torch.manual_seed(0)
+    for densifier, own, of_part in zip(densifiers, optimizers, model.rows, strict=True):
+        densifier.after_step(2, own, screen_gradients(torch.ones(180)), of_part)
+    assert [len(part) for part in model.parts] == [104, 82]
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_part_without_gaussians_is_left_alone(strategy):
+    model = SplatModel([round_gaussians([]), two_cars()], None)
+    densifier, optimizers = Densifier(model.parts[0], settings_of(strategy)), make_optimizers(model).parts
+    densifier.after_step(2, optimizers[0], screen_gradients(torch.ones(80)), model.rows[0])
+    assert len(model.parts[0]) == 0 and not densifier.any_alive()

@@ -1,0 +1,173 @@
+"""What the own car's body hides teaches a training nothing: from outlines to what is, and what is not, learned."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.rig_drives import rig_drive, true_body
+from helpers.trainings import (
+    CPU,
+    HEIGHT,
+    PROVENANCE,
+    WIDTH,
+    files_in,
+    inputs_in,
+    job_of,
+    parser_record,
+    recorded_views,
+    settings_of,
+    trained,
+)
+
+from drivesplat.io.storage import write_json, write_plain_pickle
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.preprocess.ego_mask import own_car_record
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.preprocess.masks import make_masks
+from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
+from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
+from drivesplat.settings.masks import MaskJob, MaskSettings
+from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.train import TrainJob
+from drivesplat.training import run
+from drivesplat.training.run import TrainingInputs, read_checkpoint, read_inputs, run_training, trained_model
+from drivesplat.training.views import Guides, TrainingView, load_views, view_of
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+BODY = (230, 20, 230)
+CORNER = np.zeros((HEIGHT, WIDTH), dtype=bool)
+CORNER[HEIGHT // 2 :, : WIDTH // 2] = True
+
+
+def views_with_a_body(masked: bool) -> list[TrainingView]:
+    """Cameras in a row, each with something magenta before its lower left quarter; what that hides others see."""
+    own_car = torch.from_numpy(CORNER)
+    views = []
+    for view in recorded_views(8):
+        pixels = torch.where(own_car[..., None], torch.tensor(BODY, dtype=torch.uint8), view.pixels)
+        views.append(dataclasses.replace(view, pixels=pixels, own_car=own_car if masked else None))
+    return views
+
+
+@torch.no_grad()
+def error_behind(model: SplatModel, like: str) -> float:
+    """The mean difference of what a model shows in the body's pixels from the body, or from what it hides."""
+    shown = torch.stack([model.render(view.view, 1).image[CORNER] for view in recorded_views(8)])
+    hidden = torch.stack([view.target()[CORNER] for view in recorded_views(8)])
+    expected = hidden if like == "hidden" else torch.tensor(BODY) / 255.0
+    return float((shown - expected).abs().mean())
+
+
+def test_a_body_before_the_camera_is_not_learned_and_what_it_hides_is(tmp_path):
+    settings = settings_of(iterations=60)
+    with_mask, without = (
+        trained(tmp_path / str(masked), settings, views_with_a_body(masked))[0] for masked in (True, False)
+    )
+    assert error_behind(without, "body") < 0.25 < 0.4 < error_behind(with_mask, "body")
+    assert error_behind(with_mask, "hidden") < 0.7 * error_behind(without, "hidden")
+
+
+# ---- how a training comes to know
+
+
+def test_images_of_a_camera_share_the_mask_of_the_body_and_have_no_depth_there(tmp_path):
+    depth = {"rows": np.array([2, 20], np.int32), "columns": np.array([3, 4], np.int32), "depth": np.array([5.0, 6.0])}
+    none = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    guides = Guides({}, {}, dict.fromkeys(range(5), depth), own_car={0: CORNER, 1: CORNER.copy(), 3: none})
+    first, second, empty, unknown = load_views(parser_record(tmp_path, recorded_views()), guides, CPU)
+    assert first.own_car.data_ptr() == second.own_car.data_ptr() and first.own_car.dtype == torch.bool
+    np.testing.assert_array_equal(first.own_car.numpy(), CORNER)
+    assert empty.own_car is None and unknown.own_car is None, "a mask without pixels costs nothing"
+    assert first.lidar.depth.tolist() == [5.0] and unknown.lidar.depth.tolist() == [5.0, 6.0]
+
+
+def views_given(monkeypatch, folder: Path, inputs: TrainingInputs, job: TrainJob) -> list[TrainingView]:
+    """The views with which a training begins; it ends there."""
+    given: list[TrainingView] = []
+
+    class EndedError(Exception):
+        pass
+
+    def begin(model: SplatModel, views: list[TrainingView], *rest: Any) -> None:
+        given.extend(views)
+        raise EndedError
+
+    monkeypatch.setattr(run, "train", begin)
+    with pytest.raises(EndedError):
+        run_training(inputs, job, DeviceSettings(kind="cpu"), files_in(folder / "it"), PROVENANCE, "train")
+    return given
+
+
+@pytest.mark.parametrize(
+    ("sky", "changes", "held"),
+    [
+        ("cubemap", {}, False),
+        ("mask", {}, True),
+        ("cubemap", {"sky_bce_weight": 0.1}, True),
+        ("none", {"sky_bce_weight": 0.1}, True),
+    ],
+)
+def test_the_device_holds_sky_masks_where_a_loss_looks_at_them(tmp_path, monkeypatch, sky, changes, held):
+    inputs = inputs_in(tmp_path, actors=True)
+    assert inputs.guides(job_of(sky=sky, **changes)).sky
+    views = views_given(monkeypatch, tmp_path, inputs, job_of(sky=sky, **changes))
+    assert [view.sky is not None for view in views] == [held] * 4
+
+
+def test_only_cameras_that_see_the_body_are_asked_for_it(tmp_path):
+    inputs = inputs_in(tmp_path, actors=True)
+    assert inputs.guides(job_of()).own_car == {}
+    asked = dataclasses.replace(inputs, seeing_own_car=frozenset({"CAM_FRONT"})).guides(job_of()).own_car
+    assert list(asked) == [0, 1, 3, 4] and not any(mask.any() for mask in asked.values())
+
+
+# ---- all of it
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory) -> Path:
+    """A drive whose CAM_BACK sees the own car, through all stages before the training."""
+    folder = tmp_path_factory.mktemp("prepared")
+    scene, images = rig_drive(folder, ["CAM_FRONT", "CAM_BACK"], own_car=True), ImageSettings()
+    holdout = HoldoutSettings(every_nth=6, offset=3, last_block=0)
+    search = OwnCarSearch(cameras=("CAM_BACK",), holdout=holdout, own_car_radius=2.5)
+    record = own_car_record(scene, OwnCarJob(polygons={}, search=search))
+    write_json(folder / "own_car.json", {**record, "provenance": {"made": "own_car"}})
+    own_car, _ = read_own_car(folder / "own_car.json")
+    made = make_masks(scene, MaskJob(masks=MaskSettings(), holdout=holdout, images=images), folder / "masks", own_car)
+    write_json(folder / "masks/masks.json", {**made, "provenance": {}})
+    settings = LidarSeedSettings(max_points=2000, far_points=500)
+    seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0), own_car)
+    parser = parser_dict(scene, seed, ParserJob(holdout=holdout, images=images))
+    write_plain_pickle(folder / "parser.pkl", {**parser, "provenance": {}})
+    return folder
+
+
+def test_a_body_that_was_found_reaches_the_training_of_its_camera(prepared, monkeypatch, tmp_path):
+    inputs, _ = read_inputs(str(prepared / "parser.pkl"), str(prepared / "masks/masks.json"), [], [], [])
+    assert inputs.seeing_own_car == {"CAM_BACK"}
+    assert json.loads((prepared / "masks/masks.json").read_text())["own_car"] == {"CAM_BACK": "images"}
+    job = job_of(sky="mask", iterations=3, checkpoint_every=10)
+    with monkeypatch.context() as patched:
+        views = views_given(patched, tmp_path, inputs, job)
+    true = true_body("CAM_BACK")
+    for view in views:
+        assert (view.own_car is not None) == (view.view.camera == "CAM_BACK")
+        if view.own_car is not None:
+            assert view.own_car.numpy()[true].mean() > 0.9 and not view.sky[view.own_car].any()
+    assert len({view.own_car.data_ptr() for view in views if view.own_car is not None}) == 1
+    files = files_in(tmp_path / "trained")
+    run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
+    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    with torch.no_grad():
+        assert torch.isfinite(model.render(view_of(inputs.parser, 0, CPU)).image).all()

@@ -1,0 +1,513 @@
+"""The training loss: its terms, their sum, and which way each pushes."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import actors_of, looking_at, motion_through, track_of
+from skimage.metrics import structural_similarity
+
+from drivesplat.model.background import Background
+from drivesplat.model.sky import ConstantSky, CubemapSky
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.model.view import View
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.colours import masked_l1
+from drivesplat.training.losses import (
+    class_cross_entropy,
+    depth_loss,
+    entropy,
+    loss_terms,
+    sky_alpha_loss,
+    sky_cross_entropy,
+)
+from drivesplat.training.ssim import ssim, ssim_in_torch
+from drivesplat.training.views import LidarDepth, TrainingView
+
+WIDTH, HEIGHT = 20, 14
+
+
+def random_image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(0, 1, (height, width, 3))).float()
+
+
+def a_model(sky: bool = True, gaussians: int = 12) -> SplatModel:
+    rng = np.random.default_rng(4)
+    part = Background.from_points(
+        rng.uniform(-1, 1, (gaussians, 3)), rng.uniform(0, 1, (gaussians, 3)), GaussianSettings(), 1.0
+    )
+    with torch.no_grad():
+        part.params["opacities"] += torch.linspace(-2, 2, gaussians)
+    return SplatModel([part], ConstantSky(torch.full((3,), 0.5), 1e-2) if sky else None)
+
+
+def a_view(pixels: torch.Tensor, sky: torch.Tensor | None) -> TrainingView:
+    return TrainingView(View(torch.eye(3), torch.eye(4), WIDTH, HEIGHT, 0.0), pixels, sky)
+
+
+def a_case(model: SplatModel, sky_known: bool = True) -> tuple[Picture, TrainingView]:
+    """A random picture of a model's Gaussians and a random recording of which the upper third is sky."""
+    pixels = (random_image(1) * 255).to(torch.uint8)
+    alpha = torch.from_numpy(np.random.default_rng(2).uniform(0.05, 0.95, (HEIGHT, WIDTH))).float()
+    sky = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    sky[: HEIGHT // 3] = True
+    return picture_of(model, random_image(3), alpha), a_view(pixels, sky if sky_known else None)
+
+
+def picture_of(
+    model: SplatModel, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None = None
+) -> Picture:
+    return Picture(model.gaussians_at(0.0), image, image, alpha, depth, {})
+
+
+def zero_padded_ssim(image: np.ndarray, target: np.ndarray) -> float:
+    """skimage's mean over the images in a wide frame of zeros, so that its own border handling reaches none of them."""
+    framed = [np.pad(x.astype(np.float64), ((16, 16), (16, 16), (0, 0))) for x in (image, target)]
+    _, full = structural_similarity(
+        *framed,
+        data_range=1.0,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    return float(full[16:-16, 16:-16].mean())
+
+
+@pytest.mark.parametrize("measure", [ssim, ssim_in_torch])
+@pytest.mark.parametrize("kind", ["unlike", "alike", "flat", "one pixel wide"])
+def test_ssim_is_skimages(kind, measure):
+    image = random_image(5, 30, 1 if kind == "one pixel wide" else 24)
+    target = {
+        "unlike": random_image(6, 30, 24),
+        "alike": (image + 0.05 * random_image(7, 30, image.shape[1])).clamp(max=1.0),
+        "flat": torch.full_like(image, 0.4),
+        "one pixel wide": random_image(6, 30, 1),
+    }[kind]
+    assert float(measure(image, target)) == pytest.approx(zero_padded_ssim(image.numpy(), target.numpy()), abs=1e-4)
+
+
+def test_ssim_of_an_image_with_itself_is_one():
+    image = random_image(8)
+    assert float(ssim(image, image)) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_ssim_has_the_gradient_of_finite_differences():
+    image, target = random_image(9, 6, 5).double().requires_grad_(), random_image(10, 6, 5).double()
+    assert torch.autograd.gradcheck(lambda x: ssim(x, target), image)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ssim_on_a_cpu_has_torchs_gradient(threads):
+    """Of an image that is not contiguous, and larger than a piece."""
+    image, target = random_image(11, 40, 70).transpose(0, 1), random_image(12, 70, 40)
+    gradients, before = [], torch.get_num_threads()
+    torch.set_num_threads(threads)
+    for measure in (ssim, ssim_in_torch):
+        asked = image.clone().requires_grad_()
+        (3.0 * measure(asked, target)).backward()
+        gradients.append(asked.grad)
+    torch.set_num_threads(before)
+    torch.testing.assert_close(*gradients, atol=1e-8, rtol=1e-4)
+
+
+def test_colour_terms_are_weighted_l1_and_ssim():
+    picture, view = a_case(model := a_model())
+    terms = loss_terms(picture, view, model, TrainSettings(ssim_weight=0.3))
+    recorded = view.pixels.numpy() / 255.0
+    assert float(terms["l1"]) == pytest.approx(0.7 * np.abs(picture.image.numpy() - recorded).mean(), rel=1e-5)
+    similarity = zero_padded_ssim(picture.image.numpy(), recorded)
+    assert float(terms["ssim"]) == pytest.approx(0.3 * (1.0 - similarity), abs=1e-4)
+
+
+def test_regularisers_are_weighted_means_over_all_gaussians():
+    picture, view = a_case(model := a_model())
+    terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=0.03, scale_reg=0.07))
+    gaussians = model.parts[0].at(0.0)
+    torch.testing.assert_close(terms["opacity_reg"], 0.03 * gaussians.opacities.mean())
+    torch.testing.assert_close(terms["scale_reg"], 0.07 * gaussians.scales.mean())
+
+
+def test_regularisers_of_several_parts_weigh_every_gaussian_alike():
+    parts = [a_model(gaussians=n).parts[0] for n in (3, 9)]
+    picture, view = a_case(model := SplatModel(parts, None))
+    terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=1.0))
+    opacities = torch.cat([part.at(0.0).opacities for part in parts])
+    torch.testing.assert_close(terms["opacity_reg"], opacities.mean())
+
+
+@pytest.mark.parametrize(
+    ("changed", "absent"),
+    [
+        ({"opacity_reg": 0.0}, "opacity_reg"),
+        ({"scale_reg": 0.0}, "scale_reg"),
+    ],
+)
+def test_a_weight_of_zero_leaves_a_term_out(changed, absent):
+    picture, view = a_case(model := a_model())
+    everything = {"l1", "ssim", "opacity_reg", "scale_reg", "sky_alpha"}
+    assert loss_terms(picture, view, model, TrainSettings()).keys() == everything
+    assert loss_terms(picture, view, model, TrainSettings(**changed)).keys() == everything - {absent}
+
+
+@pytest.mark.parametrize(
+    ("sky", "sky_known", "expected"),
+    [
+        pytest.param(ConstantSky(torch.full((3,), 0.5), 1e-2), True, True, id="one colour"),
+        pytest.param(ConstantSky(torch.full((3,), 0.5), 1e-2), False, False, id="no sky mask"),
+        pytest.param(CubemapSky(4, torch.full((3,), 0.5), 1e-2), True, False, id="a cube map holds tree tops too"),
+        pytest.param(None, True, False, id="no sky in the model"),
+    ],
+)
+def test_gaussians_are_kept_out_of_a_masked_sky_of_one_colour_alone(sky, sky_known, expected):
+    model = SplatModel(list(a_model().parts), sky)
+    picture, view = a_case(model, sky_known)
+    terms = loss_terms(picture, view, model, TrainSettings(sky_alpha_weight=0.5))
+    assert ("sky_alpha" in terms) is expected
+    if expected:
+        wanted = -0.5 * (torch.log(1.0 - picture.alpha) * view.sky).mean()
+        torch.testing.assert_close(terms["sky_alpha"], wanted)
+
+
+def test_sky_term_is_the_cross_entropy_on_sky_pixels():
+    alpha = torch.tensor([[0.2, 0.5, 0.9], [0.99, 0.3, 0.0]])
+    sky = torch.tensor([[True, False, True], [False, False, True]])
+    expected = -(math.log(0.8) + math.log(0.1) + math.log(1.0)) / 6
+    assert float(sky_alpha_loss(alpha, sky)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_sky_term_pushes_alpha_down_on_sky_pixels_alone():
+    alpha = torch.tensor([[0.2, 0.5], [0.9, 0.3]], requires_grad=True)
+    sky = torch.tensor([[True, False], [True, False]])
+    sky_alpha_loss(alpha, sky).backward()
+    torch.testing.assert_close(alpha.grad, torch.tensor([[1 / 0.8 / 4, 0.0], [1 / 0.1 / 4, 0.0]]))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_sky_term_is_finite_where_alpha_is_full(alpha):
+    value = torch.full((2, 2), alpha, requires_grad=True)
+    loss = sky_alpha_loss(value, torch.ones(2, 2, dtype=torch.bool))
+    loss.backward()
+    assert torch.isfinite(loss) and torch.isfinite(value.grad).all()
+
+
+@pytest.mark.parametrize(("term", "parameter"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
+def test_a_regulariser_makes_its_parameter_smaller_and_no_other(term, parameter):
+    picture, view = a_case(model := a_model())
+    loss_terms(picture, view, model, TrainSettings())[term].backward()
+    params = model.parts[0].params
+    assert (params[parameter].grad > 0).all()
+    assert all(value.grad is None for name, value in params.items() if name != parameter)
+
+
+@pytest.mark.parametrize("term", ["l1", "ssim"])
+def test_a_colour_term_pulls_the_image_towards_the_recording(term):
+    picture, view = a_case(model := a_model())
+    image = picture.image.clone().requires_grad_()
+    before = loss_terms(picture_of(model, image, picture.alpha), view, model, TrainSettings())[term]
+    before.backward()
+    colors = (image - 1e-2 * image.grad / image.grad.norm()).detach()
+    stepped = picture_of(model, colors, picture.alpha)
+    assert float(loss_terms(stepped, view, model, TrainSettings())[term]) < float(before.detach())
+    assert float((image.grad * (image - view.target())).sum().detach()) > 0
+
+
+def test_a_perfect_picture_costs_nothing():
+    _, view = a_case(model := a_model())
+    settings = TrainSettings(opacity_reg=0, scale_reg=0)
+    terms = loss_terms(picture_of(model, view.target(), torch.zeros(HEIGHT, WIDTH)), view, model, settings)
+    assert float(sum(terms.values()).detach()) == pytest.approx(0.0, abs=1e-5)
+
+
+# ---- the terms of models that move
+
+
+def test_the_cross_entropy_of_the_sky_is_closed_form_and_finite():
+    """-ln (1 - alpha) on the sky, -ln alpha elsewhere; alphas of 0 and 1 count as 1e-4 from them."""
+    alpha = torch.tensor([[0.2, 0.7, 0.0], [0.9, 1.0, 1.0]], requires_grad=True)
+    sky = torch.tensor([[True, False, True], [True, False, True]])
+    loss = sky_cross_entropy(alpha, sky)
+    terms = [0.8, 0.7, 1.0 - 1e-4, 0.1, 1.0 - 1e-4, 1e-4]
+    assert float(loss.detach()) == pytest.approx(-np.log(terms).mean(), rel=1e-3)
+    loss.backward()
+    assert torch.isfinite(alpha.grad).all()
+    np.testing.assert_allclose(alpha.grad[0, :2], [1 / 0.8 / 6, -1 / 0.7 / 6], rtol=1e-4)
+
+
+def a_lidar(count: int, seed: int = 0) -> tuple[torch.Tensor, LidarDepth, np.ndarray]:
+    """A random depth image, what LiDAR measured at some of its pixels, and by how much it is off there."""
+    rng = np.random.default_rng(seed)
+    depth, pixels = rng.uniform(2, 60, (HEIGHT, WIDTH)), rng.permutation(HEIGHT * WIDTH)[:count]
+    off = rng.normal(size=count) * 3.0
+    measured = depth[pixels // WIDTH, pixels % WIDTH] + off
+    lidar = LidarDepth(torch.from_numpy(pixels), torch.from_numpy(measured).float())
+    return torch.from_numpy(depth).float(), lidar, np.abs(off)
+
+
+@pytest.mark.parametrize(("count", "kept"), [(100, 95), (200, 190), (19, 18), (1, 1)])
+def test_depth_is_compared_where_lidar_measured_and_the_worst_twentieth_left_out(count, kept):
+    depth, lidar, off = a_lidar(count)
+    assert float(depth_loss(depth, lidar)) == pytest.approx(np.sort(off)[:kept].mean(), rel=1e-4)
+
+
+def test_depths_left_out_pull_on_nothing():
+    depth, lidar, off = a_lidar(100)
+    depth.requires_grad_()
+    depth_loss(depth, lidar).backward()
+    gradient = depth.grad.reshape(-1)
+    worst = set(lidar.pixels[np.argsort(off)[-5:]].tolist())
+    pulled = set(gradient.nonzero()[:, 0].tolist())
+    assert pulled == set(lidar.pixels.tolist()) - worst
+    assert all(abs(float(value)) == pytest.approx(1 / 95) for value in gradient[list(pulled)])
+
+
+def test_entropy_is_that_of_a_coin():
+    alpha = torch.tensor([[0.5, 0.1], [0.9, 0.3]])
+    expected = np.mean([-(o * np.log(o) + (1 - o) * np.log(1 - o)) for o in (0.5, 0.1, 0.9, 0.3)])
+    assert float(entropy(alpha)) == pytest.approx(expected, rel=1e-5)
+    assert float(entropy(torch.full((2, 2), 0.5))) == pytest.approx(math.log(2.0))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_entropy_is_least_and_finite_where_it_is_sure(alpha):
+    sure = torch.full((2, 2), alpha, requires_grad=True)
+    loss = entropy(sure)
+    loss.backward()
+    assert float(loss.detach()) == pytest.approx(0.0, abs=2e-3) and torch.isfinite(sure.grad).all()
+
+
+def test_entropy_pushes_away_from_even():
+    alpha = torch.tensor([[0.4, 0.6]], requires_grad=True)
+    entropy(alpha).backward()
+    assert float(alpha.grad[0, 0]) > 0.0 > float(alpha.grad[0, 1])
+
+
+def test_a_masked_difference_is_the_mean_over_the_mask():
+    image, target = random_image(11), random_image(12)
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[2:5, 3:9] = True
+    expected = np.abs(image.numpy() - target.numpy())[2:5, 3:9].mean()
+    assert float(masked_l1(image, target, mask)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_an_empty_mask_costs_nothing():
+    image = random_image(11).requires_grad_()
+    loss = masked_l1(image, random_image(12), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool))
+    loss.backward()
+    assert float(loss.detach()) == 0.0 and not image.grad.any()
+
+
+def test_classes_cost_the_logarithm_of_their_softmax_where_they_are_labelled():
+    rng = np.random.default_rng(13)
+    logits, classes = rng.normal(size=(4, 5, 3)), rng.integers(0, 3, (4, 5))
+    classes[1, 2:], classes[3, 0] = 255, 255
+    shares = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
+    labelled = classes != 255
+    expected = -np.mean(np.log(np.take_along_axis(shares, classes.clip(max=2)[..., None], axis=-1)[..., 0])[labelled])
+    found = class_cross_entropy(torch.from_numpy(logits).float(), torch.from_numpy(classes.astype(np.uint8)))
+    assert float(found) == pytest.approx(expected, rel=1e-5)
+
+
+def test_without_labels_classes_cost_nothing():
+    logits = torch.rand(4, 5, 3, requires_grad=True)
+    loss = class_cross_entropy(logits, torch.full((4, 5), 255, dtype=torch.uint8))
+    loss.backward()
+    assert float(loss.detach()) == 0.0 and not logits.grad.any()
+
+
+def test_gaussians_learn_the_classes_of_their_pixels():
+    """Two Gaussians side by side, the left half of the image of class 1, the right half of class 2 of three."""
+    rng, settings = np.random.default_rng(14), GaussianSettings(init_opacity=0.9, init_scale=1.0)
+    places = np.array([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]])
+    part = Background.from_points(places, rng.uniform(size=(2, 3)), settings, 1.0, classes=3)
+    with torch.no_grad():
+        part.params["scales"].fill_(math.log(0.2))
+    model = SplatModel([part], None)
+    view = View(torch.tensor([[12.0, 0, 10], [0, 12, 7], [0, 0, 1]]), torch.eye(4), WIDTH, HEIGHT, 0.0)
+    classes = torch.full((HEIGHT, WIDTH), 1, dtype=torch.uint8)
+    classes[:, WIDTH // 2 :] = 2
+    told = dataclasses.replace(a_view((random_image(1) * 255).to(torch.uint8), None), view=view, classes=classes)
+    for weight in (0.5, 1.5):
+        picture = model.render(view)
+        terms = loss_terms(picture, told, model, TrainSettings(semantic_weight=weight))
+        assert float(terms["semantic"].detach()) == pytest.approx(weight * math.log(3.0)), "nothing is known as yet"
+    terms["semantic"].backward()
+    pulls = -part.params["classes"].grad
+    assert pulls.argmax(dim=1).tolist() == [1, 2] and (pulls[:, 0] < 0).all()
+    assert "semantic" not in loss_terms(picture, dataclasses.replace(told, classes=None), model, TrainSettings())
+    assert "semantic" not in loss_terms(picture, told, a_model(), TrainSettings())
+
+
+def street() -> tuple[SplatModel, Picture, TrainingView]:
+    """A picture of background and two actors, one of them absent, by a view of which all is known."""
+    there = track_of(motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 0.0]] * 3, 0.3), "there", (1.0, 1.0, 1.0))
+    later = track_of(motion_through([3.0, 3.5, 4.0], [[0.0, 0.0, 0.0]] * 3), "later", (1.0, 1.0, 1.0))
+    background = a_model(gaussians=8).parts[0]
+    model = SplatModel([background, actors_of(there, later)], ConstantSky(torch.full((3,), 0.5), 1e-2))
+    view = looking_at([0.0, 0.0, 0.0], [0.0, -3.0, 0.5], time=0.5, width=WIDTH, height=HEIGHT)
+    moving, (_, lidar, _) = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), a_lidar(40)
+    moving[4:9, 6:14] = True
+    _, seen = a_case(model)
+    recorded = dataclasses.replace(seen, view=view, moving=moving, lidar=lidar)
+    return model, model.render(view, with_depth=True), recorded
+
+
+WEIGHTS = {
+    "opacity_reg": "opacity_reg",
+    "scale_reg": "scale_reg",
+    "sky_alpha": "sky_alpha_weight",
+    "sky_bce": "sky_bce_weight",
+    "depth": "depth_weight",
+    "entropy": "entropy_weight",
+    "dynamic": "dynamic_weight",
+}
+"""Terms of the loss, and the settings that weigh them."""
+
+
+@pytest.mark.parametrize("term", WEIGHTS)
+def test_every_term_has_its_weight(term):
+    model, picture, view = street()
+    once, thrice = (
+        loss_terms(
+            picture, view, model, TrainSettings(**dict.fromkeys(WEIGHTS.values(), 0.2) | {WEIGHTS[term]: weight})
+        )
+        for weight in (0.2, 0.6)
+    )
+    assert once.keys() == {"l1", "ssim", "track_size", "track_bend", *WEIGHTS}
+    for name in once:
+        torch.testing.assert_close(thrice[name], (3.0 if name == term else 1.0) * once[name])
+        assert float(once[name].detach()) > 0.0
+
+
+def test_terms_are_what_they_are_called():
+    model, picture, view = street()
+    settings = TrainSettings(sky_bce_weight=0.3, depth_weight=0.4, entropy_weight=0.5, dynamic_weight=0.6)
+    terms = loss_terms(picture, view, model, settings)
+    torch.testing.assert_close(terms["sky_bce"], 0.3 * sky_cross_entropy(picture.alpha, view.sky))
+    torch.testing.assert_close(terms["depth"], 0.4 * depth_loss(picture.depth, view.lidar))
+    alone = SplatModel([model.parts[1]], None).render(view.view).alpha
+    torch.testing.assert_close(terms["entropy"], 0.5 * entropy(alone))
+    torch.testing.assert_close(terms["dynamic"], 0.6 * masked_l1(picture.image, view.target(), view.moving))
+    penalties = model.parts[1].penalties()
+    assert penalties.keys() == {"track_size", "track_bend"}
+    for name, value in penalties.items():
+        torch.testing.assert_close(terms[name], value)
+
+
+def test_a_model_that_stands_still_has_no_terms_of_what_moves():
+    _, _, view = street()
+    model = SplatModel([a_model().parts[0]], None)
+    picture = model.render(view.view)
+    unguided = dataclasses.replace(view, sky=None, moving=None, lidar=None)
+    everything = TrainSettings(sky_bce_weight=1.0, depth_weight=1.0, entropy_weight=1.0, dynamic_weight=1.0)
+    assert loss_terms(picture, unguided, model, everything).keys() == {"l1", "ssim", "opacity_reg", "scale_reg"}
+
+
+@pytest.mark.parametrize("term", ["opacity_reg", "scale_reg"])
+def test_what_is_absent_is_not_regularised(term):
+    """Nothing in the picture could hold against it: an actor would fade while it is away."""
+    model, picture, view = street()
+    loss_terms(picture, view, model, TrainSettings())[term].backward()
+    actors = model.parts[1].params
+    gradient = actors["opacities" if term == "opacity_reg" else "scales"].grad
+    there = actors["owner"] == 0
+    assert (gradient[there] > 0).all() and not gradient[~there].any()
+
+
+def test_only_what_moves_is_made_sure_of():
+    model, picture, view = street()
+    loss_terms(picture, view, model, TrainSettings())["entropy"].backward()
+    still, actors = (part.params for part in model.parts)
+    assert all(value.grad is None or not value.grad.any() for value in still.values())
+    assert actors["opacities"].grad[actors["owner"] == 0].any()
+
+
+# ---- what the own car hides
+
+
+def beneath(seen: TrainingView) -> TrainingView:
+    """A view at whose lower left the own car's body is seen, told as the masks tell it."""
+    own_car = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    own_car[9:, :12] = True
+    columns, rows = seen.lidar.pixels % WIDTH, seen.lidar.pixels // WIDTH
+    clear = ~own_car[rows, columns]
+    lidar = LidarDepth(seen.lidar.pixels[clear], seen.lidar.depth[clear])
+    classes = torch.where(own_car, 255, torch.randint(0, 3, (HEIGHT, WIDTH), generator=torch.manual_seed(0)))
+    return dataclasses.replace(
+        seen,
+        own_car=own_car,
+        sky=seen.sky & ~own_car,
+        moving=seen.moving & ~own_car,
+        lidar=lidar,
+        classes=classes.to(torch.uint8),
+    )
+
+
+EVERYTHING = TrainSettings(
+    **dict.fromkeys(WEIGHTS.values(), 0.3), semantic_weight=0.3, gaussians=GaussianSettings(init_opacity=0.6)
+)
+
+
+def image_terms(picture: Picture, view: TrainingView, model: SplatModel) -> dict[str, torch.Tensor]:
+    """The terms that ask something of pixels."""
+    terms = loss_terms(picture, view, model, EVERYTHING)
+    return {name: term for name, term in terms.items() if not name.endswith("_reg") and not name.startswith("track")}
+
+
+def test_no_term_pulls_on_what_the_own_car_hides():
+    """Colours, opacities and depths of its pixels get no gradient; those of all others get that of the picture with
+    the recorded body in its place."""
+    model, picture, seen = street()
+    view = beneath(seen)
+    leaves = {name: getattr(picture, name).detach().clone().requires_grad_() for name in ("image", "alpha", "depth")}
+    terms = image_terms(dataclasses.replace(picture, **leaves), view, model)
+    assert terms.keys() == {"l1", "ssim", "sky_alpha", "sky_bce", "depth", "entropy", "dynamic"}
+    sum(term for name, term in terms.items() if name != "entropy").backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad.abs().sum() > 0.0, name
+        assert not leaf.grad[view.own_car].any(), name
+    beside = torch.zeros_like(view.own_car)
+    beside[7:9, :12] = True
+    assert leaves["image"].grad[beside].abs().min() > 0.0, "what is seen beside the body still counts"
+
+
+def test_what_the_own_car_hides_changes_no_term():
+    model, picture, seen = street()
+    view = beneath(seen)
+    hidden = dataclasses.replace(
+        picture,
+        image=torch.where(view.own_car[..., None], 0.1, picture.image),
+        alpha=torch.where(view.own_car, 0.4, picture.alpha),
+        depth=torch.where(view.own_car, 90.0, picture.depth),
+    )
+    before, after = (image_terms(p, view, model) for p in (picture, hidden))
+    for name, term in before.items():
+        assert torch.equal(term, after[name]), name
+    plain = dataclasses.replace(view, own_car=None)
+    assert not torch.equal(*(image_terms(p, plain, model)["ssim"] for p in (picture, hidden)))
+
+
+def test_pixels_beside_the_own_car_weigh_what_they_do_elsewhere():
+    """L1 and SSIM are means over all pixels of the picture with the recorded body before it."""
+    picture, plain = a_case(model := a_model())
+    own_car = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    own_car[9:] = True
+    terms = loss_terms(picture, dataclasses.replace(plain, own_car=own_car), model, TrainSettings(ssim_weight=0.3))
+    recorded = plain.pixels.numpy() / 255.0
+    shown = np.where(own_car[..., None], recorded, picture.image.numpy())
+    assert float(terms["l1"]) == pytest.approx(0.7 * np.abs(shown - recorded).mean(), rel=1e-5)
+    assert float(terms["ssim"]) == pytest.approx(0.3 * (1.0 - zero_padded_ssim(shown, recorded)), abs=1e-4)
+
+
+def test_actors_behind_the_own_car_are_not_made_sure_of():
+    """The body fills the image: of the entropy nothing is left, and no opacity is pulled."""
+    model, picture, seen = street()
+    view = dataclasses.replace(seen, own_car=torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
+    term = loss_terms(picture, view, model, TrainSettings())["entropy"]
+    assert float(term.detach()) == pytest.approx(0.0, abs=2e-4)
+    term.backward()
+    assert not model.parts[1].params["opacities"].grad.any()

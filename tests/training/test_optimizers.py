@@ -1,0 +1,90 @@
+"""All optimizers of a model step together as each would by itself."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import actors_of, motion_through, track_of
+
+from drivesplat.kernels import triton as on_gpu
+from drivesplat.model.background import Background
+from drivesplat.model.sky import CubemapSky
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.optimizers import ToldDevice, make_optimizers, schedule
+
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")]),
+]
+
+
+def a_model(device: str) -> SplatModel:
+    """Background, an actor and a sky: rates of all kinds, some of them alike."""
+    rng = np.random.default_rng(0)
+    settings = GaussianSettings(sh_degree=1)
+    part = Background.from_points(rng.uniform(-1, 1, (30, 3)), rng.uniform(0, 1, (30, 3)), settings, 2.0)
+    track = track_of(motion_through([0.0, 0.5, 1.0], [[0.0, 0.0, 0.0]] * 3), "car", (1.0, 1.0, 1.0))
+    return SplatModel([part, actors_of(track)], CubemapSky(3, torch.full((3,), 0.5), 1e-2)).to(device)
+
+
+def give_gradients(model: SplatModel, step: int) -> None:
+    """To all parameters but the sky's at every third step."""
+    rng = np.random.default_rng(step)
+    for name, parameter in model.named_parameters():
+        drawn = torch.from_numpy(rng.normal(size=parameter.shape)).float().to(parameter.device)
+        silent = not parameter.requires_grad or (name.startswith("sky") and step % 3 == 0)
+        parameter.grad = None if silent else drawn
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_step_together_is_every_optimizers_own(device):
+    settings, ends = TrainSettings(iterations=10), []
+    for together in (True, False):
+        model = a_model(device)
+        optimizers = make_optimizers(model)
+        for step in range(7):
+            give_gradients(model, step)
+            schedule(model, optimizers, step, settings)
+            if together:
+                optimizers.step()
+                assert all(parameter.grad is None for parameter in model.parameters())
+            else:
+                for _, optimizer in optimizers.all():
+                    optimizer.step()
+        states = {name: optimizer.state_dict()["state"] for name, optimizer in optimizers.all()}
+        ends.append((model.state_dict(), states))
+    (mine, my_states), (theirs, their_states) = ends
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs) and mine.keys() == theirs.keys()
+    assert my_states.keys() == their_states.keys() and len(my_states) > 8
+    for name, state in their_states.items():
+        assert state.keys() == my_states[name].keys()
+        for key, values in state.items():
+            assert all(torch.equal(values[part], my_states[name][key][part]) for part in values)
+    assert not torch.equal(mine["parts.0.params.means"], a_model(device).state_dict()["parts.0.params.means"])
+
+
+def test_a_cpu_need_not_be_told_rates():
+    optimizers = make_optimizers(a_model("cpu"))
+    assert ToldDevice(torch.device("cpu")).told(3, optimizers) == (3, None)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("kernels", [True, False])
+def test_steps_at_rates_that_the_device_knows_are_those_of_adam(kernels, monkeypatch):
+    monkeypatch.setattr(on_gpu, "for_tensor", lambda _: kernels)
+    settings, ends, places = TrainSettings(iterations=10), [], {}
+    for device in ("cuda", "cpu"):
+        model = a_model(device)
+        optimizers, told = make_optimizers(model), ToldDevice(torch.device(device))
+        for step in range(7):
+            give_gradients(model, step)
+            schedule(model, optimizers, step, settings)
+            counted, rates = told.told(step, optimizers)
+            optimizers.step(rates)
+            assert int(counted) == step
+            assert all(places.setdefault(name, place) is place for name, place in (rates or {}).items()), "for replays"
+        ends.append({name: value.cpu() for name, value in model.state_dict().items()})
+    for name, value in ends[1].items():
+        torch.testing.assert_close(ends[0][name], value, atol=1e-5, rtol=1e-4, msg=lambda said, name=name: name + said)

@@ -1,0 +1,167 @@
+"""Spare rows: Gaussians grow into them as they do otherwise, and until then they are nothing."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.densification import ALL, a_model, a_view, settings_of, train_step
+from helpers.trainings import ALL_TERMS, EndedError, EndingViews, guided_views, trained, untrained_street
+from helpers.trainings import settings_of as settings_of_training
+
+from drivesplat.model.part import filled
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.road import RoadSettings
+from drivesplat.settings.train import McmcSettings, TrainSettings
+from drivesplat.training import strategies
+from drivesplat.training.cuda_graph.replays import Replays
+from drivesplat.training.densify import Densifier, Optimizers
+from drivesplat.training.losses import loss_terms, mean_opacity_and_scale
+from drivesplat.training.optimizers import make_optimizers
+from drivesplat.training.road import driven_road, road_loss
+from drivesplat.training.surfaces import NOTHING_KNOWN, surface_terms
+
+
+def grown(reserves: bool, steps: int, **changes: Any) -> tuple[SplatModel, Densifier, Optimizers, list[float]]:
+    """A training that grows by half at a time, and the mean opacity and scale after every
+    iteration."""
+    torch.manual_seed(0)
+    growing = {"mcmc": McmcSettings(refine_every=2, noise_lr=0.0, growth=0.5), "cap_max": 400}
+    model, settings = a_model(), settings_of("mcmc", **{**growing, **changes})
+    densifier = Densifier(model.parts[0], settings, lambda: reserves)
+    (optimizers,) = make_optimizers(model).parts
+    means = []
+    for step in range(steps):
+        train_step(model, densifier, step, optimizers, learns_size=True)
+        opacity, scale = (
+            float(m.detach() / filled(model.parts)) for m in mean_opacity_and_scale(model.gaussians_at(0.0))
+        )
+        means += [opacity, scale]
+    return model, densifier, optimizers, means
+
+
+def test_gaussians_grow_into_spare_rows_as_they_do_otherwise(monkeypatch):
+    monkeypatch.setattr(strategies, "_explore", lambda *_: None)  # draws for every row, on a CPU
+    model, _, _, means = grown(True, 8)
+    other, _, _, expected = grown(False, 8)
+    part, count = model.parts[0], len(other.parts[0])
+    assert (len(part), part.row_count, part.spare) == (count, 400, 400 - count) and 300 < count < 400
+    for name, values in part.params.items():
+        torch.testing.assert_close(values[:count], other.parts[0].params[name], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(means, expected, rtol=1e-3)
+
+
+def test_what_is_learned_of_spare_rows_is_nothing():
+    """Neither by the loss nor by MCMC's noise."""
+    noisy = McmcSettings(refine_every=2, noise_lr=5e5, growth=0.5)
+    model, densifier, optimizers, _ = grown(True, 4, mcmc=noisy)
+    part = model.parts[0]
+    rows, moved = slice(len(part), None), part.params["means"].detach().clone()
+    before = {name: values[rows].detach().clone() for name, values in part.params.items()}
+    assert part.spare == 50 and not part.at(0.0).opacities[rows].any() and not part.at(0.0).scales[rows].any()
+    train_step(model, densifier, 5, optimizers, learns_size=True)
+    assert part.spare == 50 and not torch.equal(part.params["means"], moved)
+    with torch.no_grad():
+        alone = model.render(a_view(), gaussians=part.at(0.0)[torch.arange(part.row_count) >= len(part)])
+    assert not alone.image.any() and not alone.alpha.any()
+    for name, values in part.params.items():
+        torch.testing.assert_close(values[rows], before[name], rtol=0, atol=0)
+        assert not optimizers[name].state[values]["exp_avg_sq"][rows].any(), name
+
+
+def test_while_there_are_spare_rows_tensors_lie_where_they_do():
+    model, densifier, optimizers, _ = grown(True, 3, mcmc=McmcSettings(refine_every=2, noise_lr=0.0, growth=0.2))
+    part = model.parts[0]
+    places, counts = {name: values.data_ptr() for name, values in part.params.items()}, [len(part)]
+    for step in range(3, 5):
+        train_step(model, densifier, step, optimizers)
+        counts.append(len(part))
+    assert counts[-1] > counts[0] and part.row_count == 200
+    assert {name: values.data_ptr() for name, values in part.params.items()} == places
+
+
+def test_dead_gaussians_are_relocated_and_spare_rows_are_not():
+    model, densifier, optimizers, _ = grown(True, 3, mcmc=McmcSettings(refine_every=2, noise_lr=0.0, growth=0.05))
+    part, count = model.parts[0], len(model)
+    with torch.no_grad():
+        part.params["opacities"][:30] = -9.0
+    densifier.after_step(4, optimizers, {}, ALL)
+    opacities = torch.sigmoid(part.params["opacities"])
+    assert len(part) == int(1.05 * count) and (opacities[: len(part)] > 0.005).all()
+    assert part.spare and not opacities[len(part) :].any()
+
+
+def test_when_densification_stops_no_row_is_left_spare():
+    model, densifier, optimizers, _ = grown(True, 4)
+    part = model.parts[0]
+    kept = part.params["means"][: len(part)].detach().clone()
+    densifier.after_step(1000, optimizers, {}, ALL)
+    assert part.spare == 0 and part.row_count == len(part) == len(kept) and filled([part]) == 1.0
+    torch.testing.assert_close(part.params["means"].detach(), kept)
+    train_step(model, densifier, 1001, optimizers)
+
+
+def test_who_reserves_no_longer_grows_otherwise():
+    """As where a training goes on without a GPU."""
+    model, densifier, optimizers, _ = grown(True, 4)
+    part, count = model.parts[0], len(model)
+    assert part.spare
+    densifier._strategy.reserves = lambda: False
+    densifier.after_step(4, optimizers, {}, ALL)
+    assert part.spare == 0 and part.row_count == len(part) == count * 3 // 2
+    train_step(model, densifier, 5, optimizers)
+
+
+def test_spare_rows_on_the_road_do_not_weigh_there():
+    model, _, _, _ = grown(True, 4)
+    part = model.parts[0]
+    with torch.no_grad():
+        part.params["means"][len(part) :] = torch.tensor([0.0, 0.0, 0.2])
+    road = driven_road(np.tile(np.eye(4), (1, 1, 1)), RoadSettings())
+    with_them = road_loss(part.at(0.0), road)
+    there = part.at(0.0)[torch.arange(part.row_count) < len(part)]
+    assert float(with_them.detach()) == pytest.approx(float(road_loss(there, road).detach()))
+
+
+def test_of_the_loss_spare_rows_have_no_share():
+    model, densifier, optimizers, _ = grown(True, 4)
+    (view, *_), settings = guided_views(), TrainSettings()
+    found, with_spare = [], model.parts[0].spare
+    for _ in range(2):
+        with torch.no_grad():
+            found.append(loss_terms(model.render(view.view), view, model, settings))
+        densifier.end(optimizers)
+    assert with_spare and not model.parts[0].spare and found[0].keys() == found[1].keys() >= {"opacity_reg"}
+    for name, term in found[0].items():
+        assert float(term) == pytest.approx(float(found[1][name])), name
+
+
+def test_spare_rows_cost_flatness_nothing():
+    model, _, _, _ = grown(True, 4)
+    part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
+    found = surface_terms(model.render(a_view()), model, NOTHING_KNOWN, settings)
+    expected = part.at(0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
+    assert part.spare and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
+
+
+def test_a_training_with_spare_rows_resumes_and_leaves_none(tmp_path, monkeypatch):
+    """With every term, and actors, of whom new Gaussians have to belong to someone."""
+    reserved = []
+    monkeypatch.setattr(Replays, "give_way", lambda _: not reserved.append(1))
+    growing = McmcSettings(refine_every=4, growth=0.2)
+    settings = settings_of_training(iterations=30, checkpoint_every=12, mcmc=growing, refine_start=0.0, **ALL_TERMS)
+
+    def done(name: str, views: list) -> tuple[SplatModel, list[int]]:
+        model, summary = trained(tmp_path / name, settings, views, model=untrained_street(settings))
+        assert summary.gaussians == len(model)
+        return model, summary.resumed_at
+
+    whole, _ = done("whole", guided_views())
+    with pytest.raises(EndedError):
+        done("it", EndingViews(guided_views(), 20))
+    resumed, resumed_at = done("it", guided_views())
+    assert len(reserved) >= 4 and resumed_at == [12]
+    assert [len(part) for part in resumed.parts] == [len(part) for part in whole.parts]
+    assert all(part.spare == 0 and part.row_count == len(part) > 50 for part in resumed.parts)
+    for name, values in resumed.state_dict().items():
+        torch.testing.assert_close(values, whole.state_dict()[name])

@@ -1,0 +1,246 @@
+"""Surfaces are flat, and the road is where the car drove: the terms, what they pull on, and what they leave alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import actors_of, looking_at, motion_through, round_gaussians, track_of
+from scipy.spatial.transform import Rotation
+
+from drivesplat.model.background import Background
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.rigid import rigid
+from drivesplat.settings.road import RoadSettings
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.floaters import LARGEST_STEP
+from drivesplat.training.road import CELL, ROUGHNESS, Road, driven_road, road_loss, road_of
+from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms, surroundings_of, thickness
+
+WIDE = RoadSettings(half_width=1.2, reach=0.3)
+
+
+def straight(length: float = 20.0, step: float = 2.0, pitch: float = 0.0, roll: float = 0.0, heading: float = 0.0):
+    """Ego poses (m, 4, 4) along a straight road from the origin, climbing by `pitch` radians, leaning by `roll`."""
+    turn = Rotation.from_euler("ZYX", [heading, -pitch, roll]).as_matrix()
+    return np.stack([rigid(turn, at * turn[:, 0]) for at in np.arange(0.0, length + 1e-6, step)])
+
+
+def on_road(poses: np.ndarray, along: np.ndarray, aside: np.ndarray, above: np.ndarray) -> torch.Tensor:
+    """World points (n, 3) by their place in the frame of the first of some poses of a straight road."""
+    return torch.from_numpy(np.stack([along, aside, above], axis=1) @ poses[0, :3, :3].T + poses[0, :3, 3]).float()
+
+
+def gaussians_at(means: torch.Tensor, scales: torch.Tensor, quats: torch.Tensor) -> Gaussians:
+    n = len(means)
+    return Gaussians.of(means, quats, scales, torch.full((n,), 0.5), torch.zeros(n, 1, 3))
+
+
+def round_at(means: torch.Tensor, size: float = 1e-4) -> Gaussians:
+    return gaussians_at(means, torch.full((len(means), 3), size), torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1))
+
+
+def distance(road: Road, means: torch.Tensor) -> torch.Tensor:
+    """How far points lie over the planes that a road has for them."""
+    place, found = road.cells.find(means[:, :2])
+    assert found.all()
+    return (means * road.normals[place]).sum(dim=1) - road.offsets[place]
+
+
+ROADS = [{}, {"pitch": 0.08}, {"roll": 0.05, "heading": 0.7}, {"pitch": -0.05, "roll": -0.04, "heading": 2.0}]
+
+
+@pytest.mark.parametrize("lie", ROADS, ids=str)
+def test_the_road_is_the_plane_that_the_car_stood_on(lie):
+    random, poses = np.random.default_rng(0), straight(**lie)
+    along, aside, above = random.uniform(0, 20, 500), random.uniform(-1.0, 1.0, 500), random.uniform(-0.2, 0.2, 500)
+    found = distance(driven_road(poses, WIDE), on_road(poses, along, aside, above))
+    np.testing.assert_allclose(found.numpy(), above, atol=1e-4)
+
+
+@pytest.mark.parametrize("lie", ROADS, ids=str)
+def test_it_is_as_wide_as_told_and_counts_less_the_farther_out(lie):
+    random, poses = np.random.default_rng(1), straight(**lie)
+    along, aside = random.uniform(0, 20, 4000), random.uniform(-2.0, 2.0, 4000)
+    road = driven_road(poses, WIDE)
+    place, found = road.cells.find(on_road(poses, along, aside, np.zeros(4000))[:, :2])
+    width = np.abs(aside)
+    assert found.numpy()[width < 1.2 - CELL].all() and not found.numpy()[width > 1.2 + CELL].any()
+    off = np.abs(road.weights[place].numpy() - (1.0 - (width / 1.2) ** 2))[found.numpy()]
+    assert off.max() < 2.0 * CELL / 1.2 and float(road.weights.min()) >= 0.0
+
+
+def test_along_a_bend_the_road_turns_evenly_from_pose_to_pose():
+    """A path that comes down a hill of 100 metres' radius: halfway between two poses height and slope are between
+    theirs."""
+    angles = np.arange(0.0, 0.2, 0.02)
+    turns = Rotation.from_euler("y", angles[:, None]).as_matrix()
+    poses = np.stack(
+        [rigid(t, 100.0 * np.array([np.sin(a), 0.0, np.cos(a) - 1.0])) for t, a in zip(turns, angles, strict=True)]
+    )
+    between = 100.0 * np.stack([np.sin(angles[:-1] + 0.01), 0.0 * angles[1:], np.cos(angles[:-1] + 0.01) - 1.0], axis=1)
+    road = driven_road(poses, WIDE)
+    points = torch.from_numpy(between).float()
+    place, _ = road.cells.find(points[:, :2])
+    assert distance(road, points).abs().max() < 6e-3, "the sagitta of 2 metres is 5 millimetres"
+    np.testing.assert_allclose(road.normals[place, 0].numpy(), np.sin(angles[:-1] + 0.01), atol=1e-3)
+
+
+def test_poses_far_apart_are_not_joined_and_a_lone_one_is_a_road():
+    poses = np.concatenate([straight(4.0), straight(2.0) + 0.0])
+    poses[3:, 0, 3] += 4.0 + LARGEST_STEP + 1.0
+    road = driven_road(poses, WIDE)
+    x = torch.tensor([0.5, 3.5, 4.0 + LARGEST_STEP / 2, 21.0])
+    _, found = road.cells.find(torch.stack([x, torch.zeros(4)], dim=1))
+    assert found.tolist() == [True, True, False, True]
+    lone = driven_road(poses[:1], WIDE)
+    assert lone.cells.find(torch.tensor([[0.9, 0.0], [1.3, 0.0]]))[1].tolist() == [True, False]
+
+
+def test_the_loss_is_the_pseudo_huber_norm_of_how_far_the_mass_lies_off():
+    """By its definition: mean square distances of samples drawn from each Gaussian."""
+    random, poses = np.random.default_rng(2), straight(pitch=0.05, roll=0.03)
+    road = driven_road(poses, WIDE)
+    n, samples = 6, 200_000
+    means = on_road(
+        poses, random.uniform(3, 15, n), np.array([0.0, 0.3, -0.3, 0.7, -1.0, 0.9]), np.linspace(-0.2, 0.25, n)
+    )
+    scales = torch.from_numpy(random.uniform(0.01, 0.3, (n, 3))).float()
+    turns = Rotation.random(n, random_state=3)
+    quats = torch.from_numpy(turns.as_quat()[:, [3, 0, 1, 2]] * random.uniform(0.5, 2.0, (n, 1))).float()
+    place, _ = road.cells.find(means[:, :2])
+    normals, offsets = road.normals[place].double().numpy(), road.offsets[place].double().numpy()
+    drawn = random.normal(size=(samples, n, 3)) * scales.numpy()
+    mass = np.einsum("nij,snj->sni", turns.as_matrix(), drawn) + means.double().numpy()
+    square = (((mass * normals).sum(axis=2) - offsets) ** 2).mean(axis=0)
+    weights = road.weights[place].numpy()
+    expected = (weights * (np.sqrt(square + ROUGHNESS**2) - ROUGHNESS)).sum() / weights.sum()
+    assert float(road_loss(gaussians_at(means, scales, quats), road)) == pytest.approx(expected, rel=5e-3)
+
+
+def test_gaussians_of_the_road_come_to_lie_in_it_flat_and_the_others_stay():
+    """Of random ones those within reach and width; kerbs beside and a car's roof above are not pulled on."""
+    random, poses = np.random.default_rng(4), straight(pitch=0.06)
+    road = driven_road(poses, WIDE)
+    n = 60
+    aside, above = random.uniform(-1.0, 1.0, n), random.uniform(-0.25, 0.25, n)
+    aside[40:50], above[50:] = random.choice([-1, 1], 10) * random.uniform(1.4, 3.0, 10), 0.5
+    means = on_road(poses, random.uniform(1, 19, n), aside, above)
+    quats = torch.from_numpy(random.normal(size=(n, 4))).float()
+    parameters = [means.clone(), torch.log(torch.full((n, 3), 0.1) * torch.tensor([1.0, 0.5, 0.2])), quats]
+    parameters = [value.requires_grad_() for value in parameters]
+    optimizer = torch.optim.Adam(parameters, lr=1e-2)
+    for _ in range(200):
+        optimizer.zero_grad()
+        road_loss(gaussians_at(parameters[0], parameters[1].exp(), parameters[2]), road).backward()
+        optimizer.step()
+    with torch.no_grad():
+        scales = parameters[1].exp()
+        assert distance(road, parameters[0][:40]).abs().max() < 0.01
+        axes = Rotation.from_quat(parameters[2][:40].numpy()[:, [1, 2, 3, 0]]).as_matrix()
+        shortest = axes[np.arange(40), :, scales[:40].argmin(dim=1).numpy()]
+        assert np.median(np.abs(shortest @ road.normals[0].numpy())) > 0.95
+    for value, before in zip(parameters, (means, None, quats), strict=True):
+        assert before is None or torch.equal(value[40:].detach(), before[40:])
+
+
+def test_centres_are_pulled_straight_onto_the_road():
+    """Along its normal, the harder the farther off, up to a bound."""
+    poses = straight(pitch=0.06, roll=-0.04)
+    means = on_road(poses, np.full(5, 9.0), np.zeros(5), np.array([-0.28, -0.02, 0.0, 0.05, 0.2])).requires_grad_()
+    road_loss(round_at(means), driven_road(poses, WIDE)).backward()
+    along = means.grad @ torch.from_numpy(poses[0, :3, 2]).float()
+    torch.testing.assert_close(means.grad, torch.outer(along, torch.from_numpy(poses[0, :3, 2]).float()))
+    assert along[0] < along[1] < -1e-3 and along[2].abs() < 1e-3 < along[3] < along[4] < 0.2
+
+
+@pytest.mark.parametrize("place", [(50.0, 0.0, 0.0), (5.0, 3.0, 0.0), (5.0, 0.0, 1.0)])
+def test_where_there_is_no_gaussian_of_the_road_it_costs_nothing(place):
+    road, means = driven_road(straight(), WIDE), torch.tensor([place], requires_grad=True)
+    loss = road_loss(round_at(means), road)
+    loss.backward()
+    assert float(loss.detach()) == 0.0 and not means.grad.any()
+
+
+def test_far_ones_count_no_more_than_linearly_and_near_ones_less():
+    road = driven_road(straight(), WIDE)
+    at = [float(road_loss(round_at(torch.tensor([[5.0, 0.0, z]])), road)) for z in (0.005, 0.01, 0.14, 0.28)]
+    assert at[1] / at[0] == pytest.approx(4.0, rel=0.05) and at[3] / at[2] == pytest.approx(2.35, rel=0.05)
+
+
+def test_the_road_is_that_of_training_images_in_time_order():
+    """Three cameras' images one after the other; the key frame that is held out goes round a corner."""
+    poses = np.concatenate([straight(12.0)[::3], straight(12.0)[1::3]])
+    poses[2, 1, 3] = 8.0
+    parser = {
+        "ego_to_world": poses, "timestamps": np.array([0, 3, 6, 1, 4]), "splits": {"train": np.array([0, 1, 3, 4])},
+    }  # fmt: skip
+    road = road_of(parser, WIDE)
+    points = torch.tensor([[1.0, 0.0], [4.0, 0.0], [7.5, 0.0], [12.0, 8.0], [10.0, 4.0]])
+    assert road.cells.find(points)[1].tolist() == [True, True, True, False, False]
+
+
+# ---- the terms
+
+
+def a_street() -> SplatModel:
+    """Background over and beside a road, and a car on it."""
+    random = np.random.default_rng(5)
+    still = Background.from_points(
+        random.uniform([2, -3, -0.3], [9, 3, 0.3], (40, 3)),
+        random.uniform(size=(40, 3)),
+        TrainSettings().gaussians,
+        1.0,
+    )
+    with torch.no_grad():
+        still.params["scales"] += torch.from_numpy(random.normal(size=(40, 3))).float()
+    moving = actors_of(track_of(motion_through([0.0, 1.0], [[5.0, 0.0, 0.1], [6.0, 0.0, 0.1]])))
+    return SplatModel([still, moving], None)
+
+
+def known() -> Surroundings:
+    return Surroundings(road=driven_road(straight(), WIDE))
+
+
+def test_terms_are_weighted_and_about_what_stands_still_alone():
+    model = a_street()
+    picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
+    terms = surface_terms(picture, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
+    still = model.parts[0].at(0.0)
+    torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
+    torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known().road))
+    assert float(terms["road"].detach()) > 0.0
+    sum(terms.values()).backward()
+    moving = [*model.parts[1].params.values(), *model.parts[1].shared.values()]
+    assert not any(value.grad is not None and value.grad.any() for value in moving)
+    assert model.parts[0].params["scales"].grad.any() and model.parts[0].params["means"].grad.any()
+
+
+def test_without_their_weights_there_are_no_terms():
+    model, parser = (
+        a_street(),
+        {"ego_to_world": straight(), "timestamps": np.arange(11), "splits": {"train": np.arange(11)}},
+    )
+    picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
+    plain = TrainSettings()
+    assert surroundings_of(parser, None, plain) == NOTHING_KNOWN
+    assert surface_terms(picture, model, surroundings_of(parser, None, plain), plain) == {}
+    for changes, term in (({"flatness_weight": 0.1}, "flatness"), ({"road_weight": 0.1}, "road")):
+        settings = TrainSettings(**changes)
+        assert surface_terms(picture, model, surroundings_of(parser, None, settings), settings).keys() == {term}
+
+
+def test_flatness_makes_the_shortest_axis_shorter_and_no_other():
+    part = round_gaussians(np.zeros((2, 3)), sizes=0.2)
+    with torch.no_grad():
+        part.params["scales"] += torch.log(torch.tensor([[1.0, 0.5, 2.0], [3.0, 2.0, 0.25]]))
+    flat = thickness(part.at(0.0))
+    assert float(flat.detach()) == pytest.approx(0.2 * (0.5 + 0.25) / 2)
+    flat.backward()
+    assert (part.params["scales"].grad > 0).tolist() == [[False, True, False], [False, False, True]]
+
+
+def test_what_is_known_goes_where_it_is_asked():
+    moved = dataclasses.replace(known(), free=None).to(torch.device("meta"))
+    assert moved.free is None and {t.device.type for t in (moved.road.normals, moved.road.cells.keys)} == {"meta"}

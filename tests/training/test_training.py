@@ -1,0 +1,781 @@
+"""A training from its first iteration to its files: what it learns, and what it survives."""
+
+import dataclasses
+import errno
+import json
+import logging
+import math
+import os
+import pickle
+import resource
+import signal
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.trainings import (
+    ALL_TERMS,
+    CHECKPOINT_AT,
+    CPU,
+    ENDED_AT,
+    HEIGHT,
+    ITERATIONS,
+    PROVENANCE,
+    WIDTH,
+    EndedError,
+    EndingViews,
+    files_in,
+    guided_views,
+    in_subprocess,
+    inputs_in,
+    job_of,
+    mean_psnr,
+    parser_record,
+    recorded_views,
+    same_parameters,
+    settings_of,
+    trained,
+    untrained,
+    untrained_street,
+    workspace_of,
+)
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from drivesplat.errors import DeviceError, ResultError, TrainingError
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.settings.actors import ActorSettings
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import (
+    DefaultSettings,
+    FloaterSettings,
+    TrainJob,
+)
+from drivesplat.training import checkpoint
+from drivesplat.training.cells import Cells
+from drivesplat.training.monitor import FiniteGuard
+from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.road import driven_road
+from drivesplat.training.run import (
+    TrainingFiles,
+    mean_sky_color,
+    read_checkpoint,
+    run_training,
+    trained_model,
+)
+from drivesplat.training.surfaces import Surroundings
+from drivesplat.training.train import TrainingSummary, train
+from drivesplat.training.trainer import Trainer
+from drivesplat.training.views import Guides, TrainingView, load_views, order, view_of
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+NO_GUIDES = Guides(sky={}, moving={}, lidar={})
+
+
+def train_until_killed(folder: str) -> None:
+    """For a subprocess: a training that ends itself as `kill -9` would."""
+    torch.set_num_threads(1)
+    trained(Path(folder), settings_of(), EndingViews(recorded_views(), ENDED_AT, kill=True))
+
+
+def print_whether_torchs_compiler_is_read(folder: str) -> None:
+    """For a subprocess: a whole training with resume states."""
+    torch.set_num_threads(1)
+    trained(Path(folder), settings_of())
+    print("torch._dynamo" in sys.modules)
+
+
+def hold_the_lock(folder: str) -> None:
+    """For a subprocess: a trainer that works until it is killed."""
+    with checkpoint.sole_trainer(Path(folder)):
+        print("held", flush=True)
+        signal.pause()
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> dict[str, tuple[SplatModel, TrainingSummary]]:
+    """By strategy, a training that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("uninterrupted")
+    return {s: trained(folder / s, settings_of(s)) for s in ("mcmc", "default")}
+
+
+# ---- what it learns
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_training_comes_nearer_to_its_images(uninterrupted, strategy):
+    views = recorded_views()
+    model, summary = uninterrupted[strategy]
+    assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 3.0
+    assert summary.iterations == ITERATIONS and summary.resumed_at == []
+    assert 90 < summary.gaussians == len(model) <= 200
+    assert summary.peak_gpu_memory_gb is None and summary.device.startswith("cpu")
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_one_seed_gives_one_result_on_the_cpu(uninterrupted, strategy, tmp_path):
+    again, _ = trained(tmp_path, settings_of(strategy))
+    assert same_parameters(again, uninterrupted[strategy][0])
+
+
+def test_another_seed_gives_another_result(uninterrupted, tmp_path):
+    other, summary = trained(tmp_path, settings_of(), seed=1)
+    assert summary.random_seed == 1
+    assert not torch.equal(other.parts[0].params["means"], uninterrupted["mcmc"][0].parts[0].params["means"])
+
+
+def test_a_sky_learns_too(tmp_path):
+    settings = settings_of(iterations=20)
+    model = untrained(settings, sky=True)
+    views = [TrainingView(v.view, torch.zeros_like(v.pixels), None) for v in recorded_views()]
+    trained(tmp_path, settings, views, model=model)
+    assert (torch.sigmoid(model.sky.params["color"]) < 0.48).all()
+
+
+def test_actors_learn_with_the_background_but_for_those_that_are_absent():
+    """Views at 0 and 0.5 s see the first car; the second comes at 0.75 s."""
+    settings = settings_of(refine_start=1.0, **ALL_TERMS)
+    model = untrained_street(settings)
+    trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU)
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
+    for _ in range(15):
+        trainer.fit_one()
+        trainer.step += 1
+    moved = {name: (value.detach() - before[name]).abs() for name, value in model.named_parameters()}
+    first, second = (model.parts[1].params["owner"] == i for i in (0, 1))
+    for name in ("means", "scales", "opacities", "sh0", "shN"):
+        assert moved[f"parts.0.params.{name}"].max() > 0.0
+        assert moved[f"parts.1.params.{name}"][first].max() > 0.0
+        assert not moved[f"parts.1.params.{name}"][second].any()
+    for name in ("translation", "yaw"):
+        assert moved[f"parts.1.shared.{name}"][:2].max() > 1e-4 and not moved[f"parts.1.shared.{name}"][5:].any()
+    assert not moved["parts.1.params.owner"].any()
+
+
+def test_a_degree_that_is_not_shown_as_yet_does_not_learn():
+    """Neither of what stands still nor of what turns."""
+    settings = settings_of(sh_every=1.0, refine_start=1.0)
+    model = untrained_street(settings)
+    trainer = Trainer.begin(model, recorded_views(), settings, 0, CPU)
+    for _ in range(5):
+        trainer.fit_one()
+        trainer.step += 1
+    assert all(part.params["shN"].numel() and not part.params["shN"].any() for part in model.parts)
+
+
+def test_gaussians_that_leave_their_actors_box_are_put_back_among_the_others(tmp_path):
+    settings = settings_of(iterations=7, refine_start=0.0, refine_stop=1.0, floaters=FloaterSettings(radius=0))
+    model = untrained_street(settings)
+    actors = model.parts[1]
+    with torch.no_grad():
+        actors.params["means"][:4] += 3.0
+        actors.params["opacities"].fill_(1.0)
+    trained(tmp_path, settings, model=model)
+    assert len(actors) >= 50 and float(actors.params["means"].detach().abs().max()) < 1.5
+
+
+def test_actors_are_no_floaters(tmp_path):
+    """Their places are their boxes', near zero as the cameras of these views are."""
+    settings = settings_of(iterations=7, refine_start=1.0, floaters=FloaterSettings(every=7, radius=3.5))
+    model = untrained_street(settings)
+    trained(tmp_path, settings, model=model)
+    still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
+    assert (still < 1e-3).any() and not (actors < 1e-3).any()
+
+
+def all_around(lower: float = -10.0, edge: float = 20.0) -> Cells:
+    """A grid of one cell that holds everything."""
+    return Cells.of(np.full(3, lower), edge, np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64))
+
+
+@pytest.mark.parametrize("free", [None, all_around()], ids=["unknown", "all free"])
+def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
+    settings = settings_of(iterations=7, refine_start=1.0, floaters=FloaterSettings(every=7, radius=0))
+    model = untrained_street(settings)
+    workspace = workspace_of(tmp_path, "of this training")
+    train(model, recorded_views(), settings, 0, CPU, workspace, Surroundings(free=free))
+    still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
+    assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
+
+
+def test_a_training_is_held_to_flatness_and_the_road():
+    """The terms are among those of an iteration, and pull on the background."""
+    settings = settings_of(flatness_weight=0.2, road_weight=0.3)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, 2, 3], poses[:, 0, 3] = 4.5, [-1.0, 1.0]
+    surroundings = Surroundings(road=driven_road(poses, settings.road))
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, surroundings)
+    before = trainer.model.gaussians_at(0.0)
+    terms, *_ = trainer.fit_one()
+    torch.testing.assert_close(terms["flatness"], 0.2 * before.scales.amin(dim=1).mean())
+    assert float(terms["road"].detach()) > 0.0
+    plain = Trainer.begin(untrained(settings_of()), recorded_views(), settings_of(), 0, CPU)
+    assert plain.fit_one()[0].keys() == terms.keys() - {"flatness", "road"}
+
+
+def test_what_stands_still_knows_no_settings_of_what_moves():
+    """So that a change of these leaves trainings without moving parts as they are."""
+    changed = {"iterations": 70, "depth_weight": 0.2, "sky_bce_weight": 0.3, "opacity_reg": 0.5}
+    moving = {"actors": ActorSettings(fourier=2), "entropy_weight": 0.7, "dynamic_weight": 0.9}
+    settings = settings_of(**changed, **moving)
+    assert settings.of_what_stands_still() == settings_of(**changed)
+    assert {name for name, value in settings if getattr(settings.of_what_stands_still(), name) != value} == set(moving)
+
+
+@pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (50, 0.1), (100, 0.01)])
+def test_positions_learn_ever_more_slowly(step, factor):
+    model = untrained(settings_of())
+    optimizers = make_optimizers(model)
+    before = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
+    schedule(model, optimizers, step, settings_of(iterations=100))
+    after = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
+    assert after.pop("0.means") == pytest.approx(2e-3 * factor)
+    assert after == {name: rate for name, rate in before.items() if name != "0.means"}
+
+
+@pytest.mark.parametrize(("step", "degree"), [(0, 0), (9, 0), (10, 1), (25, 2), (35, 3)])
+def test_spherical_harmonics_gain_a_degree_at_a_time(step, degree):
+    settings = settings_of(iterations=100, sh_every=0.1, gaussians=GaussianSettings(sh_degree=3))
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU)
+    trainer.step = step
+    assert trainer.sh_degree() == degree
+
+
+# ---- the images
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_every_epoch_sees_every_view_once_in_an_order_of_its_own(count):
+    epochs = [[order(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
+    assert all(sorted(epoch) == list(range(count)) for epoch in epochs)
+    assert count == 1 or len({tuple(epoch) for epoch in epochs}) > 1
+    assert epochs == [[order(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
+
+
+def test_the_order_of_views_hangs_on_the_seed():
+    assert [order(20, i, seed=1) for i in range(20)] != [order(20, i, seed=2) for i in range(20)]
+
+
+def test_views_are_the_training_images_and_no_others(tmp_path):
+    recorded = recorded_views()
+    loaded = load_views(parser_record(tmp_path, recorded), NO_GUIDES, CPU)
+    assert len(loaded) == 4
+    for view, expected in zip(loaded, [recorded[i] for i in (0, 1, 3, 4)], strict=True):
+        assert torch.equal(view.pixels, expected.pixels) and view.sky is None
+        torch.testing.assert_close(view.view.camera_to_world, expected.view.camera_to_world)
+        assert view.view.time == pytest.approx(expected.view.time)
+        assert view.target().dtype == torch.float32 and float(view.target().max()) <= 1.0
+
+
+def test_views_know_what_guides_say_of_their_image(tmp_path):
+    """By the image's number among all of the scene, of which the third is held out."""
+    masks = {i: np.zeros((HEIGHT, WIDTH), dtype=bool) for i in range(5)}
+    for i, mask in masks.items():
+        mask[i] = True
+    depths = {
+        3: {"rows": np.array([0, 2], np.int32), "columns": np.array([7, 1], np.int32), "depth": np.array([4.5, 9.0])}
+    }
+    none = {"rows": np.zeros(0, np.int32), "columns": np.zeros(0, np.int32), "depth": np.zeros(0, np.float32)}
+    guides = Guides(sky=masks, moving={i: masks[4 - i] for i in masks}, lidar={**depths, 4: none})
+    loaded = dict(zip((0, 1, 3, 4), load_views(parser_record(tmp_path, recorded_views()), guides, CPU), strict=True))
+    for i, view in loaded.items():
+        assert view.sky.nonzero()[:, 0].unique().tolist() == [i]
+        assert view.moving.nonzero()[:, 0].unique().tolist() == [4 - i]
+    assert loaded[3].lidar.pixels.tolist() == [7, 2 * WIDTH + 1] and loaded[3].lidar.depth.tolist() == [4.5, 9.0]
+    assert loaded[0].lidar is None and loaded[4].lidar is None, "not measured, and nothing measured"
+
+
+def test_the_time_of_a_view_counts_from_the_first_image(tmp_path):
+    record = parser_record(tmp_path, recorded_views())
+    assert [view_of(record, i, CPU).time for i in range(5)] == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])
+
+
+def test_the_sky_starts_at_the_mean_colour_of_its_pixels():
+    views = recorded_views(2)
+    masks = [torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) for _ in views]
+    masks[0][:3] = True
+    masks[1][0, :5] = True
+    seen = [TrainingView(v.view, v.pixels, mask) for v, mask in zip(views, masks, strict=True)]
+    pixels = np.concatenate([v.pixels.numpy()[mask.numpy()] for v, mask in zip(views, masks, strict=True)])
+    np.testing.assert_allclose(mean_sky_color(seen), pixels.mean(axis=0) / 255.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_without_sky_pixels_the_sky_starts_at_the_mean_colour_of_all(known):
+    """By night that is dark: what no image shows of the sky stays as it starts."""
+    mask, views = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) if known else None, recorded_views(2)
+    everything = np.concatenate([view.pixels.reshape(-1, 3) for view in views]) / 255.0
+    found = mean_sky_color([TrainingView(v.view, v.pixels, mask) for v in views])
+    np.testing.assert_allclose(found, everything.mean(axis=0), atol=1e-6)
+
+
+# ---- what it survives
+
+
+def test_a_training_killed_halfway_resumes_and_ends_as_an_uninterrupted_one(uninterrupted, tmp_path):
+    process = in_subprocess(train_until_killed, str(tmp_path))
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL, errors
+    assert [path.name for path in (tmp_path / "resume").iterdir()] == ["state.pt"]
+
+    resumed, summary = trained(tmp_path, settings_of())
+    whole, whole_summary = uninterrupted["mcmc"]
+    views = recorded_views()
+    assert summary.iterations == whole_summary.iterations == ITERATIONS
+    assert summary.resumed_at == [CHECKPOINT_AT]
+    assert summary.gaussians == whole_summary.gaussians
+    assert mean_psnr(resumed, views) == pytest.approx(mean_psnr(whole, views), abs=0.1)
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_resumed_training_is_the_same_training_on_the_cpu(uninterrupted, strategy, tmp_path):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(strategy), EndingViews(recorded_views(), ENDED_AT))
+    resumed, summary = trained(tmp_path, settings_of(strategy))
+    assert summary.resumed_at == [CHECKPOINT_AT]
+    assert same_parameters(resumed, uninterrupted[strategy][0])
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_resumed_training_of_actors_is_the_same_training_on_the_cpu(strategy, tmp_path):
+    """With all terms of the loss, corrections of tracks, and Gaussians that come and go."""
+    settings = settings_of(strategy, iterations=30, checkpoint_every=12, refine_start=0.0, **ALL_TERMS)
+    whole, summary = trained(tmp_path / "whole", settings, guided_views(), model=untrained_street(settings))
+    with pytest.raises(EndedError):
+        trained(tmp_path / "it", settings, EndingViews(guided_views(), 20), model=untrained_street(settings))
+    resumed, resumed_summary = trained(tmp_path / "it", settings, guided_views(), model=untrained_street(settings))
+    assert (summary.resumed_at, resumed_summary.resumed_at) == ([], [12])
+    assert same_parameters(resumed, whole)
+    assert len(whole.parts[1]) != 50 and whole.parts[1].shared["yaw"].any()
+
+
+def test_a_training_ended_twice_resumes_twice_and_counts_all_its_time(uninterrupted, tmp_path):
+    settings = settings_of(checkpoint_every=20)
+    for looks in (25, 25):
+        with pytest.raises(EndedError):
+            trained(tmp_path, settings, EndingViews(recorded_views(), looks))
+    before = checkpoint.load(tmp_path / "resume/state.pt", "train")["seconds"]
+    resumed, summary = trained(tmp_path, settings)
+    assert summary.resumed_at == [20, 40]
+    assert summary.seconds > before > 0.0
+    assert same_parameters(resumed, uninterrupted["mcmc"][0])
+
+
+class TickingViews(EndingViews):
+    """Training images of which a look takes a second, by the clock that the training sees."""
+
+    seconds = 0.0
+
+    def __getitem__(self, index: int) -> TrainingView:
+        self.seconds += 1.0
+        return super().__getitem__(index)
+
+
+@pytest.mark.parametrize(("apart", "kept"), [(0.0, 40), (20.5, 30), (39.5, 40), (100.0, None)])
+def test_resume_states_come_no_sooner_than_their_time(apart, kept, tmp_path, monkeypatch):
+    views = TickingViews(recorded_views(), 45)
+    monkeypatch.setattr("drivesplat.training.train.time", SimpleNamespace(monotonic=lambda: views.seconds))
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(checkpoint_every=10, checkpoint_apart_s=apart), views)
+    state = tmp_path / "resume/state.pt"
+    assert (checkpoint.load(state, "train")["step"] if state.exists() else None) == kept
+
+
+def test_a_training_ended_before_its_first_checkpoint_starts_at_0(uninterrupted, tmp_path):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(), EndingViews(recorded_views(), CHECKPOINT_AT - 1))
+    again, summary = trained(tmp_path, settings_of())
+    assert summary.resumed_at == []
+    assert same_parameters(again, uninterrupted["mcmc"][0])
+
+
+def test_the_resume_state_of_another_training_is_ignored_with_a_message(uninterrupted, tmp_path, caplog):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(), EndingViews(recorded_views(), ENDED_AT), seed=9, fingerprint="of another")
+    with caplog.at_level(logging.WARNING):
+        model, summary = trained(tmp_path, settings_of())
+    assert "other settings, code or inputs" in caplog.text and "starts at 0" in caplog.text
+    assert summary.resumed_at == [] and summary.iterations == ITERATIONS
+    assert same_parameters(model, uninterrupted["mcmc"][0])
+
+
+class Malicious:
+    """A pickle of it makes a file when it is loaded."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def spoil(path: Path, kind: str) -> None:
+    """Puts something at `path` that no training of this workflow wrote whole."""
+    good = {"fingerprint": "of this training", "model": {"means": torch.zeros(50_000)}}
+    match kind:
+        case "truncated":
+            torch.save(good, path)
+            path.write_bytes(path.read_bytes()[:100_000])
+        case "empty":
+            path.write_bytes(b"")
+        case "text":
+            path.write_text("PSNR 42 dB")
+        case "a tensor":
+            torch.save(torch.zeros(3), path)
+        case "malicious":
+            torch.save({**good, "extra": Malicious(path.parent / "executed")}, path)
+        case "a malicious pickle":
+            path.write_bytes(pickle.dumps({**good, "model": Malicious(path.parent / "executed")}, protocol=2))
+        case "a whole module":
+            torch.save({**good, "model": torch.nn.Linear(2, 2)}, path)
+
+
+FOREIGN = ["truncated", "empty", "text", "a tensor", "malicious", "a malicious pickle", "a whole module"]
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_a_spoilt_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(kind, tmp_path, caplog):
+    path = tmp_path / "state.pt"
+    spoil(path, kind)
+    with caplog.at_level(logging.WARNING):
+        assert checkpoint.resumable(path, "of this training") is None
+    assert str(path) in caplog.text and "starts at 0" in caplog.text
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("kind", [*FOREIGN, "missing", "another record"])
+def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    spoil(path, kind)
+    if kind == "another record":
+        torch.save({"fingerprint": "", "step": 3}, path)
+    with pytest.raises(ResultError) as error:
+        read_checkpoint(path)
+    assert str(path) in str(error.value) and "'train'" in str(error.value) and "\n" not in str(error.value)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_without_a_resume_state_nothing_is_said(tmp_path, caplog):
+    assert checkpoint.resumable(tmp_path / "state.pt", "any") is None
+    assert caplog.text == ""
+
+
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, monkeypatch, failure):
+    path = tmp_path / "state.pt"
+    checkpoint.save(path, {"step": 1, "means": torch.ones(3)})
+
+    def half(content: Any, file: Any) -> None:
+        file.write(b"PK half a checkpoint")
+        raise failure
+
+    monkeypatch.setattr(torch, "save", half)
+    with pytest.raises(ResultError if isinstance(failure, OSError) else KeyboardInterrupt):
+        checkpoint.save(path, {"step": 2})
+    assert checkpoint.load(path, "train")["step"] == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_told_with_the_files_name_and_keeps_the_earlier_checkpoint(tmp_path):
+    """A limit on the size of files stands for the full disk: torch's writer fails in the same way."""
+    path = tmp_path / "state.pt"
+    checkpoint.save(path, {"step": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
+    try:
+        with pytest.raises(ResultError, match=r"state\.pt.*cannot be written"):
+            checkpoint.save(path, {"step": 2, "means": torch.zeros(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert checkpoint.load(path, "train")["step"] == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_second_trainer_is_refused_naming_the_first_and_a_killed_one_frees_the_folder(tmp_path):
+    holder = in_subprocess(hold_the_lock, str(tmp_path / "resume"))
+    try:
+        assert holder.stdout.readline() == "held\n", holder.stderr.read()
+        assert_refused(tmp_path / "resume", holder.pid)
+    finally:
+        holder.kill()
+        holder.communicate()
+    with checkpoint.sole_trainer(tmp_path / "resume"):
+        assert_refused(tmp_path / "resume", os.getpid())
+
+
+def assert_refused(folder: Path, process: int) -> None:
+    refusal = rf"process {process} is still training in .*{folder.name}"
+    with pytest.raises(TrainingError, match=refusal), checkpoint.sole_trainer(folder):
+        pass
+
+
+def test_a_trainer_that_fails_frees_the_folder(tmp_path):
+    with pytest.raises(EndedError), checkpoint.sole_trainer(tmp_path):
+        raise EndedError
+    with checkpoint.sole_trainer(tmp_path):
+        pass
+
+
+# ---- numbers that are none
+
+
+def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoint(tmp_path):
+    """Colours leap to 1e29 in the first step, so that the second iteration's squares overflow."""
+    settings = settings_of(
+        checkpoint_every=1,
+        log_every=10,
+        gaussians=GaussianSettings(sh_degree=1, lr_sh0=1e30),
+        opacity_reg=0,
+        scale_reg=0,
+    )
+    with pytest.raises(TrainingError) as error:
+        trained(tmp_path, settings)
+    message = str(error.value)
+    assert message.startswith("iteration 2: ") and "loss ssim" in message and "gradient of background" in message
+    assert "opacity_reg" not in message and "scale_reg" not in message
+    assert str(tmp_path / "resume/state.pt") in message
+    assert checkpoint.load(tmp_path / "resume/state.pt", "train")["step"] == 1
+
+
+@pytest.mark.parametrize("log_every", [1, 50])
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_it_is_a_training_error_however_rarely_it_is_looked_for(tmp_path, strategy, log_every):
+    """Densification comes between the loss that is no number and the check."""
+    settings = settings_of(
+        strategy,
+        checkpoint_every=1000,
+        log_every=log_every,
+        refine_start=0.0,
+        gaussians=GaussianSettings(sh_degree=1, lr_sh0=1e30),
+    )
+    with pytest.raises(TrainingError, match=r"^iteration 2: .*not finite"):
+        trained(tmp_path, settings)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_the_guard_names_the_first_iteration_and_its_terms_alone(value):
+    guard = FiniteGuard(CPU)
+    fine, bad = torch.tensor(1.0), torch.tensor(value)
+    guard.watch(0, {"loss l1": fine, "loss ssim": fine, "gradient of means": fine})
+    guard.check("state.pt")
+    guard.watch(6, {"loss l1": fine, "loss ssim": bad, "gradient of means": bad})
+    guard.watch(7, {"loss l1": bad, "loss ssim": bad, "gradient of means": bad})
+    with pytest.raises(TrainingError) as error:
+        guard.check("state.pt")
+    message = str(error.value)
+    assert "iteration 7: loss ssim, gradient of means is not finite" in message
+    assert "loss l1" not in message and "state.pt" in message
+
+
+def test_the_guard_keeps_apart_iterations_that_watch_different_terms():
+    guard = FiniteGuard(CPU)
+    guard.watch(3, {"loss l1": torch.tensor(1.0), "loss sky_alpha": torch.tensor(math.nan)})
+    guard.watch(2, {"loss l1": torch.tensor(math.nan)})
+    with pytest.raises(TrainingError, match="iteration 3: loss l1 is not finite"):
+        guard.check("state.pt")
+
+
+@pytest.mark.parametrize("log_every", [1, 50])
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_a_training_without_gaussians_left_says_so(tmp_path, strategy, log_every):
+    settings = settings_of(strategy, log_every=log_every, refine_start=0.0, checkpoint_every=1000)
+    model = untrained(settings)
+    with torch.no_grad():
+        model.parts[0].params["opacities"].fill_(-30.0)
+    with pytest.raises(TrainingError, match="no Gaussian is left"):
+        trained(tmp_path, settings, model=model)
+
+
+def test_a_reset_of_all_opacities_is_no_loss_of_gaussians(tmp_path):
+    faintest = DefaultSettings(refine_every=1000, reset_every=10, prune_opacity=1e-3, grow_grad2d=1e3)
+    settings = settings_of("default", iterations=25, log_every=1, refine_start=0.0, refine_stop=1.0, default=faintest)
+    _, summary = trained(tmp_path, settings)
+    assert summary.gaussians == 90
+
+
+def test_views_that_show_no_gaussian_are_no_error(tmp_path):
+    settings = settings_of(iterations=10)
+    model = untrained(settings)
+    with torch.no_grad():
+        model.parts[0].params["means"][:, 2] *= -1.0
+    _, summary = trained(tmp_path, settings, model=model)
+    assert summary.iterations == 10
+
+
+@pytest.mark.parametrize(
+    ("strategy", "absgrad", "asked"), [("mcmc", True, False), ("default", True, True), ("default", False, False)]
+)
+def test_absolute_gradients_are_asked_for_by_the_default_strategy_alone(monkeypatch, strategy, absgrad, asked):
+    settings = settings_of(strategy, default=DefaultSettings(absgrad=absgrad))
+    trainer = Trainer.begin(untrained(settings), recorded_views(1), settings, 0, CPU)
+    render, rendered = trainer.model.render, []
+    monkeypatch.setattr(trainer.model, "render", lambda *a, **k: rendered.append(k["absgrad"]) or render(*a, **k))
+    trainer.fit_one()
+    assert rendered == [asked]
+
+
+def test_absolute_gradients_grow_gaussians_on_the_cpu(tmp_path):
+    settings = settings_of("default", default=DefaultSettings(absgrad=True, grow_grad2d=1e-3, refine_every=5))
+    _, summary = trained(tmp_path, settings)
+    assert summary.gaussians > len(untrained(settings))
+
+
+# ---- what it tells
+
+
+def test_tensorboard_holds_every_loss_and_pictures(tmp_path):
+    trained(tmp_path, settings_of())
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    wanted = {"loss/total", "loss/l1", "loss/ssim", "loss/opacity_reg", "loss/scale_reg", "gaussians"}
+    assert set(board.Tags()["scalars"]) == wanted
+    losses = {name: [event.value for event in board.Scalars(name)] for name in wanted}
+    assert [event.step for event in board.Scalars("loss/total")] == [10, 20, 30, 40, 50, 60]
+    assert losses["loss/total"][-1] < losses["loss/total"][0]
+    parts = [losses[name] for name in wanted - {"loss/total", "gaussians"}]
+    np.testing.assert_allclose(losses["loss/total"], np.sum(parts, axis=0), rtol=1e-5)
+    assert [event.step for event in board.Images("recorded_and_rendered")] == [30, 60]
+    assert {(event.width, event.height) for event in board.Images("recorded_and_rendered")} == {(2 * WIDTH, HEIGHT)}
+
+
+def test_tensorboard_of_a_resumed_training_tells_every_iteration_once(tmp_path):
+    with pytest.raises(EndedError):
+        trained(tmp_path, settings_of(), EndingViews(recorded_views(), ENDED_AT))
+    trained(tmp_path, settings_of())
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert [event.step for event in board.Scalars("loss/total")] == [10, 20, 30, 40, 50, 60]
+
+
+# ---- its files
+
+
+def run(folder: Path, job: TrainJob, device: str = "cpu", actors: bool = False) -> TrainingFiles:
+    files = files_in(folder / "vanilla")
+    inputs = inputs_in(folder, actors)
+    run_training(inputs, job, DeviceSettings(kind=device), files, PROVENANCE, "train")
+    return files
+
+
+def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
+    files = run(tmp_path, job_of())
+    assert {path.name for path in files.checkpoint.parent.iterdir()} == {"checkpoint.pt", "train.json", "tensorboard"}
+    summary = json.loads(files.summary.read_text())
+    content = read_checkpoint(files.checkpoint)
+    model, job = trained_model(content)
+    assert content["provenance"] == summary["provenance"] == PROVENANCE
+    assert job == job_of()
+    assert summary["gaussians"] == len(model) and summary["iterations"] == 20 and summary["random_seed"] == 3
+    assert summary["peak_gpu_memory_gb"] is None and summary["resumed_at"] == []
+    views = recorded_views()
+    assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
+
+
+EVERYWHERE = {"lower": np.full(3, -10.0), "voxel": 20.0, "shape": np.ones(3, np.int64), "keys": np.zeros(1, np.int64)}
+"""Free space that holds all there is."""
+
+
+def test_a_training_keeps_gaussians_out_of_the_free_space_that_it_is_given(tmp_path):
+    """Where that is everywhere, none is left."""
+    inputs = dataclasses.replace(inputs_in(tmp_path), free_space=EVERYWHERE)
+    job = job_of(floaters=FloaterSettings(every=7, radius=0, free_space=True))
+    with pytest.raises(TrainingError, match="no Gaussian is left"):
+        run_training(inputs, job, DeviceSettings(kind="cpu"), files_in(tmp_path / "vanilla"), PROVENANCE, "train")
+
+
+def test_the_terms_about_surfaces_are_logged(tmp_path):
+    files = run(tmp_path, job_of(flatness_weight=0.1, road_weight=0.1))
+    board = EventAccumulator(str(files.checkpoint.parent / "tensorboard"))
+    board.Reload()
+    assert {"loss/flatness", "loss/road"} < set(board.Tags()["scalars"])
+
+
+def test_a_finished_training_of_actors_can_be_rendered_from_its_checkpoint_alone(tmp_path):
+    job = job_of(("background", "actors"), "cubemap", sky_resolution=4, **ALL_TERMS)
+    model, again = trained_model(read_checkpoint(run(tmp_path, job, actors=True).checkpoint))
+    assert again == job and [part.name for part in model.parts] == ["background", "actors"]
+    assert [track.id for track in model.parts[1].timeline.tracks] == ["early", "late"]
+    assert model.parts[1].shared["translation"].any(), "tracks were corrected"
+    views = recorded_views()
+    assert mean_psnr(model, views) > mean_psnr(untrained_street(job.train), views) + 1.0
+
+
+@pytest.mark.parametrize(
+    ("parts", "changes", "known"),
+    [
+        (("background",), {"dynamic_weight": 0.0}, {"lidar"}),
+        (("background", "actors"), {"dynamic_weight": 0.1}, {"lidar", "moving"}),
+        (("background", "actors"), {"dynamic_weight": 0.1, "sky_bce_weight": 0.1}, {"lidar", "moving", "sky"}),
+    ],
+)
+def test_only_what_a_training_asks_for_is_read(tmp_path, parts, changes, known):
+    """Masks are read by the training images; of people that move, too, is known that they do."""
+    guides = inputs_in(tmp_path, actors=True).guides(job_of(parts, **changes))
+    told = {name: getattr(guides, name) for name in ("sky", "moving", "lidar")}
+    assert {name for name, images in told.items() if images} == known
+    assert all(list(images) == [0, 1, 3, 4] for images in told.values() if images)
+    if "moving" in known:
+        assert guides.moving[3][HEIGHT // 2 :].all() and not guides.moving[3][: HEIGHT // 2].any()
+    if "sky" in known:
+        np.testing.assert_array_equal(guides.sky[3], np.eye(HEIGHT, WIDTH, 3, dtype=bool))
+
+
+def test_a_sky_that_is_modelled_is_read(tmp_path):
+    assert inputs_in(tmp_path, actors=True).guides(job_of(sky="cubemap")).sky
+
+
+def test_masks_that_know_no_sky_hold_no_pixel_to_be_none(tmp_path):
+    """By night the heuristic finds none: the cross entropy would fill the dark sky with Gaussians."""
+    inputs = dataclasses.replace(inputs_in(tmp_path, actors=True), sky_known=False)
+    guides = inputs.guides(job_of(("background", "actors"), sky="cubemap", sky_bce_weight=0.1, dynamic_weight=0.1))
+    assert not guides.sky and guides.moving
+    views = load_views(inputs.parser, guides, CPU)
+    assert all(view.sky is None for view in views)
+
+
+def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):
+    pixels = 4 * WIDTH * HEIGHT
+    files = run(tmp_path, job_of(pixels_per_gaussian=pixels / 95, cap_max=1000, iterations=40, refine_start=0.0))
+    assert json.loads(files.summary.read_text())["gaussians"] == 95
+
+
+def test_a_training_does_not_wait_for_torchs_compiler(tmp_path):
+    """Torch's own optimizers read it, for a second or more of every training."""
+    output, errors = in_subprocess(print_whether_torchs_compiler_is_read, str(tmp_path)).communicate(timeout=120)
+    assert output == "False\n", output + errors[-3000:]
+
+
+def test_a_failed_training_leaves_no_result_but_its_resume_state(tmp_path):
+    job = job_of(gaussians=GaussianSettings(sh_degree=1, lr_sh0=1e30), checkpoint_every=1)
+    with pytest.raises(TrainingError):
+        run(tmp_path, job)
+    assert {path.name for path in (tmp_path / "vanilla").iterdir()} == {"resume", "tensorboard"}
+    assert (tmp_path / "vanilla/resume/state.pt").is_file()
+
+
+def test_without_a_gpu_a_training_is_refused_before_it_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(DeviceError, match="device: cpu"):
+        run(tmp_path, job_of(), device="auto")
+    files = files_in(tmp_path / "vanilla")
+    assert not files.checkpoint.exists() and not files.summary.exists()
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+def test_actors_that_all_died_do_not_end_a_training(strategy, tmp_path):
+    settings = settings_of(strategy, iterations=20, refine_start=0.0, refine_stop=1.0)
+    model = untrained_street(settings)
+    with torch.no_grad():
+        model.parts[1].params["opacities"].fill_(-30.0)
+    _, summary = trained(tmp_path, settings, model=model)
+    assert summary.iterations == 20
+
+
+def test_actors_alone_can_be_trained(tmp_path):
+    settings = settings_of(iterations=20, gaussians=GaussianSettings(sh_degree=3), sh_every=0.1)
+    trained(tmp_path, settings, model=SplatModel([untrained_street(settings).parts[1]], None))

@@ -1,0 +1,32 @@
+"""What the set-up compiles beforehand is what a training on processors would wait for."""
+
+import subprocess
+import sys
+
+import pytest
+from helpers import REPOSITORY
+
+LEFT = """
+import importlib, pathlib, pkgutil, tempfile
+from numba.core.registry import CPUDispatcher
+from drivesplat import on_cpu
+from drivesplat.rasterization import cpu
+from drivesplat.training.warm_up import rehearse
+
+with tempfile.TemporaryDirectory() as folder:
+    rehearse(pathlib.Path(folder))
+for package in (on_cpu, cpu):
+    for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+        for name, kernel in vars(importlib.import_module(found.name)).items():
+            if isinstance(kernel, CPUDispatcher) and kernel.stats.cache_path:  # without: kept with its callers
+                print(name, len(kernel.signatures))
+"""
+
+
+def test_every_kernel_of_a_training_is_compiled_by_the_rehearsal():
+    done = subprocess.run([sys.executable, "-c", LEFT], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    compiled = dict(line.rsplit(" ", 1) for line in done.stdout.splitlines())
+    if not compiled:
+        pytest.skip("no folder for what is compiled can be written")
+    assert len(compiled) > 12
+    assert {name: count for name, count in compiled.items() if count == "0"} == {}

@@ -1,0 +1,105 @@
+"""How far a run is: jobs that are done, trainings that say how far they are, and what is left of the rest."""
+
+import logging
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from helpers import REPOSITORY
+
+from drivesplat.settings.config import load
+from drivesplat.training import monitor
+from drivesplat.workflow.costs.estimate import Machine, PlannedJob
+from drivesplat.workflow.costs.expected import Expectations
+from drivesplat.workflow.costs.measured import Cost, Job
+from drivesplat.workflow.costs.progress import Progress, Watch
+
+CONFIG = load(yaml.safe_load((REPOSITORY / "config.yaml").read_text()))
+MASKS, TRAIN, FILM = Job("masks", "0103"), Job("train", "0103", "street"), Job("film", "0103", "street", "original")
+COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=15000), Cost(FILM, 100.0, "")]
+BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
+ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.workflow.job: street/train 0103 ends\n"
+TOLD = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
+
+
+def progress(folder: Path, finished: set[Job], began: float = 0.0) -> Progress:
+    planned = [PlannedJob(job, 1, job is not MASKS) for job in (MASKS, TRAIN, FILM)]
+    logs = {job: folder / f"{job.stage}.log" for job in (MASKS, TRAIN, FILM)}
+    return Progress(planned, logs, lambda: Expectations(CONFIG, COSTS), lambda: finished, Machine(1, 1), began)
+
+
+def test_trainings_weigh_what_they_take(tmp_path):
+    assert progress(tmp_path, set()).line(0.0) == "0 % of the work, 0 of 3 jobs, about 17 min left"
+    assert progress(tmp_path, {MASKS}).line(0.0) == "10 % of the work, 1 of 3 jobs, about 15 min left"
+    assert progress(tmp_path, {MASKS, TRAIN}).line(0.0) == "90 % of the work, 2 of 3 jobs, about 2 min left"
+
+
+def test_a_training_at_work_tells_how_far_it_is(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("10 %, 9.0 it/s, 999 s left"))
+    with open(tmp_path / "train.log", "a") as log:
+        log.write(TOLD.format("50 %, 18.8 it/s, 400 s left"))
+    line = progress(tmp_path, {MASKS}).line(0.0)
+    assert line == "50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train (50 %)"
+
+
+def test_a_training_slower_than_expected_takes_as_long_as_it_says(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("50 %, 1.0 it/s, 4000 s left"))
+    assert progress(tmp_path, {MASKS}).line(0.0).startswith("50 % of the work, 1 of 3 jobs, about 68 min left")
+
+
+def test_a_training_faster_than_expected_is_no_further_than_it_says(tmp_path):
+    """4 % of 200 s, and the masks' 100, of 400."""
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("4 %, 99.0 it/s, 192 s left"))
+    assert progress(tmp_path, {MASKS}).line(0.0).startswith("27 % of the work, 1 of 3 jobs, about 5 min left")
+
+
+def test_a_job_that_says_nothing_is_taken_to_be_as_far_as_expected(tmp_path):
+    (tmp_path / "film.log").write_text(BEGINS)
+    looked = progress(tmp_path, {MASKS, TRAIN})
+    assert looked.line(1000.0).startswith("90 % of the work")
+    assert looked.line(1060.0) == "96 % of the work, 2 of 3 jobs, about 40 s left; at work: 0103 street film original"
+    assert "about 0 s left" in looked.line(2000.0)
+
+
+def test_a_job_that_has_ended_is_done_before_it_is_counted(tmp_path):
+    """Snakemake looks for outputs, and at other jobs, before it counts one."""
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("99 %, 18.8 it/s, 8 s left") + ENDS)
+    assert progress(tmp_path, {MASKS}).line(0.0) == "90 % of the work, 1 of 3 jobs, about 2 min left"
+
+
+def test_a_log_without_a_beginning_tells_nothing(tmp_path):
+    (tmp_path / "train.log").write_text("")
+    assert progress(tmp_path, {MASKS}).line(0.0).startswith("10 % of the work, 1 of 3 jobs, about 15 min left")
+
+
+def test_logs_of_earlier_runs_are_nobody_at_work(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("50 %, 18.8 it/s, 400 s left"))
+    assert "at work" not in progress(tmp_path, {MASKS}, began=time.time() + 60).line(0.0)
+
+
+def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):
+    clock = iter([60.0, 65.0, 72.0, 73.0, 84.0])
+    monkeypatch.setattr(monitor.time, "monotonic", lambda: next(clock))
+    watched = monitor.Monitor(tmp_path / "tensorboard", iterations=1000, start=40, label="x")
+    with caplog.at_level(logging.INFO, logger="drivesplat.training.monitor"):
+        for step in (100, 200, 340, 350, 460):
+            watched.scalars(step, {"loss/total": 1.0, "gaussians": 5.0}, 100)
+    monkeypatch.undo()
+    watched.close()
+    assert [record.message for record in caplog.records] == ["34 %, 20.0 it/s, 33 s left", "46 %, 10.0 it/s, 54 s left"]
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format(caplog.records[-1].message))
+    assert "(46 %)" in progress(tmp_path, {MASKS}).line(0.0)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_watch_prints_and_outlives_what_goes_wrong(tmp_path, capsys, fails):
+    finished = set() if not fails else None
+    watch = Watch(progress(tmp_path, finished), every_s=0.01)
+    watch.start()
+    deadline, said = time.monotonic() + 10, ""
+    while said.count("\n") < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+        said += capsys.readouterr().err
+    watch.stop()
+    assert said.count("drivesplat: ") >= 2 and ("cannot be told" if fails else "0 % of the work") in said

@@ -1,0 +1,228 @@
+"""How many cards there are, and which job has which: one job a card, and each sees its own alone."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from helpers import REPOSITORY
+
+from drivesplat.workflow.job import Job
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.workflow.gpus import visible_cards
+
+CARD_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
+
+
+@pytest.fixture
+def four_cards(monkeypatch):
+    """A machine with four NVIDIA cards, nothing hidden."""
+    for variable in CARD_VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
+    devices = [Path(f"/dev/nvidia{i}") for i in range(4)] + [Path("/dev/nvidiactl"), Path("/dev/nvidia-uvm")]
+    with_cards = {Path("/dev"): devices, Path("/sys/class/kfd/kfd/topology/nodes"): []}
+    real = Path.glob
+    monkeypatch.setattr(
+        Path, "glob", lambda self, *a, **k: iter(with_cards[self]) if self in with_cards else real(self, *a, **k)
+    )
+
+
+def test_all_cards_count_where_none_is_hidden(four_cards):
+    assert visible_cards() == 4
+
+
+@pytest.mark.parametrize("variable", CARD_VARIABLES)
+@pytest.mark.parametrize(
+    ("value", "cards"),
+    [
+        ("0", 1),
+        ("2,3", 2),
+        ("0,1,2", 3),
+        ("GPU-5a3c,GPU-77de", 2),
+        ("MIG-1f0e", 1),
+        ("-1", 1),
+        (" 0 , 1 ", 2),
+    ],
+)
+def test_hidden_cards_do_not_count_and_there_is_always_one(four_cards, monkeypatch, variable, value, cards):
+    monkeypatch.setenv(variable, value)
+    assert visible_cards() == cards
+
+
+def test_an_empty_list_hides_all_nvidia_cards(four_cards, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert visible_cards() == 1
+
+
+def test_a_machine_without_cards_schedules_one_gpu_job_at_a_time(four_cards, monkeypatch):
+    monkeypatch.setattr(Path, "glob", lambda *_: iter(()))
+    assert visible_cards() == 1
+
+
+def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path):
+    for node, gpu_id in enumerate(("0", "0", "51234", "8121")):
+        (tmp_path / str(node)).mkdir()
+        (tmp_path / str(node) / "gpu_id").write_text(f"{gpu_id}\n")
+    found = {
+        Path("/dev"): [],
+        Path("/sys/class/kfd/kfd/topology/nodes"): [tmp_path / str(node) / "gpu_id" for node in range(4)],
+    }
+    monkeypatch.setattr(Path, "glob", lambda self, *_: iter(found[self]))
+    assert visible_cards() == 2
+
+
+def test_counting_cards_does_not_import_torch():
+    """Planning takes about a second; torch takes longer."""
+    counting = "from drivesplat.workflow.gpus import visible_cards; visible_cards()"
+    script = f"import sys; {counting}; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, check=True)
+
+
+HOLD = """
+import logging, os, sys, time
+from drivesplat.workflow.gpus import hold_card
+logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
+lock = hold_card(int(sys.argv[1]))
+print("holds", os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
+time.sleep(float(sys.argv[2]))
+"""
+
+
+class Machine:
+    """One with cards, a folder for locks, and an nvidia-smi that knows the cards that a job may use by `uuids`."""
+
+    def __init__(self, folder: Path, uuids: list[str] | None = None):
+        self.folder = folder
+        for name in ("bin", "tmp"):
+            (folder / name).mkdir()
+        self.know(uuids)
+        self.jobs: list[subprocess.Popen] = []
+
+    def know(self, uuids: list[str] | None) -> None:
+        program = self.folder / "bin/nvidia-smi"
+        lines = "".join(f"echo '{index}, {uuid}'\n" for index, uuid in enumerate(uuids or []))
+        program.write_text(f"#!/bin/sh\n{lines}" if uuids else "#!/bin/sh\nexit 9\n")
+        program.chmod(0o755)
+
+    def start(self, visible: str | None, jobs_per_card: int = 1, seconds: float = 60) -> subprocess.Popen:
+        """A job that holds a card, as long as it is told to."""
+        path = f"{self.folder / 'bin'}:{os.environ['PATH']}"
+        environment = {k: v for k, v in os.environ.items() if not k.endswith("_VISIBLE_DEVICES")}
+        environment |= {"PATH": path, "TMPDIR": str(self.folder / "tmp"), "PYTHONPATH": str(REPOSITORY)}
+        if visible is not None:
+            environment["CUDA_VISIBLE_DEVICES"] = visible
+        job = subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(jobs_per_card), str(seconds)],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        self.jobs.append(job)
+        return job
+
+    def card_of(self, job: subprocess.Popen) -> str:
+        """What a job sees, once it holds it."""
+        for line in job.stdout:
+            if line.startswith("holds "):
+                return line.split()[1]
+        raise AssertionError(job.wait())
+
+    def cards(self, visible: str | None, jobs: int, jobs_per_card: int = 1) -> list[str]:
+        return [self.card_of(job) for job in [self.start(visible, jobs_per_card) for _ in range(jobs)]]
+
+
+@pytest.fixture
+def machine(tmp_path):
+    machine = Machine(tmp_path, ["GPU-a", "GPU-b", "GPU-c", "GPU-d"])
+    yield machine
+    for job in machine.jobs:
+        job.kill()
+        job.wait()
+        job.stdout.close()
+
+
+@pytest.mark.parametrize("visible", ["0,1,2,3", "GPU-a,GPU-b,GPU-c,GPU-d", "1,3"])
+def test_jobs_started_at_once_see_a_card_each(machine, visible):
+    cards = visible.split(",")
+    assert sorted(machine.cards(visible, len(cards))) == cards
+
+
+def test_one_more_job_waits_says_so_and_gets_the_card_of_one_that_is_killed(machine):
+    holders = [machine.start("0,1") for _ in range(2)]
+    cards = [machine.card_of(job) for job in holders]
+    late = machine.start("0,1")
+    line = late.stdout.readline()
+    assert line.startswith("waits for a GPU") and all(str(job.pid) in line for job in holders), line
+    assert "device.jobs_per_card" in line
+    holders[1].send_signal(signal.SIGKILL)
+    assert machine.card_of(late) == cards[1]
+
+
+def test_on_one_card_one_job_at_a_time(machine):
+    machine.know(["GPU-a"])
+    first, began = machine.start("0", seconds=1.5), time.monotonic()
+    assert machine.card_of(first) == "0"
+    assert machine.card_of(machine.start("0")) == "0"
+    assert time.monotonic() - began > 1.5
+
+
+def test_more_jobs_share_the_cards_evenly_where_they_may(machine):
+    assert sorted(machine.cards("0,1", 4, jobs_per_card=2)) == ["0", "0", "1", "1"]
+
+
+def test_a_card_is_one_and_the_same_by_number_and_by_name(machine):
+    assert machine.cards("GPU-b", 1) == ["GPU-b"]
+    assert machine.cards("0,1", 1) == ["0"]
+    assert machine.start("1").stdout.readline().startswith("waits")
+
+
+def test_cards_of_a_scheduler_that_shows_every_job_its_own_as_number_0_are_not_taken_for_one(machine):
+    machine.know(["GPU-c"])
+    first = machine.cards("0", 1)
+    machine.know(["GPU-d"])
+    assert first == machine.cards("0", 1) == ["0"]
+
+
+def test_a_single_card_of_a_scheduler_is_used_as_given_where_nobody_tells_which_it_is(machine):
+    machine.know(None)
+    assert machine.cards("0", 2) == ["0", "0"]
+    assert sorted(machine.cards("0,1", 2)) == ["0", "1"]
+
+
+@pytest.mark.parametrize("visible", ["", "-1"])
+def test_without_cards_nothing_is_held_and_nothing_changed(machine, visible):
+    assert machine.start(visible).stdout.readline() == f"holds {visible}\n"
+
+
+def test_locks_that_cannot_be_written_are_named(machine):
+    (machine.folder / f"tmp/drivesplat-cards-{os.getuid()}").write_text("a file")
+    output = machine.start("0,1").communicate(timeout=60)[0].strip().splitlines()[-1]
+    assert output.startswith("drivesplat.errors.DeviceError") and "TMPDIR" in output and "GPU-a.0" in output
+
+
+@pytest.mark.parametrize("kind", ["auto", "any", "cuda"])
+def test_a_rules_job_holds_a_card_from_when_it_asks_where_to_run(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(time, "sleep", lambda _: pytest.fail("it waits for itself"))
+    jobs = [rules_job(kind) for _ in range(2)]
+    for job, card in zip(jobs, ("GPU-x", "GPU-y"), strict=True):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-x,GPU-y")
+        for _ in ("once", "asked again"):
+            assert job.device().kind == kind
+            assert os.environ["CUDA_VISIBLE_DEVICES"] == card
+
+
+def test_a_rules_job_on_the_cpu_holds_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-x,GPU-y")
+    rules_job("cpu").device()
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "GPU-x,GPU-y" and not list(tmp_path.iterdir())
+
+
+def rules_job(kind: str) -> Job:
+    resources = SimpleNamespace(device=DeviceSettings(kind=kind).model_dump_json())
+    nothing = dict.fromkeys(("input", "output", "log", "wildcards", "threads", "rule", "params"))
+    return Job(SimpleNamespace(**nothing, resources=resources))

@@ -1,0 +1,50 @@
+"""The seam between scripts and library: what a rule's script does not wait for."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import REPOSITORY
+
+AS_A_SCRIPT = """
+snakemake = None
+import gc
+from drivesplat.workflow.job import job
+"""
+AS_A_LIBRARY = AS_A_SCRIPT.replace("snakemake = None", "")
+IN_A_JOB = """
+from types import SimpleNamespace
+told = SimpleNamespace(input=[], output=[], wildcards=[], log=["it.log"], threads=1, rule="it", params={}, resources={})
+with job(told):
+    print(gc.isenabled(), gc.get_freeze_count() > 1000)
+"""
+
+
+def said(code: str, folder: Path) -> str:
+    """What Python prints that runs `code` in a folder."""
+    environment = {"PYTHONPATH": str(REPOSITORY), "PATH": "/usr/bin:/bin"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize(("code", "collects"), [(AS_A_SCRIPT, "False"), (AS_A_LIBRARY, "True")])
+def test_garbage_is_collected_while_all_is_imported_but_by_a_rules_script(code, collects, tmp_path):
+    assert said(code + "print(gc.isenabled())", tmp_path) == collects
+
+
+@pytest.mark.parametrize("code", [AS_A_SCRIPT, AS_A_LIBRARY])
+def test_a_job_collects_its_own_garbage_and_looks_through_no_import(code, tmp_path):
+    assert said(code + IN_A_JOB, tmp_path) == "True True"
+
+
+def test_every_script_imports_the_job_before_the_rest_of_the_library():
+    for script in (REPOSITORY / "workflow_scripts").glob("*.py"):
+        imported = [
+            line.split()[1] for line in script.read_text().splitlines() if line.startswith(("from ", "import "))
+        ]
+        heavy = [name for name in imported if name.split(".")[0] not in sys.stdlib_module_names]
+        assert heavy[0] == "drivesplat.workflow.job", (
+            f"{script.name}: garbage is looked for while {heavy[0]} is imported"
+        )

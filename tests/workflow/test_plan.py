@@ -1,0 +1,237 @@
+"""What rules ask of the plan: inputs that only some methods take, and what a report may expect."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from helpers import REPOSITORY
+
+from drivesplat.errors import ConfigError
+from drivesplat.settings.config import load
+from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
+from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, refines_poses, stage_settings
+
+ACTORS = ["background", "actors"]
+HELD = {"train": {"depth_weight": 0.01}}
+KEPT_OUT = {"train": {"floaters": {"free_space": True}}}
+
+
+def plan(**values: Any) -> Plan:
+    datasets = {"a": {"scenes": ["a1", "a2"]}, "b": {"scenes": ["b1"], "overrides": values.pop("b", {})}}
+    as_recorded = {"refine_poses": {"enabled": False}}
+    return Plan({"datasets": datasets, "results_dir": "elsewhere", **as_recorded, **values}, str(REPOSITORY))
+
+
+def taken(made: Plan, scene: str, method: str) -> list[str]:
+    at = SimpleNamespace(scene=scene, method=method)
+    return [*made.actors(at), *made.lidar_depth(at), *made.free_space(at)]
+
+
+def test_actors_are_an_input_of_methods_with_that_part_alone():
+    made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
+    assert taken(made, "a1", "mine") == ["elsewhere/a1/actors.pkl"]
+    assert taken(made, "b1", "mine") == ["elsewhere/b1/actors.pkl"]
+    assert taken(made, "a1", "vanilla") == []
+
+
+def test_depth_is_an_input_where_a_training_is_held_to_it():
+    made = plan(methods={"vanilla": {}, "held": {"overrides": HELD}})
+    assert taken(made, "a1", "held") == ["elsewhere/a1/lidar_depth.pkl"]
+    assert taken(made, "a1", "vanilla") == []
+
+
+def test_free_space_is_an_input_where_a_training_keeps_gaussians_out_of_it():
+    made = plan(methods={"vanilla": {}, "kept_out": {"overrides": KEPT_OUT}})
+    assert taken(made, "a1", "kept_out") == ["elsewhere/a1/free_space.pkl"]
+    assert taken(made, "a1", "vanilla") == []
+
+
+def test_depth_follows_the_overrides_of_dataset_and_method():
+    free = {"overrides": {"train": {"depth_weight": 0.0}}}
+    made = plan(methods={"vanilla": {}, "free": free}, b=HELD)
+    assert [bool(taken(made, scene, "vanilla")) for scene in ("a1", "b1")] == [False, True]
+    assert [bool(taken(made, scene, "free")) for scene in ("a1", "b1")] == [False, False]
+    everywhere = plan(methods={"vanilla": {}, "free": free}, train={"depth_weight": 0.1})
+    assert [bool(taken(everywhere, scene, "vanilla")) for scene in ("a1", "b1")] == [True, True]
+    assert taken(everywhere, "a1", "free") == []
+
+
+@pytest.mark.parametrize(
+    ("methods", "more"),
+    [
+        ({"vanilla": {}}, {"a1": set(), "b1": {"lidar_depth"}}),
+        ({"vanilla": {}, "mine": {"parts": ACTORS}}, {"a1": {"actors"}, "b1": {"actors", "lidar_depth"}}),
+        ({"vanilla": {}, "held": {"overrides": HELD}}, {"a1": {"lidar_depth"}, "b1": {"lidar_depth"}}),
+        ({"vanilla": {}, "kept": {"overrides": KEPT_OUT}}, {"a1": {"free_space"}, "b1": {"free_space", "lidar_depth"}}),
+        (
+            {"mine": {"parts": ACTORS, "overrides": {"train": {"depth_weight": 0}}}},
+            {"a1": {"actors"}, "b1": {"actors"}},
+        ),
+    ],
+)
+def test_a_report_expects_them_where_a_method_of_the_scene_takes_them(methods, more):
+    made = plan(methods=methods, b=HELD)
+    expected = json.loads(made.report([]).settings)["expected"]
+    assert expected.keys() == {"a1", "a2", "b1"}
+    for scene, stages in more.items():
+        assert {name for name in expected[scene] if "/" not in name} == {*SCENE_STAGES, *stages}
+        for stage in stages:
+            assert expected[scene][stage]["code"] == made.code(stage)
+            assert expected[scene][stage]["settings"] == json.loads(stage_settings(made.config, stage, scene))
+
+
+REFINED = {"refine_poses": {"enabled": True}}
+
+
+def test_all_stages_take_the_refined_scene_where_poses_are_refined():
+    made = plan(b=REFINED)
+    scenes = {name: made.scene(SimpleNamespace(scene=name)) for name in ("a1", "b1")}
+    assert scenes == {"a1": "elsewhere/a1/scene.json", "b1": "elsewhere/b1/scene_refined.json"}
+
+
+@pytest.mark.parametrize(
+    ("world", "enabled", "refined"),
+    [
+        (None, "auto", True), (None, True, True), (None, False, False),
+        ({}, "auto", False), ({}, True, True), ({"pose_noise": True}, "auto", True),
+    ],
+)  # fmt: skip
+def test_poses_are_refined_unless_they_are_known_to_be_exact(world, enabled, refined):
+    """Of recorded drives, and of worlds whose poses are as noisy; the default is 'auto'."""
+    dataset = {"dataroot": "resources/w", "scenes": ["w"], "world": world}
+    settings = {} if enabled == "auto" else {"refine_poses": {"enabled": enabled}}
+    assert refines_poses(load({"datasets": {"w": dataset}, **settings}), "w") is refined
+
+
+@pytest.mark.parametrize(
+    ("settings", "taken"),
+    [
+        ({}, []),
+        (REFINED, ["elsewhere/a1/triangulated.pkl"]),
+        ({**REFINED, "lidar_seed": {"triangulated": False}}, []),
+        ({"lidar_seed": {"triangulated": True}}, []),
+    ],
+)
+def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_they_are_wanted(settings, taken):
+    assert plan(**settings).triangulated_seeds(SimpleNamespace(scene="a1")) == taken
+
+
+@pytest.mark.parametrize(
+    ("settings", "taken"),
+    [({}, 0), (REFINED, 1), ({**REFINED, "free_space": {"triangulated": False}}, 0)],
+)
+def test_triangulated_points_are_an_input_of_free_space_where_there_are_any_and_they_are_wanted(settings, taken):
+    found = plan(**settings).triangulated_ends(SimpleNamespace(scene="a1"))
+    assert found == ["elsewhere/a1/triangulated.pkl"] * taken
+
+
+def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
+    made = plan(methods={"vanilla": {}}, b=REFINED)
+    expected = json.loads(made.report([]).settings)["expected"]
+    assert {name for name in expected["a1"] if "/" not in name} == set(SCENE_STAGES)
+    assert {name for name in expected["b1"] if "/" not in name} == set(ALL_SCENE_STAGES)
+    assert expected["b1"]["refine_poses"]["code"] == made.code("refine_poses")
+    assert expected["b1"]["refine_poses"]["settings"]["refine_poses"]["enabled"] is True
+
+
+def test_the_refinement_is_told_what_decides_it_and_no_more():
+    job = told("refine_poses", random_seed=3, refine_poses={"rounds": 5})
+    assert job.keys() == {"refine_poses", "random_seed", "lidar"} and job["lidar"] is None
+    assert (job["refine_poses"]["rounds"], job["random_seed"]) == (5, 3)
+    lidar = {"lidar_depth": {"ray_spacing": [0.2, 0.4]}, "lidar_seed": {"own_car_radius": 3.0}}
+    alone = told("refine_poses", refine_poses={"start": "images"}, **lidar)
+    assert alone["lidar"] == {"ray_spacing": [0.2, 0.4], "own_car_radius": 3.0}
+
+
+def told(stage: str, **values: Any) -> dict[str, Any]:
+    return json.loads(stage_settings(load(values), stage, "0061"))
+
+
+def test_each_is_told_what_decides_it():
+    values = {
+        "actors": {"humans": True}, "holdout": {"last_block": 2}, "images": {"width": 320}, "random_seed": 7,
+        "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3},
+    }  # fmt: skip
+    values |= {"free_space": {"voxel": 0.4}, "lidar_depth": {"ray_spacing": [0.2, 0.4]}}
+    actors, depth, free = (told(stage, **values) for stage in ("actors", "lidar_depth", "free_space"))
+    for record in (actors, depth):
+        assert (record["holdout"]["last_block"], record["images"]["width"], record["own_car_radius"]) == (2, 320, 3.0)
+    assert (actors["actors"]["humans"], actors["random_seed"]) == (True, 7)
+    assert depth["box_margin"] == 0.3 and "actors" not in depth and "random_seed" not in depth
+    assert depth["ray_spacing"] == [0.2, 0.4] and told("evaluate", **values)["lidar"] == depth
+    assert (free["free_space"]["voxel"], free["holdout"]["last_block"]) == (0.4, 2)
+    assert (free["own_car_radius"], free["box_margin"]) == (3.0, 0.3) and "images" not in free
+
+
+def test_a_dataset_may_set_its_actors_for_itself():
+    overrides = {"datasets": {"nuscenes": {"overrides": {"actors": {"min_points": 9}}}}}
+    assert told("actors", **overrides)["actors"]["min_points"] == 9
+
+
+def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
+    made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
+    of_scene = {*SCENE_STAGES} - {"scene_metrics"}
+    assert made.evaluation_stages("a1", ["vanilla"]).keys() == {*of_scene, "vanilla/train", "vanilla/evaluate"}
+    assert made.evaluation_stages("a1", ["mine"]).keys() == {*of_scene, "actors", "mine/train", "mine/evaluate"}
+
+
+# ---- the report across scenes
+
+
+@pytest.mark.parametrize(
+    ("targets", "scenes", "seen", "wanted"),
+    [
+        ([], 3, True, True),
+        (["all"], 3, True, True),
+        (["metrics"], 3, False, False),
+        (["report"], 0, False, True),
+        (["gap_report", "elsewhere/gap_report.html"], 0, False, True),
+        (["elsewhere/gap_report.csv", "metrics"], 3, False, True),
+        (["elsewhere/a1/metrics.json"], 3, False, False),
+    ],
+)
+def test_a_report_waits_for_what_is_asked_for_with_it(targets, scenes, seen, wanted):
+    report = plan().report(targets)
+    assert len(report.metrics) == scenes and report.wanted == wanted
+    assert len(report.pictures) == 2 * scenes * (len(PICTURES) if seen else len(HELD_OUT_PAIR))
+    assert bool(report.links) == seen
+
+
+def test_a_report_asked_for_alone_is_of_what_is_there(tmp_path):
+    made = plan(results_dir=str(tmp_path))
+    there = ["b1/metrics.json", "b1/street/original.mp4", "b1/street/held_out_recorded.png", "b1/street/with_car.png"]
+    for name in (*there, "a1/vanilla/viewer.html"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    report = made.report(["report"])
+    found = [*report.metrics, *report.links, *report.pictures]
+    assert found == [str(tmp_path / name) for name in there]
+    assert {Path(link).name for link in made.report([]).links} >= {"original.mp4", "parts.mp4", "viewer.html"}
+
+
+def test_the_reference_is_the_first_method_that_stands_still():
+    def reference(methods):
+        return json.loads(plan(methods=methods).report([]).settings)["reference"]
+
+    assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}, "b": {}, "c": {}}) == "b"
+    assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}}) is None
+
+
+def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_been_measured(tmp_path):
+    """As after the demo: its report would give way to one of nothing."""
+    datasets = {"a": {"scenes": ["a1"]}, "demo": {"scenes": ["demo"], "batch": False}}
+    made = Plan({"datasets": datasets, "results_dir": str(tmp_path)}, str(REPOSITORY))
+    made.report(["report"]).refuse_empty()
+    for scene in ("demo", "a1"):
+        (tmp_path / scene).mkdir()
+    (tmp_path / "demo/metrics.json").touch()
+    for targets in (["report"], [f"{tmp_path}/gap_report.html"]):
+        with pytest.raises(ConfigError, match=r"demo has, .*--configfile presets/demo\.yaml"):
+            made.report(targets).refuse_empty()
+    for others in ([], ["all"], ["report", "metrics"]):
+        made.report(others).refuse_empty()
+    (tmp_path / "a1/metrics.json").touch()
+    made.report(["report"]).refuse_empty()

@@ -1,0 +1,367 @@
+"""The whole DAG on a tiny world, as users run it."""
+
+import math
+import subprocess
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.workflow_copy import WorkflowCopy, complaints
+from PIL import Image
+
+from drivesplat.io.video import read_footage
+from drivesplat.settings.report import HELD_OUT_PAIR
+
+pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("workflow")]
+
+REGIONS = ("all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human")
+
+
+CAR = "0001 instance 0"
+"""The one vehicle that moves in the tiny world, 8 m ahead of the camera's car."""
+STREET = {"sky": "none", "train": {"strategy": "default", "depth_weight": 0.01}}
+EDITS = """\
+edits:
+  gone:
+    - remove: {track: 0001 instance 0}
+  stop:
+    - shift: {track: 0001 instance 0, lateral: 1.0}
+    - stop: {track: 0001 instance 0, at: 2}
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> WorkflowCopy:
+    """The workflow run to its end on one scene with two methods and two edits."""
+    copy = WorkflowCopy.make(
+        tmp_path_factory.mktemp("finished"),
+        datasets={"nuscenes": {"dataroot": "data", "scenes": ["0001"], "edits": {"0001": "edits.yaml"}}},
+        methods={"vanilla": {}, "street": {"parts": ["background", "actors"], "overrides": STREET}},
+        actors={"random_points": 200},
+    )
+    (copy.folder / "edits.yaml").write_text(EDITS)
+    done = copy.run()
+    assert done.returncode == 0, done.stdout
+    return copy
+
+
+def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
+    metrics = finished.read("results/0001/metrics.json")
+    assert (metrics["schema"], metrics["scene"], metrics["dataset"]) == (1, "0001", "nuscenes")
+    expected = {
+        "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "eval_camera": "CAM_FRONT", "width": 96, "height": 54,
+        "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4}, "train_images": 5,
+        "held_out_frames": {"interpolation": [4], "extrapolation": [6, 7, 8, 9]}, "poses": "nuscenes",
+        "regions": "boxes", "extra_points": None, "lidar_missing": 0,
+    }  # fmt: skip
+    assert {key: metrics["protocol"][key] for key in expected} == expected
+    assert set(metrics["methods"]) == {"vanilla", "street"}
+    assert {"settings_sha256", "code_sha256", "inputs_sha256", "versions"} <= metrics["provenance"].keys()
+
+
+def test_every_method_is_measured_in_both_groups_and_all_regions(finished):
+    for result in finished.read("results/0001/metrics.json")["methods"].values():
+        for group in ("interpolation", "extrapolation"):
+            assert set(REGIONS) | {"gap_db", "depth"} == set(result[group])
+            assert result[group]["all"]["psnr"] > 8.0
+            for region in REGIONS:
+                record = result[group][region]
+                assert record is None or (
+                    record["pixels"] >= 1000 and math.isfinite(record["psnr"]) and record["ssim"] <= 1.0
+                )
+        whole, moving = result["extrapolation"]["static"], result["extrapolation"]["moving_vehicle"]
+        assert result["extrapolation"]["gap_db"] == pytest.approx(whole["psnr"] - moving["psnr"])
+        assert (result["train_iterations"], result["peak_gpu_memory_gb"]) == (60, None)
+        assert result["lpips_unavailable"] == "lpips.enabled is false"
+
+
+def test_the_report_has_a_row_per_scene_and_method(finished):
+    report = finished.read("results/gap_report.json")
+    assert [(row["scene"], row["method"]) for row in report["rows"]] == [("0001", "vanilla"), ("0001", "street")]
+    assert report["left_out"] == [] and report["missing"] == []
+    lines = (finished.folder / "results/gap_report.csv").read_text().splitlines()
+    assert len(lines) == 3 and lines[0].startswith("scene,dataset,method")
+
+
+def test_what_a_training_leaves_behind(finished):
+    folder = finished.folder / "results/0001/vanilla"
+    trained = {"checkpoint.pt", "train.json", "eval.json", "tensorboard"} | set(HELD_OUT_PAIR.values())
+    films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
+    looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
+    exports = {"splat.ply", "cameras.json", "parts", "scene.usdz", "viewer.html"}
+    of_both = trained | films | looks | exports
+    assert of_both == {path.name for path in folder.iterdir()}
+    assert list((folder / "tensorboard").glob("events.*"))
+    street = finished.folder / "results/0001/street"
+    assert of_both | {"parts.mp4", "parts.cameras.json", "edits"} == {path.name for path in street.iterdir()}
+    edits = {f"{edit}.{kind}" for edit in ("gone", "stop") for kind in ("mp4", "png", "json")}
+    assert edits == {path.name for path in (street / "edits").iterdir()}
+
+
+def test_a_film_lasts_as_long_as_the_drive_and_runs_beside_it(finished):
+    drive = finished.read("results/0001/scene.json")
+    times = [frame["timestamp"] for frame in drive["frames"]]
+    recorded, beside = (
+        finished.read(f"results/0001/vanilla/{film}.cameras.json") for film in ("original", "lateral_2m")
+    )
+    assert abs(recorded["duration_s"] - (max(times) - min(times)) * 1e-6) <= 1 / recorded["fps"]
+    assert (recorded["width"], recorded["height"], recorded["fps"]) == (64, 36, 4)
+    centers = [np.array(film["camera_to_world"])[:, :3, 3] for film in (recorded, beside)]
+    left = np.array(drive["frames"][0]["ego_to_world"])[:3, 1]  # the tiny drive goes straight on
+    np.testing.assert_allclose(centers[1] - centers[0], np.tile(2.0 * left, (recorded["frames"], 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize(("method", "by"), [("vanilla", "box"), ("street", "actor")])
+def test_the_vehicle_looked_at_is_the_one_removed(finished, method, by):
+    panel, removal = (finished.read(f"results/0001/{method}/{name}.json") for name in ("ghost_panel", "removal"))
+    assert panel["subject"] == removal["subject"] and panel["subject"]["category"] == "vehicle.car"
+    assert removal["removed_by"] == by
+    kept = removal["outside_footprint"]
+    assert kept.get("identical") or kept["psnr"] >= 90.0
+
+
+def test_an_edit_becomes_a_film_a_still_and_labels(finished):
+    """The car stands a metre beside its way in the end: braking takes two seconds, in which it comes as far as in one
+    at its 4.2 m/s."""
+    folder = finished.folder / "results/0001/street/edits"
+    labels, drive = finished.read("results/0001/street/edits/stop.json"), finished.read("results/0001/scene.json")
+    (car,) = (track for track in labels["tracks"] if track["editable"])
+    assert (car["id"], car["edited"], labels["frames"]) == (CAR, True, 19)
+    recorded = next(track for track in drive["tracks"] if track["id"] == CAR)["object_to_world"]
+    place = [pose[3] for pose in car["object_to_world"][-1][:2]]
+    np.testing.assert_allclose(place, [recorded[0][0][3] + 4.2 * (3.0 - 0.035), 1.0], atol=0.3)
+    footage = read_footage(folder / "stop.mp4")
+    assert (footage.frames, footage.width, footage.height) == (19, 64, 18)
+    assert Image.open(folder / "stop.png").size == (64, 18)
+    assert [step.keys() for step in labels["edit"]["steps"]] == [{"shift"}, {"stop"}]
+    gone = finished.read("results/0001/street/edits/gone.json")
+    assert not any(track["editable"] for track in gone["tracks"])
+    assert gone["camera_to_world"] == labels["camera_to_world"]
+
+
+def test_the_film_of_parts_is_as_long_as_the_others(finished):
+    parts, film = (finished.read(f"results/0001/street/{name}.cameras.json") for name in ("parts", "original"))
+    assert parts["timestamps"] == film["timestamps"] and parts["camera_to_world"] == film["camera_to_world"]
+    footage = read_footage(finished.folder / "results/0001/street/parts.mp4")
+    assert (footage.frames, footage.width, footage.height) == (film["frames"], 60, 10)
+
+
+def test_every_result_remembers_where_it_came_from(finished):
+    for name in ("original.cameras.json", "ghost_panel.json", "removal.json", "cameras.json", "eval.json"):
+        stages = finished.read(f"results/0001/vanilla/{name}")["provenance"]["stages"]
+        assert {"extract", "vanilla/train"} < stages.keys(), name
+    for name in ("parts.cameras.json", "edits/stop.json"):
+        stages = finished.read(f"results/0001/street/{name}")["provenance"]["stages"]
+        assert {"extract", "actors", "lidar_depth", "street/train"} < stages.keys(), name
+
+
+def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
+    command = finished.command("--report", "report.zip")
+    done = subprocess.run(command, cwd=finished.folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(finished.folder / "report.zip") as report:
+        names = {Path(name).name for name in report.namelist()}
+        page = report.read("report/report.html").decode()
+    pictures = {"ghost_panel.png", "removal.png", "original.mp4", "lateral_2m.mp4", "metrics.json", "gap_report.csv"}
+    pictures |= {"gap_report.html"}
+    assert pictures | {"parts.mp4", "stop.mp4", "stop.png", "gone.mp4", "gone.png"} < names
+    assert "Scene 0001" in page and "Across scenes" in page and "the moving vehicle that fills most pixels" in page
+    assert "what moves, before plain grey" in page and "the frame in which both differ most" in page
+
+
+OF_ACTORS = {"film_parts": 1, "edit": 2}
+"""What a method with actors has and others have not."""
+FILMS_AND_LOOKS = {"film": 4, "ghost_panel": 2, "remove_actor": 2, **OF_ACTORS}
+EXPORTS = {"export": 2, "export_usd": 2, "export_viewer": 2}
+TRAINING_AND_AFTER = {
+    "train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1, **FILMS_AND_LOOKS, **EXPORTS
+}  # fmt: skip
+ONE_TRAINING_AND_AFTER = {
+    "train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1, "film": 2, "ghost_panel": 1, "remove_actor": 1,
+    "export": 1, "export_usd": 1, "export_viewer": 1,
+}  # fmt: skip
+STREETS_TRAINING_AND_AFTER = ONE_TRAINING_AND_AFTER | OF_ACTORS
+TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
+AFTER_EXTRACTION = {
+    "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
+}  # fmt: skip
+EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ({}, {}),
+        ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
+        ({"methods": {"vanilla": {"overrides": {"sky": "mask"}}}}, ONE_TRAINING_AND_AFTER),
+        ({"actors": {"humans": True}}, {"actors": 1, **STREETS_TRAINING_AND_AFTER}),
+        ({"train": {"actors": {"fourier": 3}}}, STREETS_TRAINING_AND_AFTER),
+        ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
+        ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
+         EVERYTHING | {"extract": 0}),
+        ({"holdout": {"last_block": 3}},
+         {"lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
+        ({"lidar_seed": {"sweeps": True}}, EVERYTHING),
+        ({"extract": {"on_missing": "warn"}}, EVERYTHING),
+        ({"refine_poses": {"rounds": 2}}, {}),
+        ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
+        ({"render": {"fps": 5}}, {"film": 4, **OF_ACTORS}),
+        ({"render": {"edited_frames": True}}, {"edit": 2}),
+        ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2, "gap_report": 1}),
+        ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2, "gap_report": 1}),
+        ({"export": {"viewer_gaussians": 100}}, {"export_viewer": 2}),
+        ({"device": {"kind": "cpu", "min_free_gb": 1}}, {}),
+        ({"lpips": {"enabled": False, "timeout_s": 3}}, {}),
+        ({"methods": {"third": {}}}, ONE_TRAINING_AND_AFTER),
+    ],
+)  # fmt: skip
+def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, setting, expected):
+    changed = dict(finished.config)
+    for key, value in setting.items():
+        changed[key] = {**changed[key], **value} if isinstance(changed.get(key), dict) else value
+    assert WorkflowWithConfig(finished, changed).planned() == {rule: n for rule, n in expected.items() if n}
+
+
+def test_what_concerns_actors_reruns_nothing_of_a_method_without_them(finished):
+    changed = {**finished.config, "actors": {"humans": True}}
+    changed["train"] = {**changed["train"], "actors": {"fourier": 3}}
+    looks = ("original.mp4", "removal.png", "splat.ply")
+    targets = [f"results/0001/vanilla/{name}" for name in ("train.json", "eval.json", *looks)]
+    assert WorkflowWithConfig(finished, changed).planned(*targets) == {}
+
+
+LEFT_GONE = "results/0001/street/edits/gone.mp4"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected", "of_gone"),
+    [
+        ("at: 2}", "at: 2.5}", {"edit": 1}, {}),
+        ("remove: {track: 0001 instance 0}", "reverse: {track: 0001 instance 0}", {"edit": 1}, {"edit": 1}),
+        ("  stop:", "  also_gone:\n    - remove: {track: 0001 instance 0}\n  stop:",
+         {"edit": 1, "gap_report": 1}, None),
+        ("  gone:\n    - remove: {track: 0001 instance 0}\n", "", {"gap_report": 1}, None),
+        (EDITS, EDITS, {}, None),
+        (EDITS, """# written otherwise
+edits: {stop: [{shift: {lateral: 1, "track": "0001 instance 0", yaw: 0.0, start: null}},
+               {stop: {duration: 2, at: 2.0, track: 0001 instance 0}}],
+        gone: [{remove: {track: '0001 instance 0'}}]}
+""", {}, None),
+    ],
+    ids=["a step", "another kind of step", "one more edit", "one edit less", "touched", "written otherwise"],
+)  # fmt: skip
+def test_a_changed_step_reruns_its_edit_and_no_other(finished, old, new, expected, of_gone):
+    path = finished.folder / "edits.yaml"
+    assert old in EDITS
+    path.unlink()
+    path.write_text(EDITS.replace(old, new))
+    try:
+        assert finished.planned() == expected
+        if of_gone is not None:
+            assert finished.planned(LEFT_GONE) == of_gone
+    finally:
+        path.write_text(EDITS)
+
+
+def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
+    path = finished.folder / "edits.yaml"
+    path.write_text(EDITS + "  typo:\n    - remove: {track: abcd}\n")
+    try:
+        done = finished.run("results/0001/street/edits/typo.mp4")
+    finally:
+        path.write_text(EDITS)
+    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
+    (line,) = complaints(done.stdout)
+    words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"there are: {CAR[:8]}")
+    assert all(word in line for word in words), line
+    assert not list((finished.folder / "results/0001/street/edits").glob("*typo*"))
+
+
+def test_order_comments_and_written_out_defaults_rerun_nothing(finished):
+    import yaml
+
+    reversed_keys = {key: finished.config[key] for key in reversed(finished.config)}
+    reversed_keys["lidar_seed"] = {"voxel_size": 0.1, "far_points": 100, "max_points": 500}
+    text = "# a comment\n" + yaml.safe_dump(reversed_keys, sort_keys=False)
+    finished.write_config(text)
+    try:
+        assert finished.planned() == {}
+    finally:
+        finished.write_config()
+
+
+def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
+    for path in finished.folder.rglob("*"):
+        if (
+            path.is_file()
+            and ".snakemake" not in path.parts
+            and path.suffix in (".py", ".smk", ".yaml", ".json", ".ply")
+        ):
+            content = path.read_bytes()
+            path.unlink()
+            path.write_bytes(content)
+    assert finished.planned() == {}
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "expected"),
+    [
+        ("drivesplat/evaluation/metrics.py", "LEAST_FRAME_PIXELS = 100", "LEAST_FRAME_PIXELS = 90",
+         {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2, "remove_actor": 2}),
+        ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
+        ("drivesplat/preprocess/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71",
+         {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
+        ("drivesplat/preprocess/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
+        ("drivesplat/training/floaters.py", "LARGEST_STEP = 15.0", "LARGEST_STEP = 14.0", TRAINING_AND_AFTER),
+        ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
+        ("drivesplat/scene/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
+        ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
+        ("drivesplat/io/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
+        ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
+        ("drivesplat/editing/heading.py", "STANDS, DRIVES = 1.0", "STANDS, DRIVES = 0.5", {"edit": 2}),
+        ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
+        ("drivesplat/report/gaps.py", "SCHEMA = 2", "SCHEMA = 3", {"gap_report": 1}),
+        ("drivesplat/report/page/page.js", "Sliders", "The sliders", {"gap_report": 1}),
+        ("drivesplat/poses/refinement.py", "SCHEMA = 1", "SCHEMA = 2", {}),
+    ],
+)  # fmt: skip
+def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, old, new, expected):
+    path = finished.folder / file
+    before = path.read_text()
+    assert old in before
+    path.write_text(before.replace(old, new, 1))
+    try:
+        assert finished.planned() == {rule: count for rule, count in expected.items() if count}
+    finally:
+        path.write_text(before)
+
+
+def test_a_truncated_result_is_named_with_the_rule_that_rebuilds_it(finished, tmp_path):
+    import shutil
+
+    copy = WorkflowCopy(tmp_path / "copy", finished.config)
+    shutil.copytree(finished.folder, copy.folder)
+    seed = copy.folder / "results/0001/seed.ply"
+    seed.write_bytes(seed.read_bytes()[:2000])
+    done = copy.run("results/0001/metrics.json")
+    assert done.returncode != 0
+    (line,) = complaints(done.stdout)
+    assert "seed.ply" in line and "lidar_seed" in line
+    assert "Traceback" not in done.stdout
+    assert not (copy.folder / "results/0001/parser.pkl").exists()
+
+
+class WorkflowWithConfig(WorkflowCopy):
+    """The same folder under another config."""
+
+    def __init__(self, other: WorkflowCopy, config: dict):
+        super().__init__(other.folder, config)
+        self._other = other
+
+    def planned(self, *targets: str) -> dict[str, int]:
+        self.write_config()
+        try:
+            return super().planned(*targets)
+        finally:
+            self._other.write_config()
