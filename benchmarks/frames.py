@@ -19,12 +19,12 @@ import torch
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.machine.device import device_name
+from drivesplat.model.checkpoint import open_model, read_checkpoint
 from drivesplat.rendering.film import Shot, recorded_shot, render_film
 from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
-from drivesplat.training.run import open_model, read_checkpoint
 
 WARM_UP = 0.1
 """The share of the frames that is not timed."""

@@ -5,9 +5,9 @@ from pathlib import Path
 from drivesplat.workflow.job import job
 from drivesplat.editing.film import EditFiles, render_edit
 from drivesplat.io.storage import write_json
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.render import EditJob
-from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)

@@ -6,11 +6,12 @@ from drivesplat.workflow.job import job
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.io.storage import sha256_file, write_json
-from drivesplat.preprocess.masks import read_masks_record
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.images import write_image
+from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.training.run import read_checkpoint, read_summary
+from drivesplat.training.run import read_summary
 
 with job(snakemake) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)

@@ -2,9 +2,9 @@
 
 from drivesplat.workflow.job import job
 from drivesplat.export.splat_asset import SplatFiles, export_splat
-from drivesplat.preprocess.parser import read_parser
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scene import read_scene
-from drivesplat.training.run import read_checkpoint
+from drivesplat.scene.training_record import read_parser
 
 with job(snakemake) as current:
     scene, parser = read_scene(current.input.scene), read_parser(current.input.parser)

@@ -2,9 +2,9 @@
 
 from drivesplat.workflow.job import job
 from drivesplat.export.usd_asset import export_usd
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.export import UsdJob
-from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:
     scene, checkpoint = read_scene(current.input.scene), read_checkpoint(current.input.checkpoint)

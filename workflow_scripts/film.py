@@ -4,10 +4,10 @@ from pathlib import Path
 
 from drivesplat.workflow.job import job
 from drivesplat.io.storage import write_json
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.rendering.film import render_film
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.render import FilmJob
-from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)

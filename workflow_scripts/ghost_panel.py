@@ -6,9 +6,9 @@ from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.ghost_panel import ghost_panel
 from drivesplat.inspection.rendered_view import open_drive
 from drivesplat.io.storage import write_json
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.inspection import PanelJob
-from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)

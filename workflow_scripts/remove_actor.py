@@ -6,10 +6,10 @@ from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.removal import remove_actor
 from drivesplat.inspection.rendered_view import open_drive
 from drivesplat.io.storage import write_json
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.images import write_image
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.inspection import RemovalJob
-from drivesplat.training.run import read_checkpoint
 
 with job(snakemake) as current:
     files, made, checkpoint = current.input, current.output, read_checkpoint(current.input.checkpoint)

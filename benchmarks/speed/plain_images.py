@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from drivesplat.io.prefetch import ahead
-from drivesplat.preprocess.parser import image_size
 from drivesplat.scene.images import read_image, write_png
+from drivesplat.scene.training_record import image_size
 
 MANY_WORKERS = "This DataLoader will create"
 """How torch warns of more processes than processors, of which gsplat's example has so many nonetheless."""

@@ -21,25 +21,17 @@ from drivesplat.evaluation.evaluate import evaluate_groups, protocol
 from drivesplat.io.storage import read_json
 from drivesplat.machine.device import choose_device, device_name
 from drivesplat.model.build import gaussian_cap, some_of
+from drivesplat.model.checkpoint import load, read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.preprocess.masks import read_masks_record
-from drivesplat.preprocess.parser import read_parser
 from drivesplat.provenance.record import provenance
 from drivesplat.rasterization import rasterize
+from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.training_record import read_parser
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.training.checkpoint import load
 from drivesplat.training.clock import UNTIMED, Clock, StageClock
-from drivesplat.training.run import (
-    TrainingFiles,
-    TrainingInputs,
-    prepare,
-    read_checkpoint,
-    read_inputs,
-    run_training,
-    trained_model,
-)
+from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
 from drivesplat.training.train import Workspace, train
 from drivesplat.workflow.gpus import hold_card
 

@@ -12,6 +12,7 @@ from drivesplat.editing.cast import Actor, Role, edited_cast
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
+from drivesplat.model.checkpoint import open_model
 from drivesplat.model.part import Appearance
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -23,7 +24,6 @@ from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import EditJob, TrajectorySettings
-from drivesplat.training.run import open_model
 
 log = logging.getLogger(__name__)
 

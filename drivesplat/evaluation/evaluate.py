@@ -20,18 +20,18 @@ from drivesplat.evaluation.sample_pair import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.io.prefetch import ahead
 from drivesplat.machine.device import telling_out_of_memory
+from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
 from drivesplat.preprocess.lidar_depth import Depths, clouds_of, depths_in
-from drivesplat.preprocess.parser import image_size
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import REGIONS, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS
+from drivesplat.scene.training_record import image_size
 from drivesplat.scene.truth import read_truth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
-from drivesplat.training.run import open_model
-from drivesplat.training.views import view_of
 
 STATIC_FINDING_DB = 22.0
 VEHICLE_FINDING_DB = 18.0

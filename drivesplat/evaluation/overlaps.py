@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.preprocess.parser import image_size
+from drivesplat.scene.training_record import image_size
 
 OVERLAP_REGIONS = ("overlap", "no_overlap")
 

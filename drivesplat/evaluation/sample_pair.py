@@ -8,10 +8,10 @@ import torch
 from drivesplat.evaluation.held_out import held_out_images
 from drivesplat.evaluation.synthetic import rendered
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import region_mask
 from drivesplat.scene.splits import HELD_OUT_GROUPS
-from drivesplat.training.views import view_of
 
 
 @dataclass(frozen=True)

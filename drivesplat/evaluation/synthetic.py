@@ -15,7 +15,7 @@ from drivesplat.io.prefetch import ahead
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import View
+from drivesplat.model.view import View, view_of
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
@@ -23,7 +23,6 @@ from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at
 from drivesplat.scene.truth import Truth, TruthFrame, truth_image
-from drivesplat.training.views import view_of
 
 LATERAL_REGIONS = ("all", "static")
 REMOVAL_REGIONS = ("box", "outside")

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from drivesplat.export.placement import placement
-from drivesplat.preprocess.parser import image_size
 from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.training_record import image_size
 
 SCHEMA = 1
 CONVENTIONS = {

@@ -13,8 +13,8 @@ from drivesplat.export.parts_json import write_parts
 from drivesplat.export.splat_ply import write_splat_ply
 from drivesplat.export.trained_parts import digests, trained_gaussians, trained_pieces
 from drivesplat.io.storage import write_json
+from drivesplat.model.checkpoint import trained_model
 from drivesplat.scene.scene import Scene
-from drivesplat.training.run import trained_model
 
 log = logging.getLogger(__name__)
 

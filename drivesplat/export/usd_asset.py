@@ -11,11 +11,11 @@ from drivesplat.export.thinning import thinned_pieces
 from drivesplat.export.trained_parts import digests, trained_pieces
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND
+from drivesplat.model.checkpoint import trained_model
 from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, smooth_poses
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.export import UsdJob
-from drivesplat.training.run import trained_model
 
 log = logging.getLogger(__name__)
 

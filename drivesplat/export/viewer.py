@@ -25,13 +25,13 @@ from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.export.viewer_page import filled_page
 from drivesplat.io.storage import atomic_write, canonical_json
+from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
 from drivesplat.rendering.color_bytes import nearest_bytes
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.export import ViewerJob
-from drivesplat.training.run import trained_model
 
 log = logging.getLogger(__name__)
 

@@ -11,14 +11,13 @@ from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.machine.device import telling_out_of_memory
+from drivesplat.model.checkpoint import open_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel
-from drivesplat.model.view import View
+from drivesplat.model.view import View, view_of
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.training.run import open_model
-from drivesplat.training.views import view_of
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from drivesplat.kernels.spherical_harmonics import SH_C0
 from drivesplat.settings.gaussians import GaussianSettings
-
-SH_C0 = 0.28209479177387814
-"""The constant of the spherical harmonic of degree 0."""
 
 
 def started_at(

@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from drivesplat.scene.training_record import image_size
 
 
 @dataclass(frozen=True)
@@ -34,3 +37,22 @@ class View:
         grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         directions = torch.cat([(grid - self.K[:2, 2]) / self.K.diagonal()[:2], torch.ones_like(grid[..., :1])], dim=-1)
         return torch.nn.functional.normalize(directions @ self.camera_to_world[:3, :3].T, dim=-1)
+
+
+def view_of(parser: dict[str, Any], index: int, device: torch.device) -> View:
+    """Image `index` of a parser record as a camera."""
+    width, height = image_size(parser, index)
+    seconds = float(parser["timestamps"][index] - parser["timestamps"].min()) * 1e-6
+    return View(
+        K=torch.from_numpy(parser["Ks"][index]).float().to(device),
+        camera_to_world=torch.from_numpy(parser["camtoworlds"][index]).float().to(device),
+        width=width,
+        height=height,
+        time=seconds,
+        camera=camera_of(parser, index),
+    )
+
+
+def camera_of(parser: dict[str, Any], index: int) -> str:
+    """The name of the camera that recorded image `index` of a parser record."""
+    return parser["camera_names"][parser["camera_indices"][index]]

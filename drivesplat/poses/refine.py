@@ -28,7 +28,7 @@ from drivesplat.poses.corrections import Corrections, corrected
 from drivesplat.poses.features import find_features, match_features
 from drivesplat.poses.from_images import placed_by_images
 from drivesplat.poses.observations import Observations
-from drivesplat.poses.refinement import Refinement, verdict
+from drivesplat.poses.refinement_record import Refinement, verdict
 from drivesplat.poses.rig import RigImages, from_pycolmap
 from drivesplat.poses.triangulated import no_points, triangulated_record
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar

@@ -1,12 +1,9 @@
 """What comes of the stage `refine_poses`, and whether it has to: without pycolmap poses stay as they are."""
 
 import logging
-from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 from drivesplat.errors import DatasetError, DriveSplatError
+from drivesplat.poses.refinement_record import Refinement, verdict
 from drivesplat.poses.triangulated import no_points
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.scene import Scene
@@ -14,18 +11,8 @@ from drivesplat.settings.refine_poses import RefinePosesJob
 
 log = logging.getLogger(__name__)
 
-SCHEMA = 1
 UNKNOWN = ("images", "points", "observations", "points_per_image", "reprojection_px", "trial", "shift_m", "turn_deg")
 """What poses.json knows of a refinement, and not of one that was never tried."""
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """`scene`: with refined poses, or as it was; `record`: the content of poses.json; `points`: of triangulated.pkl."""
-
-    scene: Scene
-    record: dict[str, Any]
-    points: dict[str, np.ndarray]
 
 
 def refined_or_kept(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, threads: int = 1) -> Refinement:
@@ -58,9 +45,3 @@ def _kept(scene: Scene, job: RefinePosesJob, reason: str) -> Refinement:
     log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
     unknown = dict.fromkeys(UNKNOWN)
     return Refinement(scene, {**verdict(scene, job, reason), **unknown, "corrections": []}, no_points())
-
-
-def verdict(scene: Scene, job: RefinePosesJob, fault: str | None) -> dict[str, Any]:
-    """The head of poses.json; `fault` says why poses stay as they are, None where they do not."""
-    start = job.refine_poses.start
-    return {"schema": SCHEMA, "scene": scene.name, "start": start, "refined": fault is None, "kept_because": fault}

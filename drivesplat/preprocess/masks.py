@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.storage import read_record, unreadable
 from drivesplat.lidar.nearest_sweep import nearest_returns
 from drivesplat.lidar.sweeps import training_sweeps
 from drivesplat.preprocess.sky_mask import sky_mask
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
+from drivesplat.scene.masks import UNLABELLED, mask_name
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import Group, frame_groups
@@ -28,8 +28,6 @@ from drivesplat.settings.masks import MaskJob
 
 log = logging.getLogger(__name__)
 
-UNLABELLED = 255
-"""The value of pixels that a user's map of classes says nothing of."""
 LEAST_SKY = 0.005
 """Where the heuristic finds less sky than this share of all pixels, it has found none: it looks for what is bright."""
 NO_SKY = (
@@ -75,40 +73,6 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHE
     }
 
 
-def mask_name(kind: str, camera: str, timestamp: int) -> str:
-    """The path of a mask below the masks folder; `kind` is 'regions', 'sky' or 'semantic'."""
-    return f"{kind}/{camera}/{timestamp}.png"
-
-
-def read_masks_record(folder: Path) -> dict[str, Any]:
-    """Reads `masks.json`. Raises ResultError where it is not one."""
-    return read_record(folder / "masks.json", "masks", "regions", "sky_known", "semantic_classes", "own_car")
-
-
-def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
-    """The sky (h, w) bool of an image at `size` (width, height).
-
-    Raises ResultError where the mask is missing or unreadable.
-    """
-    return _made_mask(folder, "sky", camera, timestamp, size) > 127
-
-
-def read_labels(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
-    """The label image (h, w) of an image at `size` (width, height).
-
-    Raises ResultError where it is missing or unreadable.
-    """
-    return _made_mask(folder, "regions", camera, timestamp, size)
-
-
-def read_classes(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
-    """The user's classes (h, w) of an image at `size` (width, height), UNLABELLED where there is none.
-
-    Raises ResultError where they are missing or unreadable.
-    """
-    return _made_mask(folder, "semantic", camera, timestamp, size)
-
-
 def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int:
     """Writes the user's classes of an image, where there are any, none of them for the own car's `body` (h, w) bool;
     returns how many there are at least."""
@@ -119,14 +83,6 @@ def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int
     write_png(folder / mask_name("semantic", frame.camera, frame.timestamp), classes)
     labelled = classes[classes != UNLABELLED]
     return int(labelled.max()) + 1 if len(labelled) else 0
-
-
-def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
-    path = folder / mask_name(kind, camera, timestamp)
-    try:
-        return read_mask(path, size)
-    except DatasetError as error:
-        raise unreadable(path, "masks", str(error)) from error
 
 
 def _sky(sweeps: Sequence[Sweep], frame: Frame, job: MaskJob, size: tuple[int, int], interval: float) -> np.ndarray:

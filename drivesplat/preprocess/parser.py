@@ -11,17 +11,10 @@ import numpy as np
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud
-from drivesplat.io.storage import read_plain_pickle, unreadable
 from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames
 from drivesplat.settings.parser import ParserJob
-
-_KEYS = {
-    "Ks", "camtoworlds", "ego_to_world", "image_paths", "image_names", "image_sizes", "camera_names", "camera_indices",
-    "timestamps", "sample_indices", "is_key_frame", "points", "points_rgb", "scene_scale", "splits",
-    "held_out_frames", "scene", "seed",
-}  # fmt: skip
 
 
 def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any]:
@@ -71,17 +64,3 @@ def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any
         },
         "seed": {key: value for key, value in seed.note.items() if key != "provenance"},
     }
-
-
-def image_size(parser: dict[str, Any], index: int | np.integer) -> tuple[int, int]:
-    """Width and height in pixels at which image `index` of a parser record is trained and measured."""
-    width, height = parser["image_sizes"][index].tolist()
-    return width, height
-
-
-def read_parser(path: str | Path) -> dict[str, Any]:
-    """Reads `parser.pkl`. Raises ResultError where it is not one, or holds anything but plain data and arrays."""
-    content = read_plain_pickle(path, rule="parser")
-    if not isinstance(content, dict) or not content.keys() >= _KEYS:
-        raise unreadable(path, "parser", "it lacks the keys of a parser record")
-    return content

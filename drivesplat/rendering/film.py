@@ -17,6 +17,7 @@ from tqdm import tqdm
 from drivesplat.io.prefetch import in_advance
 from drivesplat.io.video import write_video
 from drivesplat.machine.device import telling_out_of_memory
+from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.frames import as_bytes, film_frame, film_frames
@@ -24,7 +25,6 @@ from drivesplat.rendering.trajectory import CameraPath, film_intrinsics, film_pa
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmFormat, FilmJob, TrajectorySettings
-from drivesplat.training.run import open_model
 
 log = logging.getLogger(__name__)
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.preprocess.masks import read_labels, read_masks_record
-from drivesplat.preprocess.parser import image_size, read_parser
 from drivesplat.scene.images import read_image
+from drivesplat.scene.masks import read_labels, read_masks_record
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import Frame, Scene, read_scene
+from drivesplat.scene.training_record import image_size, read_parser
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import filled
 from drivesplat.model.splat_model import Picture, SplatModel
-from drivesplat.preprocess.masks import UNLABELLED
+from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.colours import colour_difference
 from drivesplat.training.views import LidarDepth, TrainingView

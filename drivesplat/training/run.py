@@ -11,24 +11,26 @@ from typing import Any
 import numpy as np
 import torch
 
+from drivesplat.io import checkpoint_file
 from drivesplat.io.prefetch import ahead
-from drivesplat.io.storage import canonical_json, read_record, sha256_text, unreadable, write_json
+from drivesplat.io.storage import canonical_json, read_record, sha256_text, write_json
 from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.machine.device import choose_device, telling_out_of_memory
-from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap, rebuild_model
+from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.preprocess.masks import read_classes, read_labels, read_masks_record, read_sky_mask
-from drivesplat.preprocess.parser import image_size, read_parser
+from drivesplat.model.view import camera_of
 from drivesplat.scene.actor_record import read_actors
+from drivesplat.scene.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
+from drivesplat.scene.training_record import image_size, read_parser
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
-from drivesplat.training import checkpoint
+from drivesplat.training import resume_state
 from drivesplat.training.first_exposure import first_gains
 from drivesplat.training.surfaces import Surroundings, surroundings_of
 from drivesplat.training.train import TrainingSummary, Workspace, train
-from drivesplat.training.views import Guides, TrainingView, camera_of, load_views
+from drivesplat.training.views import Guides, TrainingView, load_views
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ def run_training(
     """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure, and a training
     whose parent has been killed meanwhile: Snakemake, which did not see it end, will have it made again."""
     started_by = os.getppid()
-    with checkpoint.sole_trainer(files.resume):
+    with resume_state.sole_trainer(files.resume):
         device = choose_device(device_settings)
         begun = prepare(inputs, job, device)
         fingerprint = sha256_text(
@@ -183,40 +185,15 @@ def run_training(
             "parts": definitions(model),
             "provenance": provenance,
         }
-        checkpoint.save(files.checkpoint, content)
+        checkpoint_file.save(files.checkpoint, content)
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
     if os.getppid() == started_by:
         shutil.rmtree(files.resume)
 
 
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Reads `checkpoint.pt`. Raises ResultError where it is not one, or holds anything but tensors and plain data."""
-    content = checkpoint.load(Path(path), rule="train")
-    if not {"model", "job", "parts", "provenance"} <= content.keys():
-        raise unreadable(path, "train", "not a checkpoint of a finished training")
-    return content
-
-
 def read_summary(path: str | Path) -> dict[str, Any]:
     """Reads `train.json`. Raises ResultError where it is not one."""
     return read_record(path, "train", *(field.name for field in dataclasses.fields(TrainingSummary)), "provenance")
-
-
-def trained_model(content: dict[str, Any]) -> tuple[SplatModel, TrainJob]:
-    """The model of a checkpoint's content, on the CPU, and the settings it was trained with."""
-    job = TrainJob.model_validate_json(content["job"])
-    return rebuild_model(content["model"], content["parts"], job.sky, job.train), job
-
-
-def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> tuple[SplatModel, torch.device]:
-    """The model of a checkpoint's content, to be looked at, on the device that the settings choose.
-
-    Raises DeviceError where there is none, or its memory is exhausted.
-    """
-    device = choose_device(device_settings, min_free_gb=0.0)
-    model, _ = trained_model(checkpoint)
-    with telling_out_of_memory(lambda: len(model)):
-        return model.to(device).requires_grad_(False), device
 
 
 def _of_each(images: Sequence[int], read: Callable[[int], np.ndarray]) -> dict[int, np.ndarray]:

@@ -9,11 +9,12 @@ from pathlib import Path
 import torch
 
 from drivesplat.errors import TrainingError
+from drivesplat.io import checkpoint_file
 from drivesplat.kernels.cuda_graphs import own_stream
 from drivesplat.machine.device import device_name, telling_out_of_memory
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training import checkpoint
+from drivesplat.training import resume_state
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.monitor import Monitor
@@ -100,11 +101,11 @@ class Run:
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(trainer.device)
-        saved = checkpoint.resumable(workspace.state, workspace.fingerprint)
+        saved = resume_state.resumable(workspace.state, workspace.fingerprint)
         if saved is None:
             shutil.rmtree(workspace.tensorboard, ignore_errors=True)
             return cls(trainer, workspace, 0.0, [], now := time.monotonic(), now)
-        checkpoint.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
+        resume_state.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
         log.info("resuming at iteration %d of %d", trainer.step, trainer.settings.iterations)
         now = time.monotonic()
@@ -133,9 +134,9 @@ class Run:
             "step": t.step,
             "seconds": self.seconds,
             "resumed_at": self.resumed_at,
-            "state": checkpoint.state_of(t.model, t.optimizers, t.densifiers, t.device),
+            "state": resume_state.state_of(t.model, t.optimizers, t.densifiers, t.device),
         }
-        checkpoint.save(self.workspace.state, content)
+        checkpoint_file.save(self.workspace.state, content)
         self.saved = time.monotonic()
 
     @property

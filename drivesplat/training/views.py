@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from drivesplat.io.prefetch import ahead
-from drivesplat.model.view import View
-from drivesplat.preprocess.parser import image_size
+from drivesplat.model.view import View, view_of
 from drivesplat.scene.images import read_image
+from drivesplat.scene.training_record import image_size
 
 
 @dataclass(frozen=True)
@@ -41,25 +41,6 @@ class TrainingView:
     def target(self) -> Float[Tensor, "h w 3"]:
         """The recorded colours in [0, 1]."""
         return self.pixels.float() / 255.0
-
-
-def view_of(parser: dict[str, Any], index: int, device: torch.device) -> View:
-    """Image `index` of a parser record as a camera."""
-    width, height = image_size(parser, index)
-    seconds = float(parser["timestamps"][index] - parser["timestamps"].min()) * 1e-6
-    return View(
-        K=torch.from_numpy(parser["Ks"][index]).float().to(device),
-        camera_to_world=torch.from_numpy(parser["camtoworlds"][index]).float().to(device),
-        width=width,
-        height=height,
-        time=seconds,
-        camera=camera_of(parser, index),
-    )
-
-
-def camera_of(parser: dict[str, Any], index: int) -> str:
-    """The name of the camera that recorded image `index` of a parser record."""
-    return parser["camera_names"][parser["camera_indices"][index]]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import fcntl
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,29 +15,20 @@ from typing import Any
 from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.storage import canonical_json
-from drivesplat.provenance.code_digest import code_digest
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, refuse
 from drivesplat.settings.config import for_scene, load
-from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.workflow.gpus import any_card
-from drivesplat.workflow.inputs import Inputs
+from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import (
-    METHOD_STAGES,
-    SIDE_BY_SIDE,
     idle_variants,
     no_such_edit,
     no_such_film,
     scene_edits,
-    scene_stages,
     stage_settings,
-    training_inputs,
 )
 
-SCRIPTS = "workflow_scripts"
-PARTS_FILM = "parts"
-"""The film of a method's parts."""
 ABLATION_FILES = ("ablation.json", "ablation.csv")
 
 
@@ -47,12 +38,11 @@ def let_scripts_import(folder: str) -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join([folder, *([inherited] if inherited else [])])
 
 
-class Plan(Inputs):
+class Plan(Outputs):
     """The validated config as the rules ask for it; `basedir` is the Snakefile's folder."""
 
     def __init__(self, values: Mapping[str, Any], basedir: str):
-        super().__init__(load(values))
-        self._scripts = Path(basedir) / SCRIPTS
+        super().__init__(load(values), Path(basedir) / SCRIPTS)
         self._held_lock: Any = None
 
     def settings(self, stage: str) -> Callable[[Any], str]:
@@ -63,10 +53,6 @@ class Plan(Inputs):
             return stage_settings(self.config, stage, wildcards.scene, method, trajectory or edit)
 
         return settings_of
-
-    def code(self, stage: str) -> str:
-        """The digest of all code a stage runs."""
-        return code_digest(self._scripts / f"{stage}.py")
 
     def world_settings(self, dataset: str) -> str:
         """The settings of a dataset's synthetic world."""
@@ -101,57 +87,6 @@ class Plan(Inputs):
     def report(self, targets: list[str]) -> ReportPlan:
         """What the rule of the report across scenes asks, where `targets` are wanted."""
         return ReportPlan(self, targets)
-
-    @property
-    def all_trajectories(self) -> list[str]:
-        """The names of all films of any scene."""
-        films = (for_scene(self.config, scene).render.trajectories for scene in self.config.scenes)
-        return list(dict.fromkeys(name for trajectories in films for name in trajectories))
-
-    @property
-    def methods_with_actors(self) -> list[str]:
-        """The methods whose models know objects that move: those that can be taken apart and edited."""
-        return [name for name, method in self.config.all_methods.items() if set(method.parts) & MOVING_PARTS]
-
-    def films(self, scenes: list[str]) -> list[str]:
-        """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
-        return self._films(scenes, self._films_of)
-
-    def edits(self, scenes: list[str]) -> list[str]:
-        """The films of every edit of `scenes`, by every method that can be edited."""
-        return self._films(scenes, self._edits_of)
-
-    def _films(self, scenes: list[str], names_of: Callable[[str, str], list[str]]) -> list[str]:
-        return [
-            f"{self.config.results_dir}/{scene}/{method}/{name}.mp4"
-            for scene in scenes
-            for method in self.config.methods
-            for name in names_of(scene, method)
-        ]
-
-    def _films_of(self, scene: str, method: str) -> list[str]:
-        parts = [PARTS_FILM] if method in self.methods_with_actors else []
-        return [*for_scene(self.config, scene).render.trajectories, *parts]
-
-    def _edits_of(self, scene: str, method: str) -> list[str]:
-        edits = scene_edits(self.config, scene) if method in self.methods_with_actors else {}
-        return [f"edits/{edit}" for edit in edits]
-
-    def metrics_stages(self, scene: str) -> dict[str, Any]:
-        """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
-        methods = self.evaluation_stages(scene, self.config.methods)
-        return {**methods, SIDE_BY_SIDE: self._stage(SIDE_BY_SIDE, scene)}
-
-    def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
-        """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""
-        taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
-        made = (*scene_stages(self.config, scene), *sorted(taken))
-        stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
-        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in METHOD_STAGES}
-        return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
-
-    def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:
-        return {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": self.code(stage)}
 
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know, or

@@ -2,15 +2,12 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.settings.report import HELD_OUT_PAIR, LOOKS, ReportJob
 from drivesplat.settings.train import MOVING_PARTS
-
-if TYPE_CHECKING:
-    from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.outputs import Outputs
 
 EVERYTHING = "all"
 REPORT_RULES = ("gap_report", "report")
@@ -22,7 +19,7 @@ class ReportPlan:
     for, of those that have been measured. It shows what there is to see, and waits for it where everything is asked
     for."""
 
-    def __init__(self, plan: "Plan", targets: list[str]):
+    def __init__(self, plan: Outputs, targets: list[str]):
         self._plan = plan
         self._results = plan.config.results_dir
         names = {*REPORT_RULES, *(f"{self._results}/{name}" for name in REPORT_FILES)}

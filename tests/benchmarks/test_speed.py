@@ -24,8 +24,9 @@ from benchmarks.speed.plan import Task, group_of, read_speed_file, targets_of, t
 from benchmarks.speed.settings import SpeedFile
 from benchmarks.speed.table import markdown
 from drivesplat.errors import ConfigError, TrainingError
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.settings.config import load, merged
-from drivesplat.training.run import TrainingFiles, read_checkpoint, read_inputs, run_training
+from drivesplat.training.run import TrainingFiles, read_inputs, run_training
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")

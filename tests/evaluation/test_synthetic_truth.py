@@ -22,7 +22,7 @@ from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import Picture, SplatModel
-from drivesplat.model.view import View
+from drivesplat.model.view import View, view_of
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.regions import LABELS, is_dynamic
 from drivesplat.scene.rigid import rigid
@@ -35,7 +35,6 @@ from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
-from drivesplat.training.views import view_of
 
 CPU = torch.device("cpu")
 MARGIN = 0.1

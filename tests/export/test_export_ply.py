@@ -15,6 +15,7 @@ from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.model.background import Background
 from drivesplat.model.build import definitions
+from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.parser import parser_dict
@@ -24,7 +25,6 @@ from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob, TrainSettings
-from drivesplat.training.run import trained_model
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {"train": {"settings": {"long": "x" * 20_000}}}}

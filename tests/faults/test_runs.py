@@ -21,6 +21,11 @@ from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, compl
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("faults")]
 
 
+@pytest.fixture
+def copy(tmp_path) -> WorkflowCopy:
+    return WorkflowCopy.make(tmp_path / "workflow", methods=VANILLA)
+
+
 TWO_METHODS = {**VANILLA, "street": {"parts": ["background", "actors"]}}
 
 

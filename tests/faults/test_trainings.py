@@ -29,8 +29,8 @@ from helpers.trainings import (
 
 from drivesplat.workflow.job import job
 from drivesplat.errors import ResultError, TrainingError
+from drivesplat.io import checkpoint_file
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.training import checkpoint
 from drivesplat.training.monitor import Monitor
 from drivesplat.training.run import run_training
 
@@ -63,7 +63,7 @@ def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(t
     assert process.returncode == -signal.SIGKILL, errors
     (half,) = (tmp_path / "resume").glob(".state.*.partial.pt")
     assert half.stat().st_size > 0
-    assert checkpoint.load(tmp_path / "resume/state.pt", "train")["step"] == 20
+    assert checkpoint_file.load(tmp_path / "resume/state.pt", "train")["step"] == 20
     _, summary = trained(tmp_path, settings_of(checkpoint_every=20))
     assert summary.resumed_at == [20] and summary.iterations == 60
 
@@ -72,7 +72,7 @@ def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(t
 def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
     """The digests of a training's provenance are what tells its resume state from another's."""
     files, inputs = files_in(tmp_path / "it"), inputs_in(tmp_path)
-    checkpoint_save, ends = checkpoint.save, iter([False, True])
+    checkpoint_save, ends = checkpoint_file.save, iter([False, True])
 
     def save(path: Path, content: dict[str, Any]) -> None:
         if next(ends, False):
@@ -82,7 +82,7 @@ def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
     with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
         patched.setattr(checkpoint, "save", save)
         run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
-    assert checkpoint.load(files.resume / "state.pt", "train")["step"] == 10
+    assert checkpoint_file.load(files.resume / "state.pt", "train")["step"] == 10
     provenance = {**PROVENANCE, **({other: "other"} if other else {})}
     with caplog.at_level(logging.INFO):
         run_training(inputs, RESUMABLE, CPU, files, provenance, "train")
@@ -97,7 +97,7 @@ def train_and_kill_the_parent(folder: str) -> None:
     torch.set_num_threads(1)
     if os.fork():
         signal.pause()
-    save, parent = checkpoint.save, os.getppid()
+    save, parent = checkpoint_file.save, os.getppid()
 
     def save_and_kill(path: Path, content: dict[str, Any]) -> None:
         save(path, content)
@@ -106,7 +106,7 @@ def train_and_kill_the_parent(folder: str) -> None:
         while os.getppid() == parent:  # a killed process has children until all its memory is given back
             time.sleep(0.01)
 
-    checkpoint.save = save_and_kill
+    checkpoint_file.save = save_and_kill
     run_training(inputs_in(Path(folder)), RESUMABLE, CPU, files_in(Path(folder) / "it"), PROVENANCE, "train")
 
 
@@ -132,7 +132,7 @@ def test_a_gradient_that_is_no_number_stops_a_training_whose_losses_are_numbers(
         trained(tmp_path, settings, model=model)
     message = str(error.value)
     assert message.startswith("iteration 4: gradient of background quats is not finite;") and "loss" not in message
-    kept = checkpoint.load(tmp_path / "resume/state.pt", "train")
+    kept = checkpoint_file.load(tmp_path / "resume/state.pt", "train")
     assert kept["step"] == 2
     assert all(torch.isfinite(value).all() for value in kept["state"]["model"].values())
 

@@ -8,15 +8,15 @@ import torch
 from PIL import Image
 
 from drivesplat.io.point_cloud import PointCloud
+from drivesplat.kernels.spherical_harmonics import SH_C0
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.parameters import SH_C0
 from drivesplat.model.part import Part
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.preprocess.masks import mask_name
 from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.masks import mask_name
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.rigid import rigid

@@ -3,8 +3,6 @@
 import subprocess
 from pathlib import Path
 
-import pytest
-
 from helpers.workflow_copy import WorkflowCopy, complaints
 
 
@@ -18,11 +16,6 @@ def told(done: subprocess.CompletedProcess) -> str:
 
 
 VANILLA = {"vanilla": {}}
-
-
-@pytest.fixture
-def copy(tmp_path) -> WorkflowCopy:
-    return WorkflowCopy.make(tmp_path / "workflow", methods=VANILLA)
 
 
 def training_process(copy: WorkflowCopy) -> int | None:

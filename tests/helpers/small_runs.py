@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.evaluation.scene_metrics import side_by_side
 from drivesplat.inspection.rendered_view import Drive, open_drive
+from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
@@ -27,7 +28,7 @@ from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob
-from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training
+from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
 from drivesplat.workflow.stages import stage_settings
 from helpers.workflow_copy import TINY_TRAINING
 

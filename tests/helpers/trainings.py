@@ -19,8 +19,8 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.preprocess.masks import mask_name
 from drivesplat.rasterization import rasterize
+from drivesplat.scene.masks import mask_name
 from drivesplat.scene.regions import LABELS
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import (

@@ -22,11 +22,11 @@ from drivesplat.inspection.rendered_view import Drive, Sight
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.settings.inspection import GhostSettings, PanelJob, RemovalJob, RemovalSettings, SubjectSettings
-from drivesplat.training.views import view_of
 
 SIZE = np.array([4.0, 2.0, 1.6])
 SPEED = 6.0

@@ -22,8 +22,9 @@ from drivesplat.preprocess.ego_mask import own_car_record
 from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import lidar_points, seed_points
-from drivesplat.preprocess.masks import make_masks, read_sky_mask
+from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import parser_dict
+from drivesplat.scene.masks import read_sky_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob

@@ -12,16 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.model.build import definitions, rebuild_model
 from drivesplat.model.camera_poses import CameraPoses, transform
+from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
-from drivesplat.training.checkpoint import restore_model
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, schedule
-from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
+from drivesplat.training.resume_state import restore_model
+from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 

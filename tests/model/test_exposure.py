@@ -27,8 +27,10 @@ from helpers.trainings import (
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from drivesplat.model.build import definitions, rebuild_model
+from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.parser import parser_dict
 from drivesplat.settings.config import load
@@ -41,8 +43,8 @@ from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
 from drivesplat.training.first_exposure import first_gains, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, schedule
-from drivesplat.training.run import TrainingFiles, TrainingInputs, read_checkpoint, run_training, trained_model
-from drivesplat.training.views import Guides, TrainingView, load_views, view_of
+from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
+from drivesplat.training.views import Guides, TrainingView, load_views
 from drivesplat.workflow.stages import stage_settings
 
 pytestmark = pytest.mark.usefixtures("one_thread")

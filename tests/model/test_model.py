@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.errors import ResultError
+from drivesplat.io import checkpoint_file
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.build import Beginnings, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
@@ -24,7 +25,6 @@ from drivesplat.scene.images import pixel_rays
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training import checkpoint
 
 SH_C0 = 0.5 / np.sqrt(np.pi)
 SKY_COLOR = np.array([0.2, 0.4, 0.8])
@@ -326,8 +326,8 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
     model = shaken(build_model(beginnings(parser_record(20), *records), parts, sky, settings))
     for value in model.parts[1].params.values():
         value.data = value.data[3:]
-    checkpoint.save(tmp_path / "a.pt", {"model": model.state_dict(), "parts": definitions(model)})
-    content = checkpoint.load(tmp_path / "a.pt", "train")
+    checkpoint_file.save(tmp_path / "a.pt", {"model": model.state_dict(), "parts": definitions(model)})
+    content = checkpoint_file.load(tmp_path / "a.pt", "train")
     rebuilt = rebuild_model(content["model"], content["parts"], sky, settings)
     assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
     for time in (-0.2, 0.0, 0.61, 1.0, 1.8, 2.7, 5.0):

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.adjustment import Priors, adjust, observations, priors_of, triangulated, with_poses_of
 from drivesplat.poses.refine import poses_of, refined_by_matches
-from drivesplat.poses.refinement import Refinement
+from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages, from_pycolmap, sensor, to_pycolmap
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene

@@ -13,7 +13,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.storage import canonical_json
 from drivesplat.poses.from_images import aligned
 from drivesplat.poses.refine import made_by_matches
-from drivesplat.poses.refinement import Refinement
+from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep

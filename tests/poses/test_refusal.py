@@ -28,7 +28,8 @@ from drivesplat.poses import refine
 from drivesplat.poses.adjustment import adjust, priors_of, triangulated
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.refine import Trial, doubt, refine_poses, refined_by_matches
-from drivesplat.poses.refinement import Refinement, refined_or_kept
+from drivesplat.poses.refinement import refined_or_kept
+from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.refine_poses import LimitSettings

@@ -13,19 +13,11 @@ from PIL import Image
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.lidar.sweeps import read_sweep
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.masks import (
-    NO_SKY,
-    UNLABELLED,
-    make_masks,
-    mask_name,
-    read_classes,
-    read_labels,
-    read_masks_record,
-    read_sky_mask,
-)
+from drivesplat.preprocess.masks import NO_SKY, make_masks
 from drivesplat.preprocess.sky_mask import sky_mask
 from drivesplat.scene.ego_mask import OwnCar
 from drivesplat.scene.images import project, read_image
+from drivesplat.scene.masks import UNLABELLED, mask_name, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, label_image, region_mask
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene

@@ -8,8 +8,9 @@ import pytest
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.io.storage import write_plain_pickle
-from drivesplat.preprocess.parser import parser_dict, read_parser
+from drivesplat.preprocess.parser import parser_dict
 from drivesplat.scene.splits import frame_groups
+from drivesplat.scene.training_record import read_parser
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.parser import ParserJob

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from drivesplat.model.view import View
-from drivesplat.preprocess.masks import UNLABELLED
 from drivesplat.rasterization import rasterize
+from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced

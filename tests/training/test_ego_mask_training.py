@@ -24,7 +24,9 @@ from helpers.trainings import (
 )
 
 from drivesplat.io.storage import write_json, write_plain_pickle
+from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
 from drivesplat.preprocess.ego_mask import own_car_record
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
@@ -39,8 +41,8 @@ from drivesplat.settings.masks import MaskJob, MaskSettings
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob
 from drivesplat.training import run
-from drivesplat.training.run import TrainingInputs, read_checkpoint, read_inputs, run_training, trained_model
-from drivesplat.training.views import Guides, TrainingView, load_views, view_of
+from drivesplat.training.run import TrainingInputs, read_inputs, run_training
+from drivesplat.training.views import Guides, TrainingView, load_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -46,7 +46,10 @@ from helpers.trainings import (
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
+from drivesplat.io import checkpoint_file
+from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import view_of
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
@@ -55,22 +58,16 @@ from drivesplat.settings.train import (
     FloaterSettings,
     TrainJob,
 )
-from drivesplat.training import checkpoint
+from drivesplat.training import resume_state
 from drivesplat.training.cells import Cells
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import make_optimizers, schedule
 from drivesplat.training.road import driven_road
-from drivesplat.training.run import (
-    TrainingFiles,
-    mean_sky_color,
-    read_checkpoint,
-    run_training,
-    trained_model,
-)
+from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
 from drivesplat.training.surfaces import Surroundings
 from drivesplat.training.train import TrainingSummary, train
 from drivesplat.training.trainer import Trainer
-from drivesplat.training.views import Guides, TrainingView, load_views, order, view_of
+from drivesplat.training.views import Guides, TrainingView, load_views, order
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -92,7 +89,7 @@ def print_whether_torchs_compiler_is_read(folder: str) -> None:
 
 def hold_the_lock(folder: str) -> None:
     """For a subprocess: a trainer that works until it is killed."""
-    with checkpoint.sole_trainer(Path(folder)):
+    with resume_state.sole_trainer(Path(folder)):
         print("held", flush=True)
         signal.pause()
 
@@ -359,7 +356,7 @@ def test_a_training_ended_twice_resumes_twice_and_counts_all_its_time(uninterrup
     for looks in (25, 25):
         with pytest.raises(EndedError):
             trained(tmp_path, settings, EndingViews(recorded_views(), looks))
-    before = checkpoint.load(tmp_path / "resume/state.pt", "train")["seconds"]
+    before = checkpoint_file.load(tmp_path / "resume/state.pt", "train")["seconds"]
     resumed, summary = trained(tmp_path, settings)
     assert summary.resumed_at == [20, 40]
     assert summary.seconds > before > 0.0
@@ -383,7 +380,7 @@ def test_resume_states_come_no_sooner_than_their_time(apart, kept, tmp_path, mon
     with pytest.raises(EndedError):
         trained(tmp_path, settings_of(checkpoint_every=10, checkpoint_apart_s=apart), views)
     state = tmp_path / "resume/state.pt"
-    assert (checkpoint.load(state, "train")["step"] if state.exists() else None) == kept
+    assert (checkpoint_file.load(state, "train")["step"] if state.exists() else None) == kept
 
 
 def test_a_training_ended_before_its_first_checkpoint_starts_at_0(uninterrupted, tmp_path):
@@ -443,7 +440,7 @@ def test_a_spoilt_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(
     path = tmp_path / "state.pt"
     spoil(path, kind)
     with caplog.at_level(logging.WARNING):
-        assert checkpoint.resumable(path, "of this training") is None
+        assert resume_state.resumable(path, "of this training") is None
     assert str(path) in caplog.text and "starts at 0" in caplog.text
     assert not (tmp_path / "executed").exists()
 
@@ -461,14 +458,14 @@ def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tm
 
 
 def test_without_a_resume_state_nothing_is_said(tmp_path, caplog):
-    assert checkpoint.resumable(tmp_path / "state.pt", "any") is None
+    assert resume_state.resumable(tmp_path / "state.pt", "any") is None
     assert caplog.text == ""
 
 
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
 def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, monkeypatch, failure):
     path = tmp_path / "state.pt"
-    checkpoint.save(path, {"step": 1, "means": torch.ones(3)})
+    checkpoint_file.save(path, {"step": 1, "means": torch.ones(3)})
 
     def half(content: Any, file: Any) -> None:
         file.write(b"PK half a checkpoint")
@@ -476,23 +473,23 @@ def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, m
 
     monkeypatch.setattr(torch, "save", half)
     with pytest.raises(ResultError if isinstance(failure, OSError) else KeyboardInterrupt):
-        checkpoint.save(path, {"step": 2})
-    assert checkpoint.load(path, "train")["step"] == 1
+        checkpoint_file.save(path, {"step": 2})
+    assert checkpoint_file.load(path, "train")["step"] == 1
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_full_disk_is_told_with_the_files_name_and_keeps_the_earlier_checkpoint(tmp_path):
     """A limit on the size of files stands for the full disk: torch's writer fails in the same way."""
     path = tmp_path / "state.pt"
-    checkpoint.save(path, {"step": 1})
+    checkpoint_file.save(path, {"step": 1})
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
     try:
         with pytest.raises(ResultError, match=r"state\.pt.*cannot be written"):
-            checkpoint.save(path, {"step": 2, "means": torch.zeros(100_000)})
+            checkpoint_file.save(path, {"step": 2, "means": torch.zeros(100_000)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert checkpoint.load(path, "train")["step"] == 1
+    assert checkpoint_file.load(path, "train")["step"] == 1
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -504,20 +501,20 @@ def test_a_second_trainer_is_refused_naming_the_first_and_a_killed_one_frees_the
     finally:
         holder.kill()
         holder.communicate()
-    with checkpoint.sole_trainer(tmp_path / "resume"):
+    with resume_state.sole_trainer(tmp_path / "resume"):
         assert_refused(tmp_path / "resume", os.getpid())
 
 
 def assert_refused(folder: Path, process: int) -> None:
     refusal = rf"process {process} is still training in .*{folder.name}"
-    with pytest.raises(TrainingError, match=refusal), checkpoint.sole_trainer(folder):
+    with pytest.raises(TrainingError, match=refusal), resume_state.sole_trainer(folder):
         pass
 
 
 def test_a_trainer_that_fails_frees_the_folder(tmp_path):
-    with pytest.raises(EndedError), checkpoint.sole_trainer(tmp_path):
+    with pytest.raises(EndedError), resume_state.sole_trainer(tmp_path):
         raise EndedError
-    with checkpoint.sole_trainer(tmp_path):
+    with resume_state.sole_trainer(tmp_path):
         pass
 
 
@@ -539,7 +536,7 @@ def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoi
     assert message.startswith("iteration 2: ") and "loss ssim" in message and "gradient of background" in message
     assert "opacity_reg" not in message and "scale_reg" not in message
     assert str(tmp_path / "resume/state.pt") in message
-    assert checkpoint.load(tmp_path / "resume/state.pt", "train")["step"] == 1
+    assert checkpoint_file.load(tmp_path / "resume/state.pt", "train")["step"] == 1
 
 
 @pytest.mark.parametrize("log_every", [1, 50])

@@ -323,7 +323,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report/gaps.py", "SCHEMA = 2", "SCHEMA = 3", {"gap_report": 1}),
         ("drivesplat/report/page/page.js", "Sliders", "The sliders", {"gap_report": 1}),
-        ("drivesplat/poses/refinement.py", "SCHEMA = 1", "SCHEMA = 2", {}),
+        ("drivesplat/poses/refinement_record.py", "SCHEMA = 1", "SCHEMA = 2", {}),
     ],
 )  # fmt: skip
 def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, old, new, expected):

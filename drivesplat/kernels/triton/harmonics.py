@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from drivesplat.kernels.spherical_harmonics import SH_C0
 from drivesplat.kernels.triton.rows import store_three, three
-from drivesplat.model.parameters import SH_C0
 
 BLOCK = 256
 """Gaussians a program."""

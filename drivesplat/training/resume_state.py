@@ -1,4 +1,4 @@
-"""Checkpoints: tensors and plain data only, whole or absent, resumed only by the training that wrote them."""
+"""The state of an unfinished training: resumed only by the training that wrote it."""
 
 import fcntl
 import logging
@@ -11,37 +11,13 @@ from typing import Any
 import torch
 
 from drivesplat.errors import ResultError, TrainingError
-from drivesplat.io.storage import atomic_write, unreadable, unwritable
+from drivesplat.io import checkpoint_file
+from drivesplat.io.storage import unwritable
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.densify import Densifier
 from drivesplat.training.optimizers import ModelOptimizers
 
 log = logging.getLogger(__name__)
-
-
-def save(path: Path, content: dict[str, Any]) -> None:
-    """Writes tensors and plain data, atomically. Raises ResultError naming `path` where the disk is full."""
-    with atomic_write(path) as file:
-        try:
-            torch.save(content, file)
-        except RuntimeError as error:  # what torch's zip writer makes of a failed write
-            raise OSError(f"torch could not write it: {str(error).splitlines()[0]}") from error
-
-
-def load(path: Path, rule: str) -> dict[str, Any]:
-    """Reads what `save` wrote; nothing in the file is executed.
-
-    Raises ResultError naming the file and `rule` where it is truncated, foreign, or holds anything but tensors and
-    plain data.
-    """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # zip, pickle and torch each fail in their own way
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise unreadable(path, rule, f"not a checkpoint of this workflow ({reason})") from error
-    if not isinstance(content, dict):
-        raise unreadable(path, rule, "not a checkpoint of this workflow (it holds no record)")
-    return content
 
 
 @contextmanager
@@ -134,7 +110,7 @@ def resumable(path: Path, fingerprint: str) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        content = load(path, rule="train")
+        content = checkpoint_file.load(path, rule="train")
     except ResultError as error:
         log.warning("%s: training starts at 0", error)
         return None
