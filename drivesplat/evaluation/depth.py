@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.evaluation.metrics import LEAST_REGION_PIXELS
-from drivesplat.preprocess.lidar_depth import Depths
+from drivesplat.lidar.depth import Depths
 
 
 class DepthErrors:

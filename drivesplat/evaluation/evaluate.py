@@ -19,11 +19,11 @@ from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.sample_pair import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.io.prefetch import ahead
+from drivesplat.lidar.depth import Depths, clouds_of, depths_in
 from drivesplat.machine.device import telling_out_of_memory
 from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
-from drivesplat.preprocess.lidar_depth import Depths, clouds_of, depths_in
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import REGIONS, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS

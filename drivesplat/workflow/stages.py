@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivesplat.editing.edits_file import read_edits
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.settings import Settings
@@ -16,6 +15,7 @@ from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
+from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob

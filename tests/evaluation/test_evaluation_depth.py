@@ -14,8 +14,9 @@ from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.evaluate import evaluate_groups, held_out_depths
 from drivesplat.evaluation.metrics import LEAST_REGION_PIXELS
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
+from drivesplat.lidar.depth import Depths
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.preprocess.lidar_depth import Depths, lidar_depths
+from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.holdout import HoldoutSettings

@@ -13,11 +13,12 @@ from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_plain_pickle
+from drivesplat.lidar.depth import Depths, taken_apart
 from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.movers import Mover, movers
 from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.lidar_depth import Depths, lidar_depths, taken_apart
+from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.scene.ego_mask import OwnCar
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene

@@ -68,7 +68,7 @@ def test_a_changed_setting_reruns_its_stage_and_the_trainings_that_take_it(train
     ("file", "old", "new", "expected"),
     [
         ("drivesplat/preprocess/actor_seed.py", "UNSEEN = 127", "UNSEEN = 128", {"actors": 1, "train": 1}),
-        ("drivesplat/preprocess/lidar_depth.py", "< interval", "<= interval", {"lidar_depth": 1, "train": 1}),
+        ("drivesplat/lidar/depth.py", "< interval", "<= interval", {"lidar_depth": 1, "train": 1}),
         ("drivesplat/lidar/traversal.py", "OCCUPIED - 1:", "OCCUPIED - 2:", {"free_space": 1, "train": 1}),
     ],
 )

@@ -12,12 +12,12 @@ from helpers import REPOSITORY
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.tables import token
 from drivesplat.editing.cast import Actor, edited_cast
-from drivesplat.editing.edits_file import read_edits
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.scene.motion import Motion
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit, Step
+from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.world import WorldSettings
 
 DEMO = REPOSITORY / "presets" / "edits" / "demo.yaml"
@@ -82,7 +82,7 @@ def test_an_edit_survives_its_travel_as_a_rules_parameter(tmp_path):
 
 
 def test_reading_edits_imports_nothing_heavy():
-    code = "import sys, drivesplat.editing.edits_file as _; print(' '.join(sys.modules))"
+    code = "import sys, drivesplat.settings.edits_file as _; print(' '.join(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert not {"torch", "scipy", "matplotlib", "nuscenes"} & set(done.stdout.split())
 
