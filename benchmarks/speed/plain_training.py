@@ -30,7 +30,7 @@ from benchmarks.speed.plain import (
 )
 from benchmarks.speed.plain_images import endless, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim
-from drivesplat.model.checkpoint import save
+from drivesplat.io.checkpoint_file import save
 from drivesplat.rasterization import rasterize
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.strategies import torch_twins
