@@ -18,10 +18,11 @@ from benchmarks.speed.plain_images import ImageFiles, files_of_size
 from benchmarks.speed.plain_training import CHECKPOINT, fit
 from benchmarks.speed.plan import Task
 from drivesplat.evaluation.evaluate import evaluate_groups, protocol
+from drivesplat.io.checkpoint_file import load
 from drivesplat.io.storage import read_json
 from drivesplat.machine.device import choose_device, device_name
 from drivesplat.model.build import gaussian_cap, some_of
-from drivesplat.model.checkpoint import load, read_checkpoint, trained_model
+from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.provenance.record import provenance
 from drivesplat.rasterization import rasterize
