@@ -19,7 +19,7 @@ from torch.nn.functional import normalize, one_hot
 from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics
-from drivesplat.model.parameters import learning_rates, optimised, started_at
+from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import Appearance, Part, Piece
 from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.timeline import ActorTrack, Moment, Timeline
@@ -73,10 +73,10 @@ class Actors(Part):
     ):
         super().__init__()
         self.timeline = Timeline(tracks, settings.fourier)
-        self.params = optimised(params)
+        self.params = make_parameters(params)
         annotations = sum(len(track.motion.times) for track in tracks)
         corrections = {"translation": torch.zeros(annotations, 3), "yaw": torch.zeros(annotations)}
-        self.shared = optimised(corrections).requires_grad_(settings.tracks.corrected)
+        self.shared = make_parameters(corrections).requires_grad_(settings.tracks.corrected)
         self.extent = float(np.median([np.linalg.norm(track.size) for track in tracks]))
         self.cap_max = settings.cap_max
         self._settings = settings
@@ -97,9 +97,9 @@ class Actors(Part):
         gaussians: GaussianSettings,
         classes: int = 0,
     ) -> "Actors":
-        """Started from every track's points (p, 3) in its object's frame and their colours (p, 3) in [0, 1]."""
+        """Initialised from every track's points (p, 3) in its object's frame and their colours (p, 3) in [0, 1]."""
         own = gaussians.model_copy(update={"sh_degree": settings.sh_degree})
-        sets = [started_at(p, c, own, classes) for p, c in zip(points, colors, strict=True)]
+        sets = [init_params(p, c, own, classes) for p, c in zip(points, colors, strict=True)]
         params = {key: torch.cat([s[key] for s in sets]) for key in sets[0]}
         for key in ("sh0", "shN"):
             constant = params[key][:, None]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.parameters import learning_rates, optimised, started_at
+from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part
 from drivesplat.settings.gaussians import GaussianSettings
 
@@ -20,7 +20,7 @@ class Background(Part):
 
     def __init__(self, params: dict[str, Tensor], settings: GaussianSettings, extent: float):
         super().__init__()
-        self.params = optimised(params)
+        self.params = make_parameters(params)
         self.extent = extent
         self._settings = settings
 
@@ -28,8 +28,8 @@ class Background(Part):
     def from_points(
         cls, positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings, extent: float, classes: int = 0
     ) -> "Background":
-        """Started from seed points: `positions` (n, 3) metres and `colors` (n, 3) in [0, 1]."""
-        return cls(started_at(positions, colors, settings, classes), settings, extent)
+        """Initialised from seed points: `positions` (n, 3) metres and `colors` (n, 3) in [0, 1]."""
+        return cls(init_params(positions, colors, settings, classes), settings, extent)
 
     def at(self, time: float) -> Gaussians:
         return self.at_moment(self.moment(time))

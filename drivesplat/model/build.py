@@ -27,11 +27,11 @@ FEW = 4
 
 
 @dataclass(frozen=True)
-class Beginnings:
-    """What a model starts from: the scene's parser record, the records of its `actors` (empty where none are wanted),
-    the mean colour (3,) in [0, 1] of its sky, how many classes are told apart (0: none), the cameras whose exposure is
-    learned, each with the gains (3,) that it is found to have, and those whose poses are corrected: the seconds of
-    their training images."""
+class ModelInit:
+    """What a model is initialised from: the scene's parser record, the records of its `actors` (empty where none are
+    wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
+    (3,) of every camera in `exposed`, whose exposure is learned, and for every camera in `posed`, whose poses are
+    corrected, the times of its training images in seconds."""
 
     parser: dict[str, Any]
     actors: list[dict[str, Any]]
@@ -49,18 +49,16 @@ def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
     return max(1, min(settings.cap_max, int(pixels / settings.pixels_per_gaussian)))
 
 
-def build_model(
-    beginnings: Beginnings, parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings
-) -> SplatModel:
+def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings) -> SplatModel:
     """An untrained model. A part that has nothing to consist of (actors where nothing moves) is left out."""
     makers = {"background": _background, "actors": _actors}
-    made = (makers[name](beginnings, settings) for name in parts)
+    made = (makers[name](init, settings) for name in parts)
     return SplatModel(
         [part for part in made if part is not None],
-        _sky(sky, settings, beginnings.sky_color),
+        _sky(sky, settings, init.sky_color),
         settings.antialiased,
-        _exposures(beginnings.exposed, settings),
-        _camera_poses(beginnings.posed, settings),
+        _exposures(init.exposed, settings),
+        _camera_poses(init.posed, settings),
     )
 
 
@@ -92,19 +90,19 @@ def rebuild_model(
     return model
 
 
-def _background(beginnings: Beginnings, settings: TrainSettings) -> Part:
-    parser = beginnings.parser
+def _background(init: ModelInit, settings: TrainSettings) -> Part:
+    parser = init.parser
     kept = some_of(len(parser["points"]), settings.cap_max)
     positions, colors = parser["points"][kept], parser["points_rgb"][kept] / 255.0
-    return Background.from_points(positions, colors, settings.gaussians, parser["scene_scale"], beginnings.classes)
+    return Background.from_points(positions, colors, settings.gaussians, parser["scene_scale"], init.classes)
 
 
 def _background_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
     return Background(params, settings.gaussians, definition["extent"])
 
 
-def _actors(beginnings: Beginnings, settings: TrainSettings) -> Part | None:
-    actors = [actor for actor in beginnings.actors if len(actor["points"])]
+def _actors(init: ModelInit, settings: TrainSettings) -> Part | None:
+    actors = [actor for actor in init.actors if len(actor["points"])]
     if not actors:
         return None
     tracks = [ActorTrack(actor["id"], actor["size"], motion_of(actor)) for actor in actors]
@@ -116,9 +114,7 @@ def _actors(beginnings: Beginnings, settings: TrainSettings) -> Part | None:
         [actor[key][chosen] for actor, chosen in zip(actors, kept, strict=True)] for key in ("points", "points_rgb")
     )
     capped = settings.actors.model_copy(update={"cap_max": min(settings.actors.cap_max, sum(limits))})
-    return Actors.from_points(
-        tracks, points, [c / 255.0 for c in colors], capped, settings.gaussians, beginnings.classes
-    )
+    return Actors.from_points(tracks, points, [c / 255.0 for c in colors], capped, settings.gaussians, init.classes)
 
 
 def actor_cap(actor: dict[str, Any], settings: TrainSettings) -> int:

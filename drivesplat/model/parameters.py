@@ -1,7 +1,7 @@
 """The parameters of Gaussians, under the names and in the units that gsplat's strategies densify.
 
 `means` (n, 3) metres, `scales` (n, 3) log metres, `quats` (n, 4) w, x, y, z, `opacities` (n,) logits, `sh0` and `shN`
-spherical harmonics of degree 0 and of the degrees above; with maps of classes also `classes` (n, c) logits.
+spherical harmonics of degree 0 and of the degrees above; with semantic classes also `classes` (n, c) logits.
 """
 
 import math
@@ -15,11 +15,11 @@ from drivesplat.kernels.spherical_harmonics import SH_C0
 from drivesplat.settings.gaussians import GaussianSettings
 
 
-def started_at(
+def init_params(
     positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings, classes: int = 0
 ) -> dict[str, Tensor]:
-    """Parameters of Gaussians that begin at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1], each as likely of
-    any of so many `classes`: `sh0` (n, 1, 3), `shN` (n, k - 1, 3)."""
+    """Parameters of Gaussians initialised at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1] and equal logits
+    for all `classes`: `sh0` (n, 1, 3), `shN` (n, k - 1, 3)."""
     neighbours = min(4, len(positions))
     distances = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0].reshape(len(positions), -1)[:, 1:]
     spacing = np.sqrt(np.mean(distances**2, axis=1)) if neighbours > 1 else np.ones(len(positions))
@@ -36,8 +36,8 @@ def started_at(
     }
 
 
-def optimised(params: dict[str, Tensor]) -> nn.ParameterDict:
-    """Tensors as parameters; whole numbers and what is empty are not learned."""
+def make_parameters(params: dict[str, Tensor]) -> nn.ParameterDict:
+    """Tensors as parameters; integer and empty tensors are not learned."""
     return nn.ParameterDict(
         {
             key: nn.Parameter(value, requires_grad=value.is_floating_point() and value.numel() > 0)
@@ -47,7 +47,7 @@ def optimised(params: dict[str, Tensor]) -> nn.ParameterDict:
 
 
 def learning_rates(settings: GaussianSettings, extent: float) -> dict[str, float]:
-    """The initial rate of each parameter of Gaussians that spread over `extent` metres."""
+    """The initial learning rate of each parameter of Gaussians that spread over `extent` metres."""
     rates = {"means": settings.lr_means * extent, "scales": settings.lr_scales, "quats": settings.lr_quats}
     rates |= {"opacities": settings.lr_opacities, "sh0": settings.lr_sh0, "shN": settings.lr_shN}
     return {**rates, "classes": settings.lr_classes}

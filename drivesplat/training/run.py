@@ -17,7 +17,7 @@ from drivesplat.io.storage import canonical_json, read_record, sha256_text, writ
 from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.machine.device import choose_device, telling_out_of_memory
-from drivesplat.model.build import Beginnings, build_model, definitions, gaussian_cap
+from drivesplat.model.build import ModelInit, build_model, definitions, gaussian_cap
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import camera_of
 from drivesplat.scene.actor_record import read_actors
@@ -145,7 +145,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         views = load_views(inputs.parser, inputs.guides(job), device)
     settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
     exposed = inputs.exposed(job)
-    beginnings = Beginnings(
+    init = ModelInit(
         inputs.parser,
         inputs.actors,
         mean_sky_color(views),
@@ -155,7 +155,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     )
     if not learns_from_sky_masks(job):
         views = [dataclasses.replace(view, sky=None) for view in views]
-    model = build_model(beginnings, job.parts, job.sky, settings)
+    model = build_model(init, job.parts, job.sky, settings)
     return Prepared(model, views, settings, surroundings_of(inputs.parser, inputs.free_space, settings))
 
 

@@ -14,7 +14,7 @@ import torch
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.lidar.occlusion import unhidden
-from drivesplat.model.build import Beginnings, build_model
+from drivesplat.model.build import ModelInit, build_model
 from drivesplat.model.view import View
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.train import Workspace, train
@@ -39,7 +39,7 @@ def rehearse(folder: Path) -> None:
     pixels = torch.full((height, width, 3), 200, dtype=torch.uint8)
     sky = torch.zeros(height, width, dtype=torch.bool)
     view = TrainingView(View(intrinsics, torch.eye(4), width, height, time=0.0), pixels, sky)
-    model = build_model(Beginnings(record, [], np.full(3, 0.5)), ("background",), "cubemap", settings)
+    model = build_model(ModelInit(record, [], np.full(3, 0.5)), ("background",), "cubemap", settings)
     workspace = Workspace(folder / "resume", folder / "tensorboard", "", "rehearsal")
     train(model, [view], settings, 0, torch.device("cpu"), workspace)
     pixel = np.zeros(1, dtype=np.int64)

@@ -14,7 +14,7 @@ from drivesplat.errors import ResultError
 from drivesplat.io import checkpoint_file
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
-from drivesplat.model.build import Beginnings, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
+from drivesplat.model.build import ModelInit, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -56,8 +56,8 @@ def parser_record(count: int) -> dict[str, Any]:
     }
 
 
-def beginnings(parser: dict[str, Any], *actors: dict[str, Any]) -> Beginnings:
-    return Beginnings(parser, list(actors), SKY_COLOR)
+def model_init(parser: dict[str, Any], *actors: dict[str, Any]) -> ModelInit:
+    return ModelInit(parser, list(actors), SKY_COLOR)
 
 
 def shaken(model: nn.Module) -> nn.Module:
@@ -241,7 +241,7 @@ def test_a_model_rebuilt_from_its_state_renders_the_same(sky, antialiased, sh_de
     settings = TrainSettings(
         antialiased=antialiased, sky_resolution=4, gaussians=GaussianSettings(sh_degree=sh_degree, init_scale=0.5)
     )
-    model = shaken(build_model(beginnings(parser_record(40)), ("background",), sky, settings))
+    model = shaken(build_model(model_init(parser_record(40)), ("background",), sky, settings))
     rebuilt = rebuild_model(model.state_dict(), definitions(model), sky, settings)
     picture, again = (m.render(a_view(), sh_degree, with_depth=True) for m in (model, rebuilt))
     assert float(picture.alpha.detach().max()) > 0.3
@@ -323,7 +323,7 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
     settings = TrainSettings(sky_resolution=4, actors=ActorSettings(sh_degree=2, fourier=3, cap_max=50))
     records = [actor_record(a_track(), 10), actor_record(a_track("later", 1.0), 7)]
     parts = ("background", "actors")
-    model = shaken(build_model(beginnings(parser_record(20), *records), parts, sky, settings))
+    model = shaken(build_model(model_init(parser_record(20), *records), parts, sky, settings))
     for value in model.parts[1].params.values():
         value.data = value.data[3:]
     checkpoint_file.save(tmp_path / "a.pt", {"model": model.state_dict(), "parts": definitions(model)})
@@ -342,7 +342,7 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
 
 def test_actors_start_from_their_records():
     records = [actor_record(a_track(), 10, seed=1), actor_record(a_track("later", 1.0), 7, seed=2)]
-    model = build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
+    model = build_model(model_init(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
     actors = model.parts[1]
     assert actors.params["owner"].tolist() == [0] * 10 + [1] * 7
     np.testing.assert_array_equal(actors.params["means"].detach(), np.concatenate([r["points"] for r in records]))
@@ -372,7 +372,7 @@ def test_each_actor_starts_with_no_more_points_than_its_cap():
     """A twentieth of 400 and of 2000 pixels; together they may never have more than both."""
     records = [actor_record(a_track(), 60, pixels=400), actor_record(a_track("later", 1.0), 60, pixels=2000)]
     settings = TrainSettings(pixels_per_gaussian=20.0, actors=ActorSettings(least=8))
-    (actors,) = build_model(beginnings(parser_record(20), *records), ("actors",), "none", settings).parts
+    (actors,) = build_model(model_init(parser_record(20), *records), ("actors",), "none", settings).parts
     assert actors.params["owner"].tolist() == [0] * 20 + [1] * 60 and actors.cap_max == 120
     kept = {tuple(row) for row in actors.params["means"].detach()[:20].numpy()}
     assert len(kept & {tuple(row) for row in records[0]["points"]}) == 20
@@ -387,7 +387,7 @@ def with_cap(cap_max: int, counts: list[int]) -> Actors:
     """The actors of a model whose seeds have so many points each."""
     records = [actor_record(a_track(str(i)), count, seed=i, pixels=100_000) for i, count in enumerate(counts)]
     settings = TrainSettings(actors=ActorSettings(cap_max=cap_max))
-    return build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", settings).parts[1]
+    return build_model(model_init(parser_record(20), *records), ("background", "actors"), "none", settings).parts[1]
 
 
 @pytest.mark.parametrize(
@@ -422,13 +422,13 @@ def test_seeds_are_thinned_to_points_of_their_own_the_same_every_time():
 
 @pytest.mark.parametrize("records", [[], [actor_record(track_of(motion_through([0.0], [[0.0, 0.0, 0.0]])), 0)]])
 def test_where_nothing_moves_a_street_is_its_background(records):
-    model = build_model(beginnings(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
+    model = build_model(model_init(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
     assert [part.name for part in model.parts] == ["background"] and not model.moving().any()
 
 
 @pytest.mark.parametrize(("sky", "kind"), [("none", type(None)), ("mask", ConstantSky), ("cubemap", CubemapSky)])
 def test_the_sky_setting_names_the_sky(sky, kind):
-    model = build_model(beginnings(parser_record(5)), ("background",), sky, TrainSettings(sky_resolution=4))
+    model = build_model(model_init(parser_record(5)), ("background",), sky, TrainSettings(sky_resolution=4))
     assert isinstance(model.sky, kind)
     if model.sky is not None:
         np.testing.assert_allclose(model.sky.colors(a_view().rays())[3, 4].detach(), SKY_COLOR, atol=1e-5)
@@ -436,7 +436,7 @@ def test_the_sky_setting_names_the_sky(sky, kind):
 
 def test_a_model_starts_with_no_more_points_than_its_cap():
     record = parser_record(300)
-    model = build_model(beginnings(record), ("background",), "none", TrainSettings(cap_max=120))
+    model = build_model(model_init(record), ("background",), "none", TrainSettings(cap_max=120))
     means = model.parts[0].params["means"].detach().numpy()
     assert len(model) == 120
     rows = {tuple(row) for row in record["points"]}
