@@ -239,7 +239,7 @@ def called(tmp_path, monkeypatch):
                     write_evaluation(group, recipe, seed, content)
             return Outcome(status, None, {})
 
-        monkeypatch.setattr("benchmarks.quality.run", run)
+        monkeypatch.setattr("benchmarks.quality.__main__.run", run)
         monkeypatch.chdir(REPOSITORY)
         return main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), *words]), told
 
@@ -265,7 +265,9 @@ def test_a_dry_run_writes_nothing(called, tmp_path):
 
 def test_results_lie_by_the_files_name_unless_told_otherwise(monkeypatch, capsys):
     places = []
-    monkeypatch.setattr("benchmarks.quality.measure", lambda file, out, words, workflow: places.append(out) or 0)
+    monkeypatch.setattr(
+        "benchmarks.quality.__main__.measure", lambda file, out, words, workflow: places.append(out) or 0
+    )
     assert main(["a/mine.yaml"]) == main(["a/mine.yaml", "--out", "there", "--", "-n"]) == 0
     assert places == [Path("results/quality/mine"), Path("there")]
 

@@ -226,7 +226,7 @@ def test_what_is_not_finite_stays_behind_in_every_export(tiny_scene, monkeypatch
         own.opacities[5] = torch.nan
         return own
 
-    monkeypatch.setattr("hand_made_traffic.own_gaussians", broken)
+    monkeypatch.setattr("helpers.hand_made_traffic.own_gaussians", broken)
     model = street()
     with caplog.at_level(logging.WARNING):
         together = trained_gaussians(model, tiny_scene)

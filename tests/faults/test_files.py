@@ -179,9 +179,9 @@ NO_RESULTS = {
     "compile.py": "gsplat's build, with its own log",
     "runs.py": "what Snakemake says, as it says it",
     "nuscenes_mini.py": "a lock",
-    "planning.py": "a lock",
-    "checkpoint.py": "a lock",
-    "cards.py": "a lock",
+    "plan.py": "a lock",
+    "resume_state.py": "a lock",
+    "gpus.py": "a lock",
     "fetch.py": "a download, which is checked before it counts",
     "storage.py": "the way all others go",
 }

@@ -80,7 +80,7 @@ def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
         checkpoint_save(path, content)
 
     with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
-        patched.setattr(checkpoint, "save", save)
+        patched.setattr(checkpoint_file, "save", save)
         run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
     assert checkpoint_file.load(files.resume / "state.pt", "train")["step"] == 10
     provenance = {**PROVENANCE, **({other: "other"} if other else {})}

@@ -21,10 +21,12 @@ SHOW = "from drivesplat.caller import total\nprint(total(10.0))\nprint(sum(total
 def small_package(root: Path) -> Path:
     """A package of this one's name with nothing but kernels in it: its digests see what a kernel imports."""
     package = root / "drivesplat"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    for name in ("kernels", "rerun", "meaning", "storage", "errors"):
-        (package / f"{name}.py").write_text((REPOSITORY / "drivesplat" / f"{name}.py").read_text())
+    used = ("kernels/cache", "provenance/code_digest", "provenance/syntax_digest", "io/storage", "errors")
+    for name in used:
+        file = package / f"{name}.py"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        (file.parent / "__init__.py").write_text("")
+        file.write_text((REPOSITORY / "drivesplat" / f"{name}.py").read_text())
     (package / "caller.py").write_text(CALLER)
     return package
 

@@ -24,7 +24,7 @@ case "$*" in
   *torch_builds*) exec "$REAL_PYTHON" "$@" ;;
   *gsplat_build*) echo "gsplat_build ${*:3}" >> "$FAKE_LOG"; exit "${FAKE_BUILD_STATUS:-0}" ;;
   *compileall*) echo "compileall ${*:4}" >> "$FAKE_LOG" ;;
-  *rehearsal*) echo "rehearsal" >> "$FAKE_LOG"; [ -z "${FAKE_REHEARSAL_FAILS:-}" ] ;;
+  *warm_up*) echo "warm_up" >> "$FAKE_LOG"; [ -z "${FAKE_WARM_UP_FAILS:-}" ] ;;
   *importlib.metadata*) [ -z "${FAKE_WRONG_TORCH:-}" ] ;;
   *) echo "unexpected: $*" >&2; exit 9 ;;
 esac
@@ -101,21 +101,19 @@ def test_a_good_venv_is_left_alone(machine):
     for name in ("requirements.txt", "constraints.txt"):
         digest.update((REPOSITORY / name).read_bytes())
     assert machine.stamp.read_text().strip() == digest.hexdigest()
-    assert [line.split()[0] for line in machine.done()] == ["pip", "pip", "gsplat_build", "compileall", "rehearsal"]
+    assert [line.split()[0] for line in machine.done()] == ["pip", "pip", "gsplat_build", "compileall", "warm_up"]
     second = machine.run()
     assert second.returncode == 0 and machine.done() == [] and second.stderr == ""
 
 
 def test_a_machine_on_which_nothing_can_be_trained_is_told_at_once(machine):
-    result = machine.run(FAKE_REHEARSAL_FAILS="1")
+    result = machine.run(FAKE_WARM_UP_FAILS="1")
     assert result.returncode == 0, "who has a GPU may do without"
     assert "a first training on the processors fails" in result.stderr and "make doctor" in result.stderr
     machine.done()
-    assert "a first training" in machine.run(FAKE_REHEARSAL_FAILS="1").stderr, (
-        "and again, though all packages are there"
-    )
-    assert [line.split()[0] for line in machine.done()] == ["compileall", "rehearsal"]
-    assert machine.run().returncode == 0 and [line.split()[0] for line in machine.done()] == ["compileall", "rehearsal"]
+    assert "a first training" in machine.run(FAKE_WARM_UP_FAILS="1").stderr, "and again, though all packages are there"
+    assert [line.split()[0] for line in machine.done()] == ["compileall", "warm_up"]
+    assert machine.run().returncode == 0 and [line.split()[0] for line in machine.done()] == ["compileall", "warm_up"]
     assert machine.run().returncode == 0 and machine.done() == []
 
 

@@ -9,17 +9,15 @@ from helpers import REPOSITORY
 LEFT = """
 import importlib, pathlib, pkgutil, tempfile
 from numba.core.registry import CPUDispatcher
-from drivesplat import on_cpu
-from drivesplat.rasterization import cpu
+from drivesplat.kernels import numba as package
 from drivesplat.training.warm_up import rehearse
 
 with tempfile.TemporaryDirectory() as folder:
     rehearse(pathlib.Path(folder))
-for package in (on_cpu, cpu):
-    for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
-        for name, kernel in vars(importlib.import_module(found.name)).items():
-            if isinstance(kernel, CPUDispatcher) and kernel.stats.cache_path:  # without: kept with its callers
-                print(name, len(kernel.signatures))
+for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+    for name, kernel in vars(importlib.import_module(found.name)).items():
+        if isinstance(kernel, CPUDispatcher) and kernel.stats.cache_path:  # without: kept with its callers
+            print(name, len(kernel.signatures))
 """
 
 
