@@ -1,4 +1,4 @@
-"""What makes a rerun exact: a digest of the code a stage runs, blind to comments, docstrings, layout and file times.
+"""The digest of the code that a stage runs: comments, docstrings, layout and file times do not change it.
 
 Snakemake compares a rule's `params`; this digest and the stage's canonical settings are two of them (rules/common.smk).
 """
@@ -9,19 +9,19 @@ from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
 
-from drivesplat.provenance.syntax_digest import Meaning, meanings
+from drivesplat.provenance.syntax_digest import SyntaxDigest, syntax_digests
 
 PACKAGE = "drivesplat"
 PACKAGE_FOLDER = Path(__file__).parents[1]
 PAGE_FILES = (".html", ".js")
-"""What decides a result, too, where it lies beside a package's modules."""
+"""Files beside a package's modules that are part of the package's code."""
 
 
 def code_digest(script: str | Path) -> str:
-    """A hash of the meaning of a script and of every module of this package it imports, directly or through others.
+    """A hash of the syntax of a script and of every module of this package that it imports, directly or indirectly.
 
-    The meaning is the syntax tree without bare strings (docstrings, field comments). Imports inside functions count.
-    Scripts and pages that lie in a package (viewer.html's) are part of it, every byte.
+    Bare strings (docstrings, field comments) do not count, imports inside functions do. JavaScript and HTML files in a
+    package (the viewer's) are part of it, byte by byte.
     """
     path = Path(script)
     modules, waiting = {}, set(_imports(path, package=""))
@@ -32,19 +32,19 @@ def code_digest(script: str | Path) -> str:
             modules[name] = _content(file)
             waiting |= _imports(file, package=name if file.name == "__init__.py" else name.rpartition(".")[0])
     content = [_content(path), *(f"{name}\n{modules[name]}" for name in sorted(modules))]
-    meanings(PACKAGE_FOLDER / "__pycache__").remember()
+    syntax_digests(PACKAGE_FOLDER / "__pycache__").save()
     return hashlib.sha256("\n\n".join(content).encode()).hexdigest()
 
 
 @cache
-def _meaning(path: Path) -> Meaning:
-    return meanings(PACKAGE_FOLDER / "__pycache__").of(path)
+def _syntax(path: Path) -> SyntaxDigest:
+    return syntax_digests(PACKAGE_FOLDER / "__pycache__").of(path)
 
 
 @cache
 def _content(path: Path) -> str:
-    """Digests of all that decides a result in a file, and in what lies beside it where it opens a package."""
-    digest = _meaning(path).digest
+    """The digest of a module; for a package also those of its pages and scripts."""
+    digest = _syntax(path).digest
     if path.name != "__init__.py":
         return digest
     others = sorted(file for kind in PAGE_FILES for file in path.parent.glob(f"[!.]*{kind}"))
@@ -53,8 +53,8 @@ def _content(path: Path) -> str:
 
 @cache
 def _imports(path: Path, package: str) -> frozenset[str]:
-    """The modules of this package that a file names, packages on the way to them included."""
-    parts = [name.split(".") for name in _absolute(_meaning(path).names, package)]
+    """The modules of this package that a file names, with the packages that contain them."""
+    parts = [name.split(".") for name in _absolute(_syntax(path).names, package)]
     candidates = {".".join(p[: i + 1]) for p in parts if p[0] == PACKAGE for i in range(len(p))}
     return frozenset(name for name in candidates if _file_of(name) is not None)
 

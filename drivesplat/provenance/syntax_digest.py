@@ -1,82 +1,131 @@
-"""What a source file says: its syntax tree without comments, docstrings and layout, and the modules that it names.
+"""Digests of Python source by its syntax tree: comments, docstrings, layout and the Python version change nothing.
 
-Both follow from the file's bytes alone, and are remembered by them: a plan of the workflow asks for some 200 files.
+A digest follows from the file's bytes alone and is cached by them: planning the workflow needs those of all modules.
 """
 
 import ast
 import hashlib
 import json
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_write
 
-KEPT = 5000
-"""How many files' meanings are remembered before those not asked for are forgotten; about 300 bytes each."""
+MAX_CACHED = 5000
+"""Number of cached files above which those not used by this process are dropped; about 300 bytes each."""
+IGNORED_FIELDS = ("kind", "ctx")
+"""Fields of syntax nodes that say how a string was spelled, or repeat what the parent node says."""
 
 
 @dataclass(frozen=True)
-class Meaning:
-    """What a file says."""
+class SyntaxDigest:
+    """A file's digest and the modules it may import."""
 
     digest: str
-    """Of its syntax tree without bare strings."""
+    """SHA-256 of the canonical syntax tree without bare strings."""
     names: tuple[str, ...]
-    """What may be modules, sorted: what is imported, relative to the file's package where it begins with dots, and the
-    string constants that spell dotted names."""
+    """Possible modules, sorted: imported names, relative to the file's package where they begin with dots, and string
+    constants that spell dotted names."""
 
 
-class Meanings:
-    """The meanings of files, remembered on disk at `path` where that can be written."""
+class SyntaxDigests:
+    """Digests of files, cached at `path` where that can be written."""
 
     def __init__(self, path: Path):
         self._path = path
-        self._known: dict[str, Meaning] = {}
-        with suppress(OSError, ValueError, TypeError, AttributeError):  # absent, torn or foreign: found anew
+        self._known: dict[str, SyntaxDigest] = {}
+        with suppress(OSError, ValueError, TypeError, AttributeError):  # absent, truncated or foreign: computed again
             stored = json.loads(path.read_text(encoding="utf-8"))
-            self._known = {key: Meaning(digest, tuple(names)) for key, (digest, names) in stored.items()}
-        self._asked: set[str] = set()
-        self._new = False
+            self._known = {key: SyntaxDigest(digest, tuple(names)) for key, (digest, names) in stored.items()}
+        self._used: set[str] = set()
+        self._changed = False
 
-    def of(self, file: Path) -> Meaning:
-        """The meaning of a file. Raises SyntaxError where it is no Python."""
+    def of(self, file: Path) -> SyntaxDigest:
+        """The digest of a file. Raises SyntaxError where it is not Python."""
         content = file.read_bytes()
         key = hashlib.sha256(content).hexdigest()
-        self._asked.add(key)
+        self._used.add(key)
         if key not in self._known:
-            self._known[key] = meaning(content)
-            self._new = True
+            self._known[key] = syntax_digest(content)
+            self._changed = True
         return self._known[key]
 
-    def remember(self) -> None:
-        """Writes what has been found anew."""
-        if not self._new:
+    def save(self) -> None:
+        """Writes the cache if it has changed."""
+        if not self._changed:
             return
-        if len(self._known) > KEPT:
-            self._known = {key: known for key, known in self._known.items() if key in self._asked}
+        if len(self._known) > MAX_CACHED:
+            self._known = {key: known for key, known in self._known.items() if key in self._used}
         with suppress(ResultError), atomic_write(self._path) as file:
-            file.write(json.dumps({key: (m.digest, m.names) for key, m in self._known.items()}).encode())
-        self._new = False
+            file.write(json.dumps({key: (d.digest, d.names) for key, d in self._known.items()}).encode())
+        self._changed = False
 
 
 @cache
-def meanings(folder: Path) -> Meanings:
-    """Those remembered in `folder`, for this Python and this way of reading."""
-    reading = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
-    return Meanings(folder / f"meanings-{sys.implementation.cache_tag}-{reading}.json")
+def syntax_digests(folder: Path) -> SyntaxDigests:
+    """The cache in `folder` of this version of the module."""
+    version = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
+    return SyntaxDigests(folder / f"syntax-digests-{version}.json")
 
 
-def meaning(content: bytes) -> Meaning:
-    """The meaning of a file with this content. Raises SyntaxError where it is no Python."""
+def syntax_digest(content: bytes) -> SyntaxDigest:
+    """The digest of a file with this content. Raises SyntaxError where it is not Python."""
     tree = ast.parse(content)
     names = sorted(set(_names(tree)))
-    code = ast.unparse(_WithoutBareStrings().visit(tree))
-    return Meaning(hashlib.sha256(code.encode()).hexdigest(), tuple(names))
+    return SyntaxDigest(hashlib.sha256(canonical_tree(tree).encode()).hexdigest(), tuple(names))
+
+
+def canonical_tree(node: Any) -> str:
+    """A syntax tree as text that is the same whichever Python version parsed the source.
+
+    Empty fields are left out, so that fields which later versions add change nothing. Adjacent constants of an f-string
+    are merged: versions differ in where they split them.
+    """
+    if isinstance(node, list):
+        return f"[{','.join(map(canonical_tree, node))}]"
+    if not isinstance(node, ast.AST):
+        return repr(node)
+    fields = ((name, _canonical_field(node, name)) for name in node._fields if name not in IGNORED_FIELDS)
+    written = (f"{name}={canonical_tree(value)}" for name, value in fields if value is not None and value != [])
+
+    return f"{type(node).__name__}({','.join(written)})"
+
+
+def _canonical_field(node: ast.AST, name: str) -> Any:
+    value = getattr(node, name, None)
+    if isinstance(node, ast.JoinedStr):
+        return list(_merged_constants(value))
+    if name == "body" and isinstance(value, list):
+        return [statement for statement in value if not _is_bare_string(statement)] or [ast.Pass()]
+    return value
+
+
+def _merged_constants(values: Iterable[ast.expr]) -> Iterator[ast.expr]:
+    """The values of an f-string without empty constants, with adjacent constants and nested f-strings joined."""
+    text = ""
+    for value in _flat(values):
+        if isinstance(value, ast.Constant):
+            text += value.value
+            continue
+        if text:
+            yield ast.Constant(text)
+        text = ""
+        yield value
+    if text:
+        yield ast.Constant(text)
+
+
+def _flat(values: Iterable[ast.expr]) -> Iterator[ast.expr]:
+    for value in values:
+        if isinstance(value, ast.JoinedStr):
+            yield from _flat(value.values)
+        else:
+            yield value
 
 
 def _names(tree: ast.Module) -> Iterator[str]:
@@ -94,14 +143,6 @@ def _names(tree: ast.Module) -> Iterator[str]:
 def _is_dotted(text: str) -> bool:
     """Whether a string constant may be a module that is imported by its name."""
     return "." in text and all(part.isidentifier() for part in text.split("."))
-
-
-class _WithoutBareStrings(ast.NodeTransformer):
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        super().generic_visit(node)
-        if isinstance(getattr(node, "body", None), list):
-            node.body = [s for s in node.body if not _is_bare_string(s)] or [ast.Pass()]
-        return node
 
 
 def _is_bare_string(statement: ast.AST) -> bool:

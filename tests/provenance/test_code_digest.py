@@ -1,4 +1,4 @@
-"""The digest of a stage's code: blind to comments, docstrings and layout, exact about what is imported."""
+"""The code digest of a stage: comments, docstrings and layout do not change it, every imported module does."""
 
 import itertools
 import os
@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.provenance import code_digest as rerun
-from drivesplat.provenance.syntax_digest import meanings
+from drivesplat.provenance import code_digest as module
+from drivesplat.provenance.syntax_digest import syntax_digests
 
 LEAF = '''\
 """What the others import."""
@@ -88,8 +88,8 @@ def toy(tmp_path, monkeypatch) -> Path:
         (tmp_path / "toy" / name).write_text(text)
     for name, text in {**IMPORTS_LEAF, **IMPORTS_NO_LEAF}.items():
         (tmp_path / f"{name}.py").write_text(text)
-    monkeypatch.setattr(rerun, "PACKAGE", "toy")
-    monkeypatch.setattr(rerun, "PACKAGE_FOLDER", tmp_path / "toy")
+    monkeypatch.setattr(module, "PACKAGE", "toy")
+    monkeypatch.setattr(module, "PACKAGE_FOLDER", tmp_path / "toy")
     forget()
     yield tmp_path
     forget()
@@ -97,13 +97,13 @@ def toy(tmp_path, monkeypatch) -> Path:
 
 def forget() -> None:
     """As a new process would: it reads every file anew."""
-    for remembered in (meanings, rerun._meaning, rerun._content, rerun._imports, rerun._file_of):
-        remembered.cache_clear()
+    for cached in (syntax_digests, module._syntax, module._content, module._imports, module._file_of):
+        cached.cache_clear()
 
 
 def digests(folder: Path) -> dict[str, str]:
     forget()
-    return {name: rerun.code_digest(folder / f"{name}.py") for name in (*IMPORTS_LEAF, *IMPORTS_NO_LEAF)}
+    return {name: module.code_digest(folder / f"{name}.py") for name in (*IMPORTS_LEAF, *IMPORTS_NO_LEAF)}
 
 
 def edited(path: Path, old: str, new: str) -> None:
@@ -157,21 +157,21 @@ def test_comments_docstrings_and_layout_change_no_digest(toy, old, new):
         ("import math\n", "import math\nimport os\n"),
     ],
 )
-def test_a_change_of_meaning_alters_the_scripts_that_import_it_and_no_others(toy, old, new):
+def test_changed_code_alters_the_scripts_that_import_it_and_no_others(toy, old, new):
     before = digests(toy)
     edited(toy / "toy" / "leaf.py", old, new)
     after = digests(toy)
     assert {name for name in before if before[name] != after[name]} == set(IMPORTS_LEAF)
 
 
-def test_a_change_on_the_way_alters_the_scripts_that_go_that_way(toy):
+def test_a_changed_intermediate_module_alters_the_scripts_that_import_through_it(toy):
     before = digests(toy)
     edited(toy / "toy" / "middle.py", "2 * area", "3 * area")
     after = digests(toy)
     assert {name for name in before if before[name] != after[name]} == {"through_another", "through_two_others"}
 
 
-def test_a_change_of_a_package_alters_all_that_lies_below_it(toy):
+def test_a_changed_package_alters_the_importers_of_its_modules(toy):
     before = digests(toy)
     (toy / "toy" / "sub" / "__init__.py").write_text("VALUE = 1\n")
     after = digests(toy)
@@ -187,7 +187,7 @@ def test_a_change_of_a_package_alters_all_that_lies_below_it(toy):
         ("draw.js.orig", False), ("__pycache__/inside.cpython-311.pyc", False), ("deeper/draw.js", False),
     ],
 )  # fmt: skip
-def test_pages_and_scripts_beside_a_packages_modules_count_and_nothing_else_does(toy, file, counts):
+def test_html_and_javascript_in_a_package_count_and_no_other_file(toy, file, counts):
     """Added, and then changed."""
     path = toy / "toy" / "opening" / file
     path.parent.mkdir(exist_ok=True)
@@ -200,7 +200,7 @@ def test_pages_and_scripts_beside_a_packages_modules_count_and_nothing_else_does
         assert changed == ({"through_a_package_on_the_way"} if counts else set())
 
 
-def test_an_import_that_is_added_brings_its_module_in(toy):
+def test_an_added_import_makes_its_module_count(toy):
     edited(toy / "toy" / "apart.py", "VALUE = 1\n", "import toy.leaf\n\nVALUE = 1\n")
     before = digests(toy)["another"]
     edited(toy / "toy" / "leaf.py", "LIMIT = 1000", "LIMIT = 1")
@@ -238,7 +238,7 @@ def test_touched_files_and_another_folder_change_no_digest(toy, tmp_path, monkey
     shutil.copytree(toy / "toy", elsewhere / "toy")
     for script in toy.glob("*.py"):
         shutil.copy(script, elsewhere)
-    monkeypatch.setattr(rerun, "PACKAGE_FOLDER", elsewhere / "toy")
+    monkeypatch.setattr(module, "PACKAGE_FOLDER", elsewhere / "toy")
     assert digests(elsewhere) == before
 
 
