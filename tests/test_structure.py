@@ -1,0 +1,84 @@
+"""The structure of the library: few places at its top, no import circles, bounded chains of imports."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+from helpers import REPOSITORY
+
+LIBRARY = "drivesplat"
+MAX_PLACES, MAX_LOOSE_MODULES = 26, 2
+MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 8, 20
+
+Graph = dict[str, set[str]]
+"""What each module or package imports."""
+
+
+def modules() -> dict[str, Path]:
+    """The library's modules by dotted name; a package is named without `__init__`."""
+    paths = {path.relative_to(REPOSITORY).with_suffix(""): path for path in (REPOSITORY / LIBRARY).rglob("*.py")}
+    return {".".join(name.parts).removesuffix(".__init__"): path for name, path in paths.items()}
+
+
+def imported(tree: ast.AST, known: set[str]) -> set[str]:
+    """Modules of `known` that a syntax tree imports anywhere, also inside functions."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            paths = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+            names |= {path if path in known else node.module for path in paths.values()}
+    return names & known
+
+
+def module_graph() -> Graph:
+    files = modules()
+    trees = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in files.items()}
+    return {name: imported(tree, set(files)) - {name} for name, tree in trees.items()}
+
+
+def package_graph(graph: Graph) -> Graph:
+    """The same between the places directly in the library."""
+    packages: Graph = {}
+    for module, others in graph.items():
+        place = top(module)
+        packages.setdefault(place, set()).update(top(other) for other in others if top(other) != place)
+    return packages
+
+
+def top(module: str) -> str:
+    """The place directly in the library that holds a module."""
+    return [*module.split("."), "__init__"][1]
+
+
+def longest_chain(graph: Graph) -> list[str]:
+    """The longest path of imports, from the top down. Raises CycleError, with the circle, where there is one."""
+    chains: dict[str, list[str]] = {}
+    for module in TopologicalSorter(graph).static_order():
+        below = max((chains[other] for other in graph[module]), key=len, default=[])
+        chains[module] = [module, *below]
+    return max(chains.values(), key=len)
+
+
+def test_few_places_are_directly_in_the_library():
+    packages = {path.parent.name for path in (REPOSITORY / LIBRARY).glob("*/*.py")}
+    loose = {path.name for path in (REPOSITORY / LIBRARY).glob("*.py")}
+    assert len(packages) + len(loose) <= MAX_PLACES
+    assert len(loose) <= MAX_LOOSE_MODULES, loose
+
+
+def test_modules_import_in_no_circle_and_in_short_chains():
+    chain = longest_chain(module_graph())
+    assert len(chain) <= MAX_MODULE_CHAIN, " > ".join(chain)
+
+
+def test_packages_import_in_no_circle_and_in_short_chains():
+    chain = longest_chain(package_graph(module_graph()))
+    assert len(chain) <= MAX_PACKAGE_CHAIN, " > ".join(chain)
+
+
+def test_imports_are_found_in_every_form():
+    source = "import a.b\nfrom a import b, c\nfrom a.b import d\ndef f():\n    from e import g\n"
+    assert imported(ast.parse(source), {"a", "a.b", "e"}) == {"a", "a.b", "e"}
+    assert longest_chain({"x": {"y"}, "y": {"z"}, "z": set(), "w": {"z"}}) == ["x", "y", "z"]
