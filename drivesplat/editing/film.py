@@ -13,7 +13,7 @@ from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.model.checkpoint import open_model
-from drivesplat.model.part import Appearance
+from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, recorded_shot, write_film
@@ -67,14 +67,14 @@ def render_edit(
     if crashed.any():
         first, last = seconds[crashed][[0, -1]]
         log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
-    present, still = appearances(roles, seconds), Still(crashed)
+    present, still = actor_placements(roles, seconds), Still(crashed)
     before = recorded_shot(model, left, device)
     model.expect(right.seconds)
-    after = staged_frames(model, right.views(device), present)
+    after = edited_frames(model, right.views(device), present)
     write_film(files.film, still.side_by_side(before, after), right, model, columns=2)
     write_png(files.still, still.picture)
     remove_frames(files.frames)
-    images = write_frames(files.frames, staged_frames(model, large.views(device), present)) if job.frames else []
+    images = write_frames(files.frames, edited_frames(model, large.views(device), present)) if job.frames else []
     return {
         **large.record(),
         "edit": job.edit.model_dump(mode="json"),
@@ -107,14 +107,14 @@ def actors_of(model: SplatModel, scene: Scene, where: str) -> list[Actor]:
     return actors
 
 
-def appearances(roles: Sequence[Role], seconds: np.ndarray) -> list[list[Appearance]]:
-    """Who appears where at each of `seconds` (n,)."""
-    entries: list[list[Appearance]] = [[] for _ in seconds]
+def actor_placements(roles: Sequence[Role], seconds: np.ndarray) -> list[list[ActorPlacement]]:
+    """The placements of all present objects at each of `seconds` (n,)."""
+    entries: list[list[ActorPlacement]] = [[] for _ in seconds]
     for role in roles:
         poses = role.poses(seconds) if role.edited else None
         for number in np.flatnonzero(role.present(seconds)):
             pose = poses[number] if poses is not None else None
-            entries[number].append(Appearance(role.source, pose, role.scale))
+            entries[number].append(ActorPlacement(role.source, pose, role.scale))
     return entries
 
 
@@ -129,12 +129,12 @@ def crashes(roles: Sequence[Role], path: CameraPath, seconds: np.ndarray) -> np.
     return inside
 
 
-def staged_frames(
-    model: SplatModel, views: Iterable[View], present: Iterable[Sequence[Appearance]]
+def edited_frames(
+    model: SplatModel, views: Iterable[View], present: Iterable[Sequence[ActorPlacement]]
 ) -> Iterator[np.ndarray]:
-    """What each view shows of a model with those of its objects alone that appear then: (h, w, 3) uint8 each."""
+    """Renders each view with the objects at their placements of that time: (h, w, 3) uint8 each."""
     pairs = zip(views, present, strict=True)
-    return film_frames(model, ((view, model.staged_at(view.time, shown)) for view, shown in pairs))
+    return film_frames(model, ((view, model.gaussians_with_placements(view.time, shown)) for view, shown in pairs))
 
 
 class Still:

@@ -20,7 +20,7 @@ from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
-from drivesplat.model.part import Appearance, Part, Piece
+from drivesplat.model.part import ActorPlacement, Part, Piece
 from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.timeline import ActorTrack, Moment, Timeline
 from drivesplat.scene.motion import Motion
@@ -29,28 +29,28 @@ from drivesplat.settings.gaussians import GaussianSettings
 
 
 @dataclass(frozen=True)
-class Placements:
-    """Where a actors are at one time: object to world as `quats` w, x, y, z and `translations` in metres; whether they
-    are `present`; `scales`, by how much they are enlarged."""
+class ActorPoses:
+    """Poses of a actors at one time: object to world as `quats` w, x, y, z and `translations` in metres; `present`;
+    `scales`: enlargement factors."""
 
     quats: Float[Tensor, "a 4"]
     translations: Float[Tensor, "a 3"]
     present: Bool[Tensor, " a"]
     scales: Float[Tensor, " a"]
 
-    def staged(self, ids: Sequence[str], appearances: Sequence[Appearance]) -> "Placements":
-        """These placements of the actors `ids` changed as each one's appearance says; who has none is absent."""
+    def with_placements(self, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> "ActorPoses":
+        """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
         quats, translations, scales = self.quats.clone(), self.translations.clone(), self.scales.clone()
         present = torch.zeros_like(self.present)
-        for appearance in appearances:
-            i, pose = ids.index(appearance.source), appearance.object_to_world
-            present[i], scales[i] = self.present[i], appearance.scale
+        for placement in placements:
+            i, pose = ids.index(placement.source), placement.object_to_world
+            present[i], scales[i] = self.present[i], placement.scale
             if pose is not None:
                 present[i] = True
                 turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
                 quats[i] = torch.from_numpy(turned).to(quats)
                 translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
-        return Placements(quats, translations, present, scales)
+        return ActorPoses(quats, translations, present, scales)
 
 
 class Actors(Part):
@@ -119,59 +119,59 @@ class Actors(Part):
 
     def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
         known = Moment(*moment)
-        return self.placed(known, self.placements(known))
+        return self.placed(known, self.poses(known))
 
-    def placements(self, moment: Moment) -> Placements:
+    def poses(self, moment: Moment) -> ActorPoses:
         """Where the actors are, by their annotations and the learned corrections."""
         weights = moment.weights * self._annotated
         turns = about_vertical(weights @ self.shared["yaw"])
-        return Placements(
+        return ActorPoses(
             (left_factor(moment.quats) @ turns[..., None])[..., 0],
             moment.translations + weights @ self.shared["translation"],
             moment.present,
             torch.ones_like(moment.translations[:, 0]),
         )
 
-    def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
+    def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         moment, known = self.moment(time), [track.id for track in self.timeline.tracks]
-        own = self.placements(moment)
-        first, again = [], []
-        for appearance in (appearance for appearance in appearances if appearance.source in known):
-            twice = appearance.source in {other.source for other in first}
-            (again if twice else first).append(appearance)
-        sets = [self.placed(moment, own.staged(known, first))]
-        for appearance in again:  # all are placed for the sake of one: copies are few
-            placed = self.placed(moment, own.staged(known, [appearance]))
-            sets.append(placed[self.params["owner"] == known.index(appearance.source)])
+        poses = self.poses(moment)
+        first, copies = [], []
+        for placement in (placement for placement in placements if placement.source in known):
+            repeated = placement.source in {other.source for other in first}
+            (copies if repeated else first).append(placement)
+        sets = [self.placed(moment, poses.with_placements(known, first))]
+        for placement in copies:  # few: transforming all actors for each copy costs little
+            placed = self.placed(moment, poses.with_placements(known, [placement]))
+            sets.append(placed[self.params["owner"] == known.index(placement.source)])
         return concatenate(sets)
 
-    def placed(self, moment: Moment, placements: Placements) -> Gaussians:
+    def placed(self, moment: Moment, poses: ActorPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a moment."""
-        p, rotations = self.params, rotation_matrix(placements.quats)
+        p, rotations = self.params, rotation_matrix(poses.quats)
         if on_gpu.for_tensor(p["means"]):
-            return self._placed_on_gpu(moment, placements, rotations)
-        scales = self._of_owners(placements.scales)[:, None]
+            return self._placed_on_gpu(moment, poses, rotations)
+        scales = self._of_owners(poses.scales)[:, None]
         sh = self.harmonics(moment)
         if sh.shape[1] > 1:  # colours turn by degrees at most: no gradient of theirs is worth its noise to the track
             sh = self._of_owners(rotation_of_harmonics(rotations.detach(), sh.shape[1])) @ sh
         turned = (self._of_owners(rotations) @ (scales * p["means"])[..., None])[..., 0]
         return Gaussians.of(
-            turned + self._of_owners(placements.translations),
-            (self._of_owners(left_factor(placements.quats)) @ normalize(p["quats"], dim=-1)[..., None])[..., 0],
+            turned + self._of_owners(poses.translations),
+            (self._of_owners(left_factor(poses.quats)) @ normalize(p["quats"], dim=-1)[..., None])[..., 0],
             scales * torch.exp(p["scales"]),
-            torch.sigmoid(p["opacities"]) * self._of_owners(placements.present.to(scales.dtype)),
+            torch.sigmoid(p["opacities"]) * self._of_owners(poses.present.to(scales.dtype)),
             sh,
         )
 
-    def _placed_on_gpu(self, moment: Moment, placements: Placements, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
+    def _placed_on_gpu(self, moment: Moment, poses: ActorPoses, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
         """The same by two kernels."""
         from drivesplat.kernels.triton.colours_in_time import turned_colours
         from drivesplat.kernels.triton.placing import Objects, Shapes, placed
 
         p, owner, coefficients = self.params, self.params["owner"], self.params["shN"].shape[2] + 1
         shapes = Shapes(p["means"], p["quats"], p["scales"], p["opacities"])
-        presence = placements.present.to(rotations.dtype)
-        objects = Objects(placements.quats, placements.translations, placements.scales, presence)
+        presence = poses.present.to(rotations.dtype)
+        objects = Objects(poses.quats, poses.translations, poses.scales, presence)
         turns = rotation_of_harmonics(rotations.detach(), coefficients)
         sh = turned_colours(p["sh0"], p["shN"], moment.series, turns, owner)
         return Gaussians.of(*placed(shapes, objects, owner, self._owns), sh)

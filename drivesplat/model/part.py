@@ -22,9 +22,9 @@ FADED = 1e-4
 
 
 @dataclass(frozen=True)
-class Appearance:
-    """An object as an edit wants to see it at one time: with the Gaussians of the track `source`, enlarged by `scale`
-    about its box's centre, at `object_to_world` (4, 4) in world metres; None: where it was recorded."""
+class ActorPlacement:
+    """An edited pose of an object at one time: the Gaussians of the track `source`, scaled by `scale` about the box
+    centre, at `object_to_world` (4, 4) in world metres (None: the recorded pose)."""
 
     source: str
     object_to_world: np.ndarray | None = None
@@ -85,9 +85,9 @@ class Part(nn.Module, ABC):
         there are no moments."""
         raise NotImplementedError(f"the part {self.name!r} has no moments")
 
-    def staged(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
-        """As `at`, with these of its objects and no others: an object that does not appear is absent, a second
-        appearance of one follows in rows of its own."""
+    def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
+        """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one
+        object are appended as extra rows."""
         return self.at(time)
 
     @abstractmethod

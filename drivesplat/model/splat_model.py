@@ -14,7 +14,7 @@ from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.part import Appearance, Part, Piece, Sky
+from drivesplat.model.part import ActorPlacement, Part, Piece, Sky
 from drivesplat.model.view import View
 from drivesplat.rasterization import Rendering, rasterize
 
@@ -78,9 +78,9 @@ class SplatModel(nn.Module):
         """As `gaussians_at`, by what a time means to the parts."""
         return concatenate([part.at_moment(moment) for part, moment in zip(self.parts, moments, strict=True)])
 
-    def staged_at(self, time: float, appearances: Sequence[Appearance]) -> Gaussians:
-        """As `gaussians_at`, with the objects that appear and no others: see `Part.staged`."""
-        return concatenate([part.staged(time, appearances) for part in self.parts])
+    def gaussians_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
+        """As `gaussians_at`, with objects at `placements` and no others: see `Part.with_placements`."""
+        return concatenate([part.with_placements(time, placements) for part in self.parts])
 
     def pieces(self, time: float) -> dict[str, Piece]:
         """What all parts consist of: see `Part.pieces`. Raises ResultError where two pieces have one name."""

@@ -28,11 +28,11 @@ from PIL import Image
 
 from drivesplat.editing.cast import Actor, edited_cast
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import EditFiles, Still, actors_of, appearances, crashes, render_edit
+from drivesplat.editing.film import EditFiles, Still, actor_placements, actors_of, crashes, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import read_footage
-from drivesplat.model.part import Appearance
+from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
@@ -135,11 +135,11 @@ def test_labels_and_cameras_alone_give_the_frames_again(scene, model, busy):
     assert seen == {AHEAD, GONE}
     for number, (view, picture) in enumerate(zip(views_of(busy.record, scene), busy.pictures(), strict=True)):
         shown = [
-            Appearance(track["source"], np.array(track["object_to_world"][number]), track["scale"])
+            ActorPlacement(track["source"], np.array(track["object_to_world"][number]), track["scale"])
             for track in busy.record["tracks"]
             if track["editable"] and track["object_to_world"][number] is not None
         ]
-        again = film_frame(model, view, model.staged_at(view.time, shown)).astype(int)
+        again = film_frame(model, view, model.gaussians_with_placements(view.time, shown)).astype(int)
         assert np.abs(again - picture).max() <= 1
 
 
@@ -255,10 +255,10 @@ def test_at_60_frames_a_second_there_are_twice_as_many_and_actors_move_between(s
     assert np.abs(fast.timestamps[::2] - slow.timestamps).max() <= 1
     seconds = np.array([scene.seconds(timestamp) for timestamp in fast.timestamps])
     np.testing.assert_allclose(seconds, np.arange(271) / 60, atol=1e-6)
-    present = appearances(edited_cast(actors_of(model, scene, "here"), edit_of(step), "here"), seconds)
+    present = actor_placements(edited_cast(actors_of(model, scene, "here"), edit_of(step), "here"), seconds)
     aside, motion = rigid(np.eye(3), np.array([0.0, 2.0, 0.0])), model.pieces(0.0)[TURNING].motion
     for number in (1, 77, 270):
-        shown = model.staged_at(float(seconds[number]), present[number])
+        shown = model.gaussians_with_placements(float(seconds[number]), present[number])
         pieces = model.pieces(float(seconds[number]))
         poses = {AHEAD: straight(number / 60) @ aside, TURNING: motion.poses(np.array([number / 60]))[0]}
         for name, pose in poses.items():

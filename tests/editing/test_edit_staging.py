@@ -21,7 +21,7 @@ from helpers.hand_made_traffic import placed
 
 from drivesplat.editing.cast import Role, edited_cast
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import actors_of, appearances
+from drivesplat.editing.film import actor_placements, actors_of
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -59,8 +59,8 @@ def cast(model: SplatModel, scene: Scene, *steps: dict[str, Any]) -> list[Role]:
 
 def staged(model: SplatModel, scene: Scene, *steps: dict[str, Any], times: np.ndarray = TIMES) -> list[Gaussians]:
     """What is there at `times` after these steps."""
-    present = appearances(cast(model, scene, *steps), times)
-    return [model.staged_at(float(time), shown) for time, shown in zip(times, present, strict=True)]
+    present = actor_placements(cast(model, scene, *steps), times)
+    return [model.gaussians_with_placements(float(time), shown) for time, shown in zip(times, present, strict=True)]
 
 
 def rows_of(model: SplatModel, *names: str) -> torch.Tensor:

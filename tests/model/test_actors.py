@@ -8,7 +8,7 @@ import torch
 from helpers.hand_made import about_z, actors_of, looking_at, motion_through, track_of
 from scipy.spatial.transform import Rotation
 
-from drivesplat.model.actors import Actors, Placements, track_penalties
+from drivesplat.model.actors import ActorPoses, Actors, track_penalties
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.splat_model import SplatModel
@@ -117,23 +117,21 @@ def test_at_an_annotation_its_own_correction_holds(index):
 def test_between_annotations_corrections_are_weighted_as_positions_are():
     actors = actors_of(van())
     weights = van().motion.weights(np.array([1.8]))[0]
-    placements, p = actors.placements(actors.moment(1.8)), doubled(actors)
-    np.testing.assert_allclose(
-        placements.translations[0].detach(), 1.8 * VELOCITY + weights @ p["translation"], atol=1e-5
-    )
-    np.testing.assert_allclose(matrices(placements.quats)[0], about_z(RATE * 1.8 + weights @ p["yaw"]), atol=1e-5)
+    poses, p = actors.poses(actors.moment(1.8)), doubled(actors)
+    np.testing.assert_allclose(poses.translations[0].detach(), 1.8 * VELOCITY + weights @ p["translation"], atol=1e-5)
+    np.testing.assert_allclose(matrices(poses.quats)[0], about_z(RATE * 1.8 + weights @ p["yaw"]), atol=1e-5)
 
 
 def test_actors_can_be_placed_anywhere_and_enlarged():
     actors = actors_of(van(), car())
     turns = Rotation.random(2, random_state=3)
     places, scales = np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 1.0]]), np.array([1.5, 0.5])
-    placements = Placements(
+    poses = ActorPoses(
         *(torch.from_numpy(x).float() for x in (turns.as_quat(scalar_first=True), places)),
         torch.tensor([True, True]),
         torch.from_numpy(scales).float(),
     )
-    gaussians, p = actors.placed(actors.moment(9.0), placements), doubled(actors)
+    gaussians, p = actors.placed(actors.moment(9.0), poses), doubled(actors)
     for i, rotation in enumerate(turns.as_matrix()):
         own = p["owner"] == i
         means = scales[i] * p["means"][own] @ rotation.T + places[i]
@@ -244,7 +242,7 @@ def test_an_actor_that_turns_keeps_its_colours_on_its_sides():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     seen = []
     for time in (1.0, 2.1, 2.9):
-        box = matrices(actors.placements(actors.moment(time)).quats)[0]
+        box = matrices(actors.poses(actors.moment(time)).quats)[0]
         expected = first_degree(actors.harmonics(actors.moment(time)).detach().double().numpy(), directions @ box)
         seen.append(first_degree(actors.at(time).sh.detach().double().numpy(), directions))
         np.testing.assert_allclose(seen[-1], expected, atol=1e-5)
