@@ -90,15 +90,15 @@ def actors_of(model: SplatModel, scene: Scene, where: str) -> list[Actor]:
     `where` begins messages. Raises ConfigError where it knows none, ResultError where the scene lacks one.
     """
     actors = []
-    for name, piece in model.pieces(0.0).items():
+    for name, group in model.rigid_groups(0.0).items():
         track = scene.track(name)
-        if piece.motion is None:
+        if group.motion is None:
             continue
         if track is None:
             raise ResultError(
                 f"{where}: scene.json has no track {name}, which checkpoint.pt knows; delete it and rerun"
             )
-        actors.append(Actor(track.id, track.category, track.size, piece.motion))
+        actors.append(Actor(track.id, track.category, track.size, group.motion))
     if not actors:
         raise ConfigError(
             f"{where}: nothing can be edited, since this method's model knows no actors; "

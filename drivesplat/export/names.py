@@ -1,4 +1,4 @@
-"""Names of pieces as other programs allow them."""
+"""Names of groups as other programs allow them."""
 
 from collections.abc import Callable, Iterable
 

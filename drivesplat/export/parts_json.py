@@ -1,4 +1,4 @@
-"""The pieces of a model as PLYs of their own, with parts.json to say what each is and how it moves.
+"""The groups of a model as PLYs of their own, with parts.json to say what each is and how it moves.
 
 With them a drive can be put together again at any time, or otherwise: without a vehicle, with it elsewhere.
 """
@@ -14,7 +14,7 @@ from drivesplat.export.names import distinct
 from drivesplat.export.placement import placement
 from drivesplat.export.sampled_motion import SampledMotion
 from drivesplat.export.splat_ply import note_of, write_splat_ply
-from drivesplat.export.trained_parts import SampledPiece, digests, middle_timestamp
+from drivesplat.export.trained_parts import SampledGroup, digests, middle_timestamp
 from drivesplat.io.storage import write_json
 from drivesplat.scene.scene import Scene
 
@@ -35,21 +35,21 @@ CONVENTIONS = {
 }
 
 
-def write_parts(path: str | Path, pieces: Mapping[str, SampledPiece], scene: Scene, provenance: dict[str, Any]) -> None:
-    """Writes every piece as a PLY beside `path` and, once all are there, what they are to `path`.
+def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Scene, provenance: dict[str, Any]) -> None:
+    """Writes every group as a PLY beside `path` and, once all are there, what they are to `path`.
 
-    PLYs of pieces that an earlier call left there and this one does not write are removed; other files stay.
+    PLYs of groups that an earlier call left there and this one does not write are removed; other files stay.
     """
     folder = Path(path).parent
-    files = {name: f"{stem}.ply" for name, stem in distinct(pieces, _stem).items()}
-    for name, piece in pieces.items():
-        note = {"scene": scene.name, "piece": name, "frame": _frame(piece), **digests(provenance)}
-        write_splat_ply(folder / files[name], piece.gaussians, note)
+    files = {name: f"{stem}.ply" for name, stem in distinct(groups, _stem).items()}
+    for name, group in groups.items():
+        note = {"scene": scene.name, "piece": name, "frame": _frame(group), **digests(provenance)}
+        write_splat_ply(folder / files[name], group.gaussians, note)
     _remove_others(folder, set(files.values()))
-    write_json(path, {**_record(pieces, files, scene), "provenance": provenance})
+    write_json(path, {**_record(groups, files, scene), "provenance": provenance})
 
 
-def _record(pieces: Mapping[str, SampledPiece], files: Mapping[str, str], scene: Scene) -> dict[str, Any]:
+def _record(groups: Mapping[str, SampledGroup], files: Mapping[str, str], scene: Scene) -> dict[str, Any]:
     first_image = min(frame.timestamp for frame in scene.frames)
     return {
         **placement(scene, SCHEMA, CONVENTIONS),
@@ -59,14 +59,14 @@ def _record(pieces: Mapping[str, SampledPiece], files: Mapping[str, str], scene:
             {
                 "name": name,
                 "file": files[name],
-                "gaussians": len(piece.gaussians),
-                "sh_degree": piece.gaussians.sh_degree,
-                "frame": _frame(piece),
-                "category": piece.track.category if piece.track else None,
-                "size": piece.track.size.tolist() if piece.track else None,
-                "motion": _motion(piece.motion, first_image) if piece.motion else None,
+                "gaussians": len(group.gaussians),
+                "sh_degree": group.gaussians.sh_degree,
+                "frame": _frame(group),
+                "category": group.track.category if group.track else None,
+                "size": group.track.size.tolist() if group.track else None,
+                "motion": _motion(group.motion, first_image) if group.motion else None,
             }
-            for name, piece in pieces.items()
+            for name, group in groups.items()
         ],
     }
 
@@ -80,8 +80,8 @@ def _motion(motion: SampledMotion, first_image: int) -> dict[str, Any]:
     }
 
 
-def _frame(piece: SampledPiece) -> str:
-    return "object" if piece.motion else "world"
+def _frame(group: SampledGroup) -> str:
+    return "object" if group.motion else "world"
 
 
 def _stem(name: str) -> str:
@@ -90,7 +90,7 @@ def _stem(name: str) -> str:
 
 
 def _remove_others(folder: Path, kept: set[str]) -> None:
-    """Removes PLYs of pieces that are not among the names `kept`."""
+    """Removes PLYs of groups that are not among the names `kept`."""
     for file in folder.glob("*.ply"):
         if file.name not in kept and "piece" in note_of(file):
             file.unlink()

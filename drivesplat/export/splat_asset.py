@@ -11,7 +11,7 @@ import numpy as np
 from drivesplat.export.cameras_json import cameras_record
 from drivesplat.export.parts_json import write_parts
 from drivesplat.export.splat_ply import write_splat_ply
-from drivesplat.export.trained_parts import digests, trained_gaussians, trained_pieces
+from drivesplat.export.trained_parts import digests, trained_gaussians, trained_groups
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import trained_model
 from drivesplat.scene.scene import Scene
@@ -38,9 +38,9 @@ def export_splat(
     """
     model, _ = trained_model(checkpoint)
     gaussians = trained_gaussians(model, scene)
-    pieces = trained_pieces(model, scene, np.array([frame.timestamp for frame in scene.frames]))
+    groups = trained_groups(model, scene, np.array([frame.timestamp for frame in scene.frames]))
     note = {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)}
     write_splat_ply(files.splat, gaussians, note)
     write_json(files.cameras, {**cameras_record(scene, parser), "provenance": provenance})
-    write_parts(files.parts, pieces, scene, provenance)
-    log.info("%d Gaussians, %d pieces, %d images", len(gaussians), len(pieces), len(scene.frames))
+    write_parts(files.parts, groups, scene, provenance)
+    log.info("%d Gaussians, %d groups, %d images", len(gaussians), len(groups), len(scene.frames))

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from drivesplat.export.trained_parts import SampledPiece
+from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians, concatenate
 
 LARGEST_AREA = 10.0
@@ -41,11 +41,11 @@ def thinned(gaussians: Gaussians, count: int) -> Gaussians:
     return gaussians[covering_most(gaussians, count)]
 
 
-def thinned_pieces(pieces: Mapping[str, SampledPiece], count: int) -> dict[str, SampledPiece]:
-    """The `count` Gaussians that cover most among all pieces together, absent objects included, in their pieces."""
-    sets = [piece.gaussians for piece in pieces.values()]
+def thinned_groups(groups: Mapping[str, SampledGroup], count: int) -> dict[str, SampledGroup]:
+    """The `count` Gaussians that cover most among all groups together, absent objects included, in their groups."""
+    sets = [group.gaussians for group in groups.values()]
     kept = covering_most(concatenate(sets), count).split([len(gaussians) for gaussians in sets])
     return {
-        name: replace(piece, gaussians=piece.gaussians[chosen])
-        for (name, piece), chosen in zip(pieces.items(), kept, strict=True)
+        name: replace(group, gaussians=group.gaussians[chosen])
+        for (name, group), chosen in zip(groups.items(), kept, strict=True)
     }

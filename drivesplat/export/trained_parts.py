@@ -1,4 +1,4 @@
-"""What of a training leaves the workflow: its Gaussians as they stand at one time, or piece by piece with the motion of
+"""What of a training leaves the workflow: its Gaussians as they stand at one time, or group by group with the motion of
 each; and where they come from in short.
 
 Colours that vary with time are those of the drive's middle image. Gaussians with a value that is not finite are left
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class SampledPiece:
+class SampledGroup:
     """Gaussians in world coordinates, or, where there is a `motion`, in the frame of the object that moves so.
 
     `track` is what the scene knows of that object, if it does.
@@ -45,18 +45,18 @@ def trained_gaussians(model: SplatModel, scene: Scene) -> Gaussians:
 
 
 @torch.no_grad()
-def trained_pieces(model: SplatModel, scene: Scene, timestamps: np.ndarray) -> dict[str, SampledPiece]:
-    """The pieces of a model by their names, objects in their own frames, whether they are there then or not.
+def trained_groups(model: SplatModel, scene: Scene, timestamps: np.ndarray) -> dict[str, SampledGroup]:
+    """The groups of a model by their names, objects in their own frames, whether they are there then or not.
 
     Their motions are sampled at the `timestamps` (m,) of images (microseconds), among others.
     """
     middle = scene.seconds(middle_timestamp(scene))
     recorded = (timestamps - min(frame.timestamp for frame in scene.frames)) * 1e-6
-    found: dict[str, SampledPiece] = {}
-    for name, piece in model.pieces(middle).items():
-        motion = None if piece.motion is None else sampled(piece.motion, recorded, middle)
-        track = None if piece.motion is None else scene.track(name)
-        found[name] = SampledPiece(_finite(piece.gaussians, name), motion, track)
+    found: dict[str, SampledGroup] = {}
+    for name, group in model.rigid_groups(middle).items():
+        motion = None if group.motion is None else sampled(group.motion, recorded, middle)
+        track = None if group.motion is None else scene.track(name)
+        found[name] = SampledGroup(_finite(group.gaussians, name), motion, track)
     return found
 
 

@@ -3,7 +3,7 @@
 The stage: metres, z up, the world of `Scene` with its origin in customLayerData, thirty time codes a second since the
 first image. Below /World lie
 
-- a prim for every piece that stands still: /World/background
+- a prim for every group that stands still: /World/background
 - /World/actors/{track} for every object, its Gaussians in the object's frame, its transform and visibility over time
 - /World/camera as it was recorded
 
@@ -21,8 +21,8 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from drivesplat.errors import ResultError
 from drivesplat.export.names import distinct
-from drivesplat.export.trained_parts import SampledPiece
-from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_piece, usd_matrix
+from drivesplat.export.trained_parts import SampledGroup
+from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_group, usd_matrix
 from drivesplat.io.storage import atomic_path
 
 APERTURE_WIDTH = 0.36
@@ -35,9 +35,9 @@ _OPENCV_TO_USD = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def splat_stage(
-    pieces: Mapping[str, SampledPiece], cameras: Sequence[tuple[float, Gf.Camera]], note: Mapping[str, Any]
+    groups: Mapping[str, SampledGroup], cameras: Sequence[tuple[float, Gf.Camera]], note: Mapping[str, Any]
 ) -> Usd.Stage:
-    """A stage in memory with the pieces by name, the camera at its times (seconds) and `note` in customLayerData."""
+    """A stage in memory with the groups by name, the camera at its times (seconds) and `note` in customLayerData."""
     stage = Usd.Stage.CreateInMemory("scene.usdc")
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
@@ -45,7 +45,7 @@ def splat_stage(
     Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
     stage.SetDefaultPrim(world.GetPrim())
     stage.GetRootLayer().customLayerData = {"drivesplat": dict(note)}
-    _define_pieces(stage, pieces)
+    _define_groups(stage, groups)
     _define_camera(stage, cameras)
     return stage
 
@@ -89,16 +89,16 @@ def _unwritable(path: Path, why: str) -> ResultError:
     return ResultError(f"{path}: cannot be written ({why}); free space or fix its permissions")
 
 
-def _define_pieces(stage: Usd.Stage, pieces: Mapping[str, SampledPiece]) -> None:
-    still = [name for name, piece in pieces.items() if piece.motion is None]
-    objects = [name for name in pieces if name not in still]
+def _define_groups(stage: Usd.Stage, groups: Mapping[str, SampledGroup]) -> None:
+    still = [name for name, group in groups.items() if group.motion is None]
+    objects = [name for name in groups if name not in still]
     if objects:
         Usd.ModelAPI(UsdGeom.Xform.Define(stage, _ACTORS)).SetKind(Kind.Tokens.group)
     taken = [path.rpartition("/")[2] for path in (_ACTORS, _CAMERA)]
     paths = {name: f"/World/{word}" for name, word in distinct(still, _identifier, taken).items()}
     paths |= {name: f"{_ACTORS}/{word}" for name, word in distinct(objects, _identifier).items()}
-    for name, piece in pieces.items():
-        define_piece(stage, paths[name], name, piece)
+    for name, group in groups.items():
+        define_group(stage, paths[name], name, group)
 
 
 def _identifier(name: str) -> str:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from pxr import Gf
 
-from drivesplat.export.thinning import thinned_pieces
-from drivesplat.export.trained_parts import digests, trained_pieces
+from drivesplat.export.thinning import thinned_groups
+from drivesplat.export.trained_parts import digests, trained_groups
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND
 from drivesplat.model.checkpoint import trained_model
@@ -29,12 +29,12 @@ def export_usd(
     """
     model, _ = trained_model(checkpoint)
     cameras = recorded_cameras(scene, job.eval_camera)
-    pieces = trained_pieces(model, scene, recorded_timestamps(scene, job.eval_camera))
-    kept = thinned_pieces(pieces, job.gaussians)
+    groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera))
+    kept = thinned_groups(groups, job.gaussians)
     note = {"scene": scene.name, "dataset": scene.dataset, "origin": Gf.Vec3d(*scene.origin), **digests(provenance)}
     write_usdz(path, splat_stage(kept, cameras, note))
-    before, after = (sum(len(piece.gaussians) for piece in of.values()) for of in (pieces, kept))
-    log.info("%d of %d Gaussians, %d pieces, %d poses of %s", after, before, len(kept), len(cameras), job.eval_camera)
+    before, after = (sum(len(group.gaussians) for group in of.values()) for of in (groups, kept))
+    log.info("%d of %d Gaussians, %d groups, %d poses of %s", after, before, len(kept), len(cameras), job.eval_camera)
 
 
 def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]:

@@ -12,7 +12,7 @@ from pxr import Gf, Kind, Usd, UsdGeom, UsdVol, Vt
 from torch import Tensor
 
 from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
-from drivesplat.export.trained_parts import SampledPiece
+from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians
 
 TIME_CODES_PER_SECOND = float(SAMPLES_PER_SECOND)
@@ -20,20 +20,20 @@ EXTENT_SIGMAS = 3.0
 """How far a Gaussian reaches for the extent, in its largest scale: the support that the schema gives the kernel."""
 
 
-def define_piece(stage: Usd.Stage, prim_path: str, name: str, piece: SampledPiece) -> None:
+def define_group(stage: Usd.Stage, prim_path: str, name: str, group: SampledGroup) -> None:
     """A ParticleField3DGaussianSplat at `prim_path`; one that moves says which track it is, and of what class."""
     splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, prim_path)
     Usd.ModelAPI(splat).SetKind(Kind.Tokens.component)
-    _fill(splat, piece.gaussians)
-    if piece.motion is None:
+    _fill(splat, group.gaussians)
+    if group.motion is None:
         return
     about = {"track": name}
-    if piece.track is not None:
-        about |= {"category": piece.track.category, "size": Gf.Vec3d(*piece.track.size)}
+    if group.track is not None:
+        about |= {"category": group.track.category, "size": Gf.Vec3d(*group.track.size)}
     splat.GetPrim().SetCustomDataByKey("drivesplat", about)
     splat.GetPrim().SetDisplayName(" ".join([about.get("category", "object"), name]))
-    _move(splat, piece.motion)
-    _show(splat, piece.motion)
+    _move(splat, group.motion)
+    _show(splat, group.motion)
 
 
 def usd_matrix(transform: np.ndarray) -> Gf.Matrix4d:

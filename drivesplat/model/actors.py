@@ -20,7 +20,7 @@ from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
-from drivesplat.model.part import ActorPlacement, Part, Piece
+from drivesplat.model.part import ActorPlacement, Part, RigidGroup
 from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.timeline import ActorTrack, Moment, Timeline
 from drivesplat.scene.motion import Motion
@@ -226,12 +226,12 @@ class Actors(Part):
         return self.params["owner"] == known.index(track_id) if track_id in known else None
 
     @torch.no_grad()
-    def pieces(self, time: float) -> dict[str, Piece]:
+    def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         p = self.params
         scales, opacities = torch.exp(p["scales"]), torch.sigmoid(p["opacities"])
         local = Gaussians.of(p["means"], p["quats"], scales, opacities, self.harmonics(self.moment(time)))
         return {
-            track.id: Piece(local[p["owner"] == i], motion)
+            track.id: RigidGroup(local[p["owner"] == i], motion)
             for i, (track, motion) in enumerate(zip(self.timeline.tracks, self.motions(), strict=True))
         }
 

@@ -32,9 +32,9 @@ class ActorPlacement:
 
 
 @dataclass(frozen=True)
-class Piece:
-    """Gaussians that move as one: in world coordinates where `motion` is None, else in the frame of the object that
-    moves so (spherical harmonics, too)."""
+class RigidGroup:
+    """Gaussians that move as one rigid body: in world coordinates where `motion` is None, else in the frame of the
+    moving object (their spherical harmonics too)."""
 
     gaussians: Gaussians
     motion: Motion | None
@@ -98,10 +98,10 @@ class Part(nn.Module, ABC):
     def definition(self) -> dict[str, Any]:
         """What, beside its parameters and settings, makes it what it is: plain data, for the checkpoint."""
 
-    def pieces(self, time: float) -> dict[str, Piece]:
-        """What it consists of, by names unique in a model, with the colours of a time: a set that stands still, or one
-        for every track."""
-        return {self.name: Piece(self.at(time), None)}
+    def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
+        """Its Gaussians with the colours of a time as rigid groups: one static group, or one for every track. Names are
+        unique in a model."""
+        return {self.name: RigidGroup(self.at(time), None)}
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
         """Weighted terms for the training loss about itself, by name."""

@@ -14,7 +14,7 @@ from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.part import ActorPlacement, Part, Piece, Sky
+from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Sky
 from drivesplat.model.view import View
 from drivesplat.rasterization import Rendering, rasterize
 
@@ -82,18 +82,18 @@ class SplatModel(nn.Module):
         """As `gaussians_at`, with objects at `placements` and no others: see `Part.with_placements`."""
         return concatenate([part.with_placements(time, placements) for part in self.parts])
 
-    def pieces(self, time: float) -> dict[str, Piece]:
-        """What all parts consist of: see `Part.pieces`. Raises ResultError where two pieces have one name."""
-        found: dict[str, Piece] = {}
+    def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
+        """The rigid groups of all parts: see `Part.rigid_groups`. Raises ResultError where two have the same name."""
+        found: dict[str, RigidGroup] = {}
         for part in self.parts:
-            pieces = part.pieces(time)
-            twice = found.keys() & pieces.keys()
-            if twice:
+            groups = part.rigid_groups(time)
+            duplicates = found.keys() & groups.keys()
+            if duplicates:
                 raise ResultError(
-                    f"two pieces of the model are called {min(twice)!r}; train it again with every part and track "
-                    "under a name of its own"
+                    f"the model has two rigid groups named {min(duplicates)!r}; give every part and track a unique "
+                    "name and train it again"
                 )
-            found |= pieces
+            found |= groups
         return found
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:

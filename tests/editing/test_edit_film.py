@@ -185,7 +185,7 @@ def test_what_cannot_be_edited_is_listed_where_it_was_recorded(scene, busy):
 
 def test_who_is_as_recorded_is_labelled_as_the_model_has_come_to_know_it(scene, model, tmp_path):
     made = make(scene, model, tmp_path, {"remove": {"track": AHEAD}})
-    track, motion = made.track(TURNING), model.pieces(0.0)[TURNING].motion
+    track, motion = made.track(TURNING), model.rigid_groups(0.0)[TURNING].motion
     assert (track["edited"], track["scale"]) == (False, 1.0)
     np.testing.assert_allclose(track["object_to_world"], motion.poses(seconds_of(made, scene)), atol=1e-6, rtol=0)
 
@@ -256,13 +256,13 @@ def test_at_60_frames_a_second_there_are_twice_as_many_and_actors_move_between(s
     seconds = np.array([scene.seconds(timestamp) for timestamp in fast.timestamps])
     np.testing.assert_allclose(seconds, np.arange(271) / 60, atol=1e-6)
     present = actor_placements(edited_cast(actors_of(model, scene, "here"), edit_of(step), "here"), seconds)
-    aside, motion = rigid(np.eye(3), np.array([0.0, 2.0, 0.0])), model.pieces(0.0)[TURNING].motion
+    aside, motion = rigid(np.eye(3), np.array([0.0, 2.0, 0.0])), model.rigid_groups(0.0)[TURNING].motion
     for number in (1, 77, 270):
         shown = model.gaussians_with_placements(float(seconds[number]), present[number])
-        pieces = model.pieces(float(seconds[number]))
+        groups = model.rigid_groups(float(seconds[number]))
         poses = {AHEAD: straight(number / 60) @ aside, TURNING: motion.poses(np.array([number / 60]))[0]}
         for name, pose in poses.items():
-            expected = placed(pieces[name].gaussians, pose).means
+            expected = placed(groups[name].gaussians, pose).means
             np.testing.assert_allclose(shown.means[model.of_track(name)], expected, atol=2e-4)
 
 

@@ -170,7 +170,7 @@ def test_an_edit_that_changes_nothing_leaves_the_pixels_as_recorded(model, scene
 
 def own_gaussians(model: SplatModel, name: str, time: float) -> Gaussians:
     """An actor's in its own frame."""
-    return model.pieces(time)[name].gaussians
+    return model.rigid_groups(time)[name].gaussians
 
 
 def assert_is(found: Gaussians, model: SplatModel, source: str, time: float, pose: np.ndarray, scale: float) -> None:

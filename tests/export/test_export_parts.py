@@ -1,4 +1,4 @@
-"""parts/: every piece of a model as a PLY in its own frame, from which parts.json makes the drive again."""
+"""parts/: every group of a model as a PLY in its own frame, from which parts.json makes the drive again."""
 
 import json
 import logging
@@ -25,7 +25,7 @@ from drivesplat.export.parts_json import write_parts
 from drivesplat.export.sampled_motion import sampled
 from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
-from drivesplat.export.trained_parts import SampledPiece, trained_gaussians, trained_pieces
+from drivesplat.export.trained_parts import SampledGroup, trained_gaussians, trained_groups
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.motion import Motion
@@ -87,7 +87,7 @@ def assert_same(found: Gaussians, expected: Gaussians, atol: float = 1e-6) -> No
     torch.testing.assert_close(found.sh, expected.sh, rtol=0, atol=1e-5)
 
 
-def test_every_piece_is_a_file_and_has_its_line(folder, record, parts):
+def test_every_group_has_a_file_and_an_entry(folder, record, parts):
     assert list(parts) == ["background", TURNING, GONE_AT_TIMES]
     files = {part["file"] for part in record["parts"]}
     assert files == {"background.ply", f"{TURNING}.ply", f"{GONE_AT_TIMES}.ply"}
@@ -182,7 +182,7 @@ def test_the_record_says_where_it_is_from_and_what_it_means(record, scene, folde
     assert note == {"scene": "0001", "piece": TURNING, "frame": "object", **DIGESTS}
 
 
-def test_vanilla_is_one_piece_that_holds_what_splat_ply_holds(tmp_path, tiny_scene, monkeypatch):
+def test_vanilla_is_one_group_equal_to_splat_ply(tmp_path, tiny_scene, monkeypatch):
     record = export_all(tmp_path, SplatModel([round_gaussians(STREET)], None), tiny_scene, monkeypatch)
     assert [(part["file"], part["frame"], part["motion"]) for part in record["parts"]] == [
         ("background.ply", "world", None)
@@ -190,7 +190,7 @@ def test_vanilla_is_one_piece_that_holds_what_splat_ply_holds(tmp_path, tiny_sce
     assert_same(read_splat_ply(tmp_path / "parts/background.ply"), read_splat_ply(tmp_path / "splat.ply"))
 
 
-def test_files_of_pieces_that_are_no_more_go_and_all_others_stay(tmp_path, scene, monkeypatch):
+def test_files_of_dropped_groups_are_removed_and_all_others_stay(tmp_path, scene, monkeypatch):
     export_all(tmp_path, street(), scene, monkeypatch)
     folder = tmp_path / "parts"
     (folder / "mine.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment mine\nend_header\n")
@@ -205,8 +205,8 @@ def test_files_of_pieces_that_are_no_more_go_and_all_others_stay(tmp_path, scene
 
 def test_names_that_would_be_one_file_become_two(tmp_path, tiny_scene):
     names = ["car 7", "car/7", "Car_7", "../up", ""]
-    pieces = {name: SampledPiece(some_gaussians(i + 1, 0, i)) for i, name in enumerate(names)}
-    write_parts(tmp_path / "parts/parts.json", pieces, tiny_scene, PROVENANCE)
+    groups = {name: SampledGroup(some_gaussians(i + 1, 0, i)) for i, name in enumerate(names)}
+    write_parts(tmp_path / "parts/parts.json", groups, tiny_scene, PROVENANCE)
     record = json.loads((tmp_path / "parts/parts.json").read_text())
     files = [part["file"] for part in record["parts"]]
     assert files == ["car_7.ply", "car_7_2.ply", "Car_7_3.ply", "___up.ply", "_.ply"]
@@ -230,9 +230,9 @@ def test_what_is_not_finite_stays_behind_in_every_export(tiny_scene, monkeypatch
     model = street()
     with caplog.at_level(logging.WARNING):
         together = trained_gaussians(model, tiny_scene)
-        pieces = trained_pieces(model, tiny_scene, np.array([], dtype=np.int64))
+        groups = trained_groups(model, tiny_scene, np.array([], dtype=np.int64))
     assert len(together) == 3 + 10
-    assert {name: len(piece.gaussians) for name, piece in pieces.items()} == {
+    assert {name: len(group.gaussians) for name, group in groups.items()} == {
         "background": 3, TURNING: 10, GONE_AT_TIMES: 10,
     }  # fmt: skip
     assert f"{TURNING}: 2 of 12 Gaussians are not finite and left out" in caplog.text

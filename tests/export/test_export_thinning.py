@@ -1,4 +1,4 @@
-"""Fewer Gaussians for programs that cannot show all: those stay that cover most, among all pieces together."""
+"""Fewer Gaussians for programs that cannot show all: those stay that cover most, among all groups together."""
 
 import dataclasses
 
@@ -6,8 +6,8 @@ import pytest
 import torch
 from helpers.hand_made_traffic import some_gaussians
 
-from drivesplat.export.thinning import thinned, thinned_pieces
-from drivesplat.export.trained_parts import SampledPiece
+from drivesplat.export.thinning import thinned, thinned_groups
+from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians
 
 
@@ -53,12 +53,12 @@ def test_enough_room_changes_nothing(count):
         assert torch.equal(getattr(thinned(shown, count), field.name), getattr(shown, field.name))
 
 
-def test_pieces_share_the_room_by_what_covers_most():
+def test_groups_share_the_budget_by_covered_area():
     """Of several degrees of spherical harmonics, too, which stay as they are."""
     one, other = (gaussians_of([[1.0] * 3] * 3, opacities) for opacities in ([0.9, 0.1, 0.8], [0.2, 0.7, 0.3]))
     other = dataclasses.replace(other, shN=torch.zeros(3, 3, 3))
-    kept = thinned_pieces({"a": SampledPiece(one), "b": SampledPiece(other)}, 3)
-    assert {name: places(piece.gaussians) for name, piece in kept.items()} == {"a": [0, 2], "b": [1]}
-    assert [piece.gaussians.sh_degree for piece in kept.values()] == [0, 1]
-    nothing = {"a": SampledPiece(one[torch.zeros(3, dtype=torch.bool)])}
-    assert len(thinned_pieces(nothing, 3)["a"].gaussians) == 0
+    kept = thinned_groups({"a": SampledGroup(one), "b": SampledGroup(other)}, 3)
+    assert {name: places(group.gaussians) for name, group in kept.items()} == {"a": [0, 2], "b": [1]}
+    assert [group.gaussians.sh_degree for group in kept.values()] == [0, 1]
+    nothing = {"a": SampledGroup(one[torch.zeros(3, dtype=torch.bool)])}
+    assert len(thinned_groups(nothing, 3)["a"].gaussians) == 0

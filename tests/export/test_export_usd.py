@@ -11,7 +11,7 @@ from pxr import Gf, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.export.trained_parts import SampledPiece
+from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
 from drivesplat.export.usd_asset import export_usd, recorded_cameras
 from drivesplat.model.background import Background
@@ -122,7 +122,7 @@ def test_coefficients_of_a_gaussian_stand_together(tmp_path, degree):
     g, i, c = torch.meshgrid(torch.arange(3.0), torch.arange(float(size)), torch.arange(3.0), indexing="ij")
     sh = 1000 * g + 10 * i + c
     splats = dataclasses.replace(random_splats(3), sh0=sh[:, :1], shN=sh[:, 1:])
-    write_usdz(tmp_path / "a.usdz", splat_stage({"background": SampledPiece(splats)}, [(0.0, Gf.Camera())], {}))
+    write_usdz(tmp_path / "a.usdz", splat_stage({"background": SampledGroup(splats)}, [(0.0, Gf.Camera())], {}))
     again = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     splat = splat_at(again)
     assert splat.GetRadianceSphericalHarmonicsDegreeAttr().Get() == degree
@@ -282,7 +282,7 @@ def little_room():
 
 def test_a_disk_that_is_full_is_told_and_the_package_before_stays(tmp_path, little_room):
     (tmp_path / "scene.usdz").write_text("the one before")
-    many = {"background": SampledPiece(random_splats(3000))}
+    many = {"background": SampledGroup(random_splats(3000))}
     with pytest.raises(ResultError, match=r"scene\.usdz: cannot be written .*File too large.*; free space"):
         write_usdz(tmp_path / "scene.usdz", splat_stage(many, [(0.0, Gf.Camera())], {}))
     assert [path.name for path in tmp_path.iterdir()] == ["scene.usdz"]

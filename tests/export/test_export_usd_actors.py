@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.export import usd_asset
 from drivesplat.export.sampled_motion import sampled
-from drivesplat.export.trained_parts import SampledPiece
+from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.export.usd_asset import export_usd
 from drivesplat.model.splat_model import SplatModel
@@ -194,13 +194,13 @@ def test_openusds_own_validators_find_nothing(stage, package):
     assert not assets and not unresolved
 
 
-def still(count: int) -> SampledPiece:
-    return SampledPiece(some_gaussians(count, 0, count))
+def still(count: int) -> SampledGroup:
+    return SampledGroup(some_gaussians(count, 0, count))
 
 
-def moving(count: int) -> SampledPiece:
+def moving(count: int) -> SampledGroup:
     motion = sampled(COURSES[TURNING].motion, np.array([]), 1.0)
-    return SampledPiece(some_gaussians(count, 0, count), motion)
+    return SampledGroup(some_gaussians(count, 0, count), motion)
 
 
 def counts(stage: Usd.Stage) -> dict[str, int]:
@@ -210,24 +210,24 @@ def counts(stage: Usd.Stage) -> dict[str, int]:
     }
 
 
-def test_every_piece_is_a_prim(tmp_path):
-    pieces = {"background": still(4), "kerb 7/x": still(2), "empty": still(0), "car": moving(3)}
-    write_usdz(tmp_path / "a.usdz", splat_stage(pieces, [(0.0, Gf.Camera())], {}))
+def test_every_group_is_a_prim(tmp_path):
+    groups = {"background": still(4), "kerb 7/x": still(2), "empty": still(0), "car": moving(3)}
+    write_usdz(tmp_path / "a.usdz", splat_stage(groups, [(0.0, Gf.Camera())], {}))
     found = counts(Usd.Stage.Open(str(tmp_path / "a.usdz")))
     assert found == {"/World/background": 4, "/World/kerb_7_x": 2, "/World/empty": 0, "/World/actors/car": 3}
 
 
 def test_names_that_would_be_one_identifier_become_two():
-    pieces = {"a b": moving(1), "a/b": moving(2), "1b": moving(3), "2b": moving(4), "_1b": moving(5)}
-    found = counts(splat_stage(pieces, [(0.0, Gf.Camera())], {}))
+    groups = {"a b": moving(1), "a/b": moving(2), "1b": moving(3), "2b": moving(4), "_1b": moving(5)}
+    found = counts(splat_stage(groups, [(0.0, Gf.Camera())], {}))
     assert found == {
         f"/World/actors/{n}": c for n, c in (("a_b", 1), ("a_b_2", 2), ("_1b", 3), ("_2b", 4), ("_1b_2", 5))
     }
 
 
-def test_pieces_do_not_take_the_cameras_place_nor_that_of_the_actors():
-    pieces = {"camera": still(1), "actors": still(2), "x": moving(3)}
-    stage = splat_stage(pieces, [(0.0, Gf.Camera())], {})
+def test_group_names_do_not_collide_with_the_camera_or_the_actors():
+    groups = {"camera": still(1), "actors": still(2), "x": moving(3)}
+    stage = splat_stage(groups, [(0.0, Gf.Camera())], {})
     assert counts(stage) == {"/World/camera_2": 1, "/World/actors_2": 2, "/World/actors/x": 3}
     assert stage.GetPrimAtPath("/World/camera").GetTypeName() == "Camera"
     assert stage.GetPrimAtPath("/World/actors").GetTypeName() == "Xform"
@@ -238,7 +238,7 @@ def test_an_object_may_be_called_like_the_camera():
     assert found == {"/World/actors/camera": 1, "/World/actors/background": 2}
 
 
-def test_room_is_shared_by_all_pieces_and_an_object_without_any_left_is_valid(tmp_path, scene, monkeypatch):
+def test_the_budget_is_shared_by_all_groups_and_an_empty_object_is_valid(tmp_path, scene, monkeypatch):
     """The two wide, opaque Gaussians of the background cover most."""
     monkeypatch.setattr(usd_asset, "trained_model", lambda _: (street(), None))
     monkeypatch.setattr("hand_made_traffic.own_gaussians", lambda *_: some_gaussians(12, 1, 0)[slice(0, 1)])

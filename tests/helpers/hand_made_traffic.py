@@ -10,7 +10,7 @@ from torch import nn
 
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotated
-from drivesplat.model.part import Part, Piece
+from drivesplat.model.part import Part, RigidGroup
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
@@ -107,8 +107,10 @@ class Traffic(Part):
             shown.append(replace(gaussians, opacities=gaussians.opacities * course.is_there(time)))
         return concatenate(shown)
 
-    def pieces(self, time: float) -> dict[str, Piece]:
-        return {track_id: Piece(own_gaussians(track_id, time), course.motion) for track_id, course in COURSES.items()}
+    def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
+        return {
+            track_id: RigidGroup(own_gaussians(track_id, time), course.motion) for track_id, course in COURSES.items()
+        }
 
     def learning_rates(self) -> dict[str, float]:
         return {}

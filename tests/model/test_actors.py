@@ -425,9 +425,9 @@ def test_in_its_pieces_an_actor_is_where_it_is_in_the_model(time, corrected, tol
                 times = torch.from_numpy(track.motion.times).float()
                 actors.shared["translation"][own] = times[:, None] * torch.tensor([0.1, -0.1, 0.0])
                 actors.shared["yaw"][own] = 0.15
-    together, pieces = actors.at(time), actors.pieces(time)
-    assert list(pieces) == ["van", "car"]
-    for i, piece in enumerate(pieces.values()):
+    together, groups = actors.at(time), actors.rigid_groups(time)
+    assert list(groups) == ["van", "car"]
+    for i, piece in enumerate(groups.values()):
         (pose,) = piece.motion.poses(np.array([time]))
         own = together[actors.params["owner"] == i]
         if not piece.motion.present(np.array([time]))[0]:

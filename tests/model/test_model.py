@@ -290,13 +290,13 @@ def test_a_part_that_cannot_say_a_time_in_tensors_leaves_its_model_without_momen
     assert SplatModel([still, Riding(still)], None).moments(0.5) is None
 
 
-def test_two_pieces_of_one_name_are_refused():
+def test_two_rigid_groups_of_one_name_are_refused():
     """Two parts of one name, and a track that is called like a part."""
     still = Background.from_points(*seed_points(3), GaussianSettings(), 1.0)
     for other in (still, actors_of(a_track("it"), a_track("background"))):
         with pytest.raises(ResultError, match=r"'background'.*train it again"):
-            SplatModel([still, other], None).pieces(0.0)
-    assert list(SplatModel([still, actors_of(a_track("it"))], None).pieces(0.0)) == ["background", "it"]
+            SplatModel([still, other], None).rigid_groups(0.0)
+    assert list(SplatModel([still, actors_of(a_track("it"))], None).rigid_groups(0.0)) == ["background", "it"]
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
