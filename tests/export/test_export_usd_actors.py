@@ -241,7 +241,7 @@ def test_an_object_may_be_called_like_the_camera():
 def test_the_budget_is_shared_by_all_groups_and_an_empty_object_is_valid(tmp_path, scene, monkeypatch):
     """The two wide, opaque Gaussians of the background cover most."""
     monkeypatch.setattr(usd_asset, "trained_model", lambda _: (street(), None))
-    monkeypatch.setattr("hand_made_traffic.own_gaussians", lambda *_: some_gaussians(12, 1, 0)[slice(0, 1)])
+    monkeypatch.setattr("helpers.hand_made_traffic.own_gaussians", lambda *_: some_gaussians(12, 1, 0)[slice(0, 1)])
     job = UsdJob(eval_camera="CAM_FRONT", gaussians=2)
     export_usd(tmp_path / "scene.usdz", {}, scene, job, PROVENANCE)
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
