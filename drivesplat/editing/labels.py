@@ -7,7 +7,6 @@ import numpy as np
 
 from drivesplat.editing.cast import Role
 from drivesplat.scene.motion import Motion
-from drivesplat.scene.regions import is_dynamic
 from drivesplat.scene.scene import Scene, Track
 
 DECIMALS = 6
@@ -22,7 +21,7 @@ def track_labels(scene: Scene, roles: Sequence[Role], actors: set[str], seconds:
     `size` is length, width, height in metres, `scale` included; `object_to_world` (n times 4, 4) is at the box's
     centre, to a millionth, None in frames in which the object is absent.
     """
-    others = (track for track in scene.tracks if is_dynamic(track.category) and track.id not in actors)
+    others = (track for track in scene.tracks if track.object_class.is_dynamic and track.id not in actors)
     return [*(_played(role, seconds) for role in roles), *(_recorded(scene, track, seconds) for track in others)]
 
 

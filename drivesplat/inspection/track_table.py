@@ -12,7 +12,7 @@ from drivesplat.inspection.figures import BOX, draw_outline, sheet, show
 from drivesplat.inspection.subject import Subject, seen_in
 from drivesplat.io.storage import write_csv
 from drivesplat.scene.prepared_drive import Recording
-from drivesplat.scene.regions import LEAST_PIXELS, is_dynamic
+from drivesplat.scene.regions import LEAST_PIXELS
 from drivesplat.scene.scene import Track
 from drivesplat.scene.tracks import beginnings, box_at, moves_at_all
 
@@ -59,7 +59,7 @@ def track_rows(recording: Recording, sightings: Sightings) -> list[TrackRow]:
     for subject in (subject for seen in sightings.values() for subject in seen):
         by_track.setdefault(subject.box.track_id, []).append(subject)
     interval = recording.scene.key_frame_interval
-    tracks = [track for track in recording.scene.tracks if is_dynamic(track.category)]
+    tracks = [track for track in recording.scene.tracks if track.object_class.is_dynamic]
     rows = [_row(track, by_track.get(track.id, []), interval) for track in tracks]
     return sorted(rows, key=lambda row: (not row.moves, -row.seconds_visible, -row.pixels, row.id))
 

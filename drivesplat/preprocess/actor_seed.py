@@ -18,6 +18,7 @@ from drivesplat.lidar.movers import Mover, movers
 from drivesplat.lidar.sweeps import training_returns
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import LEAST_PIXELS, hulls_in, owner_image
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
@@ -26,7 +27,7 @@ from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
 
 log = logging.getLogger(__name__)
 
-CYCLES = ("vehicle.bicycle", "vehicle.motorcycle")
+CYCLES = (ObjectClass.BICYCLE, ObjectClass.MOTORCYCLE, ObjectClass.RIDER)
 UNSEEN = 127
 """Grey of an actor that no pixel shows."""
 
@@ -55,9 +56,9 @@ def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) ->
 
 def may_be_actor(track: Track, settings: ActorSeedSettings) -> bool:
     """Whether objects of its class become actors."""
-    if track.category in CYCLES:
+    if track.object_class in CYCLES:
         return settings.cycles
-    return track.category.startswith("vehicle.") or (settings.humans and track.category.startswith("human."))
+    return track.object_class.is_vehicle or (settings.humans and track.object_class.is_human)
 
 
 def gathered_points(

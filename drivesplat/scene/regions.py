@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.tracks import Box, boxes_at
@@ -63,11 +64,6 @@ def region_masks(labels: np.ndarray) -> dict[str, np.ndarray]:
     return {region: region_mask(labels, region) for region in REGIONS}
 
 
-def is_dynamic(category: str) -> bool:
-    """Whether a class can move at all; cones, barriers and the like count as static."""
-    return category.startswith(("vehicle.", "human.")) or category == "animal"
-
-
 def hull_of(box: Box, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray | None:
     """The convex hull (n, 2), continuous pixels, of a box clipped at the near plane; None where it is behind.
 
@@ -93,7 +89,7 @@ def hulls_in(scene: Scene, frame: Frame, size: tuple[int, int]) -> list[Hull]:
     intrinsics = continuous_intrinsics(frame, size)
     hulls = []
     for box in boxes_at(scene, frame.timestamp):
-        polygon = hull_of(box, world_to_camera, intrinsics) if is_dynamic(box.category) else None
+        polygon = hull_of(box, world_to_camera, intrinsics) if box.object_class.is_dynamic else None
         if polygon is not None:
             distance = float(np.linalg.norm(box.object_to_world[:3, 3] - frame.camera_to_world[:3, 3]))
             hulls.append(Hull(box, polygon, distance))
@@ -145,9 +141,9 @@ def label_of(hull: Hull, pixels: int) -> str:
     hidden = 0 < box.visibility < LEAST_VISIBILITY
     if hidden or hull.distance > FARTHEST or pixels < LEAST_PIXELS:
         return "left_out"
-    if box.category.startswith("vehicle."):
-        kind = "car" if box.category == "vehicle.car" else "other_vehicle"
+    if box.object_class.is_vehicle:
+        kind = "car" if box.object_class is ObjectClass.CAR else "other_vehicle"
         return f"moving_{kind}" if box.moves else f"parked_{kind}"
-    if box.category.startswith("human."):
+    if box.object_class.is_human:
         return "moving_human" if box.moves else "still_human"
     return "other"

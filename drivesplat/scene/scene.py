@@ -14,6 +14,7 @@ import numpy as np
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import read_json, unreadable, write_json
+from drivesplat.scene.object_class import ObjectClass
 
 SCHEMA = 1
 REFINED = "scene_refined.json"
@@ -51,7 +52,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Track:
-    """One annotated object over time.
+    """One annotated object over time. `category` is the dataset's own name of its class.
 
     `size` (3,) is length, width, height in metres. Per annotation: `timestamps` (n,), `sample_indices` (n,),
     increasing; `object_to_world` (n, 4, 4); `visibility` (n,): 1 (0-40 %) to 4 (80-100 %), 0 where the dataset does not
@@ -59,6 +60,7 @@ class Track:
     """
 
     id: str
+    object_class: ObjectClass
     category: str
     size: np.ndarray
     timestamps: np.ndarray
@@ -185,6 +187,8 @@ def _from_plain(kind: type, plain: dict[str, Any]) -> Any:
             values[name] = np.array(value, dtype=_ARRAYS[name])
         elif name in _RECORDS:
             values[name] = tuple(_from_plain(_RECORDS[name], item) for item in value)
+        elif name == "object_class":
+            values[name] = ObjectClass(value)
         else:
             values[name] = value
     return kind(**values)

@@ -80,7 +80,7 @@ def cautions(scene: Scene, brightness: float) -> list[str]:
         found.append(
             "nothing is annotated (the test split of nuScenes has no boxes): what moves counts as static and smears"
         )
-    elif not any(track.category.startswith("vehicle.") for track in tracks_that_move(scene)):
+    elif not any(track.object_class.is_vehicle for track in tracks_that_move(scene)):
         found.append(
             "no vehicle moves: gap_db compares with parked ones (null without them), there is no vehicle to remove or "
             "edit, and a method with actors has none but what actors.humans may add"

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import apply, interpolate, inverse
 from drivesplat.scene.scene import Scene, Track
 
-MOVING_VEHICLE = 1.0
-"""Horizontal speed in m/s above which a vehicle counts as moving."""
-MOVING_HUMAN = 0.3
-"""Horizontal speed in m/s above which a person counts as moving."""
 SHORT = 8
 """At least so many characters of an id are shown to people."""
 
@@ -21,6 +18,7 @@ class Box:
     """A track at one time: `size` (3,) length, width, height in metres, `speed` horizontal in m/s."""
 
     track_id: str
+    object_class: ObjectClass
     category: str
     size: np.ndarray
     object_to_world: np.ndarray
@@ -40,12 +38,8 @@ class Box:
 
     @property
     def moves(self) -> bool:
-        """Whether it moves now, by the measuring protocol's threshold for its class (nothing else moves)."""
-        if self.category.startswith("vehicle."):
-            return self.speed > MOVING_VEHICLE
-        if self.category.startswith("human."):
-            return self.speed > MOVING_HUMAN
-        return False
+        """Whether it moves now, by the measuring protocol's threshold for its class."""
+        return self.object_class.moves_at(self.speed)
 
 
 def in_box(
@@ -77,14 +71,18 @@ def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
         nearest = first + int(np.argmin(np.abs(times - timestamp)))
         visibility = int(track.visibility[nearest])
         if first == last:
-            return Box(track.id, track.category, track.size, track.object_to_world[first], 0.0, visibility)
+            return _box(track, track.object_to_world[first], 0.0, visibility)
         segment = first + int(np.clip(np.searchsorted(times, timestamp, side="right") - 1, 0, last - first - 1))
         start, end = track.object_to_world[segment], track.object_to_world[segment + 1]
         duration = float(track.timestamps[segment + 1] - track.timestamps[segment])
         pose = interpolate(start, end, (timestamp - track.timestamps[segment]) / duration)
         speed = float(np.linalg.norm((end - start)[:2, 3])) / duration * 1e6
-        return Box(track.id, track.category, track.size, pose, speed, visibility)
+        return _box(track, pose, speed, visibility)
     return None
+
+
+def _box(track: Track, object_to_world: np.ndarray, speed: float, visibility: int) -> Box:
+    return Box(track.id, track.object_class, track.category, track.size, object_to_world, speed, visibility)
 
 
 def boxes_of(tracks: Iterable[Track], timestamp: int, interval: float) -> list[Box]:

@@ -24,7 +24,7 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View, view_of
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.regions import LABELS, is_dynamic
+from drivesplat.scene.regions import LABELS
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at, boxes_at
@@ -130,7 +130,7 @@ def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known):
     """Outside every box of what can move, seen from the lateral camera, not from the recorded one."""
     images, static, recorded = [], [], []
     for frame, truth in front_frames(known):
-        boxes = [box for box in boxes_at(known.recording.scene, frame.timestamp) if is_dynamic(box.category)]
+        boxes = [box for box in boxes_at(known.recording.scene, frame.timestamp) if box.object_class.is_dynamic]
         images.append(pixels_of(known, truth.lateral))
         for masks, pose in ((static, lateral_pose(known, truth)), (recorded, frame.camera_to_world)):
             masks.append(~np.any([rays_meet(box, pose, frame) for box in boxes], axis=0))
@@ -210,7 +210,7 @@ def test_where_recorded_poses_are_off_what_moves_is_left_out_where_it_is_seen_fr
     result = lateral_metrics(model, off, "CAM_FRONT", None, CPU)["2.0"]["static"]
     count = 0
     for view, (frame, _) in zip(model.views, front_frames(off), strict=True):
-        boxes = [box for box in boxes_at(off.recording.scene, frame.timestamp) if is_dynamic(box.category)]
+        boxes = [box for box in boxes_at(off.recording.scene, frame.timestamp) if box.object_class.is_dynamic]
         pose = view.camera_to_world.double().numpy()
         count += (~np.any([rays_meet(box, pose, frame) for box in boxes], axis=0)).sum()
     assert result["pixels"] == pytest.approx(count, rel=1e-4)

@@ -22,6 +22,7 @@ from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.render import FilmFormat
 from drivesplat.settings.train import TrainJob, TrainSettings
+from helpers.classed import classed
 from helpers.hand_made import about_z, round_gaussians
 from helpers.hand_made import actors_of as made_actors
 
@@ -86,7 +87,7 @@ def street_scene(tiny: Scene) -> Scene:
 def _track(scene: Scene, name: str, driver: Driver) -> Track:
     seen, poses = np.array(driver.seen), driver.motion.object_to_world
     timestamps = scene.key_frame_timestamps[seen]
-    return Track(name, driver.category, np.array(driver.size), timestamps, seen, poses, np.full(len(seen), 4))
+    return Track(name, *classed(driver.category), np.array(driver.size), timestamps, seen, poses, np.full(len(seen), 4))
 
 
 def street_actors() -> Actors:

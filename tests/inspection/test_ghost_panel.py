@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.classed import classed
 from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
 from matplotlib.figure import Figure
 from PIL import Image
@@ -45,7 +46,9 @@ def one_car(scene: Scene, speed: float = SPEED) -> Scene:
     """A car ahead, its centre at (6, 0.4, 0.8) at the first key frame."""
     times = scene.key_frame_timestamps
     places = [rigid(np.eye(3), np.array([6.0 + speed * (time - times[0]) * 1e-6, 0.4, 0.8])) for time in times]
-    it = Track("it", "vehicle.car", SIZE, times, np.arange(len(times)), np.stack(places), np.full(len(times), 4))
+    it = Track(
+        "it", *classed("vehicle.car"), SIZE, times, np.arange(len(times)), np.stack(places), np.full(len(times), 4)
+    )
     return dataclasses.replace(scene, tracks=(it,))
 
 

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from helpers.classed import classed
 from helpers.hand_made import Own, recording_of, round_gaussians
 from scipy.spatial.transform import Rotation
 
@@ -36,7 +37,9 @@ def track_of(poses: list[np.ndarray], seconds=None, indices=None, size=SIZE) -> 
     seconds = 0.5 * indices if seconds is None else np.array(seconds)
     times = START + np.round(seconds * 1e6).astype(np.int64)
     visibility = np.full(len(poses), 4)
-    return Track("it", "vehicle.car", np.array(size, dtype=float), times, indices, np.stack(poses), visibility)
+    return Track(
+        "it", *classed("vehicle.car"), np.array(size, dtype=float), times, indices, np.stack(poses), visibility
+    )
 
 
 def straight(speed: float, count: int = 7, heading: float = 0.0, **changes) -> Track:
@@ -209,7 +212,7 @@ def drive_ahead(tiny_scene: Scene) -> Scene:
     """One car at 10 m/s along y = 0.5, its centre 0.8 m over the road, its first box at x = 5."""
     times = tiny_scene.key_frame_timestamps
     poses = np.stack([pose(5.0 + 10.0 * (time - times[0]) * 1e-6, 0.5, 0.8) for time in times])
-    it = Track("it", "vehicle.car", SIZE, times, np.arange(10), poses, np.full(10, 4))
+    it = Track("it", *classed("vehicle.car"), SIZE, times, np.arange(10), poses, np.full(10, 4))
     return dataclasses.replace(tiny_scene, tracks=(it,))
 
 

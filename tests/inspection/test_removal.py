@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.classed import classed
 from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
 from scipy.ndimage import convolve
 
@@ -32,7 +33,7 @@ def model_of(*parts: Part) -> SplatModel:
 
 def turned_box(angle: float = 0.7) -> Box:
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    return Box("it", "vehicle.car", SIZE, rigid(turn, np.array([30.0, -7.0, 1.2])), 5.0, 4)
+    return Box("it", *classed("vehicle.car"), SIZE, rigid(turn, np.array([30.0, -7.0, 1.2])), 5.0, 4)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +96,9 @@ def one_car(tiny_scene: Scene, speed: float = 4.0) -> Scene:
     """A car ahead, its centre at (8.5, 0, 0.8) at the first key frame."""
     times = tiny_scene.key_frame_timestamps
     places = [rigid(np.eye(3), np.array([8.5 + speed * (time - times[0]) * 1e-6, 0.0, 0.8])) for time in times]
-    it = Track("it", "vehicle.car", SIZE, times, np.arange(len(times)), np.stack(places), np.full(len(times), 4))
+    it = Track(
+        "it", *classed("vehicle.car"), SIZE, times, np.arange(len(times)), np.stack(places), np.full(len(times), 4)
+    )
     return dataclasses.replace(tiny_scene, tracks=(it,))
 
 

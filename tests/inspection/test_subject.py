@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 from helpers.hand_made import recording_of, write_labels
 
 from drivesplat.errors import ConfigError, DatasetError
@@ -40,7 +41,9 @@ class Actor:
         times, indices = scene.key_frame_timestamps[list(self.seen)], np.array(self.seen)
         places = [rigid(np.eye(3), self.place((time - scene.key_frame_timestamps[0]) * 1e-6)) for time in times]
         visibility = np.full(len(times), self.visibility)
-        return Track(self.name, self.category, np.array(self.size), times, indices, np.stack(places), visibility)
+        return Track(
+            self.name, *classed(self.category), np.array(self.size), times, indices, np.stack(places), visibility
+        )
 
 
 def with_actors(scene: Scene, *actors: Actor) -> Scene:

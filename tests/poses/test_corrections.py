@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 from helpers.hand_made_views import drive_of, ego_at
 from scipy.spatial.transform import Rotation
 
@@ -105,7 +106,7 @@ def scene_of() -> Scene:
     )
     ahead = rigid(Rotation.from_euler("z", 0.3).as_matrix(), np.array([10.0, 1.0, 0.8]))
     boxes = np.stack([ego_at(time * 1e-6) @ ahead for time in times])
-    track = Track("it", "vehicle.car", np.array([4.0, 2.0, 1.6]), times, np.arange(3), boxes, np.full(3, 4))
+    track = Track("it", *classed("vehicle.car"), np.array([4.0, 2.0, 1.6]), times, np.arange(3), boxes, np.full(3, 4))
     first = drive.scene.frames[0]
     mount = inverse(first.ego_to_world) @ first.camera_to_world
     pose = ego_at(0.2)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 from helpers.tiny_world import World
 from helpers.workflow_copy import WorkflowCopy
 from PIL import Image
@@ -47,7 +48,7 @@ def filmed(recorder: Recorder, folder: Path) -> tuple[Scene, np.ndarray]:
         truth.append(to_world @ STREET_TO_GLOBAL @ recorder.ego_to_street(time * 1e-6))
     tracks = [
         Track(
-            thing.name, thing.category, np.array(thing.body.size), times, np.arange(KEY_FRAMES),
+            thing.name, *classed(thing.category), np.array(thing.body.size), times, np.arange(KEY_FRAMES),
             np.stack([to_world @ recorder.box_to_global(thing, time * 1e-6) for time in times]),
             np.full(KEY_FRAMES, 4),
         )

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 from helpers.hand_made_views import HEADINGS, SIZE, drive_of, job_of
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -97,7 +98,7 @@ def car(speed: float, ahead: float = 12.0, category: str = "vehicle.car") -> Tra
     """A car ahead of the world's origin, along x."""
     times = np.array([0, 500_000, 1_000_000])
     poses = np.stack([rigid(np.eye(3), np.array([ahead + speed * time * 1e-6, 0.0, 0.8])) for time in times])
-    return Track("it", category, np.array([4.0, 2.0, 1.6]), times, np.arange(3), poses, np.full(3, 4))
+    return Track("it", *classed(category), np.array([4.0, 2.0, 1.6]), times, np.arange(3), poses, np.full(3, 4))
 
 
 def stands_of(

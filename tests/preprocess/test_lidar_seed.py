@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 from helpers.tiny_world import CAMERA_AT, LIDAR_AT, START_US, World, cast, cast_lidar
 from PIL import Image
 from plyfile import PlyData, PlyElement
@@ -115,7 +116,9 @@ def test_own_car_returns_are_there_unless_they_are_taken_out(tiny_scene):
 
 def turned_box(angle: float) -> Box:
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-    return Box("it", "vehicle.car", np.array([4.0, 2.0, 1.5]), rigid(turn, np.array([10.0, 5.0, 1.0])), 5.0, 4)
+    return Box(
+        "it", *classed("vehicle.car"), np.array([4.0, 2.0, 1.5]), rigid(turn, np.array([10.0, 5.0, 1.0])), 5.0, 4
+    )
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.2, 1.0])

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 from helpers.hand_made import about_z, motion_through
 from scipy.spatial.transform import Rotation
 
@@ -142,8 +143,8 @@ def test_a_single_annotation_holds_still_for_its_reach():
 def annotated(scene: Scene, key_frames: list[int], poses: list[np.ndarray]) -> Track:
     indices = np.array(key_frames)
     return Track(
-        "it", "vehicle.car", np.array([4.0, 2.0, 1.6]), scene.key_frame_timestamps[indices], indices, np.stack(poses),
-        np.full(len(indices), 4),
+        "it", *classed("vehicle.car"), np.array([4.0, 2.0, 1.6]), scene.key_frame_timestamps[indices], indices,
+        np.stack(poses), np.full(len(indices), 4),
     )  # fmt: skip
 
 

@@ -4,11 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World, cast, write_world
 from scipy.spatial import ConvexHull
 
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.regions import LABELS, REGIONS, fill, hull_of, is_dynamic, label_image, region_mask
+from drivesplat.scene.regions import LABELS, REGIONS, fill, hull_of, label_image, region_mask
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.tracks import Box
@@ -55,7 +56,7 @@ def test_a_polygon_around_the_image_fills_it():
 
 def box(position, size=(4.0, 2.0, 1.5), angle=0.0, category="vehicle.car") -> Box:
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-    return Box("it", category, np.array(size), rigid(turn, np.array(position, dtype=float)), 0.0, 4)
+    return Box("it", *classed(category), np.array(size), rigid(turn, np.array(position, dtype=float)), 0.0, 4)
 
 
 def surface(it: Box, steps: int = 41) -> np.ndarray:
@@ -289,7 +290,7 @@ def test_a_left_out_box_hides_what_stands_behind_it(tmp_path):
 def test_a_box_is_labelled_by_class_and_speed(tmp_path, category, velocity, expected):
     thing = Thing(category, (2.0, 2.0, 1.6), (12.0, 0.0, 0.8), velocity=(velocity, 0.0))
     assert names(labels_at_start([thing], tmp_path)) == {"static", expected}
-    assert is_dynamic(category) == (expected != "static")
+    assert classed(category)[0].is_dynamic == (expected != "static")
 
 
 def test_no_box_in_the_image_leaves_it_static(tmp_path):

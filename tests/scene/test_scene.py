@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 
 from drivesplat.errors import ResultError
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track, read_scene, write_scene
@@ -22,7 +23,7 @@ def some_scene(times: tuple[int, ...] = (1_532_402_927_647_951, 1_532_402_928_14
     between = dataclasses.replace(frame, timestamp=first + 10, is_key_frame=False, token="b")
     sweep = Sweep("/data/a.pcd.bin", first, pose(3), True, 0, "c")
     track = Track(
-        "instance", "vehicle.car", np.array([4.1, 1.9, 1.7]), np.array([first, last]), np.array([0, 1]),
+        "instance", *classed("vehicle.car"), np.array([4.1, 1.9, 1.7]), np.array([first, last]), np.array([0, 1]),
         np.stack([pose(4), pose(5)]), np.array([4, 0]),
     )  # fmt: skip
     return Scene(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.classed import classed
 
 from drivesplat.scene.rigid import apply, interpolate, inverse, rigid
 from drivesplat.scene.scene import Track
@@ -21,7 +22,7 @@ def track(indices, positions, angles=None, category="vehicle.car", visibility=No
     """An object seen at key frames `indices`, half a second apart."""
     angles = np.zeros(len(indices)) if angles is None else angles
     return Track(
-        "it", category, np.array([4.0, 2.0, 1.5]), START + np.array(indices) * 500_000, np.array(indices),
+        "it", *classed(category), np.array([4.0, 2.0, 1.5]), START + np.array(indices) * 500_000, np.array(indices),
         np.stack([rigid(turned(a), np.array(p, dtype=float)) for a, p in zip(angles, positions, strict=True)]),
         np.array(visibility if visibility is not None else [4] * len(indices)),
     )  # fmt: skip
@@ -165,7 +166,7 @@ def test_visibility_is_that_of_the_nearer_annotation(seconds, visibility):
     ],
 )
 def test_vehicles_move_above_1_metre_a_second_and_people_above_0_3(category, speed, moves):
-    assert Box("it", category, np.ones(3), np.eye(4), speed, 4).moves is moves
+    assert Box("it", *classed(category), np.ones(3), np.eye(4), speed, 4).moves is moves
 
 
 def test_a_box_moves_while_it_moves_and_a_track_that_ever_moves_does():
@@ -182,7 +183,8 @@ def test_a_jump_across_a_gap_is_no_motion():
 
 
 def test_corners_are_half_the_size_from_the_centre_along_the_objects_axes():
-    box = Box("it", "vehicle.car", np.array([4.0, 2.0, 1.0]), rigid(turned(np.pi / 2), np.array([10.0, 0, 0])), 0.0, 4)
+    pose = rigid(turned(np.pi / 2), np.array([10.0, 0, 0]))
+    box = Box("it", *classed("vehicle.car"), np.array([4.0, 2.0, 1.0]), pose, 0.0, 4)
     expected = {(10 + y, x, z) for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (-0.5, 0.5)}
     assert {tuple(np.round(corner, 9)) for corner in box.corners} == expected
 

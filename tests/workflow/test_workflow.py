@@ -315,7 +315,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
         ("drivesplat/preprocess/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
         ("drivesplat/training/floaters.py", "LARGEST_STEP = 15.0", "LARGEST_STEP = 14.0", TRAINING_AND_AFTER),
         ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
-        ("drivesplat/scene/tracks.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
+        ("drivesplat/scene/object_class.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
         ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
         ("drivesplat/io/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
         ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),

@@ -12,6 +12,7 @@ import numpy as np
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import checked_intrinsics, checked_pose, checked_size, require_increasing
+from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
 from drivesplat.settings.extract import SceneSource
@@ -188,6 +189,7 @@ def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Tr
             raise DatasetError(f"instance {instance}: its boxes have no finite, positive size")
         yield Track(
             id=instance,
+            object_class=object_class(annotations[0]["category_name"]),
             category=annotations[0]["category_name"],
             size=np.array([length, width, height]),
             timestamps=np.array([time for _, time, _ in entries], dtype=np.int64),

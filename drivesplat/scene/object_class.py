@@ -1,0 +1,59 @@
+"""The classes of annotated objects, and what the measuring protocol needs to know of each.
+
+A reader maps its dataset's class names to these. A dataset with one class for all vehicles maps it to VEHICLE: then no
+pixel belongs to the region `car`, which is null.
+"""
+
+from enum import StrEnum
+
+MOVING_VEHICLE = 1.0
+"""Horizontal speed in m/s above which a vehicle counts as moving."""
+MOVING_HUMAN = 0.3
+"""Horizontal speed in m/s above which a person counts as moving."""
+
+
+class ObjectClass(StrEnum):
+    """What an object is; the values appear in scene.json and in settings."""
+
+    CAR = "car"
+    TRUCK = "truck"
+    BUS = "bus"
+    TRAILER = "trailer"
+    CONSTRUCTION_VEHICLE = "construction_vehicle"
+    TRAM = "tram"
+    VEHICLE = "vehicle"
+    """A vehicle of a type that the dataset does not name, or that is none of the others."""
+    MOTORCYCLE = "motorcycle"
+    BICYCLE = "bicycle"
+    RIDER = "rider"
+    """A person and a cycle, annotated as one object."""
+    PEDESTRIAN = "pedestrian"
+    ANIMAL = "animal"
+    OTHER_MOVABLE = "other_movable"
+    """Cones, barriers and the like: static, as far as the protocol is concerned."""
+
+    @property
+    def is_vehicle(self) -> bool:
+        """Whether it belongs to the region `vehicle`: cycles with or without a rider do."""
+        return not self.is_human and self not in (ObjectClass.ANIMAL, ObjectClass.OTHER_MOVABLE)
+
+    @property
+    def is_human(self) -> bool:
+        """Whether it is a person on foot."""
+        return self is ObjectClass.PEDESTRIAN
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether its boxes are left out of the region `static`, moving or not."""
+        return self is not ObjectClass.OTHER_MOVABLE
+
+    @property
+    def moving_speed(self) -> float | None:
+        """The horizontal speed in m/s above which it counts as moving; None where it never does."""
+        if self.is_vehicle:
+            return MOVING_VEHICLE
+        return MOVING_HUMAN if self.is_human else None
+
+    def moves_at(self, speed: float) -> bool:
+        """Whether it counts as moving at a horizontal `speed` in m/s."""
+        return self.moving_speed is not None and speed > self.moving_speed
