@@ -16,7 +16,7 @@ from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, make_optimiz
 from benchmarks.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
 from benchmarks.speed.plain_training import PlainTraining, fit
-from drivesplat.model.checkpoint import load
+from drivesplat.io.checkpoint_file import load
 from drivesplat.rasterization import rasterize
 
 pytestmark = pytest.mark.usefixtures("one_thread")
