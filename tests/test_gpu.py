@@ -361,7 +361,7 @@ def street_film() -> Film:
     model.requires_grad_(False)
     views = [replace(view.view, camera=None) for view in guided_views(GPU)]
     views = [replace(view, K=view.K * view.K.new_tensor([1.0 + 0.1 * i, 1.0, 1.0])) for i, view in enumerate(views)]
-    model.expect([view.time for view in views])
+    model.precompute([view.time for view in views])
     return model, views, [film_frame(model, view) for view in views]
 
 
@@ -385,7 +385,7 @@ def test_frames_in_a_row_are_those_by_themselves(street_film, captures, monkeypa
     """Captured once; also with other Gaussians and another size between them, and for two films by turns."""
     model, views, expected = street_film
     timeline = model.parts[1].timeline
-    known = dict(timeline._known)
+    known = dict(timeline._cache)
     monkeypatch.setattr(rooms, "MARGIN", 4.0)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     assert len(captures) == 1 and captures[0] is not None
@@ -397,7 +397,7 @@ def test_frames_in_a_row_are_those_by_themselves(street_film, captures, monkeypa
     mixed = [*film_frames(model, [(view, None) for pair in zip(views, smaller, strict=True) for view in pair])]
     assert_frames(mixed[::2], expected)
     assert_frames(mixed[1::2], [film_frame(model, view) for view in smaller])
-    assert None not in captures and timeline._known == known, "all of it was expected"
+    assert None not in captures and timeline._cache == known, "all of it was expected"
 
 
 def test_a_film_that_outgrows_its_room_is_captured_anew(street_film, captures):
@@ -435,14 +435,14 @@ def test_frames_of_a_camera_of_the_rig_are_not_captured(street_film, captures):
 
 def test_frames_that_cannot_be_captured_come_all_the_same(street_film, monkeypatch, caplog):
     model, views, expected = street_film
-    together = SplatModel.gaussians_in
+    together = SplatModel.gaussians_at_time_states
 
-    def asks(self, moments):
-        found = together(self, moments)
+    def asks(self, states):
+        found = together(self, states)
         assert float(found.means.sum()) < 1e9
         return found
 
-    monkeypatch.setattr(SplatModel, "gaussians_in", asks)
+    monkeypatch.setattr(SplatModel, "gaussians_at_time_states", asks)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     assert [record.message.split(",")[0] for record in caplog.records] == ["frames of films cannot be recorded"]
 

@@ -69,7 +69,7 @@ def render_edit(
         log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
     present, still = actor_placements(roles, seconds), Still(crashed)
     before = recorded_shot(model, left, device)
-    model.expect(right.seconds)
+    model.precompute(right.seconds)
     after = edited_frames(model, right.views(device), present)
     write_film(files.film, still.side_by_side(before, after), right, model, columns=2)
     write_png(files.still, still.picture)

@@ -22,7 +22,7 @@ from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup
 from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
-from drivesplat.model.timeline import ActorTrack, Moment, Timeline
+from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.actors import ActorSettings, TrackSettings
 from drivesplat.settings.gaussians import GaussianSettings
@@ -108,50 +108,50 @@ class Actors(Part):
         params["owner"] = torch.repeat_interleave(torch.arange(len(sets)), torch.tensor([len(p) for p in points]))
         return cls(params, tracks, settings, gaussians)
 
-    def expect(self, times: Sequence[float]) -> None:
-        self.timeline.prepare(times, self.params["means"].device)
+    def precompute(self, times: Sequence[float]) -> None:
+        self.timeline.precompute(times, self.params["means"].device)
 
     def at(self, time: float) -> Gaussians:
-        return self.at_moment(self.moment(time))
+        return self.at_time_state(self.time_state(time))
 
-    def moment(self, time: float) -> Moment:
+    def time_state(self, time: float) -> TimeState:
         return self.timeline.at(time, self.params["means"].device)
 
-    def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
-        known = Moment(*moment)
-        return self.placed(known, self.poses(known))
+    def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+        state = TimeState(*time_state)
+        return self.placed(state, self.poses(state))
 
-    def poses(self, moment: Moment) -> ActorPoses:
+    def poses(self, state: TimeState) -> ActorPoses:
         """Where the actors are, by their annotations and the learned corrections."""
-        weights = moment.weights * self._annotated
+        weights = state.weights * self._annotated
         turns = about_vertical(weights @ self.shared["yaw"])
         return ActorPoses(
-            (left_factor(moment.quats) @ turns[..., None])[..., 0],
-            moment.translations + weights @ self.shared["translation"],
-            moment.present,
-            torch.ones_like(moment.translations[:, 0]),
+            (left_factor(state.quats) @ turns[..., None])[..., 0],
+            state.translations + weights @ self.shared["translation"],
+            state.present,
+            torch.ones_like(state.translations[:, 0]),
         )
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
-        moment, known = self.moment(time), [track.id for track in self.timeline.tracks]
-        poses = self.poses(moment)
+        state, known = self.time_state(time), [track.id for track in self.timeline.tracks]
+        poses = self.poses(state)
         first, copies = [], []
         for placement in (placement for placement in placements if placement.source in known):
             repeated = placement.source in {other.source for other in first}
             (copies if repeated else first).append(placement)
-        sets = [self.placed(moment, poses.with_placements(known, first))]
+        sets = [self.placed(state, poses.with_placements(known, first))]
         for placement in copies:  # few: transforming all actors for each copy costs little
-            placed = self.placed(moment, poses.with_placements(known, [placement]))
+            placed = self.placed(state, poses.with_placements(known, [placement]))
             sets.append(placed[self.params["owner"] == known.index(placement.source)])
         return concatenate(sets)
 
-    def placed(self, moment: Moment, poses: ActorPoses) -> Gaussians:
-        """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a moment."""
+    def placed(self, state: TimeState, poses: ActorPoses) -> Gaussians:
+        """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
         p, rotations = self.params, rotation_matrix(poses.quats)
         if on_gpu.for_tensor(p["means"]):
-            return self._placed_on_gpu(moment, poses, rotations)
+            return self._placed_on_gpu(state, poses, rotations)
         scales = self._of_owners(poses.scales)[:, None]
-        sh = self.harmonics(moment)
+        sh = self.harmonics(state)
         if sh.shape[1] > 1:  # colours turn by degrees at most: no gradient of theirs is worth its noise to the track
             sh = self._of_owners(rotation_of_harmonics(rotations.detach(), sh.shape[1])) @ sh
         turned = (self._of_owners(rotations) @ (scales * p["means"])[..., None])[..., 0]
@@ -163,7 +163,7 @@ class Actors(Part):
             sh,
         )
 
-    def _placed_on_gpu(self, moment: Moment, poses: ActorPoses, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
+    def _placed_on_gpu(self, state: TimeState, poses: ActorPoses, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
         """The same by two kernels."""
         from drivesplat.kernels.triton.colours_in_time import turned_colours
         from drivesplat.kernels.triton.placing import Objects, Shapes, placed
@@ -173,7 +173,7 @@ class Actors(Part):
         presence = poses.present.to(rotations.dtype)
         objects = Objects(poses.quats, poses.translations, poses.scales, presence)
         turns = rotation_of_harmonics(rotations.detach(), coefficients)
-        sh = turned_colours(p["sh0"], p["shN"], moment.series, turns, owner)
+        sh = turned_colours(p["sh0"], p["shN"], state.series, turns, owner)
         return Gaussians.of(*placed(shapes, objects, owner, self._owns), sh)
 
     def _of_owners(self, values: Float[Tensor, "a *v"]) -> Float[Tensor, "n *v"]:
@@ -194,13 +194,13 @@ class Actors(Part):
                 self._known_owners = owner, owner._version, matrix
         return matrix
 
-    def harmonics(self, moment: Moment) -> Float[Tensor, "n k 3"]:
-        """The coefficients of the colours at a moment, in the object's frame: the sum over i of f_i cos(i pi t / T), t
+    def harmonics(self, state: TimeState) -> Float[Tensor, "n k 3"]:
+        """The colour coefficients at a time state, in the object's frame: the sum over i of f_i cos(i pi t / T), t
         running from 0 to T over the actor's annotations (equation 5 of the paper)."""
         coefficients = torch.cat([self.params["sh0"], self.params["shN"]], dim=2)
         if coefficients.shape[1] == 1:
             return coefficients[:, 0]
-        series = self._of_owners(moment.series)
+        series = self._of_owners(state.series)
         return (series[:, :, None, None] * coefficients).sum(dim=1)
 
     def learning_rates(self) -> dict[str, float]:
@@ -229,7 +229,7 @@ class Actors(Part):
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         p = self.params
         scales, opacities = torch.exp(p["scales"]), torch.sigmoid(p["opacities"])
-        local = Gaussians.of(p["means"], p["quats"], scales, opacities, self.harmonics(self.moment(time)))
+        local = Gaussians.of(p["means"], p["quats"], scales, opacities, self.harmonics(self.time_state(time)))
         return {
             track.id: RigidGroup(local[p["owner"] == i], motion)
             for i, (track, motion) in enumerate(zip(self.timeline.tracks, self.motions(), strict=True))

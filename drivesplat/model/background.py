@@ -32,12 +32,12 @@ class Background(Part):
         return cls(init_params(positions, colors, settings, classes), settings, extent)
 
     def at(self, time: float) -> Gaussians:
-        return self.at_moment(self.moment(time))
+        return self.at_time_state(self.time_state(time))
 
-    def moment(self, time: float) -> Sequence[Tensor]:
+    def time_state(self, time: float) -> Sequence[Tensor]:
         return ()
 
-    def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
+    def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
         p = self.params
         return Gaussians(
             p["means"],

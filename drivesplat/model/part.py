@@ -64,8 +64,8 @@ class Part(nn.Module, ABC):
         self._spare = 0
         self.register_buffer("count_on_device", torch.zeros(()), persistent=False)
 
-    def expect(self, times: Sequence[float]) -> None:
-        """Is told at which times it will be looked at: many together may be made ready sooner than one by one."""
+    def precompute(self, times: Sequence[float]) -> None:
+        """Precomputes state for the given times, which may be faster for many times together than one by one."""
 
     @abstractmethod
     def at(self, time: float) -> Gaussians:
@@ -74,16 +74,16 @@ class Part(nn.Module, ABC):
         Always `self.row_count` rows in one order; one that is absent then has opacity 0.
         """
 
-    def moment(self, time: float) -> Sequence[Tensor] | None:
-        """All that a time means to its Gaussians, as tensors on its device, of the same shapes at every time:
-        `at_moment` of it is `at`. None where that cannot be said in tensors."""
+    def time_state(self, time: float) -> Sequence[Tensor] | None:
+        """The state of its Gaussians at a time as tensors on its device, of the same shapes at every time:
+        `at_time_state` of it equals `at`. None for a part without such a state."""
         return None
 
-    def at_moment(self, moment: Sequence[Tensor]) -> Gaussians:
-        """Its Gaussians as the tensors of a `moment` have them. It asks the device nothing and goes by these tensors
-        alone: what it has the device do may be replayed when they are another time's. Raises NotImplementedError where
-        there are no moments."""
-        raise NotImplementedError(f"the part {self.name!r} has no moments")
+    def at_time_state(self, time_state: Sequence[Tensor]) -> Gaussians:
+        """Its Gaussians by a `time_state`. Depends on these tensors alone and does not synchronise with the device, so
+        that a CUDA graph of it can be replayed after the tensors of another time are copied into them. Raises
+        NotImplementedError for a part without time states."""
+        raise NotImplementedError(f"the part {self.name!r} has no time states")
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one

@@ -60,23 +60,23 @@ class SplatModel(nn.Module):
         named = {"sky": self.sky, "exposure": self.exposure, "camera_poses": self.camera_poses}
         return {name: module for name, module in named.items() if module is not None}
 
-    def expect(self, times: Sequence[float]) -> None:
-        """Is told at which times it will be looked at: see `Part.expect`."""
+    def precompute(self, times: Sequence[float]) -> None:
+        """Precomputes state for the given times: see `Part.precompute`."""
         for part in self.parts:
-            part.expect(times)
+            part.precompute(times)
 
     def gaussians_at(self, time: float) -> Gaussians:
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
         return concatenate([part.at(time) for part in self.parts])
 
-    def moments(self, time: float) -> list[Sequence[Tensor]] | None:
-        """What a time means to the parts, each: see `Part.moment`. None where one cannot say it in tensors."""
-        moments = [part.moment(time) for part in self.parts]
-        return None if any(moment is None for moment in moments) else moments
+    def time_states(self, time: float) -> list[Sequence[Tensor]] | None:
+        """The time state of every part: see `Part.time_state`. None where one has none."""
+        states = [part.time_state(time) for part in self.parts]
+        return None if any(state is None for state in states) else states
 
-    def gaussians_in(self, moments: Sequence[Sequence[Tensor]]) -> Gaussians:
-        """As `gaussians_at`, by what a time means to the parts."""
-        return concatenate([part.at_moment(moment) for part, moment in zip(self.parts, moments, strict=True)])
+    def gaussians_at_time_states(self, states: Sequence[Sequence[Tensor]]) -> Gaussians:
+        """As `gaussians_at`, by the parts' time states."""
+        return concatenate([part.at_time_state(state) for part, state in zip(self.parts, states, strict=True)])
 
     def gaussians_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         """As `gaussians_at`, with objects at `placements` and no others: see `Part.with_placements`."""

@@ -1,4 +1,4 @@
-"""What annotations say of all actors at one time, as tensors."""
+"""The annotated state of all actors at one time, as tensors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from torch import Tensor
 
 from drivesplat.scene.motion import Motion
 
-REMEMBERED = 8192
-"""Times that are kept: those of a training's images come again and again, 1,440 where six cameras record at 12 Hz for
-20 s. A moment of 30 actors with 40 annotations each takes 6 kB, so many take 50 MB."""
+MAX_CACHED_TIMES = 8192
+"""Number of times whose states are cached. A training reuses those of its images: 1,440 for six cameras at 12 Hz over
+20 s. A state of 30 actors with 40 annotations each takes 6 kB, the full cache 50 MB."""
 
 
 @dataclass(frozen=True)
 class ActorTrack:
-    """Whom a set of Gaussians belongs to: `size` (3,) length, width, height in metres, and the annotated motion."""
+    """The track that owns a set of Gaussians: `size` (3,) length, width, height in metres, and the annotated motion."""
 
     id: str
     size: np.ndarray
@@ -44,11 +44,12 @@ class ActorTrack:
         return cls(plain["id"], plain["size"].numpy(), motion)
 
 
-class Moment(NamedTuple):
-    """a actors with m annotations together, at one time.
+class TimeState(NamedTuple):
+    """The state at one time of a actors with m annotations in all.
 
-    `quats` (w, x, y, z) and `translations` (metres) are the annotated object to world; `weights` how much each
-    annotation has in its actor's position; `series` cos(i pi t / T), t running from 0 to T over an actor's annotations.
+    `quats` (w, x, y, z) and `translations` (metres) are the annotated object to world; `weights` the interpolation
+    weight of each annotation in its actor's position; `series` cos(i pi t / T), t running from 0 to T over an actor's
+    annotations.
     """
 
     quats: Float[Tensor, "a 4"]
@@ -59,12 +60,12 @@ class Moment(NamedTuple):
 
 
 class Timeline:
-    """The annotations of all actors, one track after the other; `terms` is the length of `Moment.series`."""
+    """The annotations of all actors, one track after the other; `terms` is the length of `TimeState.series`."""
 
     def __init__(self, tracks: Sequence[ActorTrack], terms: int):
         self.tracks = tuple(tracks)
         self._terms = terms
-        self._known: dict[tuple[float, torch.device], Moment] = {}
+        self._cache: dict[tuple[float, torch.device], TimeState] = {}
 
     @property
     def owned(self) -> list[slice]:
@@ -91,24 +92,24 @@ class Timeline:
         ]
         return torch.tensor(triples, dtype=torch.long).reshape(-1, 3)
 
-    def at(self, time: float, device: torch.device) -> Moment:
-        """The moment at a time, in seconds since the scene's first image."""
-        if (time, device) not in self._known:
-            self.prepare([time], device)
-        return self._known[time, device]
+    def at(self, time: float, device: torch.device) -> TimeState:
+        """The state at a time in seconds since the scene's first image."""
+        if (time, device) not in self._cache:
+            self.precompute([time], device)
+        return self._cache[time, device]
 
-    def prepare(self, times: Sequence[float], device: torch.device) -> None:
-        """Finds the moments at many times together, which takes hardly longer than one, and keeps them."""
-        times = [time for time in dict.fromkeys(times) if (time, device) not in self._known]
-        for i in range(0, len(times), REMEMBERED):
-            some = times[i : i + REMEMBERED]
-            for time, moment in zip(some, self._moments(np.array(some), device), strict=True):
-                self._known[time, device] = moment
-        while len(self._known) > REMEMBERED:
-            del self._known[next(iter(self._known))]
+    def precompute(self, times: Sequence[float], device: torch.device) -> None:
+        """Computes and caches the states at many times together, which takes hardly longer than one."""
+        times = [time for time in dict.fromkeys(times) if (time, device) not in self._cache]
+        for i in range(0, len(times), MAX_CACHED_TIMES):
+            batch = times[i : i + MAX_CACHED_TIMES]
+            for time, state in zip(batch, self._states(np.array(batch), device), strict=True):
+                self._cache[time, device] = state
+        while len(self._cache) > MAX_CACHED_TIMES:
+            del self._cache[next(iter(self._cache))]
 
-    def _moments(self, at: np.ndarray, device: torch.device) -> list[Moment]:
-        """Those at the seconds `at` (n,)."""
+    def _states(self, at: np.ndarray, device: torch.device) -> list[TimeState]:
+        """The states at the seconds `at` (n,)."""
         shape, owned = (len(at), len(self.tracks)), self.owned
         weights, poses = np.zeros((len(at), owned[-1].stop)), np.tile(np.eye(4), (*shape, 1, 1))
         present, progress = np.zeros(shape, dtype=bool), np.zeros(shape)
@@ -122,4 +123,4 @@ class Timeline:
         quats = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
         values = (quats.reshape(*shape, 4), poses[..., :3, 3], present, weights, series)
         tensors = (torch.from_numpy(value if value.dtype == bool else value.astype(np.float32)) for value in values)
-        return [Moment(*each) for each in zip(*(tensor.to(device).unbind() for tensor in tensors), strict=True)]
+        return [TimeState(*each) for each in zip(*(tensor.to(device).unbind() for tensor in tensors), strict=True)]

@@ -103,7 +103,7 @@ class FramesOnGpu:
     def _moments(self, view: View) -> Moments | None:
         """What a view's time means to the parts; None where a frame of it cannot be captured: where cameras of the rig
         were, and how they expose, goes by Python."""
-        return self._model.moments(view.time) if self._captures and view.camera is None else None
+        return self._model.time_states(view.time) if self._captures and view.camera is None else None
 
     def _graph_of(self, view: View, moments: Moments) -> "_FrameGraph | None":
         """What serves for a view, captured now unless it was before; None where the GPU or its driver refuses."""
@@ -137,7 +137,7 @@ class _FrameGraph:
         own_moments = [[values.clone() for values in moment] for moment in moments]
 
         def once() -> Frame:
-            return _frame(model, own_view, model.gaussians_in(own_moments))
+            return _frame(model, own_view, model.gaussians_at_time_states(own_moments))
 
         pool = fresh_pool()
         with own_stream(device):  # films are made beside a thread that encodes them
@@ -152,7 +152,7 @@ class _FrameGraph:
         """The graph, asked for what a view shows at moments."""
         self.view.K.copy_(view.K)
         self.view.camera_to_world.copy_(view.camera_to_world)
-        for own, moment in zip(self.moments, moments, strict=True):
+        for own, moment in zip(self.time_states, moments, strict=True):
             for place, values in zip(own, moment, strict=True):
                 place.copy_(values)
         self.graph.replay()

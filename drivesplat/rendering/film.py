@@ -104,7 +104,7 @@ def render_parts(
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
     model, device = open_model(checkpoint, device_settings)
-    model.expect(shot.seconds)
+    model.precompute(shot.seconds)
     taken = write_film(path, (_apart(model, view) for view in shot.views(device)), shot, model, columns=3)
     return {**shot.record(), "shows": ["all", "still", "moving"], **taken}
 
@@ -137,7 +137,7 @@ def write_film(
 
 def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterator[np.ndarray]:
     """The frames of a shot of a model, everything being as it was recorded, (h, w, 3) uint8 RGB."""
-    model.expect(shot.seconds)
+    model.precompute(shot.seconds)
     return film_frames(model, ((view, None) for view in shot.views(device)))
 
 

@@ -117,7 +117,7 @@ def test_at_an_annotation_its_own_correction_holds(index):
 def test_between_annotations_corrections_are_weighted_as_positions_are():
     actors = actors_of(van())
     weights = van().motion.weights(np.array([1.8]))[0]
-    poses, p = actors.poses(actors.moment(1.8)), doubled(actors)
+    poses, p = actors.poses(actors.time_state(1.8)), doubled(actors)
     np.testing.assert_allclose(poses.translations[0].detach(), 1.8 * VELOCITY + weights @ p["translation"], atol=1e-5)
     np.testing.assert_allclose(matrices(poses.quats)[0], about_z(RATE * 1.8 + weights @ p["yaw"]), atol=1e-5)
 
@@ -131,7 +131,7 @@ def test_actors_can_be_placed_anywhere_and_enlarged():
         torch.tensor([True, True]),
         torch.from_numpy(scales).float(),
     )
-    gaussians, p = actors.placed(actors.moment(9.0), poses), doubled(actors)
+    gaussians, p = actors.placed(actors.time_state(9.0), poses), doubled(actors)
     for i, rotation in enumerate(turns.as_matrix()):
         own = p["owner"] == i
         means = scales[i] * p["means"][own] @ rotation.T + places[i]
@@ -206,17 +206,17 @@ def test_colours_are_a_series_of_cosines_over_the_annotations(time, progress):
     f = np.concatenate([p["sh0"], p["shN"]], axis=2)
     assert f.shape == (6, 4, 4, 3)
     expected = sum(f[:, i] * np.cos(np.pi * i * progress) for i in range(4))
-    np.testing.assert_allclose(actors.harmonics(actors.moment(time)).detach(), expected, atol=1e-5)
+    np.testing.assert_allclose(actors.harmonics(actors.time_state(time)).detach(), expected, atol=1e-5)
 
 
 def test_with_the_constant_term_alone_colours_do_not_change():
     actors = actors_of(van(), settings=ActorSettings(fourier=5))
     with torch.no_grad():
         actors.params["sh0"][:, 1:], actors.params["shN"][:, 1:] = 0.0, 0.0
-    first = actors.harmonics(actors.moment(1.0))
+    first = actors.harmonics(actors.time_state(1.0))
     assert first.std() > 0.1
     for time in (1.4, 2.2, 3.0):
-        torch.testing.assert_close(actors.harmonics(actors.moment(time)), first)
+        torch.testing.assert_close(actors.harmonics(actors.time_state(time)), first)
 
 
 def test_each_actors_series_runs_over_its_own_annotations():
@@ -224,7 +224,7 @@ def test_each_actors_series_runs_over_its_own_annotations():
     coefficients = actors.params["sh0"][:, :, 0].detach()
     progress = torch.tensor([0.5, 2.0 / 3.5])[actors.params["owner"]]  # at 2 s, from 1 to 3 and from 0 to 3.5
     expected = coefficients[:, 0] + coefficients[:, 1] * torch.cos(torch.pi * progress)[:, None]
-    torch.testing.assert_close(actors.harmonics(actors.moment(2.0))[:, 0].detach(), expected)
+    torch.testing.assert_close(actors.harmonics(actors.time_state(2.0))[:, 0].detach(), expected)
 
 
 def first_degree(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -242,8 +242,8 @@ def test_an_actor_that_turns_keeps_its_colours_on_its_sides():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     seen = []
     for time in (1.0, 2.1, 2.9):
-        box = matrices(actors.poses(actors.moment(time)).quats)[0]
-        expected = first_degree(actors.harmonics(actors.moment(time)).detach().double().numpy(), directions @ box)
+        box = matrices(actors.poses(actors.time_state(time)).quats)[0]
+        expected = first_degree(actors.harmonics(actors.time_state(time)).detach().double().numpy(), directions @ box)
         seen.append(first_degree(actors.at(time).sh.detach().double().numpy(), directions))
         np.testing.assert_allclose(seen[-1], expected, atol=1e-5)
     assert np.abs(seen[0] - seen[1]).max() > 0.1, "turned far enough to tell"
@@ -271,13 +271,13 @@ def test_a_passing_camera_sees_front_and_back():
 
 def in_double(actors: Actors) -> Actors:
     """The same actors, computed in float64."""
-    moment_at = actors.timeline.at
+    state_at = actors.timeline.at
 
-    def doubled_moment(time, device):
-        moment = moment_at(time, device)
-        return moment._replace(**{n: value.double() for n, value in moment._asdict().items() if n != "present"})
+    def in_float64(time, device):
+        state = state_at(time, device)
+        return state._replace(**{n: value.double() for n, value in state._asdict().items() if n != "present"})
 
-    actors.timeline.at = doubled_moment
+    actors.timeline.at = in_float64
     return actors.double()
 
 

@@ -271,23 +271,23 @@ def test_rows_say_which_gaussians_are_each_parts():
     assert model.of_track("later").tolist() == [False] * 16 + [True] * 4 + [False] * 5
 
 
-def test_gaussians_are_those_of_the_moment_whose_tensors_become_anothers():
+def test_gaussians_follow_the_time_state_copied_into_the_tensors():
     model = street()
-    early, late = (model.moments(time) for time in (0.3, 1.6))
-    lying = [[values.clone() for values in moment] for moment in early]
-    for time, moments in ((0.3, early), (1.6, late)):
-        for places, moment in zip(lying, moments, strict=True):
-            for place, values in zip(places, moment, strict=True):
+    early, late = (model.time_states(time) for time in (0.3, 1.6))
+    lying = [[values.clone() for values in state] for state in early]
+    for time, states in ((0.3, early), (1.6, late)):
+        for places, state in zip(lying, states, strict=True):
+            for place, values in zip(places, state, strict=True):
                 place.copy_(values)
-        found, expected = model.gaussians_in(lying), model.gaussians_at(time)
+        found, expected = model.gaussians_at_time_states(lying), model.gaussians_at(time)
         assert all(torch.equal(getattr(found, f.name), getattr(expected, f.name)) for f in fields(found))
     assert not torch.equal(model.gaussians_at(0.3).means, model.gaussians_at(1.6).means)
 
 
-def test_a_part_that_cannot_say_a_time_in_tensors_leaves_its_model_without_moments():
+def test_a_model_with_a_part_without_time_states_has_none():
     still = Background.from_points(*seed_points(3), GaussianSettings(), 1.0)
-    assert SplatModel([still], None).moments(0.5) == [()]
-    assert SplatModel([still, Riding(still)], None).moments(0.5) is None
+    assert SplatModel([still], None).time_states(0.5) == [()]
+    assert SplatModel([still, Riding(still)], None).time_states(0.5) is None
 
 
 def test_two_rigid_groups_of_one_name_are_refused():
@@ -347,7 +347,7 @@ def test_actors_start_from_their_records():
     assert actors.params["owner"].tolist() == [0] * 10 + [1] * 7
     np.testing.assert_array_equal(actors.params["means"].detach(), np.concatenate([r["points"] for r in records]))
     colors = np.concatenate([r["points_rgb"] for r in records]) / 255.0
-    np.testing.assert_allclose(0.5 + SH_C0 * actors.harmonics(actors.moment(0.3))[:, 0].detach(), colors, atol=1e-5)
+    np.testing.assert_allclose(0.5 + SH_C0 * actors.harmonics(actors.time_state(0.3))[:, 0].detach(), colors, atol=1e-5)
     at = np.linspace(-0.5, 3.0, 15)
     for track, expected in zip(actors.timeline.tracks, (a_track(), a_track("later", 1.0)), strict=True):
         assert track.id == expected.id
@@ -377,7 +377,7 @@ def test_each_actor_starts_with_no_more_points_than_its_cap():
     kept = {tuple(row) for row in actors.params["means"].detach()[:20].numpy()}
     assert len(kept & {tuple(row) for row in records[0]["points"]}) == 20
     colors = dict(zip(map(tuple, records[0]["points"]), records[0]["points_rgb"], strict=True))
-    own = 255.0 * (0.5 + SH_C0 * actors.harmonics(actors.moment(0.0))[:20, 0].detach().numpy())
+    own = 255.0 * (0.5 + SH_C0 * actors.harmonics(actors.time_state(0.0))[:20, 0].detach().numpy())
     np.testing.assert_allclose(
         own, [colors[tuple(row)] for row in actors.params["means"].detach()[:20].numpy()], atol=0.01
     )

@@ -39,23 +39,23 @@ def test_actors_come_and_go(time, present):
 
 @pytest.mark.parametrize("time", [1.0, 1.1, 2.5, 3.1])
 def test_those_present_are_where_their_motions_say(time):
-    moment = timeline().at(time, CPU)
+    state = timeline().at(time, CPU)
     for i, track in enumerate((a_van(), a_car())):
         (pose,) = track.motion.poses(np.array([time]))
-        np.testing.assert_allclose(moment.translations[i], pose[:3, 3], rtol=1e-6)
-        rotation = Rotation.from_quat(moment.quats[i].numpy(), scalar_first=True).as_matrix()
+        np.testing.assert_allclose(state.translations[i], pose[:3, 3], rtol=1e-6)
+        rotation = Rotation.from_quat(state.quats[i].numpy(), scalar_first=True).as_matrix()
         np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
-    turned = Rotation.from_quat(moment.quats[0].numpy(), scalar_first=True).as_matrix()
+    turned = Rotation.from_quat(state.quats[0].numpy(), scalar_first=True).as_matrix()
     np.testing.assert_allclose(turned, about_z(time), atol=1e-6)
 
 
 @pytest.mark.parametrize("time", [0.9, 2.6])
 def test_every_actors_weights_stand_with_its_own_annotations(time):
-    moment = timeline().at(time, CPU)
+    state = timeline().at(time, CPU)
     assert timeline().owned == [slice(0, 5), slice(5, 12)]
     assert timeline().of_actors.tolist() == [[True] * 5 + [False] * 7, [False] * 5 + [True] * 7]
-    np.testing.assert_allclose(moment.weights[:5], a_van().motion.weights(np.array([time]))[0], atol=1e-6)
-    np.testing.assert_allclose(moment.weights[5:], a_car().motion.weights(np.array([time]))[0], atol=1e-6)
+    np.testing.assert_allclose(state.weights[:5], a_van().motion.weights(np.array([time]))[0], atol=1e-6)
+    np.testing.assert_allclose(state.weights[5:], a_car().motion.weights(np.array([time]))[0], atol=1e-6)
 
 
 def test_annotations_of_an_absent_actor_weigh_nothing():
@@ -99,42 +99,42 @@ def test_a_track_survives_a_checkpoint(tmp_path):
     np.testing.assert_array_equal(again.motion.present(at), a_car().motion.present(at))
 
 
-def test_a_moment_is_computed_once():
+def test_a_time_state_is_computed_once():
     times = timeline()
     assert times.at(1.5, CPU) is times.at(1.5, CPU) and times.at(1.5, CPU) is not times.at(1.6, CPU)
 
 
-def test_moments_found_together_are_those_found_one_by_one():
+def test_time_states_computed_together_equal_those_computed_one_by_one():
     seconds = np.linspace(-2.0, 6.0, 41)
     together, one_by_one = timeline(), timeline()
-    together.prepare([*seconds, *seconds[:3]], CPU)
-    known = [*together._known.values()]
-    assert len(known) == 41 and sum(bool(moment.present.any()) for moment in known) > 10
-    for time, moment in zip(seconds, known, strict=True):
-        assert together.at(time, CPU) is moment
+    together.precompute([*seconds, *seconds[:3]], CPU)
+    known = [*together._cache.values()]
+    assert len(known) == 41 and sum(bool(state.present.any()) for state in known) > 10
+    for time, state in zip(seconds, known, strict=True):
+        assert together.at(time, CPU) is state
         for name, value in one_by_one.at(time, CPU)._asdict().items():
-            torch.testing.assert_close(getattr(moment, name), value)
+            torch.testing.assert_close(getattr(state, name), value)
 
 
-def test_of_too_many_moments_the_first_go(monkeypatch):
-    monkeypatch.setattr(timeline_module, "REMEMBERED", 3)
+def test_a_full_cache_drops_the_oldest_time_states(monkeypatch):
+    monkeypatch.setattr(timeline_module, "MAX_CACHED_TIMES", 3)
     times = timeline()
-    times.prepare([0.1, 0.2, 0.3, 0.4, 0.5], CPU)
-    assert [time for time, _ in times._known] == [0.3, 0.4, 0.5]
+    times.precompute([0.1, 0.2, 0.3, 0.4, 0.5], CPU)
+    assert [time for time, _ in times._cache] == [0.3, 0.4, 0.5]
     times.at(0.1, CPU)
-    assert [time for time, _ in times._known] == [0.4, 0.5, 0.1]
+    assert [time for time, _ in times._cache] == [0.4, 0.5, 0.1]
 
 
-def test_the_moments_of_all_images_of_six_cameras_are_kept():
+def test_the_cache_holds_the_time_states_of_six_cameras():
     """At 12 Hz for 20 s, each camera at times of its own, once more through all of them."""
     times, seconds = timeline(), np.arange(6 * 12 * 20) / 72.0
     first = [times.at(time, CPU) for time in seconds]
-    assert all(times.at(time, CPU) is moment for time, moment in zip(seconds, first, strict=True))
+    assert all(times.at(time, CPU) is state for time, state in zip(seconds, first, strict=True))
 
 
-def test_a_moment_of_30_actors_takes_a_few_kilobytes():
+def test_a_time_state_of_30_actors_takes_less_than_10_kilobytes():
     """Each with 40 annotations, all the key frames of a drive: so many times are kept that it matters."""
     annotated = motion_through(0.5 * np.arange(40), np.zeros((40, 3)))
-    moment = Timeline([track_of(annotated, str(i)) for i in range(30)], 5).at(1.7, CPU)
-    assert [tuple(value.shape) for value in moment] == [(30, 4), (30, 3), (30,), (30 * len(annotated.times),), (30, 5)]
-    assert sum(value.untyped_storage().nbytes() for value in moment) < 10_000
+    state = Timeline([track_of(annotated, str(i)) for i in range(30)], 5).at(1.7, CPU)
+    assert [tuple(value.shape) for value in state] == [(30, 4), (30, 3), (30,), (30 * len(annotated.times),), (30, 5)]
+    assert sum(value.untyped_storage().nbytes() for value in state) < 10_000
