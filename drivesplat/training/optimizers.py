@@ -103,29 +103,30 @@ def _adam(
     )  # fmt: skip
 
 
-class ToldDevice:
-    """What changes from one iteration to the next, where the device reads it: the step, and the learning rates."""
+class DeviceSchedule:
+    """The values that change with every iteration, in device memory: the step and the learning rates. CUDA graphs read
+    them there."""
 
     def __init__(self, device: torch.device):
         self._device = device
         self._step = torch.zeros((), dtype=torch.int64, device=device)
         self._rates: dict[str, Tensor] = {}
-        self._told: dict[str, float] = {}
+        self._written: dict[str, float] = {}
 
-    def told(
+    def update(
         self, step: int, optimizers: ModelOptimizers
     ) -> tuple[int | Int[Tensor, ""], Mapping[str, Float[Tensor, ""]] | None]:
-        """The step, and the rates of `optimizers` by name, as the device knows them from now on, always in the same
-        places; a CPU, which Python is part of, need not be told."""
+        """Writes the step and the rates of `optimizers` to the device and returns the tensors, always the same ones. On
+        a CPU returns the step itself and None."""
         if self._device.type == "cpu":
             return step, None
         self._step.fill_(step)
         for name, optimizer in optimizers.all():
             rate = optimizer.param_groups[0]["lr"]
-            if self._told.get(name) != rate:
+            if self._written.get(name) != rate:
                 place = self._rates.setdefault(name, torch.zeros((), device=self._device))
                 place.fill_(rate)
-                self._told[name] = rate
+                self._written[name] = rate
         return self._step, self._rates
 
 
@@ -143,7 +144,7 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
     }
 
 
-def schedule(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
+def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
     """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, exposures' being 0
     until they start; the rest stay."""
     done = step / settings.iterations

@@ -14,7 +14,7 @@ from drivesplat.training.cuda_graph.replays import Extent, Replays, Terms, can_b
 from drivesplat.training.densify import Densifier
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
-from drivesplat.training.optimizers import ModelOptimizers, ToldDevice, make_optimizers, schedule
+from drivesplat.training.optimizers import DeviceSchedule, ModelOptimizers, make_optimizers, set_learning_rates
 from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
 from drivesplat.training.views import TrainingView
 
@@ -34,7 +34,7 @@ class Trainer:
     surroundings: Surroundings
     clock: Clock
     replays: Replays
-    on_device: ToldDevice
+    schedule: DeviceSchedule
     step: int = 0
 
     @classmethod
@@ -52,17 +52,19 @@ class Trainer:
         optimizers, known = make_optimizers(model), surroundings.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
         replayed = clock is UNTIMED and can_be_replayed(settings, images, device)
-        replays, told = Replays(replayed, device), ToldDevice(device)
+        replays, on_device = Replays(replayed, device), DeviceSchedule(device)
         densifiers = [Densifier(part, settings, replays.give_way) for part in model.parts]
-        return cls(model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, told)
+        return cls(
+            model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, on_device
+        )
 
     def fit_one(self, shown: bool = True) -> tuple[Terms, Picture | None, TrainingView]:
         """The first half of an iteration: render a view, compare, step. Returns its loss terms, the picture and the
         view; where the picture need not be `shown` the iteration may be replayed, and there is none."""
         with self.clock.stage("data"):
             number, view = self.images.number(self.step), self.images.at(self.step)
-        schedule(self.model, self.optimizers, self.step, self.settings)
-        step, rates = self.on_device.told(self.step, self.optimizers)
+        set_learning_rates(self.model, self.optimizers, self.step, self.settings)
+        step, rates = self.schedule.update(self.step, self.optimizers)
 
         def once() -> tuple[Terms, Picture]:
             return self._learn(view, step, rates)
@@ -76,8 +78,8 @@ class Trainer:
     def _learn(
         self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
     ) -> tuple[Terms, Picture]:
-        """What an iteration does with a view; `step` and `rates` as `ToldDevice` says, whose others they may be when
-        this is replayed."""
+        """An iteration with a view. `step` and `rates` are those of `DeviceSchedule.update`; a replay of this reads the
+        values that they hold then."""
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
         self.model.zero_grad()  # of an iteration that broke off
         with stage("render"):

@@ -20,7 +20,7 @@ from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training.losses import loss_terms
-from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.resume_state import restore_model
 from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
 from drivesplat.training.trainer import Trainer
@@ -213,7 +213,7 @@ def test_a_checkpoint_holds_corrections_and_their_times(learned):
 
 def test_corrections_are_learned_ever_more_slowly_and_logged(learned):
     optimizers = make_optimizers(learned)
-    schedule(learned, optimizers, 50, TrainSettings(iterations=100))
+    set_learning_rates(learned, optimizers, 50, TrainSettings(iterations=100))
     group = optimizers.beside_parts["camera_poses"]["FRONT"].param_groups[0]
     assert group["lr"] == pytest.approx(0.1 * LOOSE["learning_rate"])
     figures = learned.camera_poses.figures()

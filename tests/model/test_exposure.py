@@ -42,7 +42,7 @@ from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
 from drivesplat.training.first_exposure import first_gains, log_gains
 from drivesplat.training.losses import loss_terms
-from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
 from drivesplat.training.views import Guides, TrainingView, load_views
 from drivesplat.workflow.stages import stage_settings
@@ -200,7 +200,7 @@ def test_exposures_learn_once_there_is_a_scene_and_ever_more_slowly():
     optimizers = make_optimizers(model)
     rates = []
     for step in (0, 9, 10, 50, 100):
-        schedule(model, optimizers, step, settings)
+        set_learning_rates(model, optimizers, step, settings)
         rates.append(optimizers.beside_parts["exposure"]["BACK"].param_groups[0]["lr"])
     assert rates == pytest.approx([0.0, 0.0, 0.1 * 0.01**0.1, 0.01, 0.001])
 

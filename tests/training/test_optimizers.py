@@ -11,7 +11,7 @@ from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.optimizers import ToldDevice, make_optimizers, schedule
+from drivesplat.training.optimizers import DeviceSchedule, make_optimizers, set_learning_rates
 
 DEVICES = [
     "cpu",
@@ -45,7 +45,7 @@ def test_a_step_together_is_every_optimizers_own(device):
         optimizers = make_optimizers(model)
         for step in range(7):
             give_gradients(model, step)
-            schedule(model, optimizers, step, settings)
+            set_learning_rates(model, optimizers, step, settings)
             if together:
                 optimizers.step()
                 assert all(parameter.grad is None for parameter in model.parameters())
@@ -64,24 +64,24 @@ def test_a_step_together_is_every_optimizers_own(device):
     assert not torch.equal(mine["parts.0.params.means"], a_model(device).state_dict()["parts.0.params.means"])
 
 
-def test_a_cpu_need_not_be_told_rates():
+def test_a_cpu_reads_the_rates_of_the_optimizers():
     optimizers = make_optimizers(a_model("cpu"))
-    assert ToldDevice(torch.device("cpu")).told(3, optimizers) == (3, None)
+    assert DeviceSchedule(torch.device("cpu")).update(3, optimizers) == (3, None)
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.mark.parametrize("kernels", [True, False])
-def test_steps_at_rates_that_the_device_knows_are_those_of_adam(kernels, monkeypatch):
+def test_steps_at_device_rates_equal_those_of_adam(kernels, monkeypatch):
     monkeypatch.setattr(on_gpu, "for_tensor", lambda _: kernels)
     settings, ends, places = TrainSettings(iterations=10), [], {}
     for device in ("cuda", "cpu"):
         model = a_model(device)
-        optimizers, told = make_optimizers(model), ToldDevice(torch.device(device))
+        optimizers, schedule = make_optimizers(model), DeviceSchedule(torch.device(device))
         for step in range(7):
             give_gradients(model, step)
-            schedule(model, optimizers, step, settings)
-            counted, rates = told.told(step, optimizers)
+            set_learning_rates(model, optimizers, step, settings)
+            counted, rates = schedule.update(step, optimizers)
             optimizers.step(rates)
             assert int(counted) == step
             assert all(places.setdefault(name, place) is place for name, place in (rates or {}).items()), "for replays"

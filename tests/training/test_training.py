@@ -61,7 +61,7 @@ from drivesplat.settings.train import (
 from drivesplat.training import resume_state
 from drivesplat.training.cells import Cells
 from drivesplat.training.monitor import FiniteGuard
-from drivesplat.training.optimizers import make_optimizers, schedule
+from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.road import driven_road
 from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
 from drivesplat.training.surfaces import Surroundings
@@ -229,7 +229,7 @@ def test_positions_learn_ever_more_slowly(step, factor):
     model = untrained(settings_of())
     optimizers = make_optimizers(model)
     before = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
-    schedule(model, optimizers, step, settings_of(iterations=100))
+    set_learning_rates(model, optimizers, step, settings_of(iterations=100))
     after = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.all()}
     assert after.pop("0.means") == pytest.approx(2e-3 * factor)
     assert after == {name: rate for name, rate in before.items() if name != "0.means"}
