@@ -492,19 +492,19 @@ def test_a_training_that_is_replayed_learns_what_it_does_otherwise(caplog):
     assert steps == [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in plain.optimizers.all()]
 
 
-def test_recordings_outlive_relocation_and_growth_into_spare_rows():
+def test_graphs_stay_valid_through_relocation_and_growth_into_preallocated_rows():
     """Gaussians that MCMC moves stay where they lie, and so do tensors that have room for more of them."""
     grows = {"mcmc": McmcSettings(noise_lr=0.0, refine_every=12), "refine_start": 0.0, "refine_stop": 0.9}
     settings = {"iterations": 60, "cap_max": 10_000, **grows}
     trainer, losses = replayed(True, iterations_done=40, **settings)
     part = trainer.model.parts[0]
-    count, known, spare = len(part), dict(trainer.replays._recorded), part.spare
-    assert known and spare and losses[-1] < losses[0]
+    count, known, preallocated = len(part), dict(trainer.replays._recorded), part.preallocated
+    assert known and preallocated and losses[-1] < losses[0]
     with own_stream(GPU):
         goes_on(trainer, 10)  # step 48 is among them
-        assert len(part) > count and part.spare < spare and trainer.replays._recorded == known
+        assert len(part) > count and part.preallocated < preallocated and trainer.replays._recorded == known
         terms = goes_on(trainer, 10)
-        assert part.spare == 0 and part.row_count == len(part), "densification has stopped"
+        assert part.preallocated == 0 and part.row_count == len(part), "densification has stopped"
     assert all(bool(torch.isfinite(value)) for value in terms.values())
 
 
@@ -512,7 +512,7 @@ def test_a_training_that_grows_learns_the_same_replayed():
     grows = {"mcmc": McmcSettings(noise_lr=0.0, refine_every=10, growth=0.3), "refine_start": 0.0, "refine_stop": 1.0}
     (recorded, mine), (plain, theirs) = (replayed(record, 60, cap_max=10_000, **grows) for record in (True, False))
     assert [len(part) for part in recorded.model.parts] == [len(part) for part in plain.model.parts]
-    assert recorded.model.parts[0].spare and not plain.model.parts[0].spare
+    assert recorded.model.parts[0].preallocated and not plain.model.parts[0].preallocated
     assert mine[-1] == pytest.approx(theirs[-1], rel=0.1) and mine[-1] < 0.8 * mine[0]
 
 

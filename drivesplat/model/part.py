@@ -56,12 +56,12 @@ class Part(nn.Module, ABC):
     """The most Gaussians that densification may make of it; None: as many as the training's settings say."""
     params: nn.ParameterDict
     count_on_device: Float[Tensor, ""]
-    """The number of its Gaussians where the device reads it; only where rows are `spare`."""
+    """The number of its Gaussians in device memory; valid only with `preallocated` rows."""
 
     def __init__(self) -> None:
         super().__init__()
         self.shared = nn.ParameterDict()
-        self._spare = 0
+        self._preallocated = 0
         self.register_buffer("count_on_device", torch.zeros(()), persistent=False)
 
     def precompute(self, times: Sequence[float]) -> None:
@@ -122,7 +122,7 @@ class Part(nn.Module, ABC):
 
     def __len__(self) -> int:
         """The number of its Gaussians."""
-        return self.row_count - self.spare
+        return self.row_count - self.preallocated
 
     @property
     def row_count(self) -> int:
@@ -130,25 +130,25 @@ class Part(nn.Module, ABC):
         return len(self.params["means"])
 
     @property
-    def spare(self) -> int:
-        """So many of the last rows are no Gaussians, but wait to become some
-        (`drivesplat.training.cuda_graph.preallocation`); none outside trainings."""
-        return self._spare
+    def preallocated(self) -> int:
+        """The number of rows at the end that are not Gaussians yet (`drivesplat.training.cuda_graph.preallocation`);
+        0 outside training."""
+        return self._preallocated
 
-    @spare.setter
-    def spare(self, rows: int) -> None:
-        self._spare = rows
+    @preallocated.setter
+    def preallocated(self, rows: int) -> None:
+        self._preallocated = rows
         self.count_on_device.fill_(self.row_count - rows)
 
 
-def filled(parts: Iterable[Part]) -> float | Float[Tensor, ""]:
-    """The share of the parts' rows that are Gaussians; where some are spare the device reads how many each time anew,
-    also in what is recorded."""
+def active_fraction(parts: Iterable[Part]) -> float | Float[Tensor, ""]:
+    """The fraction of the parts' rows that are Gaussians. With preallocated rows it is a tensor computed from
+    `count_on_device`, so that a replayed CUDA graph sees the current number."""
     every = list(parts)
-    if not any(part.spare for part in every):
+    if not any(part.preallocated for part in every):
         return 1.0
-    there = sum(part.count_on_device if part.spare else len(part) for part in every)
-    return there / sum(part.row_count for part in every)
+    active = sum(part.count_on_device if part.preallocated else len(part) for part in every)
+    return active / sum(part.row_count for part in every)
 
 
 class Sky(nn.Module, ABC):

@@ -14,17 +14,17 @@ from drivesplat.training.optimizers import Optimizers
 
 
 class Densifier:
-    """The densification of one part: call `after_step` at every iteration. With strategy: mcmc, while `reserves` says
-    so, asked whenever tensors are about to lie elsewhere, it grows into spare rows, in which they stay for a while."""
+    """The densification of one part: call `after_step` at every iteration. With strategy: mcmc, `preallocates` is
+    called before the part's tensors are reallocated; where it returns True, the part gets preallocated rows."""
 
-    def __init__(self, part: Part, settings: TrainSettings, reserves: Callable[[], bool] = lambda: False):
+    def __init__(self, part: Part, settings: TrainSettings, preallocates: Callable[[], bool] = lambda: False):
         from drivesplat.training import strategies  # gsplat; the stage says in a sentence where it is missing
 
         self._part = part
         self._by_gradient = settings.strategy == "default"
         self._cap = part.cap_max or settings.cap_max
         self._few, self._few_until = few_at_first(self._cap, settings)
-        self._strategy = strategies.make_strategy(settings, part, self._cap, reserves)
+        self._strategy = strategies.make_strategy(settings, part, self._cap, preallocates)
         self._on_cpu = strategies.torch_twins
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
@@ -65,11 +65,11 @@ class Densifier:
             self.end(optimizers)
 
     def end(self, optimizers: Optimizers) -> None:
-        """Drops rows that have stayed spare."""
-        if self._part.spare:
-            from drivesplat.training.cuda_graph import preallocation as spares
+        """Drops the preallocated rows that are left."""
+        if self._part.preallocated:
+            from drivesplat.training.cuda_graph.preallocation import release_rows
 
-            spares.release(self._part, optimizers)
+            release_rows(self._part, optimizers)
 
 
 def few_at_first(cap: int, settings: TrainSettings) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.part import filled
+from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
@@ -34,7 +34,7 @@ def loss_terms(
         terms["dynamic"] = settings.dynamic_weight * colours.moving_l1
     regularisers = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
     if any(regularisers.values()):
-        means, share = mean_opacity_and_scale(shown), filled(model.parts)
+        means, share = mean_opacity_and_scale(shown), active_fraction(model.parts)
         terms |= {name: w * mean / share for (name, w), mean in zip(regularisers.items(), means, strict=True) if w}
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
@@ -66,7 +66,7 @@ def _moving_terms(
 
 def mean_opacity_and_scale(shown: Gaussians) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """The mean opacity, and the mean of all scales in metres, 0 for those of what is not there, of opacity 0; over all
-    rows, spare ones, too."""
+    rows, preallocated ones included."""
     if on_gpu.for_tensor(shown.scales) and len(shown):
         from drivesplat.kernels.triton import regularisers
 

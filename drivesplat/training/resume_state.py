@@ -56,7 +56,7 @@ def state_of(
         "model": {key: value.detach() for key, value in model.state_dict().items()},
         "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.all()},
         "densifiers": [densifier.state for densifier in densifiers],
-        "spare": [part.spare for part in model.parts],
+        "preallocated": [part.preallocated for part in model.parts],
         "random": torch.get_rng_state(),
         "random_cuda": torch.cuda.get_rng_state(device) if device.type == "cuda" else None,
     }
@@ -83,8 +83,8 @@ def restore(
 ) -> None:
     """The inverse of `state_of`, in place."""
     restore_model(model, state["model"])
-    for part, spare in zip(model.parts, state["spare"], strict=True):
-        part.spare = spare
+    for part, rows in zip(model.parts, state["preallocated"], strict=True):
+        part.preallocated = rows
     parameters = [(part.params, group) for part, group in zip(model.parts, optimizers.parts, strict=True)]
     parameters += [(part.shared, group) for part, group in zip(model.parts, optimizers.shared, strict=True)]
     parameters += [(it.params, optimizers.beside_parts[name]) for name, it in model.beside_parts.items()]

@@ -16,7 +16,7 @@ from torch import Tensor
 from drivesplat.kernels import triton as on_gpu
 from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.cuda_graph import preallocation as spares
+from drivesplat.training.cuda_graph.preallocation import activate, release_rows, reserve_rows
 from drivesplat.training.optimizers import Optimizers
 
 
@@ -48,14 +48,14 @@ class CappedDefaultStrategy(DefaultStrategy):
 
 
 @dataclass
-class ExploringStrategy(MCMCStrategy):
-    """gsplat's MCMCStrategy for a `part`, which explores in one compiled pass, grows by `growth` at a time, into spare
-    rows where `reserves`, asked whenever there are too few, has it so, and keeps the memory that torch holds: what it
-    would hand back after every densification has to be asked for again."""
+class PreallocatingMcmcStrategy(MCMCStrategy):
+    """gsplat's MCMCStrategy for a `part`. It adds noise in one compiled pass and grows by a fraction `growth` at a
+    time. New Gaussians go into preallocated rows where `preallocates`, called whenever there are too few, returns True.
+    Unlike gsplat's it does not empty torch's memory cache after every densification."""
 
     part: Part = field(kw_only=True)
     growth: float = 0.05
-    reserves: Callable[[], bool] = field(kw_only=True)
+    preallocates: Callable[[], bool] = field(kw_only=True)
 
     @torch.no_grad()
     def step_post_backward(
@@ -65,7 +65,7 @@ class ExploringStrategy(MCMCStrategy):
             state["binoms"] = state["binoms"].to(params["means"].device)
             self._relocate_gs(params, optimizers, state["binoms"])
             self._add_new_gs(params, optimizers, state["binoms"])
-        _explore(params, optimizers, lr * self.noise_lr)
+        _add_noise(params, optimizers, lr * self.noise_lr)
 
     @torch.no_grad()
     def _relocate_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
@@ -80,20 +80,20 @@ class ExploringStrategy(MCMCStrategy):
     def _add_new_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
         count = len(self.part)
         more = max(0, min(self.cap_max, int((1.0 + self.growth) * count)) - count)
-        if more > self.part.spare:
-            if self.reserves():
-                spares.reserve(self.part, optimizers, min(self.cap_max, max(2 * count, count + more)))
+        if more > self.part.preallocated:
+            if self.preallocates():
+                reserve_rows(self.part, optimizers, min(self.cap_max, max(2 * count, count + more)))
             else:
-                spares.release(self.part, optimizers)
-        if more and self.part.spare:
-            spares.wake(self.part, more, binoms, self.min_opacity)
+                release_rows(self.part, optimizers)
+        if more and self.part.preallocated:
+            activate(self.part, more, binoms, self.min_opacity)
         elif more:
             ops.sample_add(params, optimizers, {}, more, binoms, self.min_opacity)
         return more
 
 
-def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
-    """Moves positions at random, the farther the fainter and larger a Gaussian is."""
+def _add_noise(params: Any, optimizers: Optimizers, strength: float) -> None:
+    """Adds noise to positions, the more the more transparent and the larger a Gaussian is."""
     if on_gpu.for_tensor(params["means"]):
         from drivesplat.kernels.triton.exploration import explore
 
@@ -107,13 +107,13 @@ def _explore(params: Any, optimizers: Optimizers, strength: float) -> None:
 
 
 def make_strategy(
-    settings: TrainSettings, part: Part, cap_max: int, reserves: Callable[[], bool]
-) -> CappedDefaultStrategy | ExploringStrategy:
-    """The strategy that the settings name, for at most `cap_max` Gaussians of a part; with MCMC it has them grow
-    into spare rows where `reserves`."""
+    settings: TrainSettings, part: Part, cap_max: int, preallocates: Callable[[], bool]
+) -> CappedDefaultStrategy | PreallocatingMcmcStrategy:
+    """The strategy that the settings name, for at most `cap_max` Gaussians of a part. With MCMC new Gaussians go into
+    preallocated rows where `preallocates` returns True."""
     start, stop = (int(fraction * settings.iterations) for fraction in (settings.refine_start, settings.refine_stop))
     if settings.strategy == "mcmc":
-        return ExploringStrategy(
+        return PreallocatingMcmcStrategy(
             cap_max=cap_max,
             noise_lr=settings.mcmc.noise_lr,
             min_opacity=settings.mcmc.min_opacity,
@@ -122,7 +122,7 @@ def make_strategy(
             refine_every=settings.mcmc.refine_every,
             growth=settings.mcmc.growth,
             part=part,
-            reserves=reserves,
+            preallocates=preallocates,
         )
     strategy = CappedDefaultStrategy(
         grow_grad2d=settings.default.grow_grad2d,

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.model.gaussians import Gaussians, concatenate
-from drivesplat.model.part import filled
+from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.cells import Cells
@@ -51,7 +51,7 @@ def surface_terms(
     still = concatenate([picture.gaussians[rows] for _, rows in parts])
     terms = {}
     if settings.flatness_weight:
-        terms["flatness"] = settings.flatness_weight * thickness(still) / filled([part for part, _ in parts])
+        terms["flatness"] = settings.flatness_weight * thickness(still) / active_fraction([part for part, _ in parts])
     if surroundings.road is not None:
         terms["road"] = settings.road_weight * road_loss(still, surroundings.road)
     return terms

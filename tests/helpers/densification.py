@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from drivesplat.model.background import Background
-from drivesplat.model.part import filled
+from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.gaussians import GaussianSettings
@@ -58,7 +58,7 @@ def train_step(
     picture.info["means2d"].retain_grad()
     loss = (picture.image - target).abs().mean()
     if learns_size:
-        loss = loss + 0.1 * sum(mean_opacity_and_scale(picture.gaussians)) / filled(model.parts)
+        loss = loss + 0.1 * sum(mean_opacity_and_scale(picture.gaussians)) / active_fraction(model.parts)
     loss.backward()
     for optimizer in optimizers.values():
         optimizer.step()

@@ -1,4 +1,4 @@
-"""Spare rows: Gaussians grow into them as they do otherwise, and until then they are nothing."""
+"""Preallocated rows: growth into them equals growth without them, and until then they have no effect."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from helpers.densification import ALL, a_model, a_view, settings_of, train_step
 from helpers.trainings import ALL_TERMS, EndedError, EndingViews, guided_views, trained, untrained_street
 from helpers.trainings import settings_of as settings_of_training
 
-from drivesplat.model.part import filled
+from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.road import RoadSettings
 from drivesplat.settings.train import McmcSettings, TrainSettings
@@ -22,45 +22,45 @@ from drivesplat.training.road import driven_road, road_loss
 from drivesplat.training.surfaces import NOTHING_KNOWN, surface_terms
 
 
-def grown(reserves: bool, steps: int, **changes: Any) -> tuple[SplatModel, Densifier, Optimizers, list[float]]:
+def grown(preallocates: bool, steps: int, **changes: Any) -> tuple[SplatModel, Densifier, Optimizers, list[float]]:
     """A training that grows by half at a time, and the mean opacity and scale after every
     iteration."""
     torch.manual_seed(0)
     growing = {"mcmc": McmcSettings(refine_every=2, noise_lr=0.0, growth=0.5), "cap_max": 400}
     model, settings = a_model(), settings_of("mcmc", **{**growing, **changes})
-    densifier = Densifier(model.parts[0], settings, lambda: reserves)
+    densifier = Densifier(model.parts[0], settings, lambda: preallocates)
     (optimizers,) = make_optimizers(model).parts
     means = []
     for step in range(steps):
         train_step(model, densifier, step, optimizers, learns_size=True)
         opacity, scale = (
-            float(m.detach() / filled(model.parts)) for m in mean_opacity_and_scale(model.gaussians_at(0.0))
+            float(m.detach() / active_fraction(model.parts)) for m in mean_opacity_and_scale(model.gaussians_at(0.0))
         )
         means += [opacity, scale]
     return model, densifier, optimizers, means
 
 
-def test_gaussians_grow_into_spare_rows_as_they_do_otherwise(monkeypatch):
-    monkeypatch.setattr(strategies, "_explore", lambda *_: None)  # draws for every row, on a CPU
+def test_preallocated_rows_do_not_change_growth(monkeypatch):
+    monkeypatch.setattr(strategies, "_add_noise", lambda *_: None)  # draws for every row, on a CPU
     model, _, _, means = grown(True, 8)
     other, _, _, expected = grown(False, 8)
     part, count = model.parts[0], len(other.parts[0])
-    assert (len(part), part.row_count, part.spare) == (count, 400, 400 - count) and 300 < count < 400
+    assert (len(part), part.row_count, part.preallocated) == (count, 400, 400 - count) and 300 < count < 400
     for name, values in part.params.items():
         torch.testing.assert_close(values[:count], other.parts[0].params[name], rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(means, expected, rtol=1e-3)
 
 
-def test_what_is_learned_of_spare_rows_is_nothing():
+def test_preallocated_rows_learn_nothing():
     """Neither by the loss nor by MCMC's noise."""
     noisy = McmcSettings(refine_every=2, noise_lr=5e5, growth=0.5)
     model, densifier, optimizers, _ = grown(True, 4, mcmc=noisy)
     part = model.parts[0]
     rows, moved = slice(len(part), None), part.params["means"].detach().clone()
     before = {name: values[rows].detach().clone() for name, values in part.params.items()}
-    assert part.spare == 50 and not part.at(0.0).opacities[rows].any() and not part.at(0.0).scales[rows].any()
+    assert part.preallocated == 50 and not part.at(0.0).opacities[rows].any() and not part.at(0.0).scales[rows].any()
     train_step(model, densifier, 5, optimizers, learns_size=True)
-    assert part.spare == 50 and not torch.equal(part.params["means"], moved)
+    assert part.preallocated == 50 and not torch.equal(part.params["means"], moved)
     with torch.no_grad():
         alone = model.render(a_view(), gaussians=part.at(0.0)[torch.arange(part.row_count) >= len(part)])
     assert not alone.image.any() and not alone.alpha.any()
@@ -69,7 +69,7 @@ def test_what_is_learned_of_spare_rows_is_nothing():
         assert not optimizers[name].state[values]["exp_avg_sq"][rows].any(), name
 
 
-def test_while_there_are_spare_rows_tensors_lie_where_they_do():
+def test_tensors_keep_their_addresses_while_rows_are_preallocated():
     model, densifier, optimizers, _ = grown(True, 3, mcmc=McmcSettings(refine_every=2, noise_lr=0.0, growth=0.2))
     part = model.parts[0]
     places, counts = {name: values.data_ptr() for name, values in part.params.items()}, [len(part)]
@@ -80,7 +80,7 @@ def test_while_there_are_spare_rows_tensors_lie_where_they_do():
     assert {name: values.data_ptr() for name, values in part.params.items()} == places
 
 
-def test_dead_gaussians_are_relocated_and_spare_rows_are_not():
+def test_dead_gaussians_are_relocated_and_preallocated_rows_are_not():
     model, densifier, optimizers, _ = grown(True, 3, mcmc=McmcSettings(refine_every=2, noise_lr=0.0, growth=0.05))
     part, count = model.parts[0], len(model)
     with torch.no_grad():
@@ -88,31 +88,31 @@ def test_dead_gaussians_are_relocated_and_spare_rows_are_not():
     densifier.after_step(4, optimizers, {}, ALL)
     opacities = torch.sigmoid(part.params["opacities"])
     assert len(part) == int(1.05 * count) and (opacities[: len(part)] > 0.005).all()
-    assert part.spare and not opacities[len(part) :].any()
+    assert part.preallocated and not opacities[len(part) :].any()
 
 
-def test_when_densification_stops_no_row_is_left_spare():
+def test_no_preallocated_row_is_left_when_densification_stops():
     model, densifier, optimizers, _ = grown(True, 4)
     part = model.parts[0]
     kept = part.params["means"][: len(part)].detach().clone()
     densifier.after_step(1000, optimizers, {}, ALL)
-    assert part.spare == 0 and part.row_count == len(part) == len(kept) and filled([part]) == 1.0
+    assert part.preallocated == 0 and part.row_count == len(part) == len(kept) and active_fraction([part]) == 1.0
     torch.testing.assert_close(part.params["means"].detach(), kept)
     train_step(model, densifier, 1001, optimizers)
 
 
-def test_who_reserves_no_longer_grows_otherwise():
+def test_growth_continues_when_preallocation_is_switched_off():
     """As where a training goes on without a GPU."""
     model, densifier, optimizers, _ = grown(True, 4)
     part, count = model.parts[0], len(model)
-    assert part.spare
-    densifier._strategy.reserves = lambda: False
+    assert part.preallocated
+    densifier._strategy.preallocates = lambda: False
     densifier.after_step(4, optimizers, {}, ALL)
-    assert part.spare == 0 and part.row_count == len(part) == count * 3 // 2
+    assert part.preallocated == 0 and part.row_count == len(part) == count * 3 // 2
     train_step(model, densifier, 5, optimizers)
 
 
-def test_spare_rows_on_the_road_do_not_weigh_there():
+def test_preallocated_rows_have_no_weight_in_the_road_loss():
     model, _, _, _ = grown(True, 4)
     part = model.parts[0]
     with torch.no_grad():
@@ -123,28 +123,28 @@ def test_spare_rows_on_the_road_do_not_weigh_there():
     assert float(with_them.detach()) == pytest.approx(float(road_loss(there, road).detach()))
 
 
-def test_of_the_loss_spare_rows_have_no_share():
+def test_preallocated_rows_do_not_change_the_loss():
     model, densifier, optimizers, _ = grown(True, 4)
     (view, *_), settings = guided_views(), TrainSettings()
-    found, with_spare = [], model.parts[0].spare
+    found, preallocated = [], model.parts[0].preallocated
     for _ in range(2):
         with torch.no_grad():
             found.append(loss_terms(model.render(view.view), view, model, settings))
         densifier.end(optimizers)
-    assert with_spare and not model.parts[0].spare and found[0].keys() == found[1].keys() >= {"opacity_reg"}
+    assert preallocated and not model.parts[0].preallocated and found[0].keys() == found[1].keys() >= {"opacity_reg"}
     for name, term in found[0].items():
         assert float(term) == pytest.approx(float(found[1][name])), name
 
 
-def test_spare_rows_cost_flatness_nothing():
+def test_preallocated_rows_do_not_change_flatness():
     model, _, _, _ = grown(True, 4)
     part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
     found = surface_terms(model.render(a_view()), model, NOTHING_KNOWN, settings)
     expected = part.at(0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
-    assert part.spare and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
+    assert part.preallocated and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
 
 
-def test_a_training_with_spare_rows_resumes_and_leaves_none(tmp_path, monkeypatch):
+def test_a_training_with_preallocated_rows_resumes_and_leaves_none(tmp_path, monkeypatch):
     """With every term, and actors, of whom new Gaussians have to belong to someone."""
     reserved = []
     monkeypatch.setattr(Replays, "give_way", lambda _: not reserved.append(1))
@@ -162,6 +162,6 @@ def test_a_training_with_spare_rows_resumes_and_leaves_none(tmp_path, monkeypatc
     resumed, resumed_at = done("it", guided_views())
     assert len(reserved) >= 4 and resumed_at == [12]
     assert [len(part) for part in resumed.parts] == [len(part) for part in whole.parts]
-    assert all(part.spare == 0 and part.row_count == len(part) > 50 for part in resumed.parts)
+    assert all(part.preallocated == 0 and part.row_count == len(part) > 50 for part in resumed.parts)
     for name, values in resumed.state_dict().items():
         torch.testing.assert_close(values, whole.state_dict()[name])

@@ -1,8 +1,8 @@
-"""Spare rows: room for Gaussians that densification will make.
+"""Preallocated rows for Gaussians that densification will add.
 
-With them a part's tensors stay where they lie, and as long as they are, while its Gaussians become more, so that what
-is recorded of iterations outlives that. A spare row has no opacity and no size, exactly: nothing shows it, no gradient
-reaches it, and neither Adam nor MCMC's noise moves it.
+With them a part's tensors keep their addresses and sizes while its number of Gaussians grows, so that the CUDA graphs
+of iterations stay valid. The opacity and scales of a preallocated row are exactly 0: it is not rendered, receives no
+gradient, and is moved neither by Adam nor by the noise of MCMC.
 """
 
 import torch
@@ -13,46 +13,46 @@ from torch import Tensor, nn
 from drivesplat.model.part import Part
 from drivesplat.training.optimizers import Optimizers
 
-NOTHING = -1000.0
-"""The log of a size and the logit of an opacity of which single precision leaves 0."""
+INACTIVE = -1000.0
+"""Log scale and opacity logit whose exponential and sigmoid are exactly 0 in single precision."""
 
 
 @torch.no_grad()
-def reserve(part: Part, optimizers: Optimizers, rows: int) -> None:
-    """Adds spare rows up to so many in all."""
-    more, there = rows - part.row_count, len(part)
+def reserve_rows(part: Part, optimizers: Optimizers, rows: int) -> None:
+    """Adds preallocated rows up to `rows` rows in all."""
+    more, active = rows - part.row_count, len(part)
 
     def longer(name: str, values: Tensor) -> nn.Parameter:
         added = values[:1].expand(more, *values.shape[1:])
         if name in ("scales", "opacities"):
-            added = torch.full_like(added, NOTHING)
+            added = torch.full_like(added, INACTIVE)
         return nn.Parameter(torch.cat([values, added]), requires_grad=values.requires_grad)
 
     def unmoved(_: str, moments: Tensor) -> Tensor:
         return torch.cat([moments, moments.new_zeros(more, *moments.shape[1:])])
 
     ops._update_param_with_optimizer(longer, unmoved, part.params, optimizers)
-    part.spare = rows - there
+    part.preallocated = rows - active
 
 
 @torch.no_grad()
-def release(part: Part, optimizers: Optimizers) -> None:
-    """Drops all spare rows."""
-    there = len(part)
+def release_rows(part: Part, optimizers: Optimizers) -> None:
+    """Drops all preallocated rows."""
+    active = len(part)
 
     def shorter(_: str, values: Tensor) -> nn.Parameter:
-        return nn.Parameter(values[:there].clone(), requires_grad=values.requires_grad)
+        return nn.Parameter(values[:active].clone(), requires_grad=values.requires_grad)
 
-    ops._update_param_with_optimizer(shorter, lambda _, moments: moments[:there].clone(), part.params, optimizers)
-    part.spare = 0
+    ops._update_param_with_optimizer(shorter, lambda _, moments: moments[:active].clone(), part.params, optimizers)
+    part.preallocated = 0
 
 
 @torch.no_grad()
-def wake(part: Part, count: int, binoms: Float[Tensor, "n_max n_max"], min_opacity: float) -> None:
-    """Makes Gaussians of so many spare rows, as gsplat's `sample_add` makes new ones: each is a copy of one drawn by
-    opacity, and both together look as that one did (Kheradmand et al. 2024, equation 9)."""
-    params, there = part.params, len(part)
-    opacities, scales = torch.sigmoid(params["opacities"][:there]), torch.exp(params["scales"][:there])
+def activate(part: Part, count: int, binoms: Float[Tensor, "n_max n_max"], min_opacity: float) -> None:
+    """Turns `count` preallocated rows into Gaussians as gsplat's `sample_add` adds new ones: each is a copy of one
+    drawn by opacity, and both together look as that one did (Kheradmand et al. 2024, equation 9)."""
+    params, active = part.params, len(part)
+    opacities, scales = torch.sigmoid(params["opacities"][:active]), torch.exp(params["scales"][:active])
     drawn = ops._multinomial_sample(opacities, count)
     times = torch.bincount(drawn)[drawn] + 1
     opacities, scales = ops.compute_relocation(opacities[drawn], scales[drawn], times, binoms)
@@ -60,5 +60,5 @@ def wake(part: Part, count: int, binoms: Float[Tensor, "n_max n_max"], min_opaci
     params["opacities"][drawn] = torch.logit(opacities.clamp(min_opacity, most))
     params["scales"][drawn] = torch.log(scales)
     for values in params.values():
-        values[there : there + count] = values[drawn]
-    part.spare -= count
+        values[active : active + count] = values[drawn]
+    part.preallocated -= count
