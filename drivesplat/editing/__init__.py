@@ -1,1 +1,1 @@
-"""Edits of a recorded drive: objects, and the camera's car, that move otherwise than they did."""
+"""Edits of a recorded drive: changed motion of actors and of the ego vehicle."""

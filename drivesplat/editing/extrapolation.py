@@ -1,7 +1,7 @@
-"""How an object goes on past the ends of its track: steadily, however its annotations tremble there.
+"""Extrapolation of a track past its ends, robust to annotation noise.
 
-The motion between annotations swings from one to the next; its speed at the very end is as good as two boxes are. Ten
-seconds on, centimetres of theirs would be metres.
+The speed at the very end of an interpolated motion is as inaccurate as two boxes: centimetres of annotation noise would
+become metres ten seconds later. Speed and direction are therefore fitted to several annotations.
 """
 
 from dataclasses import dataclass
@@ -9,23 +9,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from drivesplat.editing.easing import Onset
+from drivesplat.editing.transition import Transition
 from drivesplat.scene.motion import Motion
 
-LOOKS_BACK = 4
-"""Steps from annotation to annotation from which speed and direction at an end are taken."""
-STANDS = 0.5
-"""Speed (m/s) under which what a track ends with stands: boxes that tremble by 5 cm make less."""
-DRIVES = 1.0
-"""Speed (m/s) from which on a bend is told from trembling."""
-GRADE_OVER = 20.0
-"""Metres over which the climb at an end is taken; what came less far goes on level."""
+FITTED_STEPS = 4
+"""Number of steps between annotations to which speed and direction at an end are fitted."""
+STANDSTILL_SPEED = 0.5
+"""Speed (m/s) below which a track counts as standing at its end; annotation noise of 5 cm stays below it."""
+MIN_TURNING_SPEED = 1.0
+"""Speed (m/s) from which a change of direction is fitted; below, it cannot be told from annotation noise."""
+SLOPE_DISTANCE = 20.0
+"""Distance (metres) over which the slope at an end is measured; a shorter track is extrapolated at constant height."""
 
 
 @dataclass(frozen=True)
-class End:
-    """How it goes on at the first or last annotation: `direction` (3,) in the world, horizontally of length 1, and
-    `speed` in m/s, horizontally along it; 0 for what stands. Both as time goes."""
+class EndState:
+    """The motion at an end of a track, in the direction of time: `direction` (3,) in the world, of horizontal length 1,
+    and the horizontal `speed` along it in m/s, 0 for a standing object."""
 
     direction: np.ndarray
     speed: float
@@ -35,57 +35,59 @@ class End:
         """(3,) m/s."""
         return self.speed * self.direction
 
-    def after(self, momentary: np.ndarray) -> np.ndarray:
-        """Where (3,) a path that leads `momentary` (3,) there goes on: what stands may have come backwards."""
-        backwards = not self.speed and momentary[:2] @ self.direction[:2] < 0.0
+    def continuation(self, tangent: np.ndarray) -> np.ndarray:
+        """The direction (3,) in which a path with this `tangent` (3,) continues; a standing object may have arrived
+        backwards."""
+        backwards = not self.speed and tangent[:2] @ self.direction[:2] < 0.0
         return self.direction * [-1.0, -1.0, 1.0] if backwards else self.direction
 
 
-def end_of(motion: Motion, last: bool) -> End:
-    """How a motion goes on at its last annotation, or before its first.
+def end_state(motion: Motion, last: bool) -> EndState:
+    """The state of a motion at its last annotation, or at its first.
 
-    Speed and direction of the LOOKS_BACK nearest steps between annotations are taken to change evenly towards the end;
-    what stands goes where its box points. It climbs as it did over GRADE_OVER.
+    Speed and direction are linear fits to the FITTED_STEPS nearest steps between annotations; a standing object has the
+    direction of its box. The slope is that over SLOPE_DISTANCE.
     """
     first, final = motion.runs[-1 if last else 0]
     indices = np.arange(first, final + 1)
-    near = indices[-1 - LOOKS_BACK :] if last else indices[: 1 + LOOKS_BACK]
+    near = indices[-1 - FITTED_STEPS :] if last else indices[: 1 + FITTED_STEPS]
     end = motion.times[final if last else first]
     speed, direction = _velocity(motion.times[near] - end, motion.object_to_world[near, :2, 3])
-    if speed < STANDS:
+    if speed < STANDSTILL_SPEED:
         heading = motion.poses(np.array([end]))[0, :2, 0]
         speed, direction = 0.0, heading / np.linalg.norm(heading)
-    climb = _climb(motion.object_to_world[indices if last else indices[::-1], :3, 3])
-    return End(np.array([*direction, climb if last else -climb]), speed)
+    slope = _slope(motion.object_to_world[indices if last else indices[::-1], :3, 3])
+    return EndState(np.array([*direction, slope if last else -slope]), speed)
 
 
-def _velocity(times: np.ndarray, places: np.ndarray) -> tuple[float, np.ndarray]:
-    """Speed in m/s and direction (2,) at second 0, of what was at `places` (k, 2) at `times` (k,)."""
+def _velocity(times: np.ndarray, positions: np.ndarray) -> tuple[float, np.ndarray]:
+    """Speed in m/s and direction (2,) at second 0, fitted to `positions` (k, 2) at `times` (k,)."""
     if len(times) < 2:
         return 0.0, np.zeros(2)
-    steps, middles = np.diff(places, axis=0), (times[1:] + times[:-1]) / 2
+    steps, middles = np.diff(positions, axis=0), (times[1:] + times[:-1]) / 2
     lengths = np.linalg.norm(steps, axis=1)
     speeds, angles = lengths / np.diff(times), np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     degree = 1 if len(steps) >= 3 else 0
     speed = float(Polynomial.fit(middles, speeds, degree)(0.0))
-    if speed < STANDS:
+    if speed < STANDSTILL_SPEED:
         return 0.0, np.zeros(2)
-    angle = Polynomial.fit(middles, angles, degree if speeds.min() > DRIVES else 0, w=lengths)(0.0)
+    angle = Polynomial.fit(middles, angles, degree if speeds.min() > MIN_TURNING_SPEED else 0, w=lengths)(0.0)
     return speed, np.array([np.cos(angle), np.sin(angle)])
 
 
-def _climb(places: np.ndarray) -> float:
-    """Metres up per metre on towards the last of `places` (m, 3), over the last GRADE_OVER metres; 0 where it came less
-    far."""
-    far = np.linalg.norm(places[:, :2] - places[-1, :2], axis=1)
-    enough = np.flatnonzero(far >= GRADE_OVER)
-    return float((places[-1, 2] - places[enough[-1], 2]) / far[enough[-1]]) if len(enough) else 0.0
+def _slope(positions: np.ndarray) -> float:
+    """Height gained per horizontal metre over the last SLOPE_DISTANCE of `positions` (m, 3); 0 if they span less."""
+    distances = np.linalg.norm(positions[:, :2] - positions[-1, :2], axis=1)
+    far = np.flatnonzero(distances >= SLOPE_DISTANCE)
+    return float((positions[-1, 2] - positions[far[-1], 2]) / distances[far[-1]]) if len(far) else 0.0
 
 
-def onward(past: np.ndarray, momentary: np.ndarray, steady: np.ndarray, over: float) -> np.ndarray:
-    """How far what was `momentary` (...) comes while it becomes `steady` (...), over as much as `over` past an end:
-    (n, ...) at `past` (n,), negative before a beginning."""
+def extrapolate(past: np.ndarray, initial: np.ndarray, steady: np.ndarray, over: float) -> np.ndarray:
+    """The displacement (n, ...) at `past` (n,) an end, negative before a beginning.
+
+    The derivative changes from `initial` (...) to `steady` (...) over the interval `over`, in the unit of `past`.
+    """
     amount = np.abs(past)
-    settled = Onset(0.0, over).elapsed(amount)
-    shares = np.sign(past)[:, None] * np.stack([amount - settled, settled], axis=-1)
-    return np.tensordot(shares, np.stack([momentary, steady]), axes=1)
+    settled = Transition(0.0, over).integral(amount)
+    weights = np.sign(past)[:, None] * np.stack([amount - settled, settled], axis=-1)
+    return np.tensordot(weights, np.stack([initial, steady]), axes=1)

@@ -1,4 +1,4 @@
-"""The stage `edit`: a drive that was never driven, as a film with the recorded one beside it, and as labels."""
+"""The stage `edit`: an edited drive as a film beside the recorded one, and as labels."""
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.editing.cast import Actor, Role, edited_cast
+from drivesplat.editing.edited_actors import EditedActor, RecordedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
@@ -27,13 +27,13 @@ from drivesplat.settings.render import EditJob, TrajectorySettings
 
 log = logging.getLogger(__name__)
 
-NEAR = 0.5
-"""Metres from a box within which a camera sees little but what is in it."""
+COLLISION_MARGIN = 0.5
+"""Metres around a box within which a camera sees little but the inside of the object."""
 
 
 @dataclass(frozen=True)
 class EditFiles:
-    """What an edit writes: the film, and a still of it; frames, if wanted, into the folder of the film's name."""
+    """The outputs of an edit: the film and a still of it; optional frames go into the folder of the film's name."""
 
     film: Path
     still: Path
@@ -46,48 +46,48 @@ class EditFiles:
 def render_edit(
     scene: Scene, checkpoint: dict[str, Any], job: EditJob, device_settings: DeviceSettings, files: EditFiles
 ) -> dict[str, Any]:
-    """Writes the film and the still, both with the recorded drive on the left and the edited one on the right, and the
-    frames of the edited one, if wanted; returns the content of the edit's JSON, provenance aside: the cameras of the
-    edited drive, at the size of the frames, and where everything is in it.
+    """Writes the film and the still, both with the recorded drive on the left and the edited one on the right, and, if
+    `job.frames`, the frames of the edited one.
 
-    `checkpoint` is the content of checkpoint.pt. Raises ConfigError where the edit does not fit the scene or the model
-    has no actors; DatasetError, DeviceError and ResultError as films do.
+    Returns the content of the edit's JSON without provenance: cameras of the edited drive at the size of the frames,
+    and the poses of all objects. `checkpoint` is the content of checkpoint.pt. Raises ConfigError if the edit does not
+    fit the scene or the model has no actors; DatasetError, DeviceError and ResultError as `render_film` does.
     """
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {scene.name}, edit {files.film.stem!r}"
-    actors = actors_of(model, scene, where)
-    others = {track.id for track in scene.tracks} - {actor.id for actor in actors}
-    roles = edited_cast(actors, job.edit, where, others)
+    actors = editable_actors(model, scene, where)
+    editable = {actor.id for actor in actors}
+    edited = edited_actors(actors, job.edit, where, {track.id for track in scene.tracks} - editable)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     recorded = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     left, right = (Shot(scene, cameras, job, job.tile(2)) for cameras in (recorded, path))
     large = Shot(scene, path, job, (job.width, job.height))
     seconds = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])
-    crashed = crashes(roles, path, seconds)
-    if crashed.any():
-        first, last = seconds[crashed][[0, -1]]
+    colliding = collisions(edited, path, seconds)
+    if colliding.any():
+        first, last = seconds[colliding][[0, -1]]
         log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
-    present, still = actor_placements(roles, seconds), Still(crashed)
+    placed, still = actor_placements(edited, seconds), Still(colliding)
     before = recorded_shot(model, left, device)
     model.precompute(right.seconds)
-    after = edited_frames(model, right.views(device), present)
+    after = edited_frames(model, right.views(device), placed)
     write_film(files.film, still.side_by_side(before, after), right, model, columns=2)
     write_png(files.still, still.picture)
     remove_frames(files.frames)
-    images = write_frames(files.frames, edited_frames(model, large.views(device), present)) if job.frames else []
+    images = write_frames(files.frames, edited_frames(model, large.views(device), placed)) if job.frames else []
     return {
         **large.record(),
         "edit": job.edit.model_dump(mode="json"),
         "still_frame": still.number,
         "images": images,
-        "tracks": track_labels(scene, roles, {actor.id for actor in actors}, seconds),
+        "tracks": track_labels(scene, edited, editable, seconds),
     }
 
 
-def actors_of(model: SplatModel, scene: Scene, where: str) -> list[Actor]:
-    """Who can be edited: the objects that the model knows, as it has come to know their motion.
+def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[RecordedActor]:
+    """The actors of the model, with their motion as trained.
 
-    `where` begins messages. Raises ConfigError where it knows none, ResultError where the scene lacks one.
+    Messages start with `where`. Raises ConfigError if there are none, ResultError if the scene lacks one of them.
     """
     actors = []
     for name, group in model.rigid_groups(0.0).items():
@@ -96,70 +96,70 @@ def actors_of(model: SplatModel, scene: Scene, where: str) -> list[Actor]:
             continue
         if track is None:
             raise ResultError(
-                f"{where}: scene.json has no track {name}, which checkpoint.pt knows; delete it and rerun"
+                f"{where}: scene.json has no track {name}, which checkpoint.pt contains; delete checkpoint.pt and rerun"
             )
-        actors.append(Actor(track.id, track.category, track.size, group.motion))
+        actors.append(RecordedActor(track.id, track.category, track.size, group.motion))
     if not actors:
         raise ConfigError(
-            f"{where}: nothing can be edited, since this method's model knows no actors; "
-            "train one with the part 'actors' (the method 'street'), on a scene in which something moves"
+            f"{where}: nothing can be edited, since the model of this method has no actors; "
+            "train one with the part 'actors' (the method 'street') on a scene with moving vehicles"
         )
     return actors
 
 
-def actor_placements(roles: Sequence[Role], seconds: np.ndarray) -> list[list[ActorPlacement]]:
-    """The placements of all present objects at each of `seconds` (n,)."""
-    entries: list[list[ActorPlacement]] = [[] for _ in seconds]
-    for role in roles:
-        poses = role.poses(seconds) if role.edited else None
-        for number in np.flatnonzero(role.present(seconds)):
+def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list[list[ActorPlacement]]:
+    """The actors present at each of `seconds` (n,), with their poses."""
+    result: list[list[ActorPlacement]] = [[] for _ in seconds]
+    for actor in actors:
+        poses = actor.poses(seconds) if actor.edited else None
+        for number in np.flatnonzero(actor.present(seconds)):
             pose = poses[number] if poses is not None else None
-            entries[number].append(ActorPlacement(role.source, pose, role.scale))
-    return entries
+            result[number].append(ActorPlacement(actor.source, pose, actor.scale))
+    return result
 
 
-def crashes(roles: Sequence[Role], path: CameraPath, seconds: np.ndarray) -> np.ndarray:
-    """In which frames (n,) bool the camera is in the box of an object, or nearer to it than NEAR: its picture is then
-    of that object's inside."""
+def collisions(actors: Sequence[EditedActor], path: CameraPath, seconds: np.ndarray) -> np.ndarray:
+    """The frames (n,) bool in which the camera is inside a box enlarged by COLLISION_MARGIN, and so shows the inside of
+    an object."""
     inside = np.zeros(len(seconds), dtype=bool)
-    for role in roles:
-        to_object = inverse(role.poses(seconds))
+    for actor in actors:
+        to_object = inverse(actor.poses(seconds))
         camera = (to_object[:, :3, :3] @ path.camera_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
-        inside |= role.present(seconds) & (np.abs(camera) < role.size / 2 + NEAR).all(axis=1)
+        inside |= actor.present(seconds) & (np.abs(camera) < actor.size / 2 + COLLISION_MARGIN).all(axis=1)
     return inside
 
 
 def edited_frames(
-    model: SplatModel, views: Iterable[View], present: Iterable[Sequence[ActorPlacement]]
+    model: SplatModel, views: Iterable[View], placed: Iterable[Sequence[ActorPlacement]]
 ) -> Iterator[np.ndarray]:
-    """Renders each view with the objects at their placements of that time: (h, w, 3) uint8 each."""
-    pairs = zip(views, present, strict=True)
-    return film_frames(model, ((view, model.gaussians_with_placements(view.time, shown)) for view, shown in pairs))
+    """The rendering of each view with the actors placed in it and no others, (h, w, 3) uint8 each."""
+    pairs = zip(views, placed, strict=True)
+    return film_frames(model, ((view, model.gaussians_with_placements(view.time, actors)) for view, actors in pairs))
 
 
 class Still:
-    """Of the pairs of a recorded and an edited frame that went by the one whose frames differ most, `spoilt` (n,) bool
-    ones only where there is no other: its `number`, counted from 0, and `picture`, both side by side."""
+    """The pair of a recorded and an edited frame that differ most: its `number` from 0 and side-by-side `picture`.
+    `avoided` (n,) bool frames are chosen only if there is no other."""
 
     number: int
     picture: np.ndarray
 
-    def __init__(self, spoilt: np.ndarray):
-        self._spoilt = spoilt
+    def __init__(self, avoided: np.ndarray):
+        self._avoided = avoided
 
     def side_by_side(self, recorded: Iterable[np.ndarray], edited: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-        """The pairs, each as one picture."""
-        most = (False, -1.0)
+        """Yields each pair as one picture."""
+        best = (False, -1.0)
         for number, pair in enumerate(zip(recorded, edited, strict=True)):
             picture, difference = np.hstack(pair), float(np.abs(np.subtract(*pair, dtype=np.int16)).mean())
-            worth = (not self._spoilt[number], difference)
-            if worth > most:
-                most, self.number, self.picture = worth, number, picture
+            score = (not self._avoided[number], difference)
+            if score > best:
+                best, self.number, self.picture = score, number, picture
             yield picture
 
 
 def write_frames(folder: Path, frames: Iterable[np.ndarray]) -> list[str]:
-    """Writes frames (h, w, 3) uint8 as PNGs into `folder`; returns their paths from the folder above it."""
+    """Writes frames (h, w, 3) uint8 as PNGs into `folder`; returns their paths relative to its parent."""
     folder.mkdir(exist_ok=True)
     names = []
     for number, frame in enumerate(frames):
@@ -169,7 +169,7 @@ def write_frames(folder: Path, frames: Iterable[np.ndarray]) -> list[str]:
 
 
 def remove_frames(folder: Path) -> None:
-    """Removes the frames that an earlier run wrote into `folder`, and it, if nothing else is in it."""
+    """Removes the frames of an earlier run from `folder`, and the folder if it is then empty."""
     for file in folder.glob("[0-9]" * 6 + ".png"):
         file.unlink()
     if folder.is_dir() and not any(folder.iterdir()):

@@ -1,7 +1,7 @@
-"""What each step of an edit does to a way: pure functions from one way to the next.
+"""The effect of each step of an edit on an actor's path, as pure functions.
 
-`speed` and `reverse` change how far an actor has come, and leave what lies beside its path at its second of the film.
-`stop` and a delay take the whole way with them: what rests does not slide.
+`speed` and `reverse` change the position along the path; offsets keep their film seconds. `stop` and a delay act on
+position and offsets, so that a stopped actor does not slide.
 """
 
 from collections.abc import Callable
@@ -10,127 +10,128 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from drivesplat.editing.easing import Onset
-from drivesplat.editing.path import Offsets, Progress, Way
+from drivesplat.editing.actor_path import ActorPath, PathOffsets, PathPosition
+from drivesplat.editing.transition import Transition
 from drivesplat.settings.edit import Duplicate, Reverse, Shift, Speed, Stop
 
-INTEGRATED = 0.005
-"""Seconds between the places from which the way during a change of speed is integrated."""
+INTEGRATION_STEP = 0.005
+"""Seconds between the samples of the distance integral during a change of speed."""
 
 Clock = Callable[[np.ndarray], np.ndarray]
-"""Which second of the way before a step (n,) the way after it is at, at seconds (n,)."""
+"""Maps seconds (n,) of the path after a step to seconds (n,) of the path before it."""
 
 
-def sped(way: Way, speed: Speed) -> Way:
-    """Faster or slower: by a factor it lives through its way at another pace; at a speed of its own it leaves the
-    recorded pace behind."""
+def apply_speed(path: ActorPath, speed: Speed) -> ActorPath:
+    """Scales the pace by a factor, or replaces it by a constant speed."""
     if speed.factor == 1.0:
-        return way
-    beginning = max(way.begin, 0.0)
-    onset = Onset.of(speed, beginning)
-    onset = Onset(max(onset.start, beginning), onset.duration)
+        return path
+    beginning = max(path.begin, 0.0)
+    transition = Transition.of(speed, beginning)
+    transition = Transition(max(transition.start, beginning), transition.duration)
     if speed.factor is None:
-        return _at_own_speed(way, onset, way.direction * speed.to)
-    return _paced(way, lambda at: onset.paced(at, speed.factor), onset.start)
+        return _at_constant_speed(path, transition, path.direction * speed.to)
+    return _paced(path, lambda times: transition.warp_time(times, speed.factor), transition.start)
 
 
-def stopped(way: Way, stop: Stop) -> Way:
-    """Its pace falls from 1 to 0 over the duration, and with it everything else that it does."""
-    onset = Onset(stop.at, stop.duration)
+def apply_stop(path: ActorPath, stop: Stop) -> ActorPath:
+    """Reduces the pace from 1 to 0 over the duration; offsets stop changing with it."""
+    transition = Transition(stop.at, stop.duration)
 
-    def offsets(at: np.ndarray) -> Offsets:
-        then = way.offsets(onset.paced(at, 0.0))
-        return replace(then, drift=then.drift * (1.0 - onset.share(at)))
+    def clock(times: np.ndarray) -> np.ndarray:
+        return transition.warp_time(times, 0.0)
 
-    return replace(_paced(way, lambda at: onset.paced(at, 0.0), stop.at), offsets=offsets)
+    def offsets(times: np.ndarray) -> PathOffsets:
+        before = path.offsets(clock(times))
+        return replace(before, lateral_speed=before.lateral_speed * (1.0 - transition.fraction(times)))
+
+    return replace(_paced(path, clock, stop.at), offsets=offsets)
 
 
-def reversed_way(way: Way, reverse: Reverse) -> Way:
-    """Time runs backwards between its first and its last second."""
-    back = _paced(way, lambda at: way.begin + way.end - at, -np.inf)
-    back = replace(back, direction=-way.direction)
+def apply_reverse(path: ActorPath, reverse: Reverse) -> ActorPath:
+    """Reverses time between the first and the last second of the path."""
+    reversed_path = _paced(path, lambda times: path.begin + path.end - times, -np.inf)
+    reversed_path = replace(reversed_path, direction=-path.direction)
     if not reverse.turn:
-        return back
-    half_turn = np.pi * way.faces  # there and back again
-    return replace(back, offsets=_added(way, lambda at: {"yaw": np.full(len(at), half_turn)}), faces=-way.faces)
+        return reversed_path
+    half_turn = np.pi * path.facing  # a second reversal turns back
+    offsets = _added_offsets(path, lambda times: {"yaw": np.full(len(times), half_turn)})
+    return replace(reversed_path, offsets=offsets, facing=-path.facing)
 
 
-def shifted(way: Way, shift: Shift) -> Way:
-    """Further on along its way, to its left, and turned."""
-    onset = Onset.of(shift, -np.inf)
+def apply_shift(path: ActorPath, shift: Shift) -> ActorPath:
+    """Adds offsets forward along the path, to the left, and in yaw."""
+    transition = Transition.of(shift, -np.inf)
 
-    def more(at: np.ndarray) -> dict[str, np.ndarray]:
-        share = onset.share(at)
+    def added(times: np.ndarray) -> dict[str, np.ndarray]:
+        fraction = transition.fraction(times)
         return {
-            "ahead": way.direction * shift.longitudinal * share,
-            "lateral": way.faces * shift.lateral * share,
-            "drift": way.faces * shift.lateral * onset.rate(at),
-            "yaw": np.radians(shift.yaw) * share,
+            "longitudinal": path.direction * shift.longitudinal * fraction,
+            "lateral": path.facing * shift.lateral * fraction,
+            "lateral_speed": path.facing * shift.lateral * transition.rate(times),
+            "yaw": np.radians(shift.yaw) * fraction,
         }
 
-    return replace(way, offsets=_added(way, more))
+    return replace(path, offsets=_added_offsets(path, added))
 
 
-def copied(way: Way, duplicate: Duplicate) -> Way:
-    """The way of a copy: everything `delay` seconds later, and beside the original."""
+def apply_duplicate(path: ActorPath, duplicate: Duplicate) -> ActorPath:
+    """The path of a copy: `delay` seconds later, and offset from the original."""
     delay = duplicate.delay
-
-    def clock(at: np.ndarray) -> np.ndarray:
-        return at - delay
-
-    later = replace(
-        way,
-        progress=lambda at: way.progress(clock(at)),
-        offsets=lambda at: way.offsets(clock(at)),
-        recorded=lambda at: way.recorded(at) | way.recorded(clock(at)),
-        begin=min(way.begin, way.begin + delay),
-        end=max(way.end, way.end + delay),
-        since=way.since + delay,
+    delayed = replace(
+        path,
+        position=lambda times: path.position(times - delay),
+        offsets=lambda times: path.offsets(times - delay),
+        recorded=lambda times: path.recorded(times) | path.recorded(times - delay),
+        begin=min(path.begin, path.begin + delay),
+        end=max(path.end, path.end + delay),
+        paced_from=path.paced_from + delay,
     )
     if not (duplicate.longitudinal or duplicate.lateral):
-        return later
+        return delayed
     offset = {"longitudinal": duplicate.longitudinal, "lateral": duplicate.lateral}
-    return shifted(later, Shift(track=duplicate.name, **offset))
+    return apply_shift(delayed, Shift(track=duplicate.name, **offset))
 
 
-def _paced(way: Way, clock: Clock, since: float) -> Way:
-    """A way whose progress at a second is that of `way` when `clock` says, from second `since` on another."""
-    return replace(way, progress=lambda at: way.progress(clock(at)), since=min(way.since, since))
+def _paced(path: ActorPath, clock: Clock, start: float) -> ActorPath:
+    """The path whose position follows `clock`, which differs from film time from second `start` on."""
+    return replace(path, position=lambda times: path.position(clock(times)), paced_from=min(path.paced_from, start))
 
 
-def _at_own_speed(way: Way, onset: Onset, velocity: float) -> Way:
-    """Along its course at `velocity` (m/s, negative: backwards), to which the speed changes from what it would be."""
-    left_behind = _integral(way, onset)
+def _at_constant_speed(path: ActorPath, transition: Transition, velocity: float) -> ActorPath:
+    """The path along which the speed changes over `transition` to `velocity` (m/s, negative: backwards)."""
+    remainder = _integral(path, transition)
 
-    def progress(at: np.ndarray) -> Progress:
-        old, remaining = way.progress(at), 1.0 - onset.share(at)
-        there = way.course.metres(old.clock)
-        metres = remaining * (there + old.along) + left_behind(at) + velocity * onset.elapsed(at)
-        return Progress(old.clock, metres - there, old.faithful * remaining)
+    def position(times: np.ndarray) -> PathPosition:
+        before, remaining = path.position(times), 1.0 - transition.fraction(times)
+        recorded = path.trajectory.distance(before.clock)
+        distance = remaining * (recorded + before.advance) + remainder(times) + velocity * transition.integral(times)
+        return PathPosition(before.clock, distance - recorded, before.deviation_weight * remaining)
 
-    return replace(way, progress=progress, since=min(way.since, onset.start))
+    return replace(path, position=position, paced_from=min(path.paced_from, transition.start))
 
 
-def _integral(way: Way, onset: Onset) -> Callable[[np.ndarray], np.ndarray]:
-    """The integral up to the seconds (n,) of the rate of `onset` times the metres of `way`: (n,).
+def _integral(path: ActorPath, transition: Transition) -> Callable[[np.ndarray], np.ndarray]:
+    """The integral (n,) up to the seconds (n,) of the rate of `transition` times the distance of `path`.
 
-    By parts, the integral of (1 - share) times the way's speed is (1 - share) times its metres plus this: metres are
-    smoother than speeds.
+    By partial integration, the integral of (1 - fraction) times the speed is (1 - fraction) times the distance plus
+    this integral; distances are smoother than speeds.
     """
-    end = onset.start + onset.duration
-    if not onset.duration:
-        place = way.metres(np.array([onset.start]))
-        return lambda at: onset.share(at) * place
-    during = np.linspace(onset.start, end, max(5, int(onset.duration / INTEGRATED) + 1))
-    integral = CubicSpline(during, onset.rate(during) * way.metres(during)).antiderivative()
-    return lambda at: integral(at.clip(onset.start, end))
+    end = transition.start + transition.duration
+    if not transition.duration:
+        distance = path.distance(np.array([transition.start]))
+        return lambda times: transition.fraction(times) * distance
+    during = np.linspace(transition.start, end, max(5, int(transition.duration / INTEGRATION_STEP) + 1))
+    integral = CubicSpline(during, transition.rate(during) * path.distance(during)).antiderivative()
+    return lambda times: integral(times.clip(transition.start, end))
 
 
-def _added(way: Way, more: Callable[[np.ndarray], dict[str, np.ndarray]]) -> Callable[[np.ndarray], Offsets]:
-    """The offsets of `way` and `more`."""
+def _added_offsets(
+    path: ActorPath, added: Callable[[np.ndarray], dict[str, np.ndarray]]
+) -> Callable[[np.ndarray], PathOffsets]:
+    """The offsets of `path` plus those `added`."""
 
-    def offsets(at: np.ndarray) -> Offsets:
-        old = way.offsets(at)
-        return replace(old, **{name: getattr(old, name) + value for name, value in more(at).items()})
+    def offsets(times: np.ndarray) -> PathOffsets:
+        before = path.offsets(times)
+        return replace(before, **{name: getattr(before, name) + value for name, value in added(times).items()})
 
     return offsets

@@ -1,4 +1,4 @@
-"""What an edit leaves: its film beside the recorded one, a still, labels that belong to its frames, and refusals."""
+"""The outputs of an edit: film, still and labels; and refused edits."""
 
 import json
 import time
@@ -26,9 +26,9 @@ from helpers.hand_made_street import (
 from helpers.hand_made_traffic import placed
 from PIL import Image
 
-from drivesplat.editing.cast import Actor, edited_cast
+from drivesplat.editing.edited_actors import RecordedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import EditFiles, Still, actor_placements, actors_of, crashes, render_edit
+from drivesplat.editing.film import EditFiles, Still, actor_placements, collisions, editable_actors, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import read_footage
@@ -116,7 +116,7 @@ def large(scene, model, tmp_path_factory) -> Made:
     return make(scene, model, tmp_path_factory.mktemp("large"), *BUSY, width=128, height=72)
 
 
-def test_the_recorded_drive_is_on_the_left_as_its_own_film_shows_it(scene, model, large, tmp_path, monkeypatch):
+def test_the_left_half_equals_the_film_of_the_recorded_drive(scene, model, large, tmp_path, monkeypatch):
     reels = Reels()
     monkeypatch.setattr("drivesplat.rendering.film.write_video", reels)
     job = FilmJob(**a_format(width=64, height=36).model_dump(), trajectory=TrajectorySettings())
@@ -124,13 +124,13 @@ def test_the_recorded_drive_is_on_the_left_as_its_own_film_shows_it(scene, model
     np.testing.assert_array_equal(large.halves[0], reels["original"])
 
 
-def test_the_edited_drive_is_on_the_right_as_its_frames_show_it(busy, large):
+def test_the_right_half_equals_the_frames_of_the_edited_drive(busy, large):
     np.testing.assert_array_equal(large.halves[1], busy.pictures())
     assert (large.halves[0] != large.halves[1]).any(axis=(1, 2, 3)).all()
 
 
-def test_labels_and_cameras_alone_give_the_frames_again(scene, model, busy):
-    """Everything that the model knows stands where the labels have it; by a rounding of float32, of one in a byte."""
+def test_labels_and_cameras_reproduce_the_frames(scene, model, busy):
+    """All actors of the model are at the poses of the labels; bytes differ by at most 1 due to float32 rounding."""
     seen = {track["source"] for track in busy.record["tracks"] if track["editable"]}
     assert seen == {AHEAD, GONE}
     for number, (view, picture) in enumerate(zip(views_of(busy.record, scene), busy.pictures(), strict=True)):
@@ -147,7 +147,7 @@ def seconds_of(made: Made, scene: Scene) -> np.ndarray:
     return np.array([scene.seconds(timestamp) for timestamp in made.record["timestamps"]])
 
 
-def test_labels_say_where_everyone_is_in_every_frame(scene, busy):
+def test_labels_hold_the_pose_of_every_object_in_every_frame(scene, busy):
     times = seconds_of(busy, scene)
     np.testing.assert_allclose(times, 0.25 * np.arange(19), atol=1e-6)
     ahead, twin = ([*map(np.array, busy.track(name)["object_to_world"])] for name in (AHEAD, "twin"))
@@ -159,7 +159,7 @@ def test_labels_say_where_everyone_is_in_every_frame(scene, busy):
     assert 0 < sum(there) < len(times)
 
 
-def test_labels_say_who_everyone_is(busy):
+def test_labels_hold_the_attributes_of_every_object(busy):
     known = {
         track["id"]: [track[key] for key in ("source", "category", "scale", "edited", "editable")]
         for track in busy.record["tracks"]
@@ -175,7 +175,7 @@ def test_labels_say_who_everyone_is(busy):
     np.testing.assert_allclose(busy.track("twin")["size"], DRIVERS[AHEAD].size)
 
 
-def test_what_cannot_be_edited_is_listed_where_it_was_recorded(scene, busy):
+def test_objects_that_cannot_be_edited_are_labelled_as_recorded(scene, busy):
     """A parked truck, and a pedestrian who walks at 1.2 m/s; the tiny world's key frames begin at second 0.035."""
     parked, walker = (busy.track(f"0001 instance {i}")["object_to_world"] for i in (1, 2))
     np.testing.assert_allclose(parked, [rigid(np.eye(3), np.array([16.0, -4.5, 1.3]))] * 19, atol=1e-6)
@@ -183,14 +183,14 @@ def test_what_cannot_be_edited_is_listed_where_it_was_recorded(scene, busy):
     np.testing.assert_allclose(np.array(walker)[:, :3, 3], expected, atol=1e-6)
 
 
-def test_who_is_as_recorded_is_labelled_as_the_model_has_come_to_know_it(scene, model, tmp_path):
+def test_unedited_actors_are_labelled_with_the_trained_motion(scene, model, tmp_path):
     made = make(scene, model, tmp_path, {"remove": {"track": AHEAD}})
     track, motion = made.track(TURNING), model.rigid_groups(0.0)[TURNING].motion
     assert (track["edited"], track["scale"]) == (False, 1.0)
     np.testing.assert_allclose(track["object_to_world"], motion.poses(seconds_of(made, scene)), atol=1e-6, rtol=0)
 
 
-def test_the_record_counts_what_was_made_and_holds_the_edit(busy):
+def test_the_record_holds_the_edit_and_the_number_of_frames(busy):
     record = busy.record
     assert (record["frames"], record["width"], record["height"], record["fps"]) == (19, 64, 36, 4)
     assert len(record["camera_to_world"]) == len(record["timestamps"]) == len(busy.reels["it"]) == 19
@@ -199,7 +199,7 @@ def test_the_record_counts_what_was_made_and_holds_the_edit(busy):
     assert Edit.model_validate(record["edit"]) == edit_of(*BUSY)
 
 
-def test_the_still_is_the_pair_that_differs_most(large):
+def test_the_still_is_the_pair_with_the_largest_difference(large):
     left, right = (half.astype(float) for half in large.halves)
     difference = np.abs(left - right).mean(axis=(1, 2, 3))
     number = int(difference.argmax())
@@ -224,7 +224,7 @@ def test_a_later_run_without_frames_removes_them_and_nothing_else(scene, model, 
     assert left() == kept | {"it.mp4", "it.png"} and made.record["images"] == []
 
 
-def test_a_folder_that_held_frames_alone_goes_with_them(scene, model, tmp_path):
+def test_a_folder_that_held_only_frames_is_removed_with_them(scene, model, tmp_path):
     step, small = {"remove": {"track": AHEAD}}, {"width": 16, "height": 16, "fps": 1}
     make(scene, model, tmp_path, step, frames=True, **small)
     assert (tmp_path / "it").is_dir()
@@ -232,7 +232,7 @@ def test_a_folder_that_held_frames_alone_goes_with_them(scene, model, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"it.mp4", "it.png"}
 
 
-def test_a_faster_camera_shortens_both_halves(scene, model, tmp_path):
+def test_a_faster_ego_vehicle_shortens_both_halves(scene, model, tmp_path):
     """The recorded drive goes on beside it at its own speed until the edited film ends."""
     small = {"width": 32, "height": 18}
     made, slow = (make(scene, model, tmp_path, {"ego": {"speed": speed}}, **small) for speed in (1.5, 0.5))
@@ -248,14 +248,14 @@ def test_a_faster_camera_shortens_both_halves(scene, model, tmp_path):
     assert (frames[-1] != made.halves[0][-1]).mean() > 0.5
 
 
-def test_at_60_frames_a_second_there_are_twice_as_many_and_actors_move_between(scene, model):
+def test_at_60_frames_a_second_actors_move_in_every_frame(scene, model):
     step = {"shift": {"track": AHEAD, "lateral": 2.0}}
     slow, fast = (edited_camera_path(scene, "CAM_FRONT", fps, edit_of(step), "") for fps in (30, 60))
     assert (len(slow), len(fast)) == (136, 271)
     assert np.abs(fast.timestamps[::2] - slow.timestamps).max() <= 1
     seconds = np.array([scene.seconds(timestamp) for timestamp in fast.timestamps])
     np.testing.assert_allclose(seconds, np.arange(271) / 60, atol=1e-6)
-    present = actor_placements(edited_cast(actors_of(model, scene, "here"), edit_of(step), "here"), seconds)
+    present = actor_placements(edited_actors(editable_actors(model, scene, "here"), edit_of(step), "here"), seconds)
     aside, motion = rigid(np.eye(3), np.array([0.0, 2.0, 0.0])), model.rigid_groups(0.0)[TURNING].motion
     for number in (1, 77, 270):
         shown = model.gaussians_with_placements(float(seconds[number]), present[number])
@@ -274,7 +274,7 @@ def test_an_encoded_film_has_as_many_frames_and_is_twice_as_wide(scene, model, t
     assert (footage.width, footage.height) == (36, 10) == Image.open(tmp_path / "it.png").size
 
 
-def test_an_edit_leaves_the_checkpoint_as_it_is(scene, model, tmp_path, monkeypatch):
+def test_an_edit_does_not_change_the_checkpoint(scene, model, tmp_path, monkeypatch):
     monkeypatch.setattr("drivesplat.rendering.film.write_video", Reels())
     checkpoint, before = checkpoint_of(model), checkpoint_of(model)
     render_edit(scene, checkpoint, a_job(*BUSY, width=16, height=16, fps=1), CPU, files_in(tmp_path))
@@ -282,7 +282,7 @@ def test_an_edit_leaves_the_checkpoint_as_it_is(scene, model, tmp_path, monkeypa
     assert all(bool((value == checkpoint["model"][key]).all()) for key, value in before["model"].items())
 
 
-def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, model, tmp_path, monkeypatch):
+def test_few_frames_are_rendered_ahead_of_the_encoder(scene, model, tmp_path, monkeypatch):
     rendered = []
 
     def counted(_: SplatModel, shown: Iterable[Any]) -> Iterator[np.ndarray]:
@@ -304,7 +304,7 @@ def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, model
 
 
 def refusal(scene: Scene, model: SplatModel, folder: Path, *steps: dict[str, Any], kind: type[DriveSplatError]) -> str:
-    """What is said of an edit that cannot be made, of which nothing is left."""
+    """The message of a refused edit, which must leave no files."""
     with pytest.raises(kind) as caught:
         render_edit(scene, checkpoint_of(model), a_job(*steps, frames=True), CPU, files_in(folder))
     message = str(caught.value)
@@ -315,8 +315,9 @@ def refusal(scene: Scene, model: SplatModel, folder: Path, *steps: dict[str, Any
 @pytest.mark.parametrize(
     ("steps", "words"),
     [
-        ([{"reverse": {"track": "ffff"}}], ["step 1 (reverse)", "'ffff'", f"there are: {AHEAD}, {TURNING}, {GONE}"]),
-        ([{"stop": {"track": "0001 instance 1", "at": 1.0}}], ["no track that can be edited", "'0001 instance 1'"]),
+        ([{"reverse": {"track": "ffff"}}],
+         ["step 1 (reverse)", "'ffff'", f"editable tracks: {AHEAD}, {TURNING}, {GONE}"]),
+        ([{"stop": {"track": "0001 instance 1", "at": 1.0}}], ["no editable track", "'0001 instance 1'"]),
         ([{"remove": {"track": AHEAD}}, {"reverse": {"track": AHEAD}}], ["step 2 (reverse)", "removed by step 1"]),
         ([{"stop": {"track": GONE, "at": 0.1}}], ["step 1 (stop)", "begins after 'at' (0.1 s)", "from 0.29 to 4.29 s"]),
     ],
@@ -330,30 +331,30 @@ def test_an_edit_that_does_not_fit_is_refused_before_anything_is_written(scene, 
 def test_a_model_without_actors_cannot_be_edited(scene, model, tmp_path):
     still = street_model(model.parts[0])
     message = refusal(scene, still, tmp_path, *BUSY, kind=ConfigError)
-    assert "knows no actors" in message and "the method 'street'" in message
+    assert "has no actors" in message and "the method 'street'" in message
 
 
-def test_actors_that_the_scene_does_not_hold_are_refused(scene, model, tmp_path):
-    """Left out, they would vanish from the film without a word."""
+def test_actors_missing_in_the_scene_are_refused(scene, model, tmp_path):
+    """Otherwise they would silently be missing in the film."""
     other = replace(scene, tracks=tuple(track for track in scene.tracks if track.id != TURNING))
     message = refusal(other, model, tmp_path, {"remove": {"track": AHEAD}}, kind=ResultError)
     assert TURNING in message and "checkpoint.pt" in message
 
 
-def test_a_still_is_not_taken_from_inside_a_vehicle_unless_there_is_no_other():
+def test_a_still_avoids_collision_frames_unless_there_is_no_other():
     recorded = [np.zeros((2, 2, 3), np.uint8)] * 3
     edited = [np.full((2, 2, 3), value, np.uint8) for value in (10, 200, 90)]
-    for spoilt, number in (([False, True, False], 2), ([True, True, True], 1)):
-        still = Still(np.array(spoilt))
+    for avoided, number in (([False, True, False], 2), ([True, True, True], 1)):
+        still = Still(np.array(avoided))
         assert len(list(still.side_by_side(recorded, edited))) == 3
         assert still.number == number
 
 
 BESIDE = Edit.model_validate({"steps": [{"ego": {"lateral": 1.0}}]})
-"""Of the camera alone."""
+"""An edit of the camera only."""
 
 
-def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
+def test_a_camera_collides_inside_the_box_of_a_present_actor():
     """A car 4 m long and 2 m wide stands across the world's axes at x = 10, from second 1 on."""
     places = [
         (10.0, 0.0, 0.0),
@@ -368,6 +369,6 @@ def test_a_camera_crashes_where_it_is_in_a_box_of_what_is_there():
     seconds = np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
     across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
-    car = Actor("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
-    found = crashes(edited_cast([car], BESIDE, ""), CameraPath(np.arange(6), cameras), seconds)
+    car = RecordedActor("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
+    found = collisions(edited_actors([car], BESIDE, ""), CameraPath(np.arange(6), cameras), seconds)
     assert found.tolist() == [False, True, True, False, True, False]

@@ -11,7 +11,7 @@ from helpers import REPOSITORY
 
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.tables import token
-from drivesplat.editing.cast import Actor, edited_cast
+from drivesplat.editing.edited_actors import RecordedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.scene.motion import Motion
@@ -189,11 +189,11 @@ def test_yaml_merges_stay_possible(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def demo_actors() -> list[Actor]:
+def demo_actors() -> list[RecordedActor]:
     """What moves in the demo's drive, at all its key frames."""
     recorder, times = Recorder(WorldSettings()), 0.5 * np.arange(20)
     return [
-        Actor(
+        RecordedActor(
             token("demo", "instance", thing.name), thing.category, np.asarray(thing.body.size),
             Motion(times, np.stack([recorder.box_to_global(thing, t) for t in times]), ((0, 19),), 0.25),
         )
@@ -206,7 +206,7 @@ def test_the_demos_edits_name_what_is_there_and_use_every_step(demo_actors):
     edits = read_edits(DEMO)
     assert {step.kind for edit in edits.values() for step in edit.steps} == set(Step.model_fields)
     for name, edit in edits.items():
-        cast = edited_cast(demo_actors, edit, name)
-        moved = [role for role in cast if role.edited]
-        assert moved or len(cast) < len(demo_actors) or any(step.kind == "ego" for step in edit.steps), name
+        edited_drive = edited_actors(demo_actors, edit, name)
+        moved = [actor for actor in edited_drive if actor.edited]
+        assert moved or len(edited_drive) < len(demo_actors) or any(step.kind == "ego" for step in edit.steps), name
     assert yaml.safe_load(DEMO.read_text())["edits"].keys() == edits.keys()

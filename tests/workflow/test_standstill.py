@@ -9,7 +9,7 @@ from helpers.small_runs import Finished, run
 from helpers.tiny_world import World, write_world
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from drivesplat.editing.film import actors_of
+from drivesplat.editing.film import editable_actors
 from drivesplat.errors import ConfigError
 from drivesplat.evaluation.summary import in_words
 from drivesplat.inspection.ghost_panel import ghost_panel
@@ -104,7 +104,7 @@ def test_where_nothing_moves_looks_say_so_and_nothing_can_be_edited(drives, meth
     _, removal = remove_actor(drive, made.job("remove_actor", RemovalJob, method))
     assert "no vehicle moves" in panel["why_null"] and "no vehicle moves" in removal["why_null"]
     with pytest.raises(ConfigError, match=r"scene 0001, edit 'gone': nothing can be edited.*something moves"):
-        actors_of(drive.model, drive.recording.scene, "scene 0001, edit 'gone'")
+        editable_actors(drive.model, drive.recording.scene, "scene 0001, edit 'gone'")
 
 
 @pytest.mark.parametrize(("name", "told"), [("night", False), ("still", True)])

@@ -1,4 +1,4 @@
-"""From where an edited drive is watched: the recorded path, beside it, faster or slower."""
+"""The camera path of an edited drive: recorded, offset, faster or slower."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def seconds(path: CameraPath) -> np.ndarray:
 
 
 @pytest.mark.parametrize("motion", [straight, circle])
-def test_without_steps_of_its_own_the_camera_takes_the_recorded_path(motion):
+def test_without_ego_steps_the_camera_follows_the_recorded_path(motion):
     scene = scene_of(motion)
     path = edited_camera_path(
         scene, "CAM_FRONT", FPS, Edit.model_validate({"steps": [{"stop": {"track": "x", "at": 1}}]}), ""
@@ -72,21 +72,21 @@ def test_without_steps_of_its_own_the_camera_takes_the_recorded_path(motion):
 
 
 @pytest.mark.parametrize("motion", [straight, circle])
-def test_beside_its_way_it_takes_the_path_of_a_film_beside_it(motion):
+def test_a_lateral_offset_equals_that_of_a_film_trajectory(motion):
     beside = film_path(scene_of(motion), "CAM_FRONT", FPS, TrajectorySettings(lateral=2.0))
     path = edited(motion, {"lateral": 1.5}, {"lateral": 0.5})
     np.testing.assert_array_equal(path.timestamps, beside.timestamps)
     np.testing.assert_allclose(path.camera_to_world, beside.camera_to_world, atol=1e-9)
 
 
-def test_at_half_its_speed_it_covers_half_of_its_path_while_the_world_runs_on():
+def test_at_half_speed_the_camera_covers_half_of_its_path_in_the_same_time():
     path = edited(circle, {"speed": 0.5})
     assert len(path) == 10 * FPS + 1 and seconds(path)[-1] == pytest.approx(10.0 + DELAY)
     expected = np.stack([circle(DELAY + 0.5 * (t - DELAY)) for t in seconds(path)])
     np.testing.assert_allclose(cars(path), expected, atol=1e-4)
 
 
-def test_a_camera_that_stands_watches_from_where_it_began():
+def test_at_speed_zero_the_camera_stays_at_its_start():
     path = edited(straight, {"speed": 0.0})
     assert len(path) == 10 * FPS + 1
     np.testing.assert_allclose(path.camera_to_world, np.tile(path.camera_to_world[0], (len(path), 1, 1)), atol=1e-9)
@@ -94,14 +94,14 @@ def test_a_camera_that_stands_watches_from_where_it_began():
 
 
 @pytest.mark.parametrize("factor", [1.25, 2.0])
-def test_a_faster_cameras_film_ends_where_the_recorded_path_does(factor):
+def test_the_film_of_a_faster_camera_ends_where_the_recorded_path_does(factor):
     path = edited(straight, {"speed": factor})
     assert len(path) == int(10.0 / factor * FPS) + 1
     np.testing.assert_allclose(cars(path)[:, 0, 3], SPEED * (DELAY + factor * (seconds(path) - DELAY)), atol=1e-4)
     assert cars(path)[-1, 0, 3] == pytest.approx(SPEED * (10.0 + DELAY), abs=1e-4)
 
 
-def test_speeds_come_in_smoothly_and_multiply():
+def test_ego_speeds_change_smoothly_and_multiply():
     path = edited(
         straight, {"speed": 0.5, "start": 2.0, "duration": 2.0}, {"speed": 0.5, "start": 6.0, "duration": 2.0}
     )
@@ -111,7 +111,7 @@ def test_speeds_come_in_smoothly_and_multiply():
 
 
 @pytest.mark.parametrize("motion", [straight, circle])
-def test_changing_lanes_the_car_points_where_it_drives(motion):
+def test_in_a_lane_change_the_ego_vehicle_points_along_its_motion(motion):
     path = edited(motion, {"lateral": 3.5, "start": 3.0, "duration": 3.0})
     recorded = film_path(scene_of(motion), "CAM_FRONT", FPS, TrajectorySettings()).camera_to_world
     early = seconds(path) <= 3.0
@@ -130,15 +130,17 @@ def test_changing_lanes_the_car_points_where_it_drives(motion):
     assert veers.max() > 12.0
 
 
-def test_a_camera_that_the_scene_does_not_hold_is_refused():
+def test_an_unknown_camera_is_refused():
     with pytest.raises(DatasetError, match="no image of camera CAM_LEFT"):
         edit = Edit.model_validate({"steps": [{"ego": {"speed": 2}}]})
         edited_camera_path(scene_of(straight), "CAM_LEFT", FPS, edit, "")
 
 
-def test_a_step_that_begins_after_the_drive_is_refused():
+def test_a_step_that_starts_after_the_drive_is_refused():
     scene = scene_of(straight)
     end = scene.seconds(recorded_frames(scene, "CAM_FRONT")[-1].timestamp)
     edit = Edit.model_validate({"steps": [{"ego": {"lateral": 1}}, {"ego": {"speed": 0.5, "start": 100.0}}]})
-    with pytest.raises(ConfigError, match=rf"^here, step 2 \(ego\): the drive ends before 'start': at {end:.2f} s$"):
+    with pytest.raises(
+        ConfigError, match=rf"^here, step 2 \(ego\): 'start' is not before the end of the drive \({end:.2f} s\)$"
+    ):
         edited_camera_path(scene, "CAM_FRONT", FPS, edit, "here")

@@ -1,4 +1,4 @@
-"""A model with its actors as an edit wants them: who changes, where it then is, and that nothing else changes."""
+"""Gaussians of an edited model: actors are placed where the edit moves them, and nothing else changes."""
 
 from dataclasses import fields, replace
 from typing import Any
@@ -19,9 +19,9 @@ from helpers.hand_made_street import (
 )
 from helpers.hand_made_traffic import placed
 
-from drivesplat.editing.cast import Role, edited_cast
+from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import actor_placements, actors_of
+from drivesplat.editing.film import actor_placements, editable_actors
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -36,7 +36,7 @@ from drivesplat.settings.render import FilmFormat, TrajectorySettings
 LAST = 4.5
 """The tiny drive's first image is at 0, its last at this second."""
 TIMES = np.array([0.0, 1.3, 2.2, 3.1, LAST])
-"""At the third the actor that is gone for a while is absent."""
+"""At the third the actor GONE is absent."""
 
 
 def an_edit(*steps: dict[str, Any]) -> Edit:
@@ -53,14 +53,16 @@ def model() -> SplatModel:
     return street_model()
 
 
-def cast(model: SplatModel, scene: Scene, *steps: dict[str, Any]) -> list[Role]:
-    return edited_cast(actors_of(model, scene, "here"), an_edit(*steps), "here")
+def edited(model: SplatModel, scene: Scene, *steps: dict[str, Any]) -> list[EditedActor]:
+    return edited_actors(editable_actors(model, scene, "here"), an_edit(*steps), "here")
 
 
-def staged(model: SplatModel, scene: Scene, *steps: dict[str, Any], times: np.ndarray = TIMES) -> list[Gaussians]:
-    """What is there at `times` after these steps."""
-    present = actor_placements(cast(model, scene, *steps), times)
-    return [model.gaussians_with_placements(float(time), shown) for time, shown in zip(times, present, strict=True)]
+def edited_gaussians(
+    model: SplatModel, scene: Scene, *steps: dict[str, Any], times: np.ndarray = TIMES
+) -> list[Gaussians]:
+    """The Gaussians at `times` after these steps."""
+    placed = actor_placements(edited(model, scene, *steps), times)
+    return [model.gaussians_with_placements(float(time), actors) for time, actors in zip(times, placed, strict=True)]
 
 
 def rows_of(model: SplatModel, *names: str) -> torch.Tensor:
@@ -81,7 +83,7 @@ STEPS = {
     "rescale": (TURNING,),
     "ego": (),
 }
-"""Kinds of steps, and whom the one below changes."""
+"""Kinds of steps, and the actors that the step below changes."""
 STEP = {
     "remove": {"remove": {"track": AHEAD}},
     "speed": {"speed": {"track": AHEAD, "factor": 0.5}},
@@ -97,11 +99,11 @@ STEP = {
 
 
 @pytest.mark.parametrize("kind", STEPS)
-def test_no_parameter_of_anything_that_an_edit_does_not_name_changes(model, scene, kind):
+def test_parameters_of_unnamed_actors_do_not_change(model, scene, kind):
     before = {key: value.clone() for key, value in model.state_dict().items()}
     others = ~rows_of(model, *STEPS[kind])
     differs = False
-    for time, edited in zip(TIMES, staged(model, scene, STEP[kind]), strict=True):
+    for time, edited in zip(TIMES, edited_gaussians(model, scene, STEP[kind]), strict=True):
         recorded = model.gaussians_at(float(time))
         for field in fields(Gaussians):
             now, then = (getattr(gaussians, field.name)[: len(model)] for gaussians in (edited, recorded))
@@ -125,10 +127,10 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in STEPS if kind != "ego"])
-def test_no_pixel_changes_that_the_edited_actor_does_not_reach(model, scene, kind):
+def test_only_pixels_reached_by_the_edited_actor_change(model, scene, kind):
     """Where its own alpha, alone, is under 1/255 at its old and at its new place."""
     changed = []
-    for time, edited in zip(TIMES, staged(model, scene, STEP[kind]), strict=True):
+    for time, edited in zip(TIMES, edited_gaussians(model, scene, STEP[kind]), strict=True):
         view, recorded = view_at(scene, time), model.gaussians_at(float(time))
         own = rows_of(model, *STEPS[kind])
         own_now = torch.cat([own, torch.ones(len(edited) - len(own), dtype=torch.bool)])
@@ -154,9 +156,9 @@ NOTHING = {
 
 
 @pytest.mark.parametrize("steps", NOTHING.values(), ids=NOTHING)
-def test_an_edit_that_changes_nothing_leaves_the_pixels_as_recorded(model, scene, steps):
+def test_an_edit_without_effect_leaves_the_pixels_as_recorded(model, scene, steps):
     """By a rounding of float32: no value of a picture differs by more than 0.002, none of its bytes by more than 1."""
-    for time, edited in zip(TIMES, staged(model, scene, *steps), strict=True):
+    for time, edited in zip(TIMES, edited_gaussians(model, scene, *steps), strict=True):
         view = view_at(scene, time)
         then, now = (model.render(view, gaussians=gaussians).image for gaussians in (None, edited))
         assert (then - now).abs().max() < 0.002
@@ -195,7 +197,7 @@ def left_of(pose: np.ndarray, metres: float, degrees: float = 0.0) -> np.ndarray
 
 
 def braked(seconds: float) -> float:
-    """How many seconds of its way it has come that brakes to rest from second 1 to 3: its pace falls along the quintic
+    """Seconds of its path covered by an actor that brakes from second 1 to 3: its pace falls along the quintic
     from 1 to 0 that has neither jolt nor jump, of which this is the integral."""
     x = np.clip((seconds - 1.0) / 2.0, 0.0, 1.0)
     return min(seconds, 1.0) + 2.0 * (x - (2.5 * x**4 - 3.0 * x**5 + x**6))
@@ -215,34 +217,38 @@ CLOSED_FORMS = {
 
 
 @pytest.mark.parametrize(("step", "pose"), CLOSED_FORMS.values(), ids=CLOSED_FORMS)
-def test_where_a_step_sends_an_actor_its_gaussians_are(model, scene, step, pose):
-    for time, edited in zip(TIMES, staged(model, scene, step), strict=True):
+def test_gaussians_are_placed_where_a_step_moves_their_actor(model, scene, step, pose):
+    for time, edited in zip(TIMES, edited_gaussians(model, scene, step), strict=True):
         assert_is(edited[rows_of(model, AHEAD)], model, AHEAD, time, pose(time), 1.0)
 
 
 @pytest.mark.parametrize("name", [AHEAD, TURNING])
-def test_who_is_enlarged_stands_where_it_stood(model, scene, name):
+def test_a_rescaled_actor_stands_on_its_recorded_ground(model, scene, name):
     """The box grows about the middle of its floor."""
-    motion = {actor.id: actor.motion for actor in actors_of(model, scene, "here")}[name]
-    for time, edited in zip(TIMES, staged(model, scene, {"rescale": {"track": name, "factor": 1.4}}), strict=True):
+    motion = {actor.id: actor.motion for actor in editable_actors(model, scene, "here")}[name]
+    for time, edited in zip(
+        TIMES, edited_gaussians(model, scene, {"rescale": {"track": name, "factor": 1.4}}), strict=True
+    ):
         stood = motion.poses(np.array([time]))[0]
         pose = stood @ rigid(np.eye(3), np.array([0.0, 0.0, 0.4 * DRIVERS[name].size[2] / 2]))
         assert_is(edited[rows_of(model, name)], model, name, time, pose, 1.4)
 
 
-def test_who_is_removed_is_absent(model, scene):
+def test_a_removed_actor_is_absent(model, scene):
     own = rows_of(model, AHEAD)
-    for time, edited in zip(TIMES, staged(model, scene, {"remove": {"track": "6e5c"}}), strict=True):
+    for time, edited in zip(TIMES, edited_gaussians(model, scene, {"remove": {"track": "6e5c"}}), strict=True):
         assert (edited.opacities[own] == 0).all() and len(edited) == len(model)
         view, without = view_at(scene, time), model.gaussians_at(float(time))[~own]
         assert torch.equal(model.render(view, gaussians=edited).image, model.render(view, gaussians=without).image)
 
 
-def test_each_of_two_that_swap_is_in_the_others_place_on_the_same_ground(model, scene):
+def test_swapped_actors_are_in_each_others_place_on_the_ground(model, scene):
     """At the other's times, too: the truck is a metre and a half higher and absent for a while."""
-    motions = {actor.id: actor.motion for actor in actors_of(model, scene, "here")}
+    motions = {actor.id: actor.motion for actor in editable_actors(model, scene, "here")}
     heights = {name: driver.size[2] for name, driver in DRIVERS.items()}
-    for time, edited in zip(TIMES, staged(model, scene, {"swap": {"track": AHEAD, "with": GONE}}), strict=True):
+    for time, edited in zip(
+        TIMES, edited_gaussians(model, scene, {"swap": {"track": AHEAD, "with": GONE}}), strict=True
+    ):
         for name, other in ((AHEAD, GONE), (GONE, AHEAD)):
             found, there = edited[rows_of(model, name)], motions[other].present(np.array([time]))[0]
             assert bool((found.opacities > 0).any()) == there
@@ -251,14 +257,14 @@ def test_each_of_two_that_swap_is_in_the_others_place_on_the_same_ground(model, 
                 assert_is(found, model, name, time, raised(pose, (heights[name] - heights[other]) / 2), 1.0)
 
 
-def test_a_duplicate_is_there_beside_its_original(model, scene):
+def test_a_duplicate_appears_beside_its_original(model, scene):
     steps = [
         {"duplicate": {"track": AHEAD, "as": "behind", "longitudinal": -6.0, "lateral": 2.0}},
         {"duplicate": {"track": AHEAD, "as": "later", "delay": 1.0}},
         {"shift": {"track": "later", "lateral": -3.0}},
     ]
     own = rows_of(model, AHEAD)
-    for time, edited in zip(TIMES, staged(model, scene, *steps), strict=True):
+    for time, edited in zip(TIMES, edited_gaussians(model, scene, *steps), strict=True):
         recorded, count = model.gaussians_at(float(time)), int(own.sum())
         assert len(edited) == len(model) + 2 * count
         assert torch.equal(edited.means[: len(model)], recorded.means)
@@ -268,10 +274,11 @@ def test_a_duplicate_is_there_beside_its_original(model, scene):
         assert_is(copies[1], model, AHEAD, time, left_of(straight(time - 1.0), -3.0), 1.0)
 
 
-def test_where_it_was_not_annotated_an_actor_is_absent_until_it_is_made_to_drive_on(model, scene):
+def test_an_actor_is_absent_in_gaps_of_its_track_unless_its_pace_is_edited(model, scene):
     rows = rows_of(model, GONE)
     shifted, slow = (
-        staged(model, scene, step) for step in (STEP["shift"], {"speed": {"track": GONE, "to": 1.0, "start": 1.0}})
+        edited_gaussians(model, scene, step)
+        for step in (STEP["shift"], {"speed": {"track": GONE, "to": 1.0, "start": 1.0}})
     )
     assert [bool((edited.opacities[rows] > 0).any()) for edited in shifted] == [False, True, False, True, False]
     assert [bool((edited.opacities[rows] > 0).any()) for edited in slow] == [False, True, True, True, True]

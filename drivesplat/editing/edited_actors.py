@@ -1,0 +1,188 @@
+"""The actors of an edited drive: the recorded actors after every step of an edit."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from drivesplat.editing.actor_path import ActorPath, recorded_path
+from drivesplat.editing.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
+from drivesplat.errors import ConfigError
+from drivesplat.scene.motion import Motion
+from drivesplat.scene.tracks import beginnings
+from drivesplat.settings.edit import Duplicate, Edit, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
+
+MIN_DISTANCE = 0.5
+"""Metres; an actor that moves less counts as standing, since annotations are noisy."""
+LOOKAHEAD = 60.0
+"""Seconds past the end of a track in which that distance counts."""
+
+
+@dataclass(frozen=True)
+class RecordedActor:
+    """An object before any edit: `size` (3,) is length, width, height in metres."""
+
+    id: str
+    category: str
+    size: np.ndarray
+    motion: Motion
+
+
+@dataclass(frozen=True)
+class EditedActor:
+    """An actor of an edited drive: `id` is a track's or the name of a duplicate. It has the Gaussians of the track
+    `source`, scaled by `scale` about the box centre to `size` (3,) metres. Unless `edited` it moves as recorded."""
+
+    id: str
+    source: str
+    scale: float
+    category: str
+    size: np.ndarray
+    edited: bool
+    path: ActorPath = field(repr=False)
+
+    def present(self, times: np.ndarray) -> np.ndarray:
+        """Whether the actor is present at `times` (n,) in film seconds: (n,) bool."""
+        return self.path.present(np.asarray(times, dtype=np.float64))
+
+    def poses(self, times: np.ndarray) -> np.ndarray:
+        """Object to world (n, 4, 4) at `times` (n,) in film seconds, at the centre of the scaled box."""
+        times = np.asarray(times, dtype=np.float64)
+        if not self.edited:
+            return self.path.trajectory.motion.poses(times)
+        return self.path.poses(times, float(self.size[2]))
+
+
+def edited_actors(
+    actors: Sequence[RecordedActor], edit: Edit, where: str, other_ids: Collection[str] = ()
+) -> list[EditedActor]:
+    """The actors after all steps of an edit: in their order without the removed ones, then the duplicates.
+
+    `other_ids` are those of tracks that cannot be edited; no duplicate may have one. Raises ConfigError, one line that
+    starts with `where` (the scene and the edit), if a step names an unknown track, changes nothing or contradicts an
+    earlier step.
+    """
+    state = _EditState({actor.id: _as_recorded(actor) for actor in actors}, {}, frozenset(other_ids))
+    for number, step in enumerate(edit.steps, start=1):
+        try:
+            state = _after_step(state, step, number)
+        except _StepError as error:
+            raise ConfigError(f"{where}, step {number} ({step.kind}): {error}") from None
+    return list(state.actors.values())
+
+
+def _as_recorded(actor: RecordedActor) -> EditedActor:
+    path = recorded_path(actor.motion, float(actor.size[2]))
+    return EditedActor(actor.id, actor.id, 1.0, actor.category, actor.size, False, path)
+
+
+class _StepError(Exception):
+    """The problem with a step, without its number."""
+
+
+@dataclass(frozen=True)
+class _EditState:
+    """The actors after some steps by id; per removed id the number of the step that removed it; ids of other tracks."""
+
+    actors: dict[str, EditedActor]
+    removed: dict[str, int]
+    other_ids: frozenset[str]
+
+    def find(self, name: str) -> EditedActor:
+        """The actor with that id, or the only one whose id starts with it."""
+        known = [*self.actors, *self.removed]
+        found = [name] if name in known else [other for other in known if other.startswith(name)]
+        short = beginnings(known)
+        remaining = ", ".join(short[other] for other in self.actors) or "none"
+        if not found:
+            raise _StepError(f"no editable track has an id starting with {name!r}; editable tracks: {remaining}")
+        if len(found) > 1:
+            matches = ", ".join(short[other] for other in found)
+            raise _StepError(f"{len(found)} tracks have ids starting with {name!r}: {matches}; give more characters")
+        if found[0] in self.removed:
+            number = self.removed[found[0]]
+            raise _StepError(f"track {short[found[0]]} was removed by step {number}; remaining tracks: {remaining}")
+        return self.actors[found[0]]
+
+    def with_actors(self, *actors: EditedActor) -> "_EditState":
+        """The state with these actors replaced or added."""
+        return replace(self, actors=self.actors | {actor.id: actor for actor in actors})
+
+    def without(self, actor: EditedActor, number: int) -> "_EditState":
+        """The state after step `number` has removed an actor."""
+        remaining = {name: other for name, other in self.actors.items() if name != actor.id}
+        return replace(self, actors=remaining, removed=self.removed | {actor.id: number})
+
+
+def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
+    change = step.change
+    if step.kind == "ego":
+        return state
+    actor = state.find(change.track)
+    match change:
+        case Swap():
+            return _swapped(state, actor, change)
+        case Duplicate():
+            return _duplicated(state, actor, change)
+        case Rescale():
+            scale, size = actor.scale * change.factor, actor.size * change.factor
+            return state.with_actors(replace(actor, scale=scale, size=size, edited=True))
+        case Speed() | Stop() | Reverse() | Shift():
+            return state.with_actors(replace(actor, path=_changed_path(actor.path, change), edited=True))
+        case _:
+            return state.without(actor, number)
+
+
+def _changed_path(path: ActorPath, change: Speed | Stop | Reverse | Shift) -> ActorPath:
+    match change:
+        case Speed():
+            _require_present(path, change.start, "start", may_precede=True)
+            if change.factor is not None:
+                _require_moving(path, change.start)
+            return apply_speed(path, change)
+        case Stop():
+            _require_present(path, change.at, "at", may_precede=False)
+            return apply_stop(path, change)
+        case Reverse():
+            return apply_reverse(path, change)
+        case Shift():
+            _require_present(path, change.start, "start", may_precede=True)
+            return apply_shift(path, change)
+
+
+def _require_present(path: ActorPath, second: float | None, key: str, may_precede: bool) -> None:
+    """A change after the track has no effect; one before it has, if it `may_precede` the track."""
+    if second is None or bool(path.present(np.array([second]))[0]):
+        return
+    if second <= path.end and (may_precede or second >= path.begin):
+        return
+    problem = "ends before" if second > path.end else "begins after"
+    raise _StepError(
+        f"the track {problem} {key!r} ({second:g} s): it was recorded from {path.begin:.2f} to {path.end:.2f} s"
+    )
+
+
+def _require_moving(path: ActorPath, start: float | None) -> None:
+    """A speed factor has no effect on a standing actor."""
+    begin = max(path.begin, start or 0.0)
+    first, last = path.distance(np.array([begin, max(begin, path.end) + LOOKAHEAD]))
+    if abs(last - first) < MIN_DISTANCE:
+        raise _StepError(f"the track stands from {begin:.2f} s on, where 'factor' has no effect; use 'to'")
+
+
+def _swapped(state: _EditState, actor: EditedActor, swap: Swap) -> _EditState:
+    other = state.find(swap.other)
+    if other.id == actor.id:
+        raise _StepError(f"{swap.track!r} and {swap.other!r} are the same track; name two tracks")
+    return state.with_actors(replace(actor, path=other.path, edited=True), replace(other, path=actor.path, edited=True))
+
+
+def _duplicated(state: _EditState, actor: EditedActor, duplicate: Duplicate) -> _EditState:
+    taken = [*state.actors, *state.removed]
+    if duplicate.name in taken:
+        used = ", ".join(beginnings(taken).values())
+        raise _StepError(f"the name {duplicate.name!r} in 'as' is already used; names in use: {used}")
+    if duplicate.name in state.other_ids:
+        raise _StepError(f"the name {duplicate.name!r} in 'as' is the id of another track; choose another name")
+    path = apply_duplicate(actor.path, duplicate)
+    return state.with_actors(replace(actor, id=duplicate.name, path=path, edited=True))
