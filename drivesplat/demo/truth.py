@@ -14,7 +14,7 @@ from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.demo.rig import Sensor, height_of
 from drivesplat.demo.tables import token
 from drivesplat.io.storage import atomic_write
-from drivesplat.scene.truth import TRUTH_FILE, Truth, TruthFrame, write_truth_file
+from drivesplat.readers.truth import TRUTH_FILE, Truth, TruthFrame, write_truth_file
 
 LEFT = 2.0
 """How far (metres) to the own car's left the other view lies."""

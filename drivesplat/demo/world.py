@@ -16,7 +16,7 @@ from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor, firing_times, hei
 from drivesplat.demo.tables import NuScenesTables
 from drivesplat.demo.truth import write_truth, write_truth_frame
 from drivesplat.io.storage import atomic_write, canonical_json, sha256_text
-from drivesplat.scene.truth import TruthFrame
+from drivesplat.readers.truth import TruthFrame
 from drivesplat.settings.world import WorldJob, WorldSettings
 
 log = logging.getLogger(__name__)

@@ -24,11 +24,11 @@ from drivesplat.machine.device import telling_out_of_memory
 from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
+from drivesplat.readers.truth import read_truth
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import REGIONS, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import image_size
-from drivesplat.scene.truth import read_truth
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.lidar_depth import LidarDepthJob

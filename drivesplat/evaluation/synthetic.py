@@ -16,13 +16,13 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
+from drivesplat.readers.truth import Truth, TruthFrame, truth_image
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at
-from drivesplat.scene.truth import Truth, TruthFrame, truth_image
 
 LATERAL_REGIONS = ("all", "static")
 REMOVAL_REGIONS = ("box", "outside")

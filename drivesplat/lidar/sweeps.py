@@ -1,47 +1,16 @@
 """LiDAR sweeps in world coordinates, without the own car and without what moves."""
 
-import logging
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 
 from drivesplat.errors import DatasetError
+from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.rigid import apply
-from drivesplat.scene.scene import Scene, Sweep, place_of
+from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.scene.splits import Group, sweep_groups
 from drivesplat.scene.tracks import Box
 from drivesplat.settings.holdout import HoldoutSettings
-
-log = logging.getLogger(__name__)
-
-_RECORD = 5
-"""nuScenes' .pcd.bin: x, y, z (metres, sensor frame), intensity, ring; five float32 a return."""
-
-
-def read_sweep(sweep: Sweep) -> np.ndarray:
-    """The returns (n, 3) of a sweep in its sensor's frame, metres, non-finite ones left out.
-
-    Raises DatasetError naming the sample_data token and the path where the file is missing, truncated or empty.
-    """
-    fault = sweep_fault(sweep)
-    if fault:
-        leave_out = "" if sweep.is_key_frame else "lidar_seed.sweeps: false to do without all between key frames, or "
-        raise DatasetError(f"{fault}; restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it")
-    points = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, _RECORD)[:, :3]
-    return points[np.isfinite(points).all(axis=1)].astype(np.float64)
-
-
-def sweep_fault(sweep: Sweep) -> str | None:
-    """What is wrong with a sweep's file, beside its sample_data token and path, or None."""
-    path = Path(sweep.path)
-    where = f"{place_of(sweep)}: LiDAR file {path}"
-    if not path.is_file():
-        return f"{where} is missing"
-    size = path.stat().st_size
-    if size == 0 or size % (4 * _RECORD):
-        return f"{where} is corrupt ({size} bytes are no whole number of returns)"
-    return None
 
 
 def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:
@@ -68,7 +37,7 @@ def returns_of(
     found = []
     for sweep in sweeps_of(scene, holdout, groups):
         with suppress(DatasetError):
-            points = without_own_car(read_sweep(sweep), own_car_radius)
+            points = without_own_car(read_returns(sweep).points, own_car_radius)
             found.append((sweep, apply(sweep.sensor_to_world, points)))
     return found
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers import reader
+from drivesplat.readers.datasets import reader
 from drivesplat.scene.scene import Frame, Scene, place_of
 from drivesplat.scene.scene_warnings import cautions, luminance
 from drivesplat.settings.extract import SceneSource

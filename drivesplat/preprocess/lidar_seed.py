@@ -18,9 +18,10 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud, read_positions
 from drivesplat.io.prefetch import ahead
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
-from drivesplat.lidar.sweeps import outside_boxes, read_sweep, sweep_fault, thin, without_own_car
+from drivesplat.lidar.sweeps import outside_boxes, thin, without_own_car
 from drivesplat.poses.triangulated import mean_over_views, seen_in
 from drivesplat.preprocess.far_points import far_points, uncovered
+from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.regions import fill, hulls_in
@@ -94,7 +95,7 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
     moving = tracks_that_move(scene)
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
         try:
-            points = read_sweep(sweep)
+            points = read_returns(sweep).points
         except DatasetError:
             if settings.on_missing == "stop":
                 raise

@@ -3,7 +3,7 @@
 Frames of reference. World: metres, z up, the axes of the dataset's global frame, its origin moved to the first ego
 position (`Scene.origin`, kept in float64). Camera: OpenCV (x right, y down, z forward). Intrinsics: OpenCV (integer
 coordinates at pixel centres), in pixels of the recorded image. Object: x forward, y left, z up, at the box centre.
-Ego: nuScenes (x forward, y left, z up, on the ground under the rear axle). Timestamps: microseconds.
+Ego: x forward, y left, z up, on the ground under the rear axle. Timestamps: microseconds.
 """
 
 from dataclasses import dataclass, field
@@ -15,6 +15,7 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import read_json, unreadable, write_json
 from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.sensors import Camera, Lidar
 
 SCHEMA = 1
 REFINED = "scene_refined.json"
@@ -23,7 +24,8 @@ REFINED = "scene_refined.json"
 
 @dataclass(frozen=True)
 class Frame:
-    """One image. `intrinsics` (3, 3); `camera_to_world`, `ego_to_world` (4, 4) at the image's own timestamp."""
+    """One image. `intrinsics` (3, 3); `camera_to_world`, `ego_to_world` (4, 4) at the image's own timestamp. `camera` is a
+    name in `Scene.cameras`."""
 
     camera: str
     timestamp: int
@@ -40,7 +42,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One LiDAR revolution. `sensor_to_world` (4, 4) at the sweep's timestamp; `path` may be missing on disk."""
+    """One LiDAR revolution. `sensor_to_world` (4, 4) at the sweep's timestamp; `path` may be missing on disk. `lidar` is
+    a name in `Scene.lidars`; `reader` (a key of `drivesplat.readers.sweeps.SWEEP_FILES`) reads it."""
 
     path: str
     timestamp: int
@@ -48,6 +51,8 @@ class Sweep:
     is_key_frame: bool
     sample_index: int
     token: str
+    lidar: str
+    reader: str
 
 
 @dataclass(frozen=True)
@@ -74,8 +79,9 @@ class Scene:
     """A recorded drive.
 
     `key_frame_timestamps` (n,): key frame i is `sample_index` i. `origin` (3,): global = world + origin. `poses` names
-    where the poses come from ('nuscenes', 'refined', 'images'); `key_frame_range` the dataset's key frames
-    [first, last + 1) that were read, None for all.
+    where the poses come from (a reader, 'refined', 'images'); `key_frame_hz` is the nominal rate of key frames;
+    `key_frame_range` the dataset's key frames [first, last + 1) that were read, None for all. `cameras` and `lidars`
+    are the sensors that frames and sweeps name.
     """
 
     name: str
@@ -88,15 +94,18 @@ class Scene:
     sweeps: tuple[Sweep, ...]
     tracks: tuple[Track, ...]
     poses: str
+    key_frame_hz: float
     key_frame_range: list[int] | None = None
     missing_images: int = 0
+    cameras: tuple[Camera, ...] = ()
+    lidars: tuple[Lidar, ...] = ()
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
     def key_frame_interval(self) -> float:
-        """The median time between key frames, in microseconds (nuScenes: 500,000)."""
+        """The median time between key frames, in microseconds."""
         if len(self.key_frame_timestamps) < 2:
-            return 500_000.0
+            return 1e6 / self.key_frame_hz
         return float(np.median(np.diff(self.key_frame_timestamps)))
 
     def seconds(self, timestamp: int | np.integer) -> float:
@@ -132,7 +141,7 @@ class Scene:
 def place_of(recording: Frame | Sweep) -> str:
     """Which recording it is, for messages: its key frame, or the nearest one, and its token."""
     where = "" if recording.is_key_frame else "between key frames, nearest "
-    return f"{where}key frame {recording.sample_index}, sample_data {recording.token}"
+    return f"{where}key frame {recording.sample_index}, token {recording.token}"
 
 
 _ARRAYS = {
@@ -147,8 +156,10 @@ _ARRAYS = {
     "sample_indices": np.int64,
     "visibility": np.int64,
     "key_frame_timestamps": np.int64,
+    "distortion": np.float64,
+    "beam_elevations": np.float64,
 }
-_RECORDS: dict[str, type] = {"frames": Frame, "sweeps": Sweep, "tracks": Track}
+_RECORDS: dict[str, type] = {"frames": Frame, "sweeps": Sweep, "tracks": Track, "cameras": Camera, "lidars": Lidar}
 
 
 def write_scene(path: str | Path, scene: Scene) -> None:
@@ -183,7 +194,7 @@ def _to_plain(record: Any) -> dict[str, Any]:
 def _from_plain(kind: type, plain: dict[str, Any]) -> Any:
     values = {}
     for name, value in plain.items():
-        if name in _ARRAYS:
+        if name in _ARRAYS and value is not None:
             values[name] = np.array(value, dtype=_ARRAYS[name])
         elif name in _RECORDS:
             values[name] = tuple(_from_plain(_RECORDS[name], item) for item in value)

@@ -4,9 +4,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from drivesplat.readers import layout
+from drivesplat.readers.datasets import layout
+from drivesplat.readers.truth import TRUTH_FILE
 from drivesplat.scene.scene import REFINED
-from drivesplat.scene.truth import TRUTH_FILE
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.workflow.stages import refines_poses, training_inputs

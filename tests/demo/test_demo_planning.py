@@ -12,7 +12,7 @@ from helpers import REPOSITORY
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.machine.device import choose_device
 from drivesplat.readers.nuscenes.layout import TABLES
-from drivesplat.scene.truth import TRUTH_FILE
+from drivesplat.readers.truth import TRUTH_FILE
 from drivesplat.settings.config import load
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.workflow.plan import Plan

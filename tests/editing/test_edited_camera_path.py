@@ -43,7 +43,7 @@ def scene_of(motion) -> Scene:
 
     frames = [frame("CAM_FRONT", DELAY + i / 12) for i in range(121)]
     frames.append(frame("CAM_BACK", 0.0))
-    return Scene("drive", "made", "v1", "", np.zeros(3), np.array([START]), tuple(frames), (), (), "made")
+    return Scene("drive", "made", "v1", "", np.zeros(3), np.array([START]), tuple(frames), (), (), "made", 2.0)
 
 
 def edited(motion, *ego: dict) -> CameraPath:

@@ -24,11 +24,11 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View, view_of
 from drivesplat.preprocess.extract import extract_scene
+from drivesplat.readers.truth import Truth, TruthFrame, read_truth, truth_image
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at, boxes_at
-from drivesplat.scene.truth import Truth, TruthFrame, read_truth, truth_image
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings

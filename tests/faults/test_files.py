@@ -21,12 +21,12 @@ from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.poses.triangulated import read_triangulated
+from drivesplat.readers.truth import read_truth
 from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.scene import read_scene
 from drivesplat.scene.training_record import read_parser
-from drivesplat.scene.truth import read_truth
 from drivesplat.training.resume_state import resumable
 from drivesplat.training.run import read_summary
 

@@ -92,6 +92,7 @@ def drive_of(
     whole = {
         "name": "made", "dataset": "made", "version": "none", "description": "", "origin": np.zeros(3),
         "key_frame_timestamps": times, "frames": tuple(frames), "sweeps": (), "tracks": (), "poses": "nuscenes",
+        "key_frame_hz": 2.0,
     }  # fmt: skip
     return Drive(Scene(**{**whole, **fields}), np.stack(truth))
 

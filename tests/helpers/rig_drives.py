@@ -33,7 +33,19 @@ def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = KEY_FRAMES
         sweeps.append(_sweep(folder, recorder, index))
     times = START_US + KEY_FRAME_US * np.arange(key_frames)
     zero = np.zeros(3)
-    return Scene("rig", "demo", "v1.0-mini", "", zero, times, tuple(frames), tuple(sweeps), (), poses="nuscenes")
+    return Scene(
+        "rig",
+        "demo",
+        "v1.0-mini",
+        "",
+        zero,
+        times,
+        tuple(frames),
+        tuple(sweeps),
+        (),
+        poses="nuscenes",
+        key_frame_hz=2.0,
+    )
 
 
 def _frame(folder: Path, recorder: Recorder, sensor: Sensor, index: int) -> Frame:
@@ -52,7 +64,9 @@ def _sweep(folder: Path, recorder: Recorder, index: int) -> Sweep:
     points, _ = recorder.sweep(sensor, index * KEY_FRAME_US)
     points.tofile(path)
     sensor_to_world = recorder.ego_to_street(index * KEY_FRAME_US * 1e-6) @ sensor.sensor_to_ego
-    return Sweep(str(path), START_US + index * KEY_FRAME_US, sensor_to_world, True, index, path.stem)
+    return Sweep(
+        str(path), START_US + index * KEY_FRAME_US, sensor_to_world, True, index, path.stem, "LIDAR_TOP", "nuscenes"
+    )
 
 
 def true_body(camera: str, width: int = 160, seconds: float = 1.0) -> np.ndarray:

@@ -19,11 +19,11 @@ from drivesplat.lidar.movers import Mover, movers
 from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
+from drivesplat.readers.truth import read_truth
 from drivesplat.scene.ego_mask import OwnCar
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
-from drivesplat.scene.truth import read_truth
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
 

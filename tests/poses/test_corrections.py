@@ -102,7 +102,8 @@ def scene_of() -> Scene:
     times = drive.scene.key_frame_timestamps
     lidar = rigid(np.eye(3), np.array([0.9, 0.0, 1.8]))
     sweeps = tuple(
-        Sweep(f"{i}.bin", int(time), ego_at(time * 1e-6) @ lidar, True, i, str(i)) for i, time in enumerate(times)
+        Sweep(f"{i}.bin", int(time), ego_at(time * 1e-6) @ lidar, True, i, str(i), "LIDAR_TOP", "nuscenes")
+        for i, time in enumerate(times)
     )
     ahead = rigid(Rotation.from_euler("z", 0.3).as_matrix(), np.array([10.0, 1.0, 0.8]))
     boxes = np.stack([ego_at(time * 1e-6) @ ahead for time in times])

@@ -54,7 +54,9 @@ def filmed(recorder: Recorder, folder: Path) -> tuple[Scene, np.ndarray]:
         )
         for thing in recorder.things if thing.category
     ]  # fmt: skip
-    scene = Scene("demo", "demo", "v1.0-mini", "", np.zeros(3), times, tuple(frames), (), tuple(tracks), "nuscenes")
+    scene = Scene(
+        "demo", "demo", "v1.0-mini", "", np.zeros(3), times, tuple(frames), (), tuple(tracks), "nuscenes", 2.0
+    )
     return scene, np.stack(truth)
 
 

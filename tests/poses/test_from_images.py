@@ -95,7 +95,7 @@ def sweeps_of(folder: Path, scene: Scene, way, error, points, stretch) -> tuple[
         returns[:, :3] = apply(inverse(pose @ LIDAR), points) * (stretch(i) if stretch else 1.0)
         returns.tofile(path)
         recorded = pose @ (error or nowhere(way))(time * 1e-6)
-        sweeps.append(Sweep(str(path), int(time), recorded @ LIDAR, True, i, str(i)))
+        sweeps.append(Sweep(str(path), int(time), recorded @ LIDAR, True, i, str(i), "LIDAR_TOP", "nuscenes"))
     return tuple(sweeps)
 
 

@@ -15,10 +15,11 @@ from plyfile import PlyData, PlyElement
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
-from drivesplat.lidar.sweeps import outside_boxes, read_sweep, thin, without_own_car
+from drivesplat.lidar.sweeps import outside_boxes, thin, without_own_car
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.far_points import far_points, uncovered
 from drivesplat.preprocess.lidar_seed import color_view, lidar_points, seed_points
+from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import OwnCar
 from drivesplat.scene.images import project
 from drivesplat.scene.regions import fill, hull_of
@@ -490,7 +491,7 @@ def test_returns_that_are_not_finite_are_left_out(root):
     returns[3, 0], returns[7, 2] = np.nan, np.inf
     returns.tofile(sweep.path)
     expected = np.delete(returns, [3, 7], axis=0)[:, :3]
-    np.testing.assert_array_equal(read_sweep(sweep), expected.astype(np.float64))
+    np.testing.assert_array_equal(read_returns(sweep).points, expected.astype(np.float64))
 
 
 def test_1_4_million_points_are_thinned_and_coloured_over_30_views_within_half_a_minute():

@@ -11,10 +11,10 @@ from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 from PIL import Image
 
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.lidar.sweeps import read_sweep
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.masks import NO_SKY, make_masks
 from drivesplat.preprocess.sky_mask import sky_mask
+from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import OwnCar
 from drivesplat.scene.images import project, read_image
 from drivesplat.scene.masks import UNLABELLED, mask_name, read_classes, read_labels, read_masks_record, read_sky_mask
@@ -98,7 +98,7 @@ def test_the_record_says_how_much_of_the_images_is_sky(tiny_scene, made):
 def test_no_sky_lies_where_lidar_returns(tiny_scene, made):
     for frame in tiny_scene.frames[::2]:
         sweep = min(tiny_scene.sweeps, key=lambda s: abs(s.timestamp - frame.timestamp))
-        at, depth = project(apply(sweep.sensor_to_world, read_sweep(sweep)), inverse(frame.camera_to_world), K)
+        at, depth = project(apply(sweep.sensor_to_world, read_returns(sweep).points), inverse(frame.camera_to_world), K)
         inside = (depth > 1.0) & (at >= 0).all(axis=1) & (at < SIZE).all(axis=1)
         columns, rows = at[inside].astype(int).T
         assert len(rows) > 100

@@ -15,6 +15,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.readers.nuscenes.layout import TABLES, find_root, table_files
+from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.lidar_seed import SeedJob
@@ -551,3 +552,23 @@ def camera_pose(tables: dict, frame: Frame) -> np.ndarray:
         tables["calibrated_sensor"][data["calibrated_sensor_token"]],
     )
     return pose_of(ego["translation"], ego["rotation"]) @ pose_of(sensor["translation"], sensor["rotation"])
+
+
+def test_the_sensors_of_the_tiny_drive_are_told(tiny_root):
+    scene = extract_scene(source(), tiny_root)
+    (camera,), (lidar,) = scene.cameras, scene.lidars
+    assert (camera.name, camera.width, camera.height) == ("CAM_FRONT", 96, 54)
+    np.testing.assert_array_equal(camera.intrinsics, World().intrinsics)
+    assert not camera.distortion.any() and camera.readout_s is None and camera.readout_direction is None
+    assert lidar.name == "LIDAR_TOP" and {sweep.lidar for sweep in scene.sweeps} == {lidar.name}
+    np.testing.assert_allclose(np.degrees(lidar.beam_elevations[[0, -1]]), [-30.67, 10.67])
+
+
+def test_the_returns_of_a_sweep_have_their_intensity_and_ring(root):
+    sweep = extract_scene(source(), root).sweeps[3]
+    file = np.array([[1.0, 2.0, 3.0, 51.0, 7.0], [np.nan, 0.0, 0.0, 1.0, 1.0], [4.0, 5.0, -6.0, 255.0, 31.0]])
+    file.astype(np.float32).tofile(sweep.path)
+    returns = read_returns(sweep)
+    np.testing.assert_array_equal(returns.points, [[1.0, 2.0, 3.0], [4.0, 5.0, -6.0]])
+    np.testing.assert_allclose(returns.intensity, [0.2, 1.0])
+    assert returns.rings.tolist() == [7, 31] and returns.offsets_s is None

@@ -59,7 +59,7 @@ def frame_at(microseconds: int, motion: Motion, camera: str = "CAM_FRONT") -> Fr
 
 
 def scene_of(frames: list[Frame]) -> Scene:
-    return Scene("bend", "made", "v1", "", np.zeros(3), np.array([START_US]), tuple(frames), (), (), "made")
+    return Scene("bend", "made", "v1", "", np.zeros(3), np.array([START_US]), tuple(frames), (), (), "made", 2.0)
 
 
 def drive(motion: Motion, seconds: float = 10.0, rate: float = 2.0) -> Scene:

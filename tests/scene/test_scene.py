@@ -9,6 +9,7 @@ from helpers.classed import classed
 
 from drivesplat.errors import ResultError
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track, read_scene, write_scene
+from drivesplat.scene.sensors import Camera, Lidar
 
 
 def pose(seed: int) -> np.ndarray:
@@ -21,14 +22,16 @@ def some_scene(times: tuple[int, ...] = (1_532_402_927_647_951, 1_532_402_928_14
     intrinsics = np.array([[1266.417203046554, 0.0, 816.2670197447984], [0.0, 1266.4, 491.507], [0.0, 0.0, 1.0]])
     frame = Frame("CAM_FRONT", first - 35_000, "/data/ä.jpg", 1600, 900, intrinsics, pose(1), pose(2), True, 0, "a")
     between = dataclasses.replace(frame, timestamp=first + 10, is_key_frame=False, token="b")
-    sweep = Sweep("/data/a.pcd.bin", first, pose(3), True, 0, "c")
+    sweep = Sweep("/data/a.pcd.bin", first, pose(3), True, 0, "c", "LIDAR_TOP", "nuscenes")
     track = Track(
         "instance", *classed("vehicle.car"), np.array([4.1, 1.9, 1.7]), np.array([first, last]), np.array([0, 1]),
         np.stack([pose(4), pose(5)]), np.array([4, 0]),
     )  # fmt: skip
     return Scene(
         "0061", "nuscenes", "v1.0-mini", "Parked truck, ä", np.array([411.3039349319818, 1180.8903791765097, 0.1]),
-        np.array(times), (frame, between), (sweep,), (track,), "refined", [0, 2], 3, {"stages": {"extract": {}}},
+        np.array(times), (frame, between), (sweep,), (track,), "refined", 2.0, [0, 2], 3,
+        (Camera("CAM_FRONT", 1600, 900, intrinsics, np.zeros(5), 0.03, "down"), Camera("CAM_BACK", 8, 9, intrinsics)),
+        (Lidar("LIDAR_TOP", np.array([-0.1, 0.1]), 1085), Lidar("LIDAR_SIDE")), {"stages": {"extract": {}}},
     )  # fmt: skip
 
 

@@ -26,9 +26,11 @@ def drive(key_frames: int, cameras=("CAM_FRONT", "CAM_BACK"), between: int = 5) 
             )
     for step in range((key_frames - 1) * 10 + 1):
         index, part = divmod(step, 10)
-        sweeps.append(Sweep("", step * INTERVAL // 10, np.eye(4), part == 0, index, f"sweep {step}"))
+        sweeps.append(
+            Sweep("", step * INTERVAL // 10, np.eye(4), part == 0, index, f"sweep {step}", "LIDAR_TOP", "nuscenes")
+        )
     times = np.arange(key_frames) * INTERVAL
-    return Scene("0001", "", "", "", np.zeros(3), times, tuple(frames), tuple(sweeps), (), "nuscenes")
+    return Scene("0001", "", "", "", np.zeros(3), times, tuple(frames), tuple(sweeps), (), "nuscenes", 2.0)
 
 
 def held_out(count: int, **settings) -> tuple[list[int], list[int]]:

@@ -18,7 +18,7 @@ from drivesplat.machine.doctor.torch_builds import Capability, Card, read_cards
 from drivesplat.machine.gsplat_build import diagnose
 from drivesplat.machine.gsplat_build.installed import build_record, compiled_extension, package_folder
 from drivesplat.machine.gsplat_build.toolkit import nvcc_release, own_home, system_homes
-from drivesplat.readers import layout
+from drivesplat.readers.datasets import layout
 from drivesplat.settings.config import Config, load, merged
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD, LpipsSettings
 

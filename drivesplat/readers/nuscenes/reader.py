@@ -4,6 +4,7 @@ nuScenes fires its cameras and its LiDAR at different times, so every image and 
 record, never the key frame's. The tables' quaternions are w, x, y, z; box sizes are width, length, height.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,16 @@ from drivesplat.readers.checks import checked_intrinsics, checked_pose, checked_
 from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
+from drivesplat.scene.sensors import Camera, Lidar
 from drivesplat.settings.extract import SceneSource
 
+READER = "nuscenes"
+KEY_FRAME_HZ = 2.0
 LIDAR = "LIDAR_TOP"
+BEAM_ELEVATIONS = np.radians(np.linspace(-30.67, 10.67, 32))
+AZIMUTH_STEPS = 1085
+"""Of the LiDAR, a Velodyne HDL-32E at 20 Hz (data sheet 63-9113): its 32 beams, lowest first as rings count, fire every
+46.08 microseconds, so that revolutions differ by one or two firings."""
 
 
 def read(root: Path, source: SceneSource) -> Scene:
@@ -40,28 +48,34 @@ def read(root: Path, source: SceneSource) -> Scene:
     times = require_increasing([s["timestamp"] for s in samples], [s["token"] for s in samples], "sample")
     origin = _origin(tables, samples[0], cameras)
     scene = Scene(
-        name,
-        "",
-        version,
-        record.get("description", ""),
-        origin,
-        times,
-        (),
-        (),
-        (),
-        "nuscenes",
-        list(frames) if frames else None,
+        name=name,
+        dataset="",
+        version=version,
+        description=record.get("description", ""),
+        origin=origin,
+        key_frame_timestamps=times,
+        frames=(),
+        sweeps=(),
+        tracks=(),
+        poses=READER,
+        key_frame_hz=KEY_FRAME_HZ,
+        key_frame_range=list(frames) if frames else None,
     )
-    return Scene(
-        **{
-            **vars(scene),
-            "frames": tuple(
-                f for camera in cameras for f in _frames(tables, root, samples, camera, source.sweeps, scene)
-            ),
-            "sweeps": tuple(_sweeps(tables, root, samples, source.lidar_sweeps, scene)),
-            "tracks": tuple(_tracks(tables, samples, origin)),
-        }
+    images = [f for camera in cameras for f in _frames(tables, root, samples, camera, source.sweeps, scene)]
+    sweeps = tuple(_sweeps(tables, root, samples, source.lidar_sweeps, scene))
+    return dataclasses.replace(
+        scene,
+        frames=tuple(images),
+        sweeps=sweeps,
+        tracks=tuple(_tracks(tables, samples, origin)),
+        cameras=tuple({frame.camera: _camera(frame) for frame in images}.values()),
+        lidars=(Lidar(LIDAR, BEAM_ELEVATIONS, AZIMUTH_STEPS),) if sweeps else (),
     )
+
+
+def _camera(frame: Frame) -> Camera:
+    """The camera of a frame; nuScenes' images are rectified, and of its shutters nothing is said."""
+    return Camera(frame.camera, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5))
 
 
 def _load(root: Path, version: str) -> Any:
@@ -170,7 +184,14 @@ def _sweeps(tables: Any, root: Path, samples: list[dict], sweeps: bool, scene: S
         _, sensor_to_world, _ = _place(tables, data, scene)
         index = _index(data, index_of_sample, scene)
         yield Sweep(
-            str(root / data["filename"]), data["timestamp"], sensor_to_world, data["is_key_frame"], index, data["token"]
+            str(root / data["filename"]),
+            data["timestamp"],
+            sensor_to_world,
+            data["is_key_frame"],
+            index,
+            data["token"],
+            LIDAR,
+            "nuscenes",
         )
 
 

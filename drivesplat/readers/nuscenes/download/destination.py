@@ -6,7 +6,7 @@ Cheap to import: the Snakefile asks before any job runs.
 from pathlib import Path
 
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.readers import layout
+from drivesplat.readers.datasets import layout
 from drivesplat.settings.config import Config
 from drivesplat.settings.download import DownloadJob
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers import layout
+from drivesplat.readers.datasets import layout
 from drivesplat.readers.nuscenes.download.destination import dataroot, is_there, refuse
 from drivesplat.readers.nuscenes.download.disk import require_space
 from drivesplat.readers.nuscenes.download.fetch import fetch, part_of, size_of

@@ -1,0 +1,35 @@
+"""LiDAR sweeps from the files of any dataset."""
+
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from drivesplat.errors import DatasetError
+from drivesplat.scene.scene import Sweep, place_of
+from drivesplat.scene.sensors import LidarReturns
+
+SWEEP_FILES = {"nuscenes": "drivesplat.readers.nuscenes.sweep_file"}
+"""By reader, the module with `read_file` and `file_fault`."""
+
+
+def read_returns(sweep: Sweep) -> LidarReturns:
+    """The returns of a sweep, those without finite coordinates left out.
+
+    Raises DatasetError naming the sweep's token and path where the file is missing, truncated or empty.
+    """
+    fault = sweep_fault(sweep)
+    if fault:
+        leave_out = "" if sweep.is_key_frame else "lidar_seed.sweeps: false to do without all between key frames, or "
+        raise DatasetError(f"{fault}; restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it")
+    return _files(sweep).read_file(Path(sweep.path))
+
+
+def sweep_fault(sweep: Sweep) -> str | None:
+    """What is wrong with a sweep's file, with its token and path; None where nothing is."""
+    path = Path(sweep.path)
+    fault = _files(sweep).file_fault(path) if path.is_file() else "is missing"
+    return f"{place_of(sweep)}: LiDAR file {path} {fault}" if fault else None
+
+
+def _files(sweep: Sweep) -> ModuleType:
+    return import_module(SWEEP_FILES[sweep.reader])

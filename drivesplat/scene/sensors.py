@@ -1,0 +1,45 @@
+"""Cameras and LiDARs, and what a LiDAR returns."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera. `width`, `height` in pixels; `intrinsics` (3, 3), OpenCV (integer coordinates at pixel centres);
+    `distortion` OpenCV's coefficients, all 0 where images are rectified. `readout_s` seconds from the first line of
+    pixels to the last, read in `readout_direction`. None where the dataset does not say."""
+
+    name: str
+    width: int
+    height: int
+    intrinsics: np.ndarray
+    distortion: np.ndarray | None = None
+    readout_s: float | None = None
+    readout_direction: Literal["down", "up", "left", "right"] | None = None
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """A spinning LiDAR. `beam_elevations` (b,) radians over the sensor's horizontal plane, in the order of rings;
+    `azimuth_steps` firings of a beam in one revolution. None where the dataset does not say."""
+
+    name: str
+    beam_elevations: np.ndarray | None = None
+    azimuth_steps: int | None = None
+
+
+@dataclass(frozen=True)
+class LidarReturns:
+    """The n returns of a sweep. `points` (n, 3) float64, metres, in the sensor's frame at the sweep's timestamp.
+
+    None where the file does not say: `intensity` (n,) float32 in [0, 1]; `rings` (n,) int64, indices of
+    `Lidar.beam_elevations`; `offsets_s` (n,) float64, seconds after the sweep's timestamp.
+    """
+
+    points: np.ndarray
+    intensity: np.ndarray | None = None
+    rings: np.ndarray | None = None
+    offsets_s: np.ndarray | None = None

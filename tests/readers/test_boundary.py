@@ -1,0 +1,37 @@
+"""Nothing past the readers knows a dataset's class names, tables or files."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import drivesplat
+from drivesplat.readers.nuscenes.layout import TABLES
+
+LIBRARY = Path(drivesplat.__file__).parent
+KNOWING = ("readers", "demo")
+WORDS_OF_ITS_OWN = ("calibrated_sensor", "ego_pose", "sample_annotation", "sample_data")
+"""The tables whose names are no plain words."""
+DATASETS_OWN = re.compile(
+    r"\b(vehicle|human|movable_object|static_object)\.[a-z_]|\"(vehicle|human)\.\"|\.pcd\b|LIDAR_TOP|KEY_FRAME_US|"
+    r"\b500_?000\.0|_token\"\]|" + "|".join(rf"\b{name}\b" for name in WORDS_OF_ITS_OWN)
+)
+ALLOWED = {"settings/world.py"}
+"""The settings of the demo's writer, whose channels are nuScenes'."""
+
+
+def modules() -> list[Path]:
+    found = (path.relative_to(LIBRARY) for path in LIBRARY.rglob("*.py") if "__pycache__" not in path.parts)
+    return sorted(path for path in found if path.parts[0] not in KNOWING and path.as_posix() not in ALLOWED)
+
+
+@pytest.mark.parametrize("module", modules(), ids=str)
+def test_no_module_past_the_readers_knows_nuscenes_class_names_tables_or_files(module):
+    lines = (LIBRARY / module).read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if DATASETS_OWN.search(line)] == []
+
+
+def test_the_words_looked_for_are_those_that_the_reader_knows():
+    readers = "\n".join(path.read_text(encoding="utf-8") for path in (LIBRARY / "readers" / "nuscenes").glob("*.py"))
+    found = {match.group() for match in DATASETS_OWN.finditer(readers)}
+    assert found >= {"vehicle.c", ".pcd", "LIDAR_TOP", *WORDS_OF_ITS_OWN} and set(WORDS_OF_ITS_OWN) < set(TABLES)
