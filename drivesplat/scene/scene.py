@@ -24,8 +24,8 @@ REFINED = "scene_refined.json"
 
 @dataclass(frozen=True)
 class Frame:
-    """One image. `intrinsics` (3, 3); `camera_to_world`, `ego_to_world` (4, 4) at the image's own timestamp. `camera` is a
-    name in `Scene.cameras`."""
+    """One image. `camera` is a name in `Scene.cameras`; `intrinsics` (3, 3); `camera_to_world`, `ego_to_world` (4, 4)
+    at the image's own timestamp."""
 
     camera: str
     timestamp: int
@@ -42,8 +42,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One LiDAR revolution. `sensor_to_world` (4, 4) at the sweep's timestamp; `path` may be missing on disk. `lidar` is
-    a name in `Scene.lidars`; `reader` (a key of `drivesplat.readers.sweeps.SWEEP_FILES`) reads it."""
+    """One LiDAR revolution. `sensor_to_world` (4, 4) at the sweep's timestamp; `path` may be missing on disk. `lidar`
+    is a name in `Scene.lidars`; `reader` (a key of `drivesplat.readers.sweeps.SWEEP_FILES`) reads it."""
 
     path: str
     timestamp: int

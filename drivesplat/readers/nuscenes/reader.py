@@ -24,7 +24,7 @@ KEY_FRAME_HZ = 2.0
 LIDAR = "LIDAR_TOP"
 BEAM_ELEVATIONS = np.radians(np.linspace(-30.67, 10.67, 32))
 AZIMUTH_STEPS = 1085
-"""Of the LiDAR, a Velodyne HDL-32E at 20 Hz (data sheet 63-9113): its 32 beams, lowest first as rings count, fire every
+"""Of the LiDAR, a Velodyne HDL-32E at 20 Hz (its user's manual): its 32 beams, lowest first as rings count, fire every
 46.08 microseconds, so that revolutions differ by one or two firings."""
 
 
