@@ -5,7 +5,6 @@ It is what this workflow's training is held to, so nothing here follows what is 
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor, nn
 
 from drivesplat.model.background import Background
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.gaussians import GaussianSettings
 
 FULL_LENGTH = 30_000
@@ -86,9 +86,9 @@ class PlainRecipe:
         )
 
 
-def scene_scale(parser: dict[str, Any]) -> float:
+def scene_scale(record: TrainingRecord) -> float:
     """What the rate of means counts in, in metres."""
-    return SCALE_MARGIN * parser["scene_scale"]
+    return SCALE_MARGIN * record.scene_scale
 
 
 def started(points: np.ndarray, colors: np.ndarray, seed: int) -> Splats:
@@ -124,6 +124,6 @@ def make_optimizers(splats: Splats, scale: float) -> Optimizers:
     }
 
 
-def as_model(splats: dict[str, Tensor], parser: dict[str, Any]) -> SplatModel:
+def as_model(splats: dict[str, Tensor], record: TrainingRecord) -> SplatModel:
     """What was trained, as a model that this workflow measures: a background before black."""
-    return SplatModel([Background(dict(splats), GaussianSettings(), parser["scene_scale"])], sky=None)
+    return SplatModel([Background(dict(splats), GaussianSettings(), record.scene_scale)], sky=None)

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Iterator
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,18 +13,18 @@ from torch.utils.data import DataLoader, Dataset
 
 from drivesplat.io.prefetch import ahead
 from drivesplat.scene.images import read_image, write_png
-from drivesplat.scene.training_record import image_size
+from drivesplat.scene.training_record import TrainingRecord
 
 MANY_WORKERS = "This DataLoader will create"
 """How torch warns of more processes than processors, of which gsplat's example has so many nonetheless."""
 
 
 class ImageFiles(Dataset):
-    """The training images of a parser record; `paths` are files of their size."""
+    """The training images of a training record; `paths` are files of their size."""
 
-    def __init__(self, parser: dict[str, Any], paths: list[str]):
-        self._parser = parser
-        self._images = [int(i) for i in parser["splits"]["train"]]
+    def __init__(self, record: TrainingRecord, paths: list[str]):
+        self._record = record
+        self._images = record.train_images
         self._paths = paths
 
     def __len__(self) -> int:
@@ -37,18 +36,18 @@ class ImageFiles(Dataset):
         with Image.open(self._paths[item]) as image:
             pixels = np.array(image.convert("RGB"))
         return {
-            "K": torch.from_numpy(self._parser["Ks"][index]).float(),
-            "camtoworld": torch.from_numpy(self._parser["camtoworlds"][index]).float(),
+            "K": torch.from_numpy(self._record.Ks[index]).float(),
+            "camtoworld": torch.from_numpy(self._record.camtoworlds[index]).float(),
             "image": torch.from_numpy(pixels).float(),
         }
 
 
-def files_of_size(parser: dict[str, Any], folder: Path) -> list[str]:
+def files_of_size(record: TrainingRecord, folder: Path) -> list[str]:
     """Files of the training images at the size they are trained at: the recorded ones where they have it, else PNGs in
     `folder`, made once, as the example keeps reduced copies of a scene's images."""
 
     def file_of(index: int) -> str:
-        recorded, size = parser["image_paths"][index], image_size(parser, index)
+        recorded, size = record.image_paths[index], record.image_size(index)
         with Image.open(recorded) as image:
             if image.size == size:
                 return recorded
@@ -57,7 +56,7 @@ def files_of_size(parser: dict[str, Any], folder: Path) -> list[str]:
             write_png(reduced, read_image(recorded, size))
         return str(reduced)
 
-    return list(ahead(file_of, [int(i) for i in parser["splits"]["train"]]))
+    return list(ahead(file_of, record.train_images))
 
 
 def loader_of(images: Dataset, workers: int, device: torch.device) -> DataLoader:

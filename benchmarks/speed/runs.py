@@ -28,7 +28,7 @@ from drivesplat.provenance.record import provenance
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.prepared_drive import read_recording
-from drivesplat.scene.training_record import read_parser
+from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training.clock import UNTIMED, Clock, StageClock
@@ -51,8 +51,8 @@ def run(task: Task) -> dict[str, Any]:
     """
     shutil.rmtree(task.folder, ignore_errors=True)
     with held_device(task.device) as device:
-        parser = read_parser(task.files.parser)
-        paths = files_of_size(parser, task.images)
+        record = read_training_record(task.files.parser)
+        paths = files_of_size(record, task.images)
         before = Moment.now()
         times, model = plain(task, device, paths) if task.recipe == "plain" else ours(task, device)
         elsewhere = busy_elsewhere(before, Moment.now())
@@ -66,10 +66,10 @@ def run(task: Task) -> dict[str, Any]:
             "device": device_name(device),
             "processors": os.cpu_count(),
             "busy_elsewhere": elsewhere,
-            "cap_max": gaussian_cap(parser, task.train.train),
+            "cap_max": gaussian_cap(record, task.train.train),
             **times,
-            "dataset": parser["scene"]["dataset"],
-            "protocol": protocol(parser, masks, task.evaluate),
+            "dataset": record.scene.dataset,
+            "protocol": protocol(record, masks, task.evaluate),
             "result": groups,
         }
 
@@ -77,15 +77,15 @@ def run(task: Task) -> dict[str, Any]:
 def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, SplatModel]:
     """A training by the plain recipe, and its model."""
     began = time.monotonic()
-    parser = read_parser(task.files.parser)
-    cap = gaussian_cap(parser, task.train.train)
-    kept = some_of(len(parser["points"]), cap)
-    splats = started(parser["points"][kept], parser["points_rgb"][kept], task.seed).to(device)
+    record = read_training_record(task.files.parser)
+    cap = gaussian_cap(record, task.train.train)
+    kept = some_of(len(record.points), cap)
+    splats = started(record.points[kept], record.points_rgb[kept], task.seed).to(device)
     recipe = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers)
-    summary = fit(splats, ImageFiles(parser, paths), scene_scale(parser), recipe, task.folder)
+    summary = fit(splats, ImageFiles(record, paths), scene_scale(record), recipe, task.folder)
     costs = {key: getattr(summary, key) for key in ("gaussians", "peak_gpu_memory_gb", "ssim")}
     times = {"loop": summary.seconds, "whole": summary.ended - began, **costs}
-    return times, as_model({name: value.detach() for name, value in splats.items()}, parser)
+    return times, as_model({name: value.detach() for name, value in splats.items()}, record)
 
 
 def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
@@ -119,12 +119,12 @@ def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:
 
 
 def _profile_plain(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
-    parser = read_parser(task.files.parser)
+    record = read_training_record(task.files.parser)
     splats = as_splats(load(task.folder / CHECKPOINT, rule="train")["splats"]).to(device)
-    cap = gaussian_cap(parser, task.train.train)
+    cap = gaussian_cap(record, task.train.train)
     recipe = PlainRecipe(Schedule.of_trained(iterations), cap, task.seed, task.workers)
-    images = ImageFiles(parser, files_of_size(parser, task.images))
-    fit(splats, images, scene_scale(parser), recipe, _aside(task), clock)
+    images = ImageFiles(record, files_of_size(record, task.images))
+    fit(splats, images, scene_scale(record), recipe, _aside(task), clock)
     shutil.rmtree(_aside(task))
 
 

@@ -28,8 +28,8 @@ def _group(recording: Recording, camera: str, images: list[int]) -> dict[str, fl
     their static pixels' mean colour has in place of a rendering, which a model has to beat; None without such pixels or
     where all are alike.
     """
-    places = recording.parser["camtoworlds"][:, :3, 3]
-    training = [i for i in recording.parser["splits"]["train"] if recording.frame(int(i)).camera == camera]
+    places = recording.record.camtoworlds[:, :3, 3]
+    training = [i for i in recording.record.train_images if recording.frame(i).camera == camera]
     distances = np.linalg.norm(places[images][:, None] - places[training], axis=2)
     lumas, count, sums, squares = [], 0, np.zeros(3), np.zeros(3)
     for index in images:

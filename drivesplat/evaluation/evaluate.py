@@ -28,7 +28,7 @@ from drivesplat.readers.truth import read_truth
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import REGIONS, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS
-from drivesplat.scene.training_record import image_size
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -63,7 +63,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     """One method on the images that it has not seen, and against the truth where there is any."""
     model, device = open_model(inputs.checkpoint, device_settings)
     unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
-    parser, summary = inputs.recording.parser, inputs.summary
+    record, summary = inputs.recording.record, inputs.summary
     with telling_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
         groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
@@ -71,10 +71,10 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
         shown = held_out_pair(model, inputs.recording, job.eval_camera, device)
     record = {
         "schema": 1,
-        "scene": parser["scene"]["name"],
-        "dataset": parser["scene"]["dataset"],
-        "protocol": protocol(parser, inputs.masks_record, job),
-        "drive": drive_record(inputs.recording, job.eval_camera, measured_images(parser, job.eval_camera)),
+        "scene": record.scene.name,
+        "dataset": record.scene.dataset,
+        "protocol": protocol(record, inputs.masks_record, job),
+        "drive": drive_record(inputs.recording, job.eval_camera, measured_images(record, job.eval_camera)),
         "result": {
             **groups,
             **against,
@@ -104,27 +104,27 @@ def against_truth(
     return {**({"lateral": lateral} if lateral else {}), **({"removal": removal} if removal else {})}
 
 
-def protocol(parser: dict[str, Any], masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
+def protocol(record: TrainingRecord, masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
     """What every figure must be read with."""
-    measured = [i for images in measured_images(parser, job.eval_camera).values() for i in images]
-    width, height = image_size(parser, measured[0] if measured else 0)
+    measured = [i for images in measured_images(record, job.eval_camera).values() for i in images]
+    width, height = record.image_size(measured[0] if measured else 0)
     return {
-        "version": parser["scene"]["version"],
+        "version": record.scene.version,
         "cameras": list(job.cameras),
         "eval_camera": job.eval_camera,
         "width": width,
         "height": height,
         "sweeps": job.sweeps,
         "holdout": job.holdout.model_dump(),
-        "held_out_frames": parser["held_out_frames"],
-        "train_images": len(parser["splits"]["train"]),
-        "poses": parser["scene"]["poses"],
+        "held_out_frames": record.held_out_frames,
+        "train_images": len(record.train_images),
+        "poses": record.scene.poses,
         "regions": masks_record["regions"],
         "own_car": masks_record["own_car"].get(job.eval_camera),
-        "extra_points": parser["seed"]["extra_points"],
-        "lidar_missing": parser["seed"]["lidar_missing"],
-        "images_missing": parser["scene"]["missing_images"],
-        "key_frame_range": parser["scene"]["key_frame_range"],
+        "extra_points": record.seed.extra_points,
+        "lidar_missing": record.seed.lidar_missing,
+        "images_missing": record.scene.missing_images,
+        "key_frame_range": record.scene.key_frame_range,
     }
 
 
@@ -146,7 +146,7 @@ def held_out_depths(recording: Recording, camera: str, job: LidarDepthJob) -> di
     whose sweep is missing are left out."""
     scene = recording.scene
     clouds = {cloud.sample_index: cloud for cloud in clouds_of(scene, job, HELD_OUT_GROUPS)}
-    images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.parser, group, camera)]
+    images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.record, group, camera)]
     owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
     return {i: depths_in(scene, scene.frames[i], cloud, job, recording.own_car(i)) for i, cloud in owned.items()}
 
@@ -163,7 +163,7 @@ def evaluate_groups(
     their numbers; with several cameras `overlap` and `no_overlap`, the static pixels where others look, too, and where
     none does."""
     of_group = partial(_group, model, recording, lpips_map, device, depths)
-    return {group: of_group(images) for group, images in measured_images(recording.parser, camera).items()}
+    return {group: of_group(images) for group, images in measured_images(recording.record, camera).items()}
 
 
 def _group(
@@ -175,13 +175,13 @@ def _group(
     images: list[int],
 ) -> dict[str, Any]:
     """The metrics of a held-out group of `images`."""
-    parser = recording.parser
-    rig = len(parser["camera_names"]) > 1
+    record = recording.record
+    rig = len(record.camera_names) > 1
     metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if rig else ()))), DepthErrors()
 
     def shown() -> Iterator[tuple[int, np.ndarray]]:
         for index in images:
-            image, metres = rendered_with_depth(model, view_of(parser, index, device))
+            image, metres = rendered_with_depth(model, view_of(record, index, device))
             if index in depths:
                 depth.add(metres, depths[index])
             yield index, image
@@ -190,7 +190,7 @@ def _group(
         index, image = one
         masks = region_masks(recording.labels(index))
         if rig:
-            masks |= overlap_masks(parser, index, masks["static"])
+            masks |= overlap_masks(record, index, masks["static"])
         return metrics.measured(image, recording.image(index), masks)
 
     for frame in ahead(measured, shown(), measuring_threads()):

@@ -30,13 +30,13 @@ def held_out_pair(model: SplatModel, recording: Recording, camera: str, device: 
     group, images = _candidates(recording, camera)
     moving = [int(region_mask(recording.labels(index), "moving_vehicle").sum()) for index in images]
     index = images[int(np.argmax(moving))] if any(moving) else images[len(images) // 2]
-    picture = rendered(model, view_of(recording.parser, index, device))
+    picture = rendered(model, view_of(recording.record, index, device))
     return Shown(group, index, recording.image(index), picture.clip(0.0, 1.0))
 
 
 def _candidates(recording: Recording, camera: str) -> tuple[str, list[int]]:
     for group in (*HELD_OUT_GROUPS, "train"):
-        images = held_out_images(recording.parser, group, camera)
+        images = held_out_images(recording.record, group, camera)
         if images:
             return group, images
     raise ValueError(f"no key frame of {camera} takes part")

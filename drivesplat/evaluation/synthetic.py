@@ -103,7 +103,7 @@ def lateral_metrics(
             to_left = inverse(np.array(truth.camera_to_global)) @ np.array(truth.lateral_camera_to_global)
             aside = dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ to_left)
             pose = torch.from_numpy(aside.camera_to_world).float().to(device)
-            view = dataclasses.replace(view_of(recording.parser, index, device), camera_to_world=pose)
+            view = dataclasses.replace(view_of(recording.record, index, device), camera_to_world=pose)
             yield aside, rendered(model, view), truth, recording.size(index)
 
     def measured(one: tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]) -> dict[str, FrameErrors]:
@@ -131,7 +131,7 @@ def removal_metrics(
             if seen is None:
                 continue
             box, inside = seen
-            view = view_of(recording.parser, index, device)
+            view = view_of(recording.record, index, device)
             with torch.no_grad():
                 gaussians = model.gaussians_at(view.time)
                 kept = gaussians[~removal_of(model, gaussians, box, margin).removed]

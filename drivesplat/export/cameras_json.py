@@ -6,7 +6,7 @@ import numpy as np
 
 from drivesplat.export.placement import placement
 from drivesplat.scene.scene import Frame, Scene
-from drivesplat.scene.training_record import image_size
+from drivesplat.scene.training_record import TrainingRecord
 
 SCHEMA = 1
 CONVENTIONS = {
@@ -23,17 +23,17 @@ CONVENTIONS = {
 }
 
 
-def cameras_record(scene: Scene, parser: dict[str, Any]) -> dict[str, Any]:
-    """The images of a scene as plain data in the order of `scene.frames`, of which `parser` is the training record.
+def cameras_record(scene: Scene, record: TrainingRecord) -> dict[str, Any]:
+    """The images of a scene as plain data in the order of `scene.frames`, of which `record` is the training record.
 
     Poses and `origin` keep their float64; sizes and K are those at which images are trained.
     """
-    split_of = {int(i): split for split, images in parser["splits"].items() for i in images}
+    split_of = {int(i): split for split, images in record.splits.items() for i in images}
     return {
         **placement(scene, SCHEMA, CONVENTIONS),
         "key_frame_timestamps": scene.key_frame_timestamps.tolist(),
         "images": [
-            _image(frame, parser["image_names"][i], image_size(parser, i), parser["Ks"][i], split_of[i])
+            _image(frame, record.image_names[i], record.image_size(i), record.Ks[i], split_of[i])
             for i, frame in enumerate(scene.frames)
         ],
     }

@@ -15,6 +15,7 @@ from drivesplat.export.trained_parts import digests, trained_gaussians, trained_
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import trained_model
 from drivesplat.scene.scene import Scene
+from drivesplat.scene.training_record import TrainingRecord
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +30,7 @@ class SplatFiles:
 
 
 def export_splat(
-    files: SplatFiles, checkpoint: dict[str, Any], parser: dict[str, Any], scene: Scene, provenance: dict[str, Any]
+    files: SplatFiles, checkpoint: dict[str, Any], record: TrainingRecord, scene: Scene, provenance: dict[str, Any]
 ) -> None:
     """Writes all Gaussians of a checkpoint's content: together as they stand when the middle image was taken, and part
     by part; with the recorded cameras.
@@ -41,6 +42,6 @@ def export_splat(
     groups = trained_groups(model, scene, np.array([frame.timestamp for frame in scene.frames]))
     note = {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)}
     write_splat_ply(files.splat, gaussians, note)
-    write_json(files.cameras, {**cameras_record(scene, parser), "provenance": provenance})
+    write_json(files.cameras, {**cameras_record(scene, record), "provenance": provenance})
     write_parts(files.parts, groups, scene, provenance)
     log.info("%d Gaussians, %d groups, %d images", len(gaussians), len(groups), len(scene.frames))

@@ -44,7 +44,7 @@ class Sight:
 
     @cached_property
     def view(self) -> View:
-        return view_of(self.drive.recording.parser, self.index, self.drive.device)
+        return view_of(self.drive.recording.record, self.index, self.drive.device)
 
     @property
     def frame(self) -> Frame:

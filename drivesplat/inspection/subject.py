@@ -18,7 +18,7 @@ MOVERS = REGIONS["moving_vehicle"]
 
 @dataclass(frozen=True)
 class Subject:
-    """A vehicle in one image. `index` counts the scene's frames, and the parser record's images; `label` is one of
+    """A vehicle in one image. `index` counts the scene's frames, and the training record's images; `label` is one of
     `regions.LABELS`; `visible` (h, w) bool the pixels of its hull that neither a nearer box nor the own car hides."""
 
     index: int
@@ -97,7 +97,7 @@ def described(subject: Subject, recording: Recording) -> dict[str, Any]:
         "label_value": LABELS[subject.label],
         "key_frame": subject.frame.sample_index,
         "timestamp": subject.frame.timestamp,
-        "image": recording.parser["image_names"][subject.index],
+        "image": recording.record.image_names[subject.index],
         "split": recording.split(subject.index),
         "distance_m": subject.hull.distance,
         "speed_m_s": box.speed,

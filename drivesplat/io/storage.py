@@ -23,6 +23,9 @@ from drivesplat.errors import ResultError
 
 ABANDONED_SECONDS = 3600.0
 
+Provenance = dict[str, Any]
+"""What a result was made of: a JSON document of settings, code and inputs (`drivesplat.provenance.record`)."""
+
 _PLAIN_GLOBALS = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),

@@ -16,6 +16,7 @@ from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.scene.actor_record import motion_of
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
 EXPOSED = "exposure.first."
@@ -28,12 +29,12 @@ FEW = 4
 
 @dataclass(frozen=True)
 class ModelInit:
-    """What a model is initialised from: the scene's parser record, the records of its `actors` (empty where none are
+    """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
     (3,) of every camera in `exposed`, whose exposure is learned, and for every camera in `posed`, whose poses are
     corrected, the times of its training images in seconds."""
 
-    parser: dict[str, Any]
+    record: TrainingRecord
     actors: list[dict[str, Any]]
     sky_color: np.ndarray
     classes: int = 0
@@ -41,11 +42,11 @@ class ModelInit:
     posed: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
 
-def gaussian_cap(parser: dict[str, Any], settings: TrainSettings) -> int:
-    """The most Gaussians a parser record's training images can hold: `cap_max`, or fewer where they have few pixels."""
+def gaussian_cap(record: TrainingRecord, settings: TrainSettings) -> int:
+    """The most Gaussians a scene's training images can hold: `cap_max`, or fewer where they have few pixels."""
     if not settings.pixels_per_gaussian:
         return settings.cap_max
-    pixels = int(parser["image_sizes"][parser["splits"]["train"]].prod(axis=1).sum())
+    pixels = int(record.image_sizes[record.splits["train"]].prod(axis=1).sum())
     return max(1, min(settings.cap_max, int(pixels / settings.pixels_per_gaussian)))
 
 
@@ -91,10 +92,10 @@ def rebuild_model(
 
 
 def _background(init: ModelInit, settings: TrainSettings) -> Part:
-    parser = init.parser
-    kept = some_of(len(parser["points"]), settings.cap_max)
-    positions, colors = parser["points"][kept], parser["points_rgb"][kept] / 255.0
-    return Background.from_points(positions, colors, settings.gaussians, parser["scene_scale"], init.classes)
+    record = init.record
+    kept = some_of(len(record.points), settings.cap_max)
+    positions, colors = record.points[kept], record.points_rgb[kept] / 255.0
+    return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes)
 
 
 def _background_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:

@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.scene.training_record import image_size
+from drivesplat.scene.training_record import TrainingRecord
 
 
 @dataclass(frozen=True)
@@ -39,20 +38,14 @@ class View:
         return torch.nn.functional.normalize(directions @ self.camera_to_world[:3, :3].T, dim=-1)
 
 
-def view_of(parser: dict[str, Any], index: int, device: torch.device) -> View:
-    """Image `index` of a parser record as a camera."""
-    width, height = image_size(parser, index)
-    seconds = float(parser["timestamps"][index] - parser["timestamps"].min()) * 1e-6
+def view_of(record: TrainingRecord, index: int, device: torch.device) -> View:
+    """Image `index` of a training record as a camera."""
+    width, height = record.image_size(index)
     return View(
-        K=torch.from_numpy(parser["Ks"][index]).float().to(device),
-        camera_to_world=torch.from_numpy(parser["camtoworlds"][index]).float().to(device),
+        K=torch.from_numpy(record.Ks[index]).float().to(device),
+        camera_to_world=torch.from_numpy(record.camtoworlds[index]).float().to(device),
         width=width,
         height=height,
-        time=seconds,
-        camera=camera_of(parser, index),
+        time=record.seconds(index),
+        camera=record.camera_name(index),
     )
-
-
-def camera_of(parser: dict[str, Any], index: int) -> str:
-    """The name of the camera that recorded image `index` of a parser record."""
-    return parser["camera_names"][parser["camera_indices"][index]]

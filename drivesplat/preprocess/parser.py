@@ -1,11 +1,7 @@
-"""The stage `parser`: what a trainer needs of a scene, in one pickle of plain containers and arrays.
-
-The dict has the keys that users of gsplat's example trainer will recognise. Frames: world (metres, z up), OpenCV
-cameras; `Ks` in the continuous pixel convention at `image_sizes`, the size at which images are trained and measured.
-"""
+"""The stage `parser`: what a trainer needs of a scene, in one record."""
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -14,17 +10,13 @@ from drivesplat.io.point_cloud import PointCloud
 from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames
+from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
 from drivesplat.settings.parser import ParserJob
 
 
-def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any]:
-    """The training record of a scene with N images and P seed points.
-
-    `Ks` (N, 3, 3), `camtoworlds` and `ego_to_world` (N, 4, 4), `image_sizes` (N, 2) width and height, `camera_indices`
-    (N,) of cameras, `timestamps` (N,) microseconds, `points` (P, 3), `points_rgb` (P, 3) uint8, `scene_scale` metres
-    (the farthest training camera from their mean), `splits`: indices of images by group. Raises DatasetError where no
-    training image is left.
-    """
+def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingRecord:
+    """The training record of a scene and its seed, without provenance. Raises DatasetError where no training image is
+    left."""
     frames = scene.frames
     sizes = [target_size(frame, job.images) for frame in frames]
     cameras = list(dict.fromkeys(frame.camera for frame in frames))
@@ -37,30 +29,30 @@ def parser_dict(scene: Scene, seed: PointCloud, job: ParserJob) -> dict[str, Any
         )
     camera_to_world = np.stack([frame.camera_to_world for frame in frames])
     centers = camera_to_world[splits["train"], :3, 3]
-    return {
-        "Ks": np.stack([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)]),
-        "camtoworlds": camera_to_world,
-        "ego_to_world": np.stack([frame.ego_to_world for frame in frames]),
-        "image_paths": [frame.image_path for frame in frames],
-        "image_names": [Path(frame.image_path).name for frame in frames],
-        "image_sizes": np.array(sizes, dtype=np.int64),
-        "camera_names": cameras,
-        "camera_indices": np.array([cameras.index(frame.camera) for frame in frames], dtype=np.int64),
-        "timestamps": np.array([frame.timestamp for frame in frames], dtype=np.int64),
-        "sample_indices": np.array([frame.sample_index for frame in frames], dtype=np.int64),
-        "is_key_frame": np.array([frame.is_key_frame for frame in frames], dtype=bool),
-        "points": seed.positions,
-        "points_rgb": seed.colors,
-        "scene_scale": max(1.0, float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())),
-        "splits": splits,
-        "held_out_frames": held_out_key_frames(len(scene.key_frame_timestamps), job.holdout),
-        "scene": {
-            "name": scene.name,
-            "dataset": scene.dataset,
-            "version": scene.version,
-            "poses": scene.poses,
-            "key_frame_range": scene.key_frame_range,
-            "missing_images": scene.missing_images,
-        },
-        "seed": {key: value for key, value in seed.note.items() if key != "provenance"},
-    }
+    return TrainingRecord(
+        Ks=np.stack([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)]),
+        camtoworlds=camera_to_world,
+        ego_to_world=np.stack([frame.ego_to_world for frame in frames]),
+        image_paths=[frame.image_path for frame in frames],
+        image_names=[Path(frame.image_path).name for frame in frames],
+        image_sizes=np.array(sizes, dtype=np.int64),
+        camera_names=cameras,
+        camera_indices=np.array([cameras.index(frame.camera) for frame in frames], dtype=np.int64),
+        timestamps=np.array([frame.timestamp for frame in frames], dtype=np.int64),
+        sample_indices=np.array([frame.sample_index for frame in frames], dtype=np.int64),
+        is_key_frame=np.array([frame.is_key_frame for frame in frames], dtype=bool),
+        points=seed.positions,
+        points_rgb=seed.colors,
+        scene_scale=max(1.0, float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())),
+        splits=splits,
+        held_out_frames=held_out_key_frames(len(scene.key_frame_timestamps), job.holdout),
+        scene=SceneInfo(
+            name=scene.name,
+            dataset=scene.dataset,
+            version=scene.version,
+            poses=scene.poses,
+            key_frame_range=scene.key_frame_range,
+            missing_images=scene.missing_images,
+        ),
+        seed=SeedInfo(**{key: value for key, value in seed.note.items() if key != "provenance"}),
+    )

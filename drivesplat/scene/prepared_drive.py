@@ -10,16 +10,16 @@ from drivesplat.scene.images import read_image
 from drivesplat.scene.masks import read_labels, read_masks_record
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import Frame, Scene, read_scene
-from drivesplat.scene.training_record import image_size, read_parser
+from drivesplat.scene.training_record import TrainingRecord, read_training_record
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A `scene`, the `parser` record made of it, whose images are the scene's frames in their order, and the folder
+    """A `scene`, the training `record` made of it, whose images are the scene's frames in their order, and the folder
     `masks` of the stage of that name; without it the labels are those of the scene's boxes."""
 
     scene: Scene
-    parser: dict[str, Any]
+    record: TrainingRecord
     masks: Path | None = None
 
     def frame(self, index: int) -> Frame:
@@ -27,7 +27,7 @@ class Recording:
 
     def size(self, index: int) -> tuple[int, int]:
         """Width and height in pixels at which an image is trained and measured."""
-        return image_size(self.parser, index)
+        return self.record.image_size(index)
 
     def image(self, index: int) -> np.ndarray:
         """A recorded image (h, w, 3) in [0, 1]."""
@@ -46,11 +46,11 @@ class Recording:
 
     def split(self, index: int) -> str | None:
         """What an image is used for: 'train', a held-out group or 'excluded'."""
-        return next((name for name, images in self.parser["splits"].items() if index in images), None)
+        return next((name for name, images in self.record.splits.items() if index in images), None)
 
 
 def read_recording(scene: str | Path, parser: str | Path, masks: str | Path) -> tuple[Recording, list[dict[str, Any]]]:
     """The recording of scene.json, parser.pkl and masks.json, and the provenances of these files."""
-    recording = Recording(read_scene(scene), read_parser(parser), Path(masks).parent)
+    recording = Recording(read_scene(scene), read_training_record(parser), Path(masks).parent)
     record = read_masks_record(recording.masks)
-    return recording, [recording.scene.provenance, recording.parser["provenance"], record["provenance"]]
+    return recording, [recording.scene.provenance, recording.record.provenance, record["provenance"]]

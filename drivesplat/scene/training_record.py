@@ -1,28 +1,129 @@
-"""What a training reads of a scene: the record in parser.pkl."""
+"""What training reads of a scene: the content of parser.pkl."""
 
+import dataclasses
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
 
-from drivesplat.io.storage import read_plain_pickle, unreadable
+from drivesplat.io.storage import Provenance, read_plain_pickle, unreadable, write_plain_pickle
+from drivesplat.io.typed_record import typed_record
 
-_KEYS = {
-    "Ks", "camtoworlds", "ego_to_world", "image_paths", "image_names", "image_sizes", "camera_names", "camera_indices",
-    "timestamps", "sample_indices", "is_key_frame", "points", "points_rgb", "scene_scale", "splits",
-    "held_out_frames", "scene", "seed",
-}  # fmt: skip
+RULE = "parser"
 
 
-def image_size(parser: dict[str, Any], index: int | np.integer) -> tuple[int, int]:
-    """Width and height in pixels at which image `index` of a parser record is trained and measured."""
-    width, height = parser["image_sizes"][index].tolist()
-    return width, height
+@dataclass(frozen=True)
+class SceneInfo:
+    """What the measuring protocol reports of the scene; fields as in `drivesplat.scene.scene.Scene`."""
+
+    name: str
+    dataset: str
+    version: str
+    poses: str
+    key_frame_range: list[int] | None = None
+    missing_images: int = 0
 
 
-def read_parser(path: str | Path) -> dict[str, Any]:
-    """Reads `parser.pkl`. Raises ResultError where it is not one, or holds anything but plain data and arrays."""
-    content = read_plain_pickle(path, rule="parser")
-    if not isinstance(content, dict) or not content.keys() >= _KEYS:
-        raise unreadable(path, "parser", "it lacks the keys of a parser record")
-    return content
+@dataclass(frozen=True)
+class SeedInfo:
+    """Number of seed points by source, in the order in which they are stored, the number of missing LiDAR sweeps, and
+    the name of the file of extra points (None: not given)."""
+
+    lidar: int = 0
+    triangulated: int = 0
+    points_file: int = 0
+    far: int = 0
+    lidar_missing: int = 0
+    extra_points: str | None = None
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """A scene as training reads it: n images in the order of the scene's frames, and p seed points.
+
+    Field names are the keys of parser.pkl, which users of gsplat's example trainer recognise. World frame: metres, z
+    up. Cameras: OpenCV. `Ks` are in continuous pixels (the centre of the first pixel is at 0.5, 0.5) at `image_sizes`
+    (width, height), the size at which images are trained and evaluated; `camtoworlds` is camera to world;
+    `camera_indices` index `camera_names`; `timestamps` are in microseconds; `sample_indices` number the key frame that
+    an image belongs to. `scene_scale` is the distance in metres of the farthest training camera from their mean, at
+    least 1. `splits` has the indices of images by group; `held_out_frames` the held-out key frames by group.
+    """
+
+    Ks: Float[np.ndarray, "n 3 3"]
+    camtoworlds: Float[np.ndarray, "n 4 4"]
+    ego_to_world: Float[np.ndarray, "n 4 4"]
+    image_paths: list[str]
+    image_names: list[str]
+    image_sizes: Int[np.ndarray, "n 2"]
+    camera_names: list[str]
+    camera_indices: Int[np.ndarray, " n"]
+    timestamps: Int[np.ndarray, " n"]
+    sample_indices: Int[np.ndarray, " n"]
+    is_key_frame: Bool[np.ndarray, " n"]
+    points: Float[np.ndarray, "p 3"]
+    points_rgb: UInt8[np.ndarray, "p 3"]
+    scene_scale: float
+    splits: dict[str, np.ndarray]
+    held_out_frames: dict[str, list[int]]
+    scene: SceneInfo
+    seed: SeedInfo
+    provenance: Provenance = field(default_factory=dict)
+
+    @property
+    def train_images(self) -> list[int]:
+        """The indices of the training images."""
+        return self.splits["train"].tolist()
+
+    def image_size(self, index: int) -> tuple[int, int]:
+        """Width and height in pixels at which an image is trained and evaluated."""
+        width, height = self.image_sizes[index].tolist()
+        return width, height
+
+    def camera_name(self, index: int) -> str:
+        """The name of the camera that recorded an image."""
+        return self.camera_names[self.camera_indices[index]]
+
+    def seconds(self, index: int) -> float:
+        """The time of an image in seconds since the first one."""
+        return float(self.timestamps[index] - self.timestamps.min()) * 1e-6
+
+    def to_plain(self) -> dict[str, Any]:
+        """The content of parser.pkl: plain containers and arrays."""
+        plain = {name: getattr(self, name) for name in _FIELDS}
+        return plain | {"scene": dataclasses.asdict(self.scene), "seed": dataclasses.asdict(self.seed)}
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> "TrainingRecord":
+        """The inverse of `to_plain`; further keys are ignored. Raises ValueError where `plain` is no training
+        record."""
+        infos = {"scene": SceneInfo, "seed": SeedInfo}
+        known = {name: typed_record(kind, plain[name]) for name, kind in infos.items() if name in plain}
+        record = typed_record(cls, {**plain, **known})
+        count, indices = len(record.Ks), np.concatenate(list(record.splits.values()))
+        if not len(record.image_paths) == len(record.image_names) == count:
+            raise ValueError(f"it has {count} images, {len(record.image_paths)} paths")
+        for name, index, limit in (
+            ("splits", indices, count),
+            ("camera_indices", record.camera_indices, len(record.camera_names)),
+        ):
+            if index.dtype.kind not in "iu" or ((index < 0) | (index >= limit)).any():
+                raise ValueError(f"{name} has indices out of range")
+        return record
+
+
+_FIELDS = tuple(f.name for f in dataclasses.fields(TrainingRecord))
+
+
+def write_training_record(path: str | Path, record: TrainingRecord) -> None:
+    write_plain_pickle(path, record.to_plain())
+
+
+def read_training_record(path: str | Path) -> TrainingRecord:
+    """Reads parser.pkl. Raises ResultError where it is not one, or holds anything but plain data and arrays."""
+    content = read_plain_pickle(path, RULE)
+    try:
+        return TrainingRecord.from_plain(content)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise unreadable(path, RULE, f"not a training record ({error})") from error

@@ -6,11 +6,11 @@ then on speaks for its exposure as it is.
 
 import logging
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from drivesplat.lidar.coloring import visible
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
@@ -24,11 +24,11 @@ ROUNDS = 8
 
 
 def first_gains(
-    parser: dict[str, Any], views: Sequence[TrainingView], cameras: Sequence[str], reference: str
+    record: TrainingRecord, views: Sequence[TrainingView], cameras: Sequence[str], reference: str
 ) -> dict[str, np.ndarray]:
     """The gain (3,) of every colour channel of each of `cameras` over the reference camera, by the seed points that lie
     on surfaces; 1 for a camera that shares too few with the others. `views` are the training images."""
-    surfaces = parser["points"][: len(parser["points"]) - parser["seed"]["far"]]
+    surfaces = record.points[: len(record.points) - record.seed.far]
     shades = log_colors(surfaces, views, [reference, *cameras])
     gains = np.exp(log_gains(shades))
     for camera, gain in zip(cameras, gains[1:], strict=True):

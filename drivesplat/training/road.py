@@ -5,7 +5,6 @@ evenly; the road at a place is the plane through the nearest point of that path,
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.quaternions import rotation_matrix
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.road import RoadSettings
 from drivesplat.training.cells import Cells
 from drivesplat.training.floaters import LARGEST_STEP
@@ -64,11 +64,11 @@ def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
     return (weights * distance).sum() / weights.sum().clamp(min=1e-6)
 
 
-def road_of(parser: dict[str, Any], settings: RoadSettings) -> Road:
-    """The road under the training images' poses of a parser record, on the CPU."""
-    images = parser["splits"]["train"]
-    in_time = images[np.argsort(parser["timestamps"][images], kind="stable")]
-    return driven_road(parser["ego_to_world"][in_time], settings)
+def road_of(record: TrainingRecord, settings: RoadSettings) -> Road:
+    """The road under the training images' poses of a training record, on the CPU."""
+    images = record.splits["train"]
+    in_time = images[np.argsort(record.timestamps[images], kind="stable")]
+    return driven_road(record.ego_to_world[in_time], settings)
 
 
 def driven_road(ego_to_world: np.ndarray, settings: RoadSettings) -> Road:

@@ -1,4 +1,4 @@
-"""A training from a parser record to its files: checkpoint.pt and train.json."""
+"""A training from a training record to its files: checkpoint.pt and train.json."""
 
 import dataclasses
 import os
@@ -19,11 +19,10 @@ from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.machine.device import choose_device, telling_out_of_memory
 from drivesplat.model.build import ModelInit, build_model, definitions, gaussian_cap
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import camera_of
 from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
-from drivesplat.scene.training_record import image_size, read_parser
+from drivesplat.scene.training_record import TrainingRecord, read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
@@ -40,7 +39,7 @@ class TrainingInputs:
     cameras that see the own car, `sky_known` (where no sky was found, it is not known of any pixel that it is none),
     and the record of free_space.pkl (None where the method has no use for it)."""
 
-    parser: dict[str, Any]
+    record: TrainingRecord
     masks: Path
     actors: list[dict[str, Any]]
     lidar_depth: list[dict[str, np.ndarray]]
@@ -51,10 +50,10 @@ class TrainingInputs:
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
-        images = [int(i) for i in self.parser["splits"]["train"]]
+        images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         moving_wanted = self.actors and job.train.dynamic_weight
-        seeing = [i for i in images if camera_of(self.parser, i) in self.seeing_own_car]
+        seeing = [i for i in images if self.record.camera_name(i) in self.seeing_own_car]
         return Guides(
             sky=_of_each(images, self._sky) if sky_wanted else {},
             moving=_of_each(images, self._moving) if moving_wanted else {},
@@ -74,7 +73,7 @@ class TrainingInputs:
         """The cameras with training images whose exposure `job` learns: all but the reference."""
         if job.reference_camera is None:
             return ()
-        seen = {camera_of(self.parser, int(i)) for i in self.parser["splits"]["train"]}
+        seen = {self.record.camera_name(i) for i in self.record.train_images}
         return tuple(sorted(seen - {job.reference_camera}))
 
     def _classes(self, index: int) -> np.ndarray:
@@ -89,7 +88,7 @@ class TrainingInputs:
 
     def _image(self, index: int) -> tuple[str, int, tuple[int, int]]:
         """Camera, timestamp and size of an image."""
-        return camera_of(self.parser, index), int(self.parser["timestamps"][index]), image_size(self.parser, index)
+        return self.record.camera_name(index), int(self.record.timestamps[index]), self.record.image_size(index)
 
 
 def read_inputs(
@@ -98,22 +97,22 @@ def read_inputs(
     """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl, lidar_depth.pkl and
     free_space.pkl, with the provenances of these files."""
     folder = Path(masks).parent
-    packed, made = read_parser(parser), read_masks_record(folder)
+    record, made = read_training_record(parser), read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
     spaces = [read_free_space(path) for path in free_space]
     inputs = TrainingInputs(
-        packed,
+        record,
         folder,
-        [actor for record in moving for actor in record["actors"]],
-        [image for record in depths for image in record["images"]],
+        [actor for it in moving for actor in it["actors"]],
+        [image for it in depths for image in it["images"]],
         made["semantic_classes"],
         frozenset(made["own_car"]),
         made["sky_known"],
         next(iter(spaces), None),
     )
-    records = [packed, made, *moving, *depths, *spaces]
-    return inputs, [record["provenance"] for record in records]
+    records = [made, *moving, *depths, *spaces]
+    return inputs, [record.provenance, *(it["provenance"] for it in records)]
 
 
 @dataclass(frozen=True)
@@ -142,21 +141,21 @@ class Prepared:
 def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
     """The training images on the device, an untrained model, and the settings with the cap that holds for them."""
     with telling_out_of_memory(lambda: 0):
-        views = load_views(inputs.parser, inputs.guides(job), device)
-    settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.parser, job.train)})
+        views = load_views(inputs.record, inputs.guides(job), device)
+    settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.record, job.train)})
     exposed = inputs.exposed(job)
     init = ModelInit(
-        inputs.parser,
+        inputs.record,
         inputs.actors,
         mean_sky_color(views),
         inputs.told_apart(job),
-        first_gains(inputs.parser, views, exposed, job.reference_camera) if exposed else {},
+        first_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
         _times_by_camera(views) if job.train.camera_poses.corrected else {},
     )
     if not learns_from_sky_masks(job):
         views = [dataclasses.replace(view, sky=None) for view in views]
     model = build_model(init, job.parts, job.sky, settings)
-    return Prepared(model, views, settings, surroundings_of(inputs.parser, inputs.free_space, settings))
+    return Prepared(model, views, settings, surroundings_of(inputs.record, inputs.free_space, settings))
 
 
 def run_training(

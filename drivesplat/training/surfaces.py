@@ -11,6 +11,7 @@ from torch import Tensor
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.cells import Cells
 from drivesplat.training.road import Road, road_loss, road_of
@@ -31,13 +32,13 @@ class Surroundings:
 NOTHING_KNOWN = Surroundings()
 
 
-def surroundings_of(parser: dict[str, Any], free_space: dict[str, Any] | None, settings: TrainSettings) -> Surroundings:
+def surroundings_of(record: TrainingRecord, free_space: dict[str, Any] | None, settings: TrainSettings) -> Surroundings:
     """What `settings` want to know, on the CPU, from the records of parser.pkl and of free_space.pkl (None: not
     made)."""
     grid = {name: free_space[name] for name in ("lower", "shape", "keys")} if free_space else {}
     return Surroundings(
         Cells.of(edge=free_space["voxel"], **grid) if free_space else None,
-        road_of(parser, settings.road) if settings.road_weight else None,
+        road_of(record, settings.road) if settings.road_weight else None,
     )
 
 

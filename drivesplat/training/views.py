@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 from drivesplat.io.prefetch import ahead
 from drivesplat.model.view import View, view_of
 from drivesplat.scene.images import read_image
-from drivesplat.scene.training_record import image_size
+from drivesplat.scene.training_record import TrainingRecord
 
 
 @dataclass(frozen=True)
@@ -56,15 +55,15 @@ class Guides:
     own_car: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
-def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> list[TrainingView]:
-    """The training images of a parser record, with all masks at training resolution; a camera's images share the mask
+def load_views(record: TrainingRecord, guides: Guides, device: torch.device) -> list[TrainingView]:
+    """The training images of a training record, with all masks at training resolution; a camera's images share the mask
     of the own car."""
     views: list[TrainingView] = []
     bodies: dict[bytes, Tensor] = {}
-    images = [int(i) for i in parser["splits"]["train"]]
-    recorded = ahead(lambda i: read_image(parser["image_paths"][i], image_size(parser, i)), images)
+    images = record.train_images
+    recorded = ahead(lambda i: read_image(record.image_paths[i], record.image_size(i)), images)
     for index, image in zip(images, recorded, strict=True):
-        size = image_size(parser, index)
+        size = record.image_size(index)
         pixels = torch.from_numpy(image.copy()).to(device)
         sky, moving, classes = (
             torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
@@ -73,7 +72,7 @@ def load_views(parser: dict[str, Any], guides: Guides, device: torch.device) -> 
         body = guides.own_car.get(index)
         lidar = _lidar_depth(guides.lidar[index], size[0], body, device) if index in guides.lidar else None
         own_car = _shared(body, bodies, device) if body is not None and body.any() else None
-        views.append(TrainingView(view_of(parser, index, device), pixels, sky, moving, lidar, classes, own_car))
+        views.append(TrainingView(view_of(record, index, device), pixels, sky, moving, lidar, classes, own_car))
     return views
 
 

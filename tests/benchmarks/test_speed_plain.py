@@ -1,14 +1,15 @@
 """The plain recipe: it is what gsplat's example trainer does in its configuration `mcmc`."""
 
+import dataclasses
 import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers.records import training_record_of
 from PIL import Image
 from skimage.metrics import structural_similarity
 
@@ -18,6 +19,7 @@ from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
 from benchmarks.speed.plain_training import PlainTraining, fit
 from drivesplat.io.checkpoint_file import load
 from drivesplat.rasterization import rasterize
+from drivesplat.scene.training_record import TrainingRecord
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CPU = torch.device("cpu")
@@ -25,7 +27,7 @@ WIDTH, HEIGHT = 32, 24
 
 
 @pytest.fixture
-def parser(tmp_path) -> dict[str, Any]:
+def record(tmp_path) -> TrainingRecord:
     """Five images of a wall of dots by a camera that drives along it, the fourth held out, and 60 seed points."""
     rng = np.random.default_rng(0)
     paths, poses = [], np.tile(np.eye(4), (5, 1, 1))
@@ -33,26 +35,27 @@ def parser(tmp_path) -> dict[str, Any]:
         poses[i, 0, 3] = 0.2 * i
         paths.append(str(tmp_path / f"{i}.png"))
         Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)).save(paths[-1])
-    return {
-        "Ks": np.tile([[20.0, 0.0, WIDTH / 2], [0.0, 20.0, HEIGHT / 2], [0.0, 0.0, 1.0]], (5, 1, 1)),
-        "camtoworlds": poses,
-        "image_paths": paths,
-        "image_sizes": np.tile([WIDTH, HEIGHT], (5, 1)),
-        "points": rng.uniform([-2.0, -1.5, 3.0], [3.0, 1.5, 5.0], (60, 3)),
-        "points_rgb": rng.integers(0, 256, (60, 3), dtype=np.uint8),
-        "scene_scale": 0.4,
-        "splits": {"train": np.array([0, 1, 2, 4]), "interpolation": np.array([3])},
-    }
+    return training_record_of(
+        5,
+        Ks=np.tile([[20.0, 0.0, WIDTH / 2], [0.0, 20.0, HEIGHT / 2], [0.0, 0.0, 1.0]], (5, 1, 1)),
+        camtoworlds=poses,
+        image_paths=paths,
+        image_sizes=np.tile([WIDTH, HEIGHT], (5, 1)),
+        points=rng.uniform([-2.0, -1.5, 3.0], [3.0, 1.5, 5.0], (60, 3)),
+        points_rgb=rng.integers(0, 256, (60, 3), dtype=np.uint8),
+        scene_scale=0.4,
+        splits={"train": np.array([0, 1, 2, 4]), "interpolation": np.array([3])},
+    )
 
 
-def begun(parser: dict[str, Any], recipe: PlainRecipe, ssim: Ssim | None = None) -> PlainTraining:
-    splats = started(parser["points"], parser["points_rgb"], recipe.seed)
-    optimizers = make_optimizers(splats, scene_scale(parser))
+def begun(record: TrainingRecord, recipe: PlainRecipe, ssim: Ssim | None = None) -> PlainTraining:
+    splats = started(record.points, record.points_rgb, recipe.seed)
+    optimizers = make_optimizers(splats, scene_scale(record))
     return PlainTraining(splats, optimizers, recipe, CPU, ssim or chosen_ssim(CPU))
 
 
-def images_of(parser: dict[str, Any]) -> ImageFiles:
-    return ImageFiles(parser, [parser["image_paths"][i] for i in parser["splits"]["train"]])
+def images_of(record: TrainingRecord) -> ImageFiles:
+    return ImageFiles(record, [record.image_paths[i] for i in record.splits["train"]])
 
 
 # --- the recipe ---
@@ -77,8 +80,8 @@ def test_what_is_densified_how_and_when(iterations, start, stop):
     assert (strategy.noise_lr, strategy.min_opacity) == (5e5, 0.005)
 
 
-def test_learning_rates_are_the_examples(parser):
-    training = begun(parser, PlainRecipe(Schedule.of(100), 100, 0))
+def test_learning_rates_are_the_examples(record):
+    training = begun(record, PlainRecipe(Schedule.of(100), 100, 0))
     rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in training.optimizers.items()}
     assert rates == pytest.approx(
         {"means": 1.6e-4 * 1.1 * 0.4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
@@ -88,31 +91,31 @@ def test_learning_rates_are_the_examples(parser):
         assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-15, (0.9, 0.999))
 
 
-def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(parser):
+def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(record):
     """Opacity 0.5; a tenth of the root mean square distance to three neighbours; the colour at degree 0."""
-    splats = started(parser["points"], parser["points_rgb"], seed=0)
-    distances = np.linalg.norm(parser["points"][:, None] - parser["points"][None], axis=2)
+    splats = started(record.points, record.points_rgb, seed=0)
+    distances = np.linalg.norm(record.points[:, None] - record.points[None], axis=2)
     nearest = np.sort(distances, axis=1)[:, 1:4]
-    assert torch.allclose(splats["means"], torch.from_numpy(parser["points"]).float())
+    assert torch.allclose(splats["means"], torch.from_numpy(record.points).float())
     expected = 0.1 * np.sqrt((nearest**2).mean(axis=1))
     assert np.allclose(torch.exp(splats["scales"]).detach().numpy(), expected[:, None], rtol=1e-5)
     assert torch.allclose(torch.sigmoid(splats["opacities"]), torch.tensor(0.5))
     shown = 0.5 + splats["sh0"][:, 0].detach().numpy() / (2.0 * math.sqrt(math.pi))
-    assert np.allclose(shown, parser["points_rgb"] / 255.0, atol=1e-6)
+    assert np.allclose(shown, record.points_rgb / 255.0, atol=1e-6)
     assert splats["shN"].shape == (60, 15, 3) and not splats["shN"].any()
 
 
-def test_seed_points_in_one_place_do_no_harm(parser):
-    splats = started(np.zeros((6, 3)), parser["points_rgb"][:6], seed=0)
+def test_seed_points_in_one_place_do_no_harm(record):
+    splats = started(np.zeros((6, 3)), record.points_rgb[:6], seed=0)
     assert torch.isfinite(splats["scales"]).all()
 
 
 # --- its images ---
 
 
-def test_images_come_decoded_each_once_an_epoch_in_random_order(parser):
-    images = images_of(parser)
-    recorded = [np.asarray(Image.open(parser["image_paths"][i]), dtype=np.float32) for i in (0, 1, 2, 4)]
+def test_images_come_decoded_each_once_an_epoch_in_random_order(record):
+    images = images_of(record)
+    recorded = [np.asarray(Image.open(record.image_paths[i]), dtype=np.float32) for i in (0, 1, 2, 4)]
     torch.manual_seed(0)
     data = endless(loader_of(images, 0, CPU))
     seen = []
@@ -125,8 +128,8 @@ def test_images_come_decoded_each_once_an_epoch_in_random_order(parser):
     assert all(sorted(epoch) == [0, 1, 2, 3] for epoch in epochs) and len({tuple(epoch) for epoch in epochs}) > 1
 
 
-def test_processes_decode_them_as_in_the_example(parser):
-    loader = loader_of(images_of(parser), 2, CPU)
+def test_processes_decode_them_as_in_the_example(record):
+    loader = loader_of(images_of(record), 2, CPU)
     assert (loader.num_workers, loader.persistent_workers, loader.batch_size) == (2, True, 1)
     assert loader.multiprocessing_context.get_start_method() == "fork", "in a spawned process, too: no import of torch"
     data = endless(loader)
@@ -134,15 +137,15 @@ def test_processes_decode_them_as_in_the_example(parser):
     assert PlainRecipe(Schedule.of(1), 1, 0).workers == 4
 
 
-def test_images_of_another_size_are_reduced_once_as_training_sees_them(parser, tmp_path):
-    assert files_of_size(parser, tmp_path / "reduced") == [parser["image_paths"][i] for i in (0, 1, 2, 4)]
-    parser["image_sizes"] = np.tile([WIDTH // 2, HEIGHT // 2], (5, 1))
-    paths = files_of_size(parser, tmp_path / "reduced")
-    whole, half = (np.asarray(Image.open(path), dtype=float) for path in (parser["image_paths"][4], paths[3]))
+def test_images_of_another_size_are_reduced_once_as_training_sees_them(record, tmp_path):
+    assert files_of_size(record, tmp_path / "reduced") == [record.image_paths[i] for i in (0, 1, 2, 4)]
+    smaller = dataclasses.replace(record, image_sizes=np.tile([WIDTH // 2, HEIGHT // 2], (5, 1)))
+    paths = files_of_size(smaller, tmp_path / "reduced")
+    whole, half = (np.asarray(Image.open(path), dtype=float) for path in (record.image_paths[4], paths[3]))
     means = whole.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
     assert np.abs(half - means).max() <= 0.5
     times = [Path(path).stat().st_mtime_ns for path in paths]
-    assert files_of_size(parser, tmp_path / "reduced") == paths
+    assert files_of_size(smaller, tmp_path / "reduced") == paths
     assert [Path(path).stat().st_mtime_ns for path in paths] == times
 
 
@@ -173,10 +176,10 @@ def test_the_fused_ssim_is_taken_on_a_gpu_where_it_is_installed(monkeypatch):
     assert chosen_ssim(torch.device("cuda")).name == "torch"
 
 
-def test_the_loss_is_that_of_the_example_mcmc(parser):
+def test_the_loss_is_that_of_the_example_mcmc(record):
     """0.8 L1 + 0.2 (1 - SSIM) + 0.01 mean opacity + 0.01 mean scale, of an image before black at degree 0."""
-    training = begun(parser, PlainRecipe(Schedule.of(30_000), 60, 0))
-    batch = next(endless(loader_of(images_of(parser), 0, CPU)))
+    training = begun(record, PlainRecipe(Schedule.of(30_000), 60, 0))
+    batch = next(endless(loader_of(images_of(record), 0, CPU)))
     terms, _ = training.fit_one(iter([batch]))
     s = {name: value.detach() for name, value in training.splats.items()}
     scales, opacities = torch.exp(s["scales"]), torch.sigmoid(s["opacities"])
@@ -195,7 +198,7 @@ def test_the_loss_is_that_of_the_example_mcmc(parser):
 # --- its loop ---
 
 
-def test_means_learn_ever_slower_and_the_noise_goes_with_them(parser, monkeypatch):
+def test_means_learn_ever_slower_and_the_noise_goes_with_them(record, monkeypatch):
     """A hundredth at the end; the noise of a step takes the rate of the next, as the example's order has it."""
     told = []
 
@@ -203,8 +206,8 @@ def test_means_learn_ever_slower_and_the_noise_goes_with_them(parser, monkeypatc
         told.append((step, lr))
 
     monkeypatch.setattr("benchmarks.speed.plain.MCMCStrategy.step_post_backward", noted)
-    training = begun(parser, PlainRecipe(Schedule.of(10), 60, 0))
-    data, first = endless(loader_of(images_of(parser), 0, CPU)), 1.6e-4 * 1.1 * 0.4
+    training = begun(record, PlainRecipe(Schedule.of(10), 60, 0))
+    data, first = endless(loader_of(images_of(record), 0, CPU)), 1.6e-4 * 1.1 * 0.4
     for step in range(10):
         assert training.optimizers["means"].param_groups[0]["lr"] == pytest.approx(first * 0.01 ** (step / 10))
         training.learn(training.fit_one(data)[1])
@@ -213,37 +216,37 @@ def test_means_learn_ever_slower_and_the_noise_goes_with_them(parser, monkeypatc
     assert training.optimizers["scales"].param_groups[0]["lr"] == 5e-3
 
 
-def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(parser, tmp_path):
-    splats = started(parser["points"], parser["points_rgb"], seed=0)
+def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(record, tmp_path):
+    splats = started(record.points, record.points_rgb, seed=0)
     schedule = Schedule(220, sh_every=1, refine_start=0, refine_stop=220)
-    before = as_model({name: value.detach().clone() for name, value in splats.items()}, parser)
+    before = as_model({name: value.detach().clone() for name, value in splats.items()}, record)
     recipe = PlainRecipe(schedule, 64, 0, workers=0)
-    summary = fit(splats, images_of(parser), scene_scale(parser), recipe, tmp_path / "out")
+    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path / "out")
     assert (summary.gaussians, summary.peak_gpu_memory_gb, summary.ssim) == (64, None, "torch")
     assert len(splats["means"]) == 64, "60, 63 after 100 iterations, 64 after 200"
     assert summary.seconds > 0
     kept = load(tmp_path / "out/ckpt.pt", rule="train")
     assert kept["step"] == 220 and torch.equal(kept["splats"]["means"], splats["means"])
-    after = as_model(kept["splats"], parser)
-    assert after.sky is None and off(after, parser) < 0.7 * off(before, parser)
+    after = as_model(kept["splats"], record)
+    assert after.sky is None and off(after, record) < 0.7 * off(before, record)
 
 
 @pytest.mark.gpu
-def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(parser, tmp_path):
-    splats = started(parser["points"], parser["points_rgb"], seed=0).to("cuda")
+def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(record, tmp_path):
+    splats = started(record.points, record.points_rgb, seed=0).to("cuda")
     recipe = PlainRecipe(Schedule(120, sh_every=1, refine_start=0, refine_stop=120), 64, 0, workers=2)
     before = torch.cuda.memory_reserved() / 1e9  # by other tests' recordings, whose memory torch does not give back
-    summary = fit(splats, images_of(parser), scene_scale(parser), recipe, tmp_path)
+    summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path)
     assert summary.gaussians == 63 and 0 < summary.peak_gpu_memory_gb < before + 1
     assert all(torch.isfinite(value).all() for value in load(tmp_path / "ckpt.pt", rule="train")["splats"].values())
 
 
-def off(model, parser: dict[str, Any]) -> float:
+def off(model, record: TrainingRecord) -> float:
     """How far a model's picture of the first image is off it, on average."""
     from drivesplat.model.view import View
 
-    pose, intrinsics = (torch.from_numpy(parser[key][0]).float() for key in ("camtoworlds", "Ks"))
+    pose, intrinsics = (torch.from_numpy(getattr(record, key)[0]).float() for key in ("camtoworlds", "Ks"))
     with torch.no_grad():
         image = model.render(View(intrinsics, pose, WIDTH, HEIGHT, 0.0)).image
-    recorded = np.asarray(Image.open(parser["image_paths"][0])) / 255.0
+    recorded = np.asarray(Image.open(record.image_paths[0])) / 255.0
     return float(np.abs(image.numpy() - recorded).mean())

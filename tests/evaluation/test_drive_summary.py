@@ -11,7 +11,7 @@ from PIL import Image
 from drivesplat.evaluation.drive_summary import drive_record
 from drivesplat.evaluation.evaluate import measured_images
 from drivesplat.io.point_cloud import PointCloud
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.scene import Scene
@@ -20,11 +20,11 @@ from drivesplat.settings.parser import ParserJob
 
 def recording_of(scene: Scene, holdout=HELD_OUT) -> Recording:
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    return Recording(scene, parser_dict(scene, seed, ParserJob(holdout=holdout, images={})))
+    return Recording(scene, training_record(scene, seed, ParserJob(holdout=holdout, images={})))
 
 
 def record_of(recording: Recording) -> dict:
-    return drive_record(recording, "CAM_FRONT", measured_images(recording.parser, "CAM_FRONT"))
+    return drive_record(recording, "CAM_FRONT", measured_images(recording.record, "CAM_FRONT"))
 
 
 def test_held_out_images_are_as_far_from_training_images_as_the_car_came_between(tiny_scene):
@@ -52,7 +52,7 @@ def test_images_of_other_cameras_do_not_count_as_near(tiny_scene):
 
 def test_brightness_is_that_of_the_held_out_images_and_flat_psnr_that_of_their_static_pixels(tiny_scene):
     recording = recording_of(tiny_scene)
-    measured = measured_images(recording.parser, "CAM_FRONT")
+    measured = measured_images(recording.record, "CAM_FRONT")
     record = record_of(recording)
     for group, key_frames in (("interpolation", (2, 6)), ("extrapolation", (8, 9))):
         assert [recording.frame(i).sample_index for i in measured[group]] == list(key_frames)

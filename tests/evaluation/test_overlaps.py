@@ -35,7 +35,7 @@ def test_the_front_camera_shares_both_edges_and_not_its_middle(front, key_frame)
     """Each pixel as another way round tells it: the far end of its ray, projected into every other camera."""
     index = image_of(front, "CAM_FRONT", key_frame)
     frame, size = front.frame(index), front.size(index)
-    seen = seen_by_others(front.parser, index)
+    seen = seen_by_others(front.record, index)
     random = np.random.default_rng(0)
     columns, rows = random.integers(0, size[0], 500), random.integers(0, size[1], 500)
     rays = np.linalg.inv(continuous_intrinsics(frame, size)) @ np.stack([columns + 0.5, rows + 0.5, np.ones(500)])
@@ -52,15 +52,15 @@ def test_the_front_camera_shares_both_edges_and_not_its_middle(front, key_frame)
 
 def test_a_camera_that_looks_the_other_way_shares_nothing(tmp_path):
     recording = recording_of(rig_drive(tmp_path, ("CAM_FRONT", "CAM_BACK"), 2), every_nth=0, offset=0, last_block=0)
-    assert not any(seen_by_others(recording.parser, index).any() for index in range(4))
+    assert not any(seen_by_others(recording.record, index).any() for index in range(4))
 
 
 def test_static_pixels_fall_into_two_parts(front):
     index = image_of(front, "CAM_FRONT", 2)
     static = np.random.default_rng(1).random(front.labels(index).shape) < 0.5
-    parts = overlap_masks(front.parser, index, static)
+    parts = overlap_masks(front.record, index, static)
     np.testing.assert_array_equal(parts["overlap"] ^ parts["no_overlap"], static)
-    np.testing.assert_array_equal(parts["overlap"], static & seen_by_others(front.parser, index))
+    np.testing.assert_array_equal(parts["overlap"], static & seen_by_others(front.record, index))
 
 
 def test_both_parts_are_measured_where_there_are_several_cameras(front, tiny_scene):
@@ -69,7 +69,7 @@ def test_both_parts_are_measured_where_there_are_several_cameras(front, tiny_sce
     groups = evaluate_groups(model, front, "CAM_FRONT", None, torch.device("cpu"))
     index = image_of(front, "CAM_FRONT", 2)
     static = front.labels(index) == 0
-    for part, mask in overlap_masks(front.parser, index, static).items():
+    for part, mask in overlap_masks(front.record, index, static).items():
         error = ((front.image(index) - GREY) ** 2)[mask].mean()
         assert groups["interpolation"][part]["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-4)
         assert groups["interpolation"][part]["pixels"] == mask.sum()

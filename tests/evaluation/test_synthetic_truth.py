@@ -276,7 +276,7 @@ def unremoved(model: SplatModel, known: KnownTruth) -> dict[str, Any]:
     """The model with the car against the street without it."""
     metrics = RegionMetrics(None, ("box", "outside"))
     for (frame, _), (image, inside, outside) in zip(front_frames(known), hulls(known), strict=True):
-        view = view_of(known.recording.parser, known.recording.scene.frames.index(frame), CPU)
+        view = view_of(known.recording.record, known.recording.scene.frames.index(frame), CPU)
         metrics.add(metrics.measured(rendered(model, view), image, {"box": inside, "outside": outside}))
     return metrics.summary()
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.export.cameras_json import cameras_record
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.io.storage import write_json
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.images import project
 from drivesplat.scene.rigid import inverse
 from drivesplat.settings.holdout import HoldoutSettings
@@ -24,7 +24,7 @@ SEED = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
 def parser(tiny_scene):
     """Trained at half the recorded width, every fourth key frame held out, the last two as a block."""
     holdout = HoldoutSettings(every_nth=4, offset=2, last_block=2)
-    return parser_dict(tiny_scene, SEED, ParserJob(holdout=holdout, images=ImageSettings(width=48)))
+    return training_record(tiny_scene, SEED, ParserJob(holdout=holdout, images=ImageSettings(width=48)))
 
 
 @pytest.fixture(scope="module")

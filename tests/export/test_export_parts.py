@@ -46,7 +46,7 @@ def export_all(folder, model, scene, monkeypatch):
     """What the stage writes into `folder` for a model; returns parts.json's content."""
     monkeypatch.setattr(splat_asset, "trained_model", lambda _: (model, None))
     files = SplatFiles(folder / "splat.ply", folder / "cameras.json", folder / "parts/parts.json")
-    export_splat(files, {}, recording_of(scene).parser, scene, PROVENANCE)
+    export_splat(files, {}, recording_of(scene).record, scene, PROVENANCE)
     return json.loads((folder / "parts/parts.json").read_text())
 
 

@@ -18,7 +18,7 @@ from drivesplat.model.build import definitions
 from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.rasterization import rasterize
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.holdout import HoldoutSettings
@@ -228,7 +228,7 @@ def test_the_stage_exports_every_gaussian_of_the_checkpoint(tmp_path, tiny_scene
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2))
     params = trained_params(50, sh_degree=2)
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    parser = parser_dict(tiny_scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings()))
+    parser = training_record(tiny_scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings()))
     files = SplatFiles(tmp_path / "splat.ply", tmp_path / "cameras.json", tmp_path / "parts/parts.json")
     export_splat(files, checkpoint_of(params, settings), parser, tiny_scene, PROVENANCE)
     splat, cameras = files.splat, files.cameras

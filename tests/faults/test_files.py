@@ -26,7 +26,7 @@ from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.scene import read_scene
-from drivesplat.scene.training_record import read_parser
+from drivesplat.scene.training_record import read_training_record
 from drivesplat.training.resume_state import resumable
 from drivesplat.training.run import read_summary
 
@@ -45,7 +45,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "own_car.json": (read_own_car, "own_car"),
     "masks.json": (lambda path: read_masks_record(path.parent), "masks"),
     "seed.ply": (lambda path: read_ply(path, "lidar_seed"), "lidar_seed"),
-    "parser.pkl": (read_parser, "parser"),
+    "parser.pkl": (read_training_record, "parser"),
     "actors.pkl": (read_actors, "actors"),
     "lidar_depth.pkl": (read_lidar_depth, "lidar_depth"),
     "free_space.pkl": (read_free_space, "free_space"),
@@ -130,7 +130,14 @@ def test_no_script_reads_results_but_by_a_reader_that_is_tested():
         "read_masks_record",
         "read_ply",
     }
-    tested |= {"read_parser", "read_actors", "read_lidar_depth", "read_free_space", "read_triangulated", "read_summary"}
+    tested |= {
+        "read_training_record",
+        "read_actors",
+        "read_lidar_depth",
+        "read_free_space",
+        "read_triangulated",
+        "read_summary",
+    }
     tested |= {"read_checkpoint", "read_evaluations", "read_backbone"}
     used = {
         name.name

@@ -15,7 +15,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Part
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.prepared_drive import Recording
@@ -138,7 +138,7 @@ def recording_of(scene: Scene, masks: Path | None = None, width: int | None = No
     settings = HoldoutSettings(**{"every_nth": 0, "last_block": 0, **holdout})
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
     job = ParserJob(holdout=settings, images=ImageSettings(width=width))
-    return Recording(scene, parser_dict(scene, seed, job), masks)
+    return Recording(scene, training_record(scene, seed, job), masks)
 
 
 def write_labels(folder: Path, scene: Scene, labels: np.ndarray) -> Path:

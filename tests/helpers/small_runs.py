@@ -15,7 +15,7 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
@@ -74,7 +74,7 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
     made = Finished(folder, load({**BASE, **changes}), {}, {})
     scene = extract_scene(made.job("extract", SceneSource), root)
     masks = make_masks(scene, made.job("masks", MaskJob), folder / "masks")
-    parser = parser_dict(scene, seed_points(scene, made.job("lidar_seed", SeedJob)), made.job("parser", ParserJob))
+    parser = training_record(scene, seed_points(scene, made.job("lidar_seed", SeedJob)), made.job("parser", ParserJob))
     actors = actors_record(scene, made.job("actors", ActorSeedJob))["actors"]
     depths = lidar_depths(scene, made.job("lidar_depth", LidarDepthJob))
     recording, known = Recording(scene, parser, folder / "masks"), {"sky_known": masks["sky_known"]}

@@ -22,6 +22,7 @@ from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.regions import LABELS
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import (
     DefaultSettings,
@@ -40,6 +41,7 @@ from drivesplat.training.train import TrainingSummary, Workspace, train
 from drivesplat.training.views import LidarDepth, TrainingView
 from helpers import REPOSITORY
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
+from helpers.records import training_record_of
 
 CPU = torch.device("cpu")
 
@@ -183,7 +185,7 @@ def same_parameters(a: SplatModel, b: SplatModel) -> bool:
     return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
-def parser_record(folder: Path, views: list[TrainingView]) -> dict[str, Any]:
+def parser_record(folder: Path, views: list[TrainingView]) -> TrainingRecord:
     """What the stage `parser` would say of recorded views; the third is held out."""
     n = len(views)
     paths = [str(folder / f"{i}.png") for i in range(n)]
@@ -191,20 +193,18 @@ def parser_record(folder: Path, views: list[TrainingView]) -> dict[str, Any]:
     for path, view in zip(paths, views, strict=True):
         Image.fromarray(view.pixels.numpy()).save(path)
     points, colors = seed_points()
-    return {
-        "Ks": np.stack([v.view.K.double().numpy() for v in views]),
-        "camtoworlds": np.stack([v.view.camera_to_world.double().numpy() for v in views]),
-        "ego_to_world": np.stack([v.view.camera_to_world.double().numpy() for v in views]),
-        "image_paths": paths,
-        "image_sizes": np.array([[WIDTH, HEIGHT]] * n, dtype=np.int64),
-        "camera_names": ["CAM_FRONT"],
-        "camera_indices": np.zeros(n, dtype=np.int64),
-        "timestamps": 1_532_402_927_000_000 + 500_000 * np.arange(n),
-        "points": points.astype(np.float32),
-        "points_rgb": (colors * 255).astype(np.uint8),
-        "scene_scale": 1.0,
-        "splits": {"train": np.array([i for i in range(n) if i != 2]), "interpolation": np.array([2])},
-    }  # fmt: skip
+    poses = np.stack([v.view.camera_to_world.double().numpy() for v in views])
+    return training_record_of(
+        n,
+        Ks=np.stack([v.view.K.double().numpy() for v in views]),
+        camtoworlds=poses,
+        ego_to_world=poses,
+        image_paths=paths,
+        image_sizes=np.array([[WIDTH, HEIGHT]] * n, dtype=np.int64),
+        points=points.astype(np.float32),
+        points_rgb=(colors * 255).astype(np.uint8),
+        splits={"train": np.array([i for i in range(n) if i != 2]), "interpolation": np.array([2])},
+    )
 
 
 PROVENANCE = {"settings_sha256": "a", "code_sha256": "b", "inputs_sha256": "c", "stages": {}, "inputs": {}}
@@ -224,7 +224,7 @@ def inputs_in(folder: Path, actors: bool = False) -> TrainingInputs:
     record = parser_record(folder / "images", recorded_views())
     if not actors:
         return TrainingInputs(record, folder / "masks", [], [])
-    for i, time in enumerate(record["timestamps"]):
+    for i, time in enumerate(record.timestamps):
         labels = np.full((HEIGHT, WIDTH), LABELS["static"], np.uint8)
         labels[HEIGHT // 2 :, : WIDTH // 2], labels[HEIGHT // 2 :, WIDTH // 2 :] = LABELS["moving_car"], 8
         for kind, mask in (("regions", labels), ("sky", np.eye(HEIGHT, WIDTH, i, dtype=np.uint8) * 255)):

@@ -107,7 +107,7 @@ def test_the_truth_is_the_recorded_image(haunted):
 
 def test_the_render_is_the_models(haunted):
     panel, _, drive = haunted
-    expected = drive.model.render(view_of(drive.recording.parser, 2 * HELD_OUT, drive.device)).image
+    expected = drive.model.render(view_of(drive.recording.record, 2 * HELD_OUT, drive.device)).image
     np.testing.assert_allclose(panel.render, expected.clamp(0, 1), atol=1e-6)
     assert (np.abs(panel.render - SKY.numpy()).max(axis=2) > 0.1).any(), "Gaussians must be seen"
 

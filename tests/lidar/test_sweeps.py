@@ -23,7 +23,7 @@ from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import lidar_points, seed_points
 from drivesplat.preprocess.masks import make_masks
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.masks import read_sky_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
@@ -122,7 +122,7 @@ def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
     groups = frame_groups(scene, HoldoutSettings(**holdout))
     training = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
     seed = seed_points(scene, job("lidar_seed", SeedJob, holdout))
-    parser = parser_dict(scene, seed, job("parser", ParserJob, holdout))
+    parser = training_record(scene, seed, job("parser", ParserJob, holdout))
     make_masks(scene, job("masks", MaskJob, holdout), folder)
     found = {
         "seed": seed,
@@ -131,7 +131,7 @@ def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
         "free_space": free_space_record(scene, job("free_space", FreeSpaceJob, holdout)),
         "own_car": own_car_record(scene, job("own_car", OwnCarJob, holdout)),
         "sky": [read_sky_mask(folder, f.camera, f.timestamp, (f.width, f.height)) for f in training],
-        "images": [Path(parser["image_paths"][i]).read_bytes() for i in parser["splits"]["train"]],
+        "images": [Path(parser.image_paths[i]).read_bytes() for i in parser.splits["train"]],
     }
     return {name: pickle.dumps(value) for name, value in found.items()}
 

@@ -32,7 +32,7 @@ from drivesplat.model.exposure import Exposures
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.preprocess.lidar_seed import seed_points
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.settings.config import load
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.holdout import HoldoutSettings
@@ -229,16 +229,16 @@ def rig(tmp_path_factory) -> TrainingInputs:
     holdout, images = HoldoutSettings(every_nth=0, last_block=0), ImageSettings()
     settings = LidarSeedSettings(max_points=20_000, far_points=2_000)
     seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0))
-    return TrainingInputs(parser_dict(scene, seed, ParserJob(holdout=holdout, images=images)), folder, [], [])
+    return TrainingInputs(training_record(scene, seed, ParserJob(holdout=holdout, images=images)), folder, [], [])
 
 
 def test_gains_of_the_demos_rig_are_found_before_the_training(rig):
     """Images are gamma encoded: a gain of light becomes its 2.2th root."""
-    views = load_views(rig.parser, Guides({}, {}, {}), CPU)
-    found = first_gains(rig.parser, views, ["CAM_BACK"], "CAM_FRONT")
+    views = load_views(rig.record, Guides({}, {}, {}), CPU)
+    found = first_gains(rig.record, views, ["CAM_BACK"], "CAM_FRONT")
     np.testing.assert_allclose(found["CAM_BACK"], np.power([1.4, 1.1, 0.75], 1 / 2.2), rtol=0.03)
     hidden = [dataclasses.replace(v, own_car=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]
-    np.testing.assert_array_equal(first_gains(rig.parser, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
+    np.testing.assert_array_equal(first_gains(rig.record, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
 
 
 def test_a_training_begins_with_what_was_found_and_its_checkpoint_holds_it(rig, tmp_path):
@@ -260,8 +260,8 @@ def test_a_training_begins_with_what_was_found_and_its_checkpoint_holds_it(rig, 
 def inputs_of(folder: Path, cameras: list[int]) -> TrainingInputs:
     """Images by FRONT, BACK and LEFT, as `cameras` numbers them; the third is held out."""
     record = parser_record(folder, recorded_views(5))
-    record |= {"camera_names": ["FRONT", "BACK", "LEFT"], "camera_indices": np.array(cameras)}
-    return TrainingInputs(record, folder, [], [])
+    rig = {"camera_names": ["FRONT", "BACK", "LEFT"], "camera_indices": np.array(cameras)}
+    return TrainingInputs(dataclasses.replace(record, **rig), folder, [], [])
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ def test_all_cameras_with_training_images_are_exposed_but_the_reference(tmp_path
 
 
 def test_a_view_knows_its_camera(tmp_path):
-    record = inputs_of(tmp_path, [0, 1, 2, 0, 1]).parser
+    record = inputs_of(tmp_path, [0, 1, 2, 0, 1]).record
     assert [view_of(record, i, CPU).camera for i in range(5)] == ["FRONT", "BACK", "LEFT", "FRONT", "BACK"]
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import actor_record, actors_of, looking_at, motion_through, round_gaussians, track_of
+from helpers.records import training_record_of
 from scipy.spatial.transform import Rotation
 from torch import nn
 
@@ -22,6 +23,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.scene.images import pixel_rays
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
@@ -45,19 +47,20 @@ def seed_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return rng.uniform([-2, -1.5, 2], [2, 1.5, 6], (count, 3)), rng.uniform(0, 1, (count, 3))
 
 
-def parser_record(count: int) -> dict[str, Any]:
+def parser_record(count: int) -> TrainingRecord:
     positions, colors = seed_points(count)
-    return {
-        "points": positions.astype(np.float32),
-        "points_rgb": (colors * 255).astype(np.uint8),
-        "scene_scale": 3.0,
-        "image_sizes": np.array([[100, 50], [100, 50], [40, 30]]),
-        "splits": {"train": np.array([0, 2]), "interpolation": np.array([1])},
-    }
+    return training_record_of(
+        3,
+        points=positions.astype(np.float32),
+        points_rgb=(colors * 255).astype(np.uint8),
+        scene_scale=3.0,
+        image_sizes=np.array([[100, 50], [100, 50], [40, 30]]),
+        splits={"train": np.array([0, 2]), "interpolation": np.array([1])},
+    )
 
 
-def model_init(parser: dict[str, Any], *actors: dict[str, Any]) -> ModelInit:
-    return ModelInit(parser, list(actors), SKY_COLOR)
+def model_init(record: TrainingRecord, *actors: dict[str, Any]) -> ModelInit:
+    return ModelInit(record, list(actors), SKY_COLOR)
 
 
 def shaken(model: nn.Module) -> nn.Module:
@@ -439,7 +442,7 @@ def test_a_model_starts_with_no_more_points_than_its_cap():
     model = build_model(model_init(record), ("background",), "none", TrainSettings(cap_max=120))
     means = model.parts[0].params["means"].detach().numpy()
     assert len(model) == 120
-    rows = {tuple(row) for row in record["points"]}
+    rows = {tuple(row) for row in record.points}
     assert len({tuple(row) for row in means} & rows) == 120
 
 

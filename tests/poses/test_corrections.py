@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.poses.corrections import Corrections, corrected
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep, Track, read_scene, write_scene
 from drivesplat.scene.splits import frame_groups
@@ -175,7 +175,7 @@ def test_the_measuring_protocol_says_refined():
     """Evaluation takes protocol.poses from here."""
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
     job = ParserJob(holdout=HoldoutSettings(every_nth=0, last_block=1), images=ImageSettings())
-    assert [parser_dict(scene, seed, job)["scene"]["poses"] for scene in (SCENE, REFINED)] == ["nuscenes", "refined"]
+    assert [training_record(scene, seed, job).scene.poses for scene in (SCENE, REFINED)] == ["nuscenes", "refined"]
 
 
 def test_no_corrections_change_nothing():

@@ -1,6 +1,7 @@
 """parser.pkl: what a trainer needs, under the names that users of gsplat's example trainer know."""
 
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -8,9 +9,9 @@ import pytest
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.io.storage import write_plain_pickle
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.splits import frame_groups
-from drivesplat.scene.training_record import read_parser
+from drivesplat.scene.training_record import read_training_record, write_training_record
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.parser import ParserJob
@@ -32,7 +33,7 @@ def seed() -> PointCloud:
 
 
 def test_the_record_has_the_keys_and_shapes_of_gsplats_example_trainer(tiny_scene, seed):
-    record = parser_dict(tiny_scene, seed, job())
+    record = training_record(tiny_scene, seed, job())
     images, points = 19, 50
     shapes = {
         "Ks": (images, 3, 3), "camtoworlds": (images, 4, 4), "ego_to_world": (images, 4, 4),
@@ -40,84 +41,86 @@ def test_the_record_has_the_keys_and_shapes_of_gsplats_example_trainer(tiny_scen
         "timestamps": (images,), "sample_indices": (images,), "is_key_frame": (images,), "points": (points, 3),
         "points_rgb": (points, 3),
     }  # fmt: skip
-    assert {key: record[key].shape for key in shapes} == shapes
-    assert record["points_rgb"].dtype == np.uint8
-    assert len(record["image_paths"]) == len(record["image_names"]) == images
-    assert record["camera_names"] == ["CAM_FRONT"]
-    assert isinstance(record["scene_scale"], float)
+    assert {key: getattr(record, key).shape for key in shapes} == shapes
+    assert record.points_rgb.dtype == np.uint8
+    assert len(record.image_paths) == len(record.image_names) == images
+    assert record.camera_names == ["CAM_FRONT"]
+    assert isinstance(record.scene_scale, float)
 
 
 def test_images_keep_their_order_paths_times_and_poses(tiny_scene, seed):
-    record = parser_dict(tiny_scene, seed, job())
+    record = training_record(tiny_scene, seed, job())
     for i, frame in enumerate(tiny_scene.frames):
-        assert record["image_paths"][i] == frame.image_path
-        assert record["image_names"][i] == frame.image_path.rsplit("/", 1)[1]
-        assert record["timestamps"][i] == frame.timestamp
-        assert record["sample_indices"][i] == frame.sample_index
-        assert record["is_key_frame"][i] == frame.is_key_frame
-        np.testing.assert_array_equal(record["camtoworlds"][i], frame.camera_to_world)
-        np.testing.assert_array_equal(record["ego_to_world"][i], frame.ego_to_world)
-    np.testing.assert_array_equal(record["points"], seed.positions)
-    np.testing.assert_array_equal(record["points_rgb"], seed.colors)
+        assert record.image_paths[i] == frame.image_path
+        assert record.image_names[i] == frame.image_path.rsplit("/", 1)[1]
+        assert record.timestamps[i] == frame.timestamp
+        assert record.sample_indices[i] == frame.sample_index
+        assert record.is_key_frame[i] == frame.is_key_frame
+        np.testing.assert_array_equal(record.camtoworlds[i], frame.camera_to_world)
+        np.testing.assert_array_equal(record.ego_to_world[i], frame.ego_to_world)
+    np.testing.assert_array_equal(record.points, seed.positions)
+    np.testing.assert_array_equal(record.points_rgb, seed.colors)
 
 
 def test_cameras_are_counted_in_order_of_appearance(tiny_scene, seed):
     back = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames]
     scene = dataclasses.replace(tiny_scene, frames=(*back, *tiny_scene.frames))
-    record = parser_dict(scene, seed, job())
-    assert record["camera_names"] == ["CAM_BACK", "CAM_FRONT"]
-    np.testing.assert_array_equal(record["camera_indices"], [0] * 19 + [1] * 19)
+    record = training_record(scene, seed, job())
+    assert record.camera_names == ["CAM_BACK", "CAM_FRONT"]
+    np.testing.assert_array_equal(record.camera_indices, [0] * 19 + [1] * 19)
 
 
 def test_splits_are_disjoint_and_cover_every_image(tiny_scene, seed):
-    record = parser_dict(tiny_scene, seed, job())
-    assert record["splits"].keys() == {"train", "interpolation", "extrapolation", "excluded"}
-    together = np.concatenate(list(record["splits"].values()))
+    record = training_record(tiny_scene, seed, job())
+    assert record.splits.keys() == {"train", "interpolation", "extrapolation", "excluded"}
+    together = np.concatenate(list(record.splits.values()))
     np.testing.assert_array_equal(np.sort(together), np.arange(19))
     groups = frame_groups(tiny_scene, HOLDOUT)
-    for group, images in record["splits"].items():
+    for group, images in record.splits.items():
         assert all(groups[i] == group for i in images)
-    assert [record["sample_indices"][i] for i in record["splits"]["interpolation"]] == [2, 6]
-    assert [record["sample_indices"][i] for i in record["splits"]["extrapolation"]] == [8, 9]
-    assert record["held_out_frames"] == {"interpolation": [2, 6], "extrapolation": [8, 9]}
+    assert [record.sample_indices[i] for i in record.splits["interpolation"]] == [2, 6]
+    assert [record.sample_indices[i] for i in record.splits["extrapolation"]] == [8, 9]
+    assert record.held_out_frames == {"interpolation": [2, 6], "extrapolation": [8, 9]}
 
 
 @pytest.mark.parametrize(("width", "size"), [(None, (96, 54)), (48, (48, 27)), (64, (64, 36)), (192, (192, 108))])
 def test_intrinsics_are_those_of_the_size_that_is_trained_at(tiny_scene, seed, width, size):
     """Continuous convention: the image's centre is at half its width and height, whatever the size."""
-    record = parser_dict(tiny_scene, seed, job(width))
-    np.testing.assert_array_equal(record["image_sizes"], [size] * 19)
+    record = training_record(tiny_scene, seed, job(width))
+    np.testing.assert_array_equal(record.image_sizes, [size] * 19)
     focal = 0.62 * size[0]
     expected = [[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]]
-    np.testing.assert_allclose(record["Ks"], [expected] * 19)
+    np.testing.assert_allclose(record.Ks, [expected] * 19)
 
 
 def test_the_scale_is_the_farthest_training_camera_from_their_mean(tiny_scene, seed):
     """The tiny drive's camera moves along x at a steady speed; a scene is at least a metre large."""
-    record = parser_dict(tiny_scene, seed, job())
-    train = record["camtoworlds"][record["splits"]["train"], 0, 3]
-    assert record["scene_scale"] == pytest.approx(np.abs(train - train.mean()).max())
+    record = training_record(tiny_scene, seed, job())
+    train = record.camtoworlds[record.splits["train"], 0, 3]
+    assert record.scene_scale == pytest.approx(np.abs(train - train.mean()).max())
     still = [dataclasses.replace(frame, camera_to_world=np.eye(4)) for frame in tiny_scene.frames]
-    assert parser_dict(dataclasses.replace(tiny_scene, frames=tuple(still)), seed, job())["scene_scale"] == 1.0
+    assert training_record(dataclasses.replace(tiny_scene, frames=tuple(still)), seed, job()).scene_scale == 1.0
 
 
 def test_held_out_cameras_do_not_widen_the_scale(tiny_scene, seed):
-    whole = parser_dict(tiny_scene, seed, job())["scene_scale"]
+    whole = training_record(tiny_scene, seed, job()).scene_scale
     frames = list(tiny_scene.frames)
     far = frames[-1].camera_to_world.copy()
     far[0, 3] += 1000.0
     frames[-1] = dataclasses.replace(frames[-1], camera_to_world=far)
-    assert parser_dict(dataclasses.replace(tiny_scene, frames=tuple(frames)), seed, job())["scene_scale"] == whole
+    assert training_record(dataclasses.replace(tiny_scene, frames=tuple(frames)), seed, job()).scene_scale == whole
 
 
 def test_what_the_protocol_says_of_scene_and_seed_is_carried_along(tiny_scene, seed):
     scene = dataclasses.replace(tiny_scene, missing_images=2, key_frame_range=[0, 10], poses="refined")
-    record = parser_dict(scene, seed, job())
-    assert record["scene"] == {
+    record = training_record(scene, seed, job())
+    assert dataclasses.asdict(record.scene) == {
         "name": "0001", "dataset": "tiny", "version": "v1.0-mini", "poses": "refined", "key_frame_range": [0, 10],
         "missing_images": 2,
     }  # fmt: skip
-    assert record["seed"] == {"lidar": 40, "points_file": 0, "far": 10, "lidar_missing": 3, "extra_points": None}
+    assert dataclasses.asdict(record.seed) == {
+        "lidar": 40, "triangulated": 0, "points_file": 0, "far": 10, "lidar_missing": 3, "extra_points": None,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -128,20 +131,41 @@ def test_a_scene_without_training_images_is_refused_with_the_settings_that_hold_
     key_frames = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
     scene = dataclasses.replace(tiny_scene, frames=key_frames)
     with pytest.raises(DatasetError, match=r"0001.*holdout\.every_nth.*holdout\.last_block"):
-        parser_dict(scene, seed, job(holdout=holdout))
+        training_record(scene, seed, job(holdout=holdout))
 
 
 def test_the_record_is_plain_data_that_returns_from_its_file(tiny_scene, seed, tmp_path):
-    record = {**parser_dict(tiny_scene, seed, job()), "provenance": {}}
-    write_plain_pickle(tmp_path / "parser.pkl", record)
-    again = read_parser(tmp_path / "parser.pkl")
-    assert again.keys() == record.keys()
-    np.testing.assert_array_equal(again["Ks"], record["Ks"])
-    np.testing.assert_array_equal(again["splits"]["train"], record["splits"]["train"])
+    record = dataclasses.replace(training_record(tiny_scene, seed, job()), provenance={"made": "here"})
+    write_training_record(tmp_path / "parser.pkl", record)
+    again = read_training_record(tmp_path / "parser.pkl")
+    assert pickle.dumps(again.to_plain()) == pickle.dumps(record.to_plain())
+    np.testing.assert_array_equal(again.Ks, record.Ks)
+    np.testing.assert_array_equal(again.splits["train"], record.splits["train"])
 
 
 @pytest.mark.parametrize("content", [{}, {"Ks": np.eye(3)}, [1], None])
 def test_a_pickle_that_is_no_parser_record_is_refused_naming_file_and_rule(tmp_path, content):
     write_plain_pickle(tmp_path / "parser.pkl", content)
     with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
-        read_parser(tmp_path / "parser.pkl")
+        read_training_record(tmp_path / "parser.pkl")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"Ks": np.zeros((18, 3, 3))}, "camtoworlds is float64"),
+        ({"camtoworlds": np.zeros((19, 3, 4))}, "camtoworlds is float64"),
+        ({"points": np.zeros((49, 3), np.float32)}, "points_rgb is uint8"),
+        ({"timestamps": np.zeros(19)}, "timestamps is float64"),
+        ({"scene_scale": "1"}, "scene_scale is a str"),
+        ({"image_names": []}, "it has 19 images"),
+        ({"camera_indices": np.full(19, 1)}, "camera_indices has indices out of range"),
+        ({"splits": {"train": np.array([19])}}, "splits has indices out of range"),
+        ({"splits": {"train": np.array([0.5])}}, "splits has indices out of range"),
+        ({"scene": {"name": "0001"}}, "it lacks dataset, version, poses"),
+    ],
+)
+def test_a_record_whose_fields_do_not_fit_is_refused_with_the_reason(tiny_scene, seed, tmp_path, changes, reason):
+    write_plain_pickle(tmp_path / "parser.pkl", training_record(tiny_scene, seed, job()).to_plain() | changes)
+    with pytest.raises(ResultError, match=rf"parser\.pkl: not a training record.*{reason}.*'parser'"):
+        read_training_record(tmp_path / "parser.pkl")

@@ -11,12 +11,13 @@ from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.evaluate import evaluate_groups
-from drivesplat.io.storage import write_json, write_plain_pickle
+from drivesplat.io.storage import write_json
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import write_scene
+from drivesplat.scene.training_record import write_training_record
 
 GREY = (0.45, 0.5, 0.4)
 
@@ -68,9 +69,9 @@ def test_every_image_has_the_split_it_was_given(tiny_scene):
 
 
 def test_a_recording_is_read_with_the_provenance_of_its_three_files(tiny_scene, masks, labels, tmp_path):
-    record = {**recording_of(tiny_scene, width=48).parser, "provenance": {"made": "parser"}}
+    record = dataclasses.replace(recording_of(tiny_scene, width=48).record, provenance={"made": "parser"})
     write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance={"made": "scene"}))
-    write_plain_pickle(tmp_path / "parser.pkl", record)
+    write_training_record(tmp_path / "parser.pkl", record)
     paths = (tmp_path / "scene.json", tmp_path / "parser.pkl", masks / "masks.json")
     recording, provenances = read_recording(*paths)
     assert provenances == [{"made": "scene"}, {"made": "parser"}, {"made": "masks"}]

@@ -23,15 +23,16 @@ from helpers.trainings import (
     trained,
 )
 
-from drivesplat.io.storage import write_json, write_plain_pickle
+from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.preprocess.ego_mask import own_car_record
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
-from drivesplat.preprocess.parser import parser_dict
+from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.training_record import write_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
 from drivesplat.settings.holdout import HoldoutSettings
@@ -150,8 +151,8 @@ def prepared(tmp_path_factory) -> Path:
     write_json(folder / "masks/masks.json", {**made, "provenance": {}})
     settings = LidarSeedSettings(max_points=2000, far_points=500)
     seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0), own_car)
-    parser = parser_dict(scene, seed, ParserJob(holdout=holdout, images=images))
-    write_plain_pickle(folder / "parser.pkl", {**parser, "provenance": {}})
+    record = training_record(scene, seed, ParserJob(holdout=holdout, images=images))
+    write_training_record(folder / "parser.pkl", record)
     return folder
 
 
@@ -172,4 +173,4 @@ def test_a_body_that_was_found_reaches_the_training_of_its_camera(prepared, monk
     run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
     model, _ = trained_model(read_checkpoint(files.checkpoint))
     with torch.no_grad():
-        assert torch.isfinite(model.render(view_of(inputs.parser, 0, CPU)).image).all()
+        assert torch.isfinite(model.render(view_of(inputs.record, 0, CPU)).image).all()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, round_gaussians, track_of
+from helpers.records import training_record_of
 from scipy.spatial.transform import Rotation
 
 from drivesplat.model.background import Background
@@ -173,10 +174,9 @@ def test_the_road_is_that_of_training_images_in_time_order():
     """Three cameras' images one after the other; the key frame that is held out goes round a corner."""
     poses = np.concatenate([straight(12.0)[::3], straight(12.0)[1::3]])
     poses[2, 1, 3] = 8.0
-    parser = {
-        "ego_to_world": poses, "timestamps": np.array([0, 3, 6, 1, 4]), "splits": {"train": np.array([0, 1, 3, 4])},
-    }  # fmt: skip
-    road = road_of(parser, WIDE)
+    splits = {"train": np.array([0, 1, 3, 4])}
+    record = training_record_of(5, ego_to_world=poses, timestamps=np.array([0, 3, 6, 1, 4]), splits=splits)
+    road = road_of(record, WIDE)
     points = torch.tensor([[1.0, 0.0], [4.0, 0.0], [7.5, 0.0], [12.0, 8.0], [10.0, 4.0]])
     assert road.cells.find(points)[1].tolist() == [True, True, True, False, False]
 
@@ -218,17 +218,14 @@ def test_terms_are_weighted_and_about_what_stands_still_alone():
 
 
 def test_without_their_weights_there_are_no_terms():
-    model, parser = (
-        a_street(),
-        {"ego_to_world": straight(), "timestamps": np.arange(11), "splits": {"train": np.arange(11)}},
-    )
+    model, record = a_street(), training_record_of(len(straight()), ego_to_world=straight())
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
     plain = TrainSettings()
-    assert surroundings_of(parser, None, plain) == NOTHING_KNOWN
-    assert surface_terms(picture, model, surroundings_of(parser, None, plain), plain) == {}
+    assert surroundings_of(record, None, plain) == NOTHING_KNOWN
+    assert surface_terms(picture, model, surroundings_of(record, None, plain), plain) == {}
     for changes, term in (({"flatness_weight": 0.1}, "flatness"), ({"road_weight": 0.1}, "road")):
         settings = TrainSettings(**changes)
-        assert surface_terms(picture, model, surroundings_of(parser, None, settings), settings).keys() == {term}
+        assert surface_terms(picture, model, surroundings_of(record, None, settings), settings).keys() == {term}
 
 
 def test_flatness_makes_the_shortest_axis_shorter_and_no_other():

@@ -731,7 +731,7 @@ def test_masks_that_know_no_sky_hold_no_pixel_to_be_none(tmp_path):
     inputs = dataclasses.replace(inputs_in(tmp_path, actors=True), sky_known=False)
     guides = inputs.guides(job_of(("background", "actors"), sky="cubemap", sky_bce_weight=0.1, dynamic_weight=0.1))
     assert not guides.sky and guides.moving
-    views = load_views(inputs.parser, guides, CPU)
+    views = load_views(inputs.record, guides, CPU)
     assert all(view.sky is None for view in views)
 
 

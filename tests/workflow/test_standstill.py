@@ -71,9 +71,9 @@ def test_in_words_they_are_read_with_a_grain_of_salt(drives):
 
 
 def test_a_standing_car_has_a_scale_and_seeds(drives):
-    parser = drives["stands"].drives["vanilla"].recording.parser
-    assert parser["scene_scale"] == 1.0 and np.ptp(parser["camtoworlds"][:, :3, 3], axis=0).max() == 0.0
-    assert parser["seed"]["lidar"] > 100 and np.isfinite(parser["points"]).all()
+    parser = drives["stands"].drives["vanilla"].recording.record
+    assert parser.scene_scale == 1.0 and np.ptp(parser.camtoworlds[:, :3, 3], axis=0).max() == 0.0
+    assert parser.seed.lidar > 100 and np.isfinite(parser.points).all()
 
 
 @pytest.mark.parametrize(("film", "left"), [("original", 0.0), ("lateral_2m", 2.0)])

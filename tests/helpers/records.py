@@ -1,0 +1,23 @@
+"""Records between stages, made by hand."""
+
+from typing import Any
+
+import numpy as np
+
+from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
+
+
+def training_record_of(images: int, **fields: Any) -> TrainingRecord:
+    """A training record of `images` images by CAM_FRONT, half a second apart; all are for training but for what
+    `fields` say."""
+    poses, indices = np.tile(np.eye(4), (images, 1, 1)), np.arange(images)
+    names = [f"{i}.png" for i in indices]
+    defaults = {
+        "Ks": np.tile(np.eye(3), (images, 1, 1)), "camtoworlds": poses, "ego_to_world": poses, "image_paths": names,
+        "image_names": names, "image_sizes": np.tile([64, 48], (images, 1)), "camera_names": ["CAM_FRONT"],
+        "camera_indices": np.zeros(images, dtype=np.int64), "timestamps": 1_532_402_927_000_000 + 500_000 * indices,
+        "sample_indices": indices, "is_key_frame": np.ones(images, dtype=bool), "points": np.zeros((1, 3), np.float32),
+        "points_rgb": np.zeros((1, 3), np.uint8), "scene_scale": 1.0, "splits": {"train": indices},
+        "held_out_frames": {}, "scene": SceneInfo("0001", "tiny", "v1.0-mini", "nuscenes"), "seed": SeedInfo(),
+    }  # fmt: skip
+    return TrainingRecord(**{**defaults, **fields})
