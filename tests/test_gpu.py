@@ -447,92 +447,94 @@ def test_frames_that_cannot_be_captured_come_all_the_same(street_film, monkeypat
     assert [record.message.split(",")[0] for record in caplog.records] == ["frames of films cannot be recorded"]
 
 
-def replayed(
-    record: bool, iterations: int = 30, iterations_done: int | None = None, **settings
+def trained_with(
+    capture: bool, iterations: int = 30, iterations_done: int | None = None, **settings
 ) -> tuple[Trainer, list[float]]:
-    """A training of background and cars by every term, recorded as soon as an image comes again, or not at all."""
+    """A training of background and cars by every loss term, with or without CUDA graphs."""
     chosen = settings_of(**{**ALL_TERMS, "mcmc": McmcSettings(noise_lr=0.0), "refine_start": 1.0, **settings})
     model = untrained_street(chosen)
     for part in model.parts:  # no spheres, whose rotations learn from rounding
         part.params["scales"].data += 0.5 * torch.randn(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
         )
-    chosen = chosen.model_copy(update={"cuda_graphs": record, "iterations": iterations})
+    chosen = chosen.model_copy(update={"cuda_graphs": capture, "iterations": iterations})
     with own_stream(GPU):
         trainer = Trainer.begin(model.to(GPU), guided_views(GPU), chosen, 0, GPU)
         losses = [
-            float(torch.stack(list(goes_on(trainer).values())).sum()) for _ in range(iterations_done or iterations)
+            float(torch.stack(list(continued(trainer).values())).sum()) for _ in range(iterations_done or iterations)
         ]
     trainer.guard.check("nowhere")
     return trainer, losses
 
 
-def goes_on(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
+def continued(trainer: Trainer, iterations: int = 1) -> dict[str, torch.Tensor]:
     """The loss terms of the last of so many iterations."""
     for _ in range(iterations):
-        terms, picture, _ = trainer.fit_one(shown=False)
+        terms, picture, _ = trainer.fit_one(with_picture=False)
         trainer.densify(picture)
     return terms
 
 
-def test_a_training_that_is_replayed_learns_what_it_does_otherwise(caplog):
-    recorded, mine = replayed(True)
-    plain, theirs = replayed(False)
+def test_a_training_by_cuda_graphs_learns_what_it_learns_without(caplog):
+    captured, mine = trained_with(True)
+    eager, theirs = trained_with(False)
     assert not caplog.records, "nothing was refused"
-    assert len(recorded.replays._recorded) == len(recorded.images.views) and not plain.replays._recorded
+    assert len(captured.graphs._graphs) == len(captured.images.views) and not eager.graphs._graphs
     np.testing.assert_allclose(mine, theirs, rtol=0.02)
     assert mine[-1] < 0.8 * mine[0]
-    before = untrained_street(recorded.settings).state_dict()
-    for name, value in plain.model.state_dict().items():
+    before = untrained_street(captured.settings).state_dict()
+    for name, value in eager.model.state_dict().items():
         moved = (value.cpu() - before[name]).abs().float()
         if moved.any() and not name.endswith(("scales", "quats")):
-            apart = (recorded.model.state_dict()[name] - value).abs().cpu()
+            apart = (captured.model.state_dict()[name] - value).abs().cpu()
             assert float(apart.quantile(0.5)) <= 0.1 * float(moved.max()), name
-    steps = [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in recorded.optimizers.all()]
-    assert steps == [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in plain.optimizers.all()]
+    steps = [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in captured.optimizers.all()]
+    assert steps == [float(o.state[o.param_groups[0]["params"][0]]["step"]) for _, o in eager.optimizers.all()]
 
 
 def test_graphs_stay_valid_through_relocation_and_growth_into_preallocated_rows():
     """Gaussians that MCMC moves stay where they lie, and so do tensors that have room for more of them."""
     grows = {"mcmc": McmcSettings(noise_lr=0.0, refine_every=12), "refine_start": 0.0, "refine_stop": 0.9}
     settings = {"iterations": 60, "cap_max": 10_000, **grows}
-    trainer, losses = replayed(True, iterations_done=40, **settings)
+    trainer, losses = trained_with(True, iterations_done=40, **settings)
     part = trainer.model.parts[0]
-    count, known, preallocated = len(part), dict(trainer.replays._recorded), part.preallocated
+    count, known, preallocated = len(part), dict(trainer.graphs._graphs), part.preallocated
     assert known and preallocated and losses[-1] < losses[0]
     with own_stream(GPU):
-        goes_on(trainer, 10)  # step 48 is among them
-        assert len(part) > count and part.preallocated < preallocated and trainer.replays._recorded == known
-        terms = goes_on(trainer, 10)
+        continued(trainer, 10)  # step 48 is among them
+        assert len(part) > count and part.preallocated < preallocated and trainer.graphs._graphs == known
+        terms = continued(trainer, 10)
         assert part.preallocated == 0 and part.row_count == len(part), "densification has stopped"
     assert all(bool(torch.isfinite(value)) for value in terms.values())
 
 
-def test_a_training_that_grows_learns_the_same_replayed():
+def test_a_growing_training_learns_the_same_by_cuda_graphs():
     grows = {"mcmc": McmcSettings(noise_lr=0.0, refine_every=10, growth=0.3), "refine_start": 0.0, "refine_stop": 1.0}
-    (recorded, mine), (plain, theirs) = (replayed(record, 60, cap_max=10_000, **grows) for record in (True, False))
-    assert [len(part) for part in recorded.model.parts] == [len(part) for part in plain.model.parts]
-    assert recorded.model.parts[0].preallocated and not plain.model.parts[0].preallocated
+    (captured, mine), (eager, theirs) = (
+        trained_with(capture, 60, cap_max=10_000, **grows) for capture in (True, False)
+    )
+    assert [len(part) for part in captured.model.parts] == [len(part) for part in eager.model.parts]
+    assert captured.model.parts[0].preallocated and not eager.model.parts[0].preallocated
     assert mine[-1] == pytest.approx(theirs[-1], rel=0.1) and mine[-1] < 0.8 * mine[0]
 
 
-def test_lists_that_outgrow_their_room_are_noticed(monkeypatch):
+def test_overflowed_lists_are_detected(monkeypatch):
     monkeypatch.setattr(rooms, "LEAST", 0)
     monkeypatch.setattr(rooms, "MARGIN", 1.0)
-    trainer, _ = replayed(True, iterations=8)
+    trainer, _ = trained_with(True, iterations=8)
     trainer.model.parts[0].params["scales"].data += 1.0
     with own_stream(GPU):
-        goes_on(trainer, 4)
-    assert any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
-    trainer.replays.check()
-    assert not any(int(recording.missing) > 0 for recording in trainer.replays._recorded.values())
+        continued(trainer, 4)
+    assert any(int(graph.missing) > 0 for graph in trainer.graphs._graphs.values())
+    trainer.graphs.check()
+    assert not any(int(graph.missing) > 0 for graph in trainer.graphs._graphs.values())
     monkeypatch.setattr(rooms, "MARGIN", 1.5)
     with own_stream(GPU):
-        goes_on(trainer, 2 * len(trainer.images.views))
-    assert trainer.replays.wanted and len(trainer.replays._recorded) == len(trainer.images.views)
+        continued(trainer, 2 * len(trainer.images.views))
+    assert trainer.graphs.enabled and len(trainer.graphs._graphs) == len(trainer.images.views)
 
 
-def test_what_cannot_be_recorded_is_done_all_the_same(monkeypatch, caplog):
+def test_a_training_that_cannot_be_captured_goes_on_without_graphs(monkeypatch, caplog):
     """As where a term of the loss asks the device something."""
 
     def asks(*told, terms=trainer_module.loss_terms):
@@ -541,7 +543,7 @@ def test_what_cannot_be_recorded_is_done_all_the_same(monkeypatch, caplog):
         return found
 
     monkeypatch.setattr(trainer_module, "loss_terms", asks)
-    trainer, losses = replayed(True, iterations=12)
+    trainer, losses = trained_with(True, iterations=12)
     assert torch.rand(3, device=GPU).any(), "random numbers can still be drawn"
     assert [record.message.startswith("iterations cannot be recorded") for record in caplog.records] == [True]
-    assert not trainer.replays.wanted and losses[-1] < losses[0] and all(map(math.isfinite, losses))
+    assert not trainer.graphs.enabled and losses[-1] < losses[0] and all(map(math.isfinite, losses))

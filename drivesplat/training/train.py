@@ -189,7 +189,7 @@ def _densify(run: Run, picture: Picture | None, empty: EmptySpace) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     if trainer.densifies():
         run.check()  # a strategy fed with what is no number ends in an assertion on the GPU, beyond rescue
-        trainer.replays.check()
+        trainer.graphs.check()
         for part in trainer.model.parts:
             part.confine()
     trainer.densify(picture)

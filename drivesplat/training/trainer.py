@@ -1,4 +1,4 @@
-"""A training between two iterations: one image seen, compared, learned from."""
+"""The state of a training and its iteration: render one image, compare it, take a step."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
-from drivesplat.training.cuda_graph.replays import Extent, Replays, Terms, can_be_replayed
+from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, Terms, can_capture
 from drivesplat.training.densify import Densifier
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
@@ -21,7 +21,7 @@ from drivesplat.training.views import TrainingView
 
 @dataclass
 class Trainer:
-    """A training between two iterations."""
+    """The state of a training between two iterations."""
 
     model: SplatModel
     images: TrainingImages
@@ -33,7 +33,7 @@ class Trainer:
     guard: FiniteGuard
     surroundings: Surroundings
     clock: Clock
-    replays: Replays
+    graphs: IterationGraphs
     schedule: DeviceSchedule
     step: int = 0
 
@@ -51,29 +51,30 @@ class Trainer:
         torch.manual_seed(seed)
         optimizers, known = make_optimizers(model), surroundings.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
-        replayed = clock is UNTIMED and can_be_replayed(settings, images, device)
-        replays, on_device = Replays(replayed, device), DeviceSchedule(device)
-        densifiers = [Densifier(part, settings, replays.give_way) for part in model.parts]
+        capture = clock is UNTIMED and can_capture(settings, images, device)
+        graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
+        densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
         return cls(
-            model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, replays, on_device
+            model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device
         )
 
-    def fit_one(self, shown: bool = True) -> tuple[Terms, Picture | None, TrainingView]:
+    def fit_one(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView]:
         """The first half of an iteration: render a view, compare, step. Returns its loss terms, the picture and the
-        view; where the picture need not be `shown` the iteration may be replayed, and there is none."""
+        view. Without `with_picture` the iteration may be a replayed CUDA graph, and the picture is None."""
         with self.clock.stage("data"):
             number, view = self.images.number(self.step), self.images.at(self.step)
         set_learning_rates(self.model, self.optimizers, self.step, self.settings)
         step, rates = self.schedule.update(self.step, self.optimizers)
 
-        def once() -> tuple[Terms, Picture]:
+        def iteration() -> tuple[Terms, Picture]:
             return self._learn(view, step, rates)
 
-        if shown or not self.replays.wanted:
-            return *self.replays.make_room(once), view
+        if with_picture or not self.graphs.enabled:
+            return *self.graphs.retry_without_graphs(iteration), view
         image = self.images.factor(self.step), number
-        gaussians = Extent(len(self.model), max(part.row_count / max(1, len(part)) for part in self.model.parts))
-        return self.replays.iterate(image, self._shape(), gaussians, lambda: once()[0]), None, view
+        headroom = max(part.row_count / max(1, len(part)) for part in self.model.parts)
+        gaussians = GaussianCount(len(self.model), headroom)
+        return self.graphs.run(image, self._layout(), gaussians, lambda: iteration()[0]), None, view
 
     def _learn(
         self, view: TrainingView, step: int | Tensor, rates: Mapping[str, Tensor] | None
@@ -81,7 +82,7 @@ class Trainer:
         """An iteration with a view. `step` and `rates` are those of `DeviceSchedule.update`; a replay of this reads the
         values that they hold then."""
         stage, by_gradient = self.clock.stage, self.settings.strategy == "default"
-        self.model.zero_grad()  # of an iteration that broke off
+        self.model.zero_grad()  # gradients of an iteration that ran out of memory
         with stage("render"):
             picture = self.model.render(
                 view.view,
@@ -104,8 +105,8 @@ class Trainer:
             self.optimizers.step(rates)
         return {name: value.detach() for name, value in terms.items()}, picture
 
-    def _shape(self) -> Hashable:
-        """What changes where a recorded iteration no longer serves: how much is rendered, and where it lies."""
+    def _layout(self) -> Hashable:
+        """Changes when captured iterations become invalid: image reduction, SH degree, and addresses of parameters."""
         places = [(parameter.data_ptr(), parameter.numel()) for parameter in self.model.parameters()]
         return self.images.factor(self.step), self.sh_degree(), *places
 
@@ -114,20 +115,20 @@ class Trainer:
         return any(densifier.due(self.step) for densifier in self.densifiers)
 
     def densify(self, picture: Picture | None) -> None:
-        """The second half: each part grows, prunes and moves its Gaussians."""
+        """The second half of an iteration: each part adds, removes and relocates its Gaussians."""
         info = {} if picture is None else picture.info
         for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
             densifier.after_step(self.step, optimizers, info, rows, self._coarse)
         self.step += 1
 
     def end(self) -> None:
-        """Leaves nothing of the model that is no Gaussian."""
+        """Drops preallocated rows."""
         for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
             densifier.end(optimizers)
 
     @property
     def _coarse(self) -> bool:
-        """Whether this iteration's images are reduced."""
+        """Whether this iteration's image is reduced."""
         return self.images.factor(self.step) > 1
 
     def sh_degree(self) -> int:
@@ -139,9 +140,9 @@ class Trainer:
     def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
         norms = torch._foreach_norm([gradient for _, gradient in named])
-        return {f"gradient of {self._spoken(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}
+        return {f"gradient of {self._readable(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}
 
-    def _spoken(self, parameter: str) -> str:
-        """What a parameter of the model is called in a message: 'background means', 'sky texels'."""
+    def _readable(self, parameter: str) -> str:
+        """The name of a parameter of the model in messages: 'background means', 'sky texels'."""
         owner, *place, name = parameter.split(".")
         return f"{self.model.parts[int(place[0])].name if owner == 'parts' else owner} {name}"

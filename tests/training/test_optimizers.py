@@ -84,7 +84,9 @@ def test_steps_at_device_rates_equal_those_of_adam(kernels, monkeypatch):
             counted, rates = schedule.update(step, optimizers)
             optimizers.step(rates)
             assert int(counted) == step
-            assert all(places.setdefault(name, place) is place for name, place in (rates or {}).items()), "for replays"
+            assert all(places.setdefault(name, place) is place for name, place in (rates or {}).items()), (
+                "CUDA graphs need constant addresses"
+            )
         ends.append({name: value.cpu() for name, value in model.state_dict().items()})
     for name, value in ends[1].items():
         torch.testing.assert_close(ends[0][name], value, atol=1e-5, rtol=1e-4, msg=lambda said, name=name: name + said)

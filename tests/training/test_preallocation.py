@@ -14,7 +14,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.road import RoadSettings
 from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.training import strategies
-from drivesplat.training.cuda_graph.replays import Replays
+from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier, Optimizers
 from drivesplat.training.losses import loss_terms, mean_opacity_and_scale
 from drivesplat.training.optimizers import make_optimizers
@@ -147,7 +147,7 @@ def test_preallocated_rows_do_not_change_flatness():
 def test_a_training_with_preallocated_rows_resumes_and_leaves_none(tmp_path, monkeypatch):
     """With every term, and actors, of whom new Gaussians have to belong to someone."""
     reserved = []
-    monkeypatch.setattr(Replays, "give_way", lambda _: not reserved.append(1))
+    monkeypatch.setattr(IterationGraphs, "invalidate", lambda _: not reserved.append(1))
     growing = McmcSettings(refine_every=4, growth=0.2)
     settings = settings_of_training(iterations=30, checkpoint_every=12, mcmc=growing, refine_start=0.0, **ALL_TERMS)
 

@@ -1,1 +1,1 @@
-"""Training iterations as CUDA graphs: replays, and the rows preallocated for them."""
+"""Training iterations as CUDA graphs, and the rows preallocated for them."""

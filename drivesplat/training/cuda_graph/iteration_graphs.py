@@ -1,0 +1,135 @@
+"""Training iterations captured as CUDA graphs and replayed: Python launches one graph in place of a thousand kernels.
+
+At 640x360 the GPU runs an iteration's hundreds of kernels faster than Python can launch them. A graph keeps the
+addresses of what it reads and writes, so it belongs to one image and stays valid while the model's tensors keep their
+addresses: preallocated rows let the number of Gaussians grow meanwhile. An image's graph is captured when the image is
+used again.
+"""
+
+import logging
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels.cuda_graphs import Graph, Pool, captured, fresh_pool
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.coarse_to_fine import TrainingImages
+
+log = logging.getLogger(__name__)
+
+Terms = dict[str, Tensor]
+T = TypeVar("T")
+MAX_IMAGES = 4096
+"""A training with more images captures nothing: graphs hold on to cached time states, and twice as many are cached."""
+
+
+@dataclass(frozen=True)
+class GaussianCount:
+    """The number of Gaussians `now`, and the factor `headroom` by which it can grow before tensors are reallocated."""
+
+    now: int
+    headroom: float
+
+
+def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.device) -> bool:
+    """Whether iterations can and shall be captured. Densification by gradient reads intermediate results of an
+    iteration; class logits have too many values for lists of planned capacity."""
+    wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(images.views) <= MAX_IMAGES
+    possible = device.type == "cuda" and on_gpu.compiles()
+    return wanted and possible and all(view.classes is None for view in images.views)
+
+
+@dataclass
+class IterationGraphs:
+    """The CUDA graphs of a training's iterations, by image; none where they are not `enabled`."""
+
+    enabled: bool
+    device: torch.device
+    _layout: Hashable = None
+    _needs: dict[Hashable, list[float]] = field(default_factory=dict)
+    """By image, the entries per Gaussian that each of its lists last needed."""
+    _graphs: dict[Hashable, Graph[Terms]] = field(default_factory=dict)
+    _count: int = 1
+    _pool: Pool | None = None
+
+    def run(self, image: Hashable, layout: Hashable, gaussians: GaussianCount, iteration: Callable[[], Terms]) -> Terms:
+        """Runs an iteration with an image, by its graph where there is one. Graphs are invalid once `layout`
+        changes."""
+        if not self.enabled:
+            return iteration()
+        if layout != self._layout:
+            self._drop(list(self._graphs))
+            self._layout = layout
+        self._count = max(1, gaussians.now)
+        graph = self._graphs.get(image)
+        if graph is None and image in self._needs:
+            graph = self._capture(image, self._count * gaussians.headroom, iteration)
+        if graph is None:
+            with rooms.counted() as needs:
+                terms = self.retry_without_graphs(iteration)
+            self._needs[image] = [need / self._count for need in needs]
+            return terms
+        graph.replay()
+        return graph.result
+
+    def retry_without_graphs(self, work: Callable[[], T]) -> T:
+        """Runs `work`; where memory runs out, again without graphs, which are then no longer `enabled`."""
+        try:
+            return work()
+        except torch.cuda.OutOfMemoryError:
+            if not self._graphs:
+                raise
+        log.warning("no GPU memory is left for CUDA graphs: training takes longer without them; lower train.cap_max")
+        self._disable()
+        torch.cuda.empty_cache()
+        return work()
+
+    def check(self) -> None:
+        """Drops the graphs whose lists overflowed, to be captured with more capacity. Waits for the device."""
+        if not self._graphs:
+            return
+        missing = torch.stack([graph.missing for graph in self._graphs.values()]).tolist()
+        overflowed = [image for image, more in zip(self._graphs, missing, strict=True) if more > 0]
+        if overflowed:
+            log.debug("the lists of %d CUDA graphs lacked up to %d entries", len(overflowed), max(missing))
+        self._drop(overflowed)
+
+    def invalidate(self) -> bool:
+        """Drops all graphs since tensors are about to be reallocated; returns whether any will be captured again."""
+        self._drop(list(self._graphs))
+        return self.enabled
+
+    def _drop(self, images: list[Hashable]) -> None:
+        """Drops the graphs of `images`; remembers the entries that their lists last needed. Waits for the device."""
+        if not images:
+            return
+        needs = iter(torch.cat([self._graphs[image].needed for image in images]).tolist())
+        for image in images:
+            self._needs[image] = [next(needs) / self._count for _ in self._graphs.pop(image).needed]
+        if not self._graphs:
+            self._pool = None  # torch frees it with the last graph
+
+    def _disable(self) -> None:
+        """Drops all graphs; none will be captured any more."""
+        self.enabled = False
+        if self._graphs:
+            torch.cuda.synchronize(self.device)
+        self._graphs.clear()
+        self._pool = None
+
+    def _capture(self, image: Hashable, gaussians: float, iteration: Callable[[], Terms]) -> Graph[Terms] | None:
+        """The graph of an iteration with lists for so many Gaussians; the capture does not run it. Where the GPU or its
+        driver refuses, returns None and disables graphs."""
+        self._pool = self._pool or fresh_pool()
+        expected = [int(need * gaussians) for need in self._needs[image]]
+        graph = captured(iteration, expected, self._pool, self.device, "iterations")
+        if graph is None:
+            self._disable()
+        else:
+            self._graphs[image] = graph
+        return graph

@@ -1,0 +1,177 @@
+"""When graphs of iterations are captured, replayed and dropped. test_gpu.py tests what a graph does, on a GPU."""
+
+import dataclasses
+from functools import partial
+
+import pytest
+import torch
+from helpers.trainings import guided_views
+
+from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels.cuda_graphs import Graph
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.coarse_to_fine import TrainingImages
+from drivesplat.training.cuda_graph import iteration_graphs
+from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, can_capture
+
+CPU = torch.device("cpu")
+HUNDRED = GaussianCount(100, 1.0)
+
+
+class FakeGraphs:
+    """IterationGraphs whose graphs log what they do in place of doing it."""
+
+    def __init__(self, monkeypatch):
+        self.log, self.capacities, self.needed = [], [], 3000
+        self.graphs = IterationGraphs(True, CPU)
+        monkeypatch.setattr(IterationGraphs, "_capture", lambda _, *arguments: self.capture(*arguments))
+        monkeypatch.setattr(torch.cuda, "synchronize", lambda _: None)
+
+    def capture(self, image, gaussians, iteration):
+        self.log.append(("captured", image))
+        self.capacities.append([need * gaussians for need in self.graphs._needs[image]])
+        replay = partial(self.log.append, ("replayed", image))
+        self.graphs._graphs[image] = Graph(
+            replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), [self.needed],
+            torch.tensor(0),
+        )  # fmt: skip
+        return self.graphs._graphs[image]
+
+    def run(self, image, layout=0, gaussians=HUNDRED):
+        def iteration():
+            self.log.append(("run", image))
+            rooms.room_for(torch.tensor(self.needed))
+            return {"l1": torch.tensor(float(image))}
+
+        terms = self.graphs.run(image, layout, gaussians, iteration)
+        assert float(terms["l1"]) == image
+        logged = [action for action, of in self.log if of == image]
+        self.log.clear()
+        return logged
+
+
+def test_an_image_is_captured_when_it_is_used_again(monkeypatch):
+    fake = FakeGraphs(monkeypatch)
+    assert fake.run(0) == ["run"], "the entries that its lists need are not known yet"
+    assert fake.run(0) == ["captured", "replayed"]
+    assert fake.run(1) == ["run"]
+    assert fake.run(0) == ["replayed"]
+    assert fake.run(1) == ["captured", "replayed"]
+
+
+def test_another_layout_captures_anew(monkeypatch):
+    """The entries that the lists of the image need are known by then."""
+    fake = FakeGraphs(monkeypatch)
+    assert [fake.run(0) for _ in range(3)] == [["run"], ["captured", "replayed"], ["replayed"]]
+    assert [fake.run(0, layout=1) for _ in range(2)] == [["captured", "replayed"], ["replayed"]]
+
+
+def test_capacities_leave_headroom_for_growth(monkeypatch):
+    fake = FakeGraphs(monkeypatch)
+    fake.run(0, gaussians=GaussianCount(100, 2.0))
+    fake.run(0, gaussians=GaussianCount(120, 1.5))
+    assert [round(room) for (room,) in fake.capacities] == [5400]
+    fake.needed = 4200
+    fake.graphs._graphs[0].needed[0] = fake.needed
+    fake.run(0, gaussians=GaussianCount(140, 1.2))
+    fake.run(0, layout=1, gaussians=GaussianCount(200, 2.0))
+    assert [round(room) for (room,) in fake.capacities] == [5400, 2 * 200 * 4200 // 140], (
+        "the entries that it needed last"
+    )
+
+
+def test_invalidated_graphs_are_captured_again_while_graphs_are_enabled(monkeypatch):
+    fake = FakeGraphs(monkeypatch)
+    for _ in range(2):
+        fake.run(0)
+    assert fake.graphs.invalidate() and fake.run(0) == ["captured", "replayed"]
+    fake.graphs.enabled = False
+    assert not fake.graphs.invalidate() and not fake.graphs._graphs
+
+
+def test_overflowed_graphs_are_captured_anew(monkeypatch):
+    fake = FakeGraphs(monkeypatch)
+    for image in (0, 0, 1, 1):
+        fake.run(image)
+    fake.graphs.check()
+    assert fake.run(0) == ["replayed"]
+    fake.graphs._graphs[0].missing.add_(1)
+    fake.graphs._graphs[0].needed[0] = 7000
+    fake.graphs.check()
+    assert fake.run(0) == ["captured", "replayed"]
+    assert [round(room) for (room,) in fake.capacities] == [3000, 3000, 7000]
+    assert fake.run(1) == ["replayed"], "its lists did not overflow"
+
+
+def test_the_memory_pool_is_released_with_the_last_graph(monkeypatch):
+    """torch frees the pool then and cannot use it again."""
+    fake = FakeGraphs(monkeypatch)
+    fake.graphs._pool = (0, 1)
+    for image in (0, 0, 1, 1):
+        fake.run(image)
+    fake.graphs._graphs[0].missing.add_(1)
+    fake.graphs.check()
+    assert fake.graphs._pool == (0, 1)
+    fake.graphs._graphs[1].missing.add_(1)
+    fake.graphs.check()
+    assert fake.graphs._pool is None
+
+
+def test_disabled_graphs_run_every_iteration(monkeypatch):
+    fake = FakeGraphs(monkeypatch)
+    fake.graphs.enabled = False
+    assert [fake.run(0) for _ in range(3)] == [["run"]] * 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "device", "compiles", "expected"),
+    [
+        ({}, "cuda", True, True),
+        ({}, "cpu", True, False),
+        ({}, "cuda", False, False),
+        ({"cuda_graphs": False}, "cuda", True, False),
+        ({"strategy": "default"}, "cuda", True, False),
+    ],
+)
+def test_which_trainings_capture_graphs(settings, device, compiles, expected, monkeypatch):
+    monkeypatch.setattr(on_gpu, "compiles", lambda: compiles)
+    chosen = TrainSettings(**settings)
+    assert can_capture(chosen, TrainingImages(guided_views(), chosen, 0), torch.device(device)) == expected
+
+
+def test_classes_and_too_many_images_disable_graphs(monkeypatch):
+    monkeypatch.setattr(on_gpu, "compiles", lambda: True)
+    views, gpu = guided_views(), torch.device("cuda")
+    labelled = [dataclasses.replace(view, classes=torch.zeros_like(view.sky, dtype=torch.uint8)) for view in views]
+    assert not can_capture(TrainSettings(), TrainingImages(labelled, TrainSettings(), 0), gpu)
+    monkeypatch.setattr(iteration_graphs, "MAX_IMAGES", len(views) - 1)
+    assert not can_capture(TrainSettings(), TrainingImages(views, TrainSettings(), 0), gpu)
+
+
+def test_graphs_are_dropped_when_memory_runs_out(monkeypatch, caplog):
+    fake, full = FakeGraphs(monkeypatch), [False, True]
+    for _ in range(2):
+        fake.run(0)
+
+    def work():
+        if full.pop():
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return "done"
+
+    assert fake.graphs.retry_without_graphs(work) == "done" and not fake.graphs.enabled
+    assert "no GPU memory is left for CUDA graphs" in caplog.text
+    full[:] = [True]
+    with pytest.raises(torch.cuda.OutOfMemoryError):  # there are no graphs to drop
+        fake.graphs.retry_without_graphs(work)
+
+
+def test_lists_have_exact_capacities_or_the_needed_entries_and_a_margin():
+    assert rooms.room_for(torch.tensor(7)) == 7
+    with rooms.counted() as needs:
+        assert [rooms.room_for(torch.tensor(need)) for need in (5000, 0)] == [5000, 0]
+    assert needs == [5000, 0]
+    with rooms.given(needs) as lists:
+        assert [rooms.room_for(torch.tensor(need)) for need in (9, 8)] == [rooms.LEAST + 7500, rooms.LEAST]
+    assert [(int(needed), room) for needed, room in lists] == [(9, rooms.LEAST + 7500), (8, rooms.LEAST)]
+    assert rooms.room_for(torch.tensor(3)) == 3
