@@ -32,7 +32,7 @@ from drivesplat.scene.images import continuous_intrinsics, pixel_rays, read_imag
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import training_images
-from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
+from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ MARGIN = 2
 """Pixels by which a body that was found is enlarged: its edge is out of focus."""
 
 
-def own_car_record(scene: Scene, job: OwnCarJob) -> dict[str, Any]:
+def own_car_record(scene: Scene, job: EgoMaskJob) -> dict[str, Any]:
     """The record of `drivesplat.scene.ego_mask`, provenance aside. Raises DatasetError naming an image that is
     unreadable."""
     cameras = {}
@@ -73,7 +73,7 @@ def own_car_record(scene: Scene, job: OwnCarJob) -> dict[str, Any]:
     return {"cameras": cameras}
 
 
-def known(scene: Scene, camera: str, job: OwnCarJob) -> tuple[tuple[Outline, ...], str | None, str | None]:
+def known(scene: Scene, camera: str, job: EgoMaskJob) -> tuple[tuple[Outline, ...], str | None, str | None]:
     """The body's outlines in the images of a camera; where they come from; and if from nowhere, why."""
     if camera in job.polygons:
         return (job.polygons[camera],), "polygons", None
@@ -93,7 +93,7 @@ class Drive:
     own_car_radius: float
 
     @classmethod
-    def of(cls, scene: Scene, camera: str, search: OwnCarSearch) -> "Drive":
+    def of(cls, scene: Scene, camera: str, search: EgoMaskSearch) -> "Drive":
         """Of a scene's training images, and its training sweeps."""
         frames = (scene.frames[i] for i in training_images(scene, search.holdout))
         moving = on_the_move([frame for frame in frames if frame.camera == camera])

@@ -1,7 +1,7 @@
-"""The base of every settings record, and its errors in one line each.
+"""The base class of all settings records, and one-line messages for their errors.
 
-A stage's settings live beside the stage. Field comments are attribute docstrings, so that a reworded comment is no
-change of the code (see `drivesplat.provenance.code_digest`).
+Fields are documented by attribute docstrings, so that a reworded comment does not change the code digest (see
+`drivesplat.provenance.code_digest`).
 """
 
 from typing import Any, TypeVar, get_args
@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from drivesplat.errors import ConfigError
 
 S = TypeVar("S", bound="Settings")
-MOST_QUOTED = 80
-"""Characters of a value in a message."""
+MAX_QUOTED = 80
+"""Maximum number of characters of a value in a message."""
 
 
 class Settings(BaseModel):
@@ -35,9 +35,9 @@ class Settings(BaseModel):
 
 
 def validated(model: type[S], values: dict[str, Any], where: str, document: str = "config.yaml") -> S:
-    """`model` made from `values`, which `document` describes.
+    """Validates `values`, which `document` describes, as `model`.
 
-    Raises ConfigError: one line that names each offending key, with `where` before it, its value and what is allowed.
+    Raises ConfigError: one line that names each invalid key, with `where` before it, its value and the allowed range.
     """
     try:
         return model.model_validate(values)
@@ -46,9 +46,9 @@ def validated(model: type[S], values: dict[str, Any], where: str, document: str 
 
 
 def _quoted(value: Any) -> str:
-    """A value, or as much of it as a line can hold."""
+    """A value, truncated to MAX_QUOTED characters."""
     text = repr(value)
-    return text if len(text) <= MOST_QUOTED else f"{text[:MOST_QUOTED]}…"
+    return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}…"
 
 
 def _sentence(item: dict[str, Any], where: str, document: str) -> str:

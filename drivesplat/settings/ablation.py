@@ -1,4 +1,4 @@
-"""The ablation of a method: what it is without each of the things that make it up, trained with several seeds."""
+"""The ablation of a method: the method without one of its components at a time, trained with several seeds."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,12 +11,12 @@ from drivesplat.settings.train import Parts
 
 
 class VariantSettings(Settings):
-    """A method with something taken out of it."""
+    """A method without one of its components."""
 
     parts: Parts | None = None
-    """What the variant's model is made of. null = what the method's is."""
+    """Parts of the variant's model. null = the method's parts."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """Settings laid over the method's own overrides, as a tree; `sky` and `train` may."""
+    """Settings laid over the method's overrides, as a tree. Only `sky` and `train` may be set."""
 
     @model_validator(mode="after")
     def _takes_something_out(self) -> "VariantSettings":
@@ -43,21 +43,21 @@ def _default_variants() -> dict[str, VariantSettings | None]:
 
 class AblationSettings(Settings):
     of: str = "street"
-    """The method that is taken apart."""
+    """The method to ablate."""
     seeds: Seeds = (0, 1, 2)
-    """Random seeds of the trainings: the method and every variant of it are trained with each."""
+    """Random seeds. The method and every variant are trained once with each seed."""
     without: dict[str, VariantSettings | None] = Field(default_factory=_default_variants)
-    """The variants, under names of your choice, by what each is without; null = no such variant. They are methods,
-    called {of}-without-{name}-seed{n}; the whole is {of}-seed{n}."""
+    """The variants, each named after the component that it lacks. null drops a variant. Each variant is a method named
+    {of}-without-{name}-seed{n}; the complete method is {of}-seed{n}."""
 
     @property
     def job(self) -> "AblationJob":
-        """What is compared."""
+        """The comparison of these trainings."""
         without = tuple(name for name, variant in self.without.items() if variant is not None)
         return AblationJob(of=self.of, seeds=self.seeds, without=without)
 
     def methods(self, whole: MethodSettings) -> dict[str, MethodSettings]:
-        """The methods to train, by name: `whole` and every variant of it, each with every seed."""
+        """The methods to train, by name: `whole` and every variant, each with every seed."""
         variants = {
             self.job.variant(name): whole.varied(variant.parts, variant.overrides)
             for name, variant in self.without.items()
@@ -67,28 +67,28 @@ class AblationSettings(Settings):
 
 
 class AblationJob(Settings):
-    """Everything that decides the content of one ablation.json, its inputs aside."""
+    """All settings that determine one ablation.json."""
 
     of: str
     seeds: tuple[int, ...]
     without: tuple[str, ...]
 
     def variant(self, without: str | None) -> str:
-        """The name of a variant; without nothing, of the whole method."""
+        """The name of the variant that lacks `without`; of the complete method where it is None."""
         return f"{self.of}-without-{without}" if without else self.of
 
     def method(self, without: str | None, seed: int) -> str:
-        """The name of a variant trained with a seed."""
+        """The name of a variant's training with one seed."""
         return with_seed(self.variant(without), seed)
 
     @property
     def spelled(self) -> str:
-        """The names of all methods, as a shell would expand them."""
+        """The names of all methods, as one pattern with braces of the shell."""
         stems = [self.of, *([self.variant(_either(self.without))] if self.without else [])]
         return ", ".join(f"{stem}-seed{_either(self.seeds)}" for stem in stems)
 
 
 def _either(names: Sequence[Any]) -> str:
-    """Names as a shell would expand them: it leaves braces around a single one."""
+    """Names in braces of the shell; a single name without braces, which the shell would not expand."""
     spelled = ",".join(map(str, names))
     return f"{{{spelled}}}" if len(names) > 1 else spelled

@@ -1,4 +1,4 @@
-"""What the stage `actors` may be told."""
+"""Settings of the rule `actors`."""
 
 from pydantic import Field
 
@@ -8,25 +8,26 @@ from drivesplat.settings.images import ImageSettings
 
 
 class ActorSeedSettings(Settings):
-    """What becomes an actor, a set of Gaussians of its own, and where its Gaussians start. An actor is a vehicle that
-    moves in the drive and that a training image sees."""
+    """Selection of actors and of their seed points. An actor is a vehicle that moves during the drive and is visible in
+    a training image; it gets a set of Gaussians in its own frame."""
 
     cycles: bool = True
-    """Whether bicycles and motorcycles become actors, too."""
+    """Make actors of bicycles and motorcycles, too."""
     humans: bool = False
-    """Whether people do: as rigid as their boxes."""
+    """Make actors of people, too. They are as rigid as their boxes."""
     min_points: int = Field(2_000, ge=0)
-    """With fewer LiDAR points than this over the whole drive an actor gets random points in its box as well."""
+    """Minimum number of LiDAR points of an actor over the whole drive. With fewer, random points in its box are added.
+    """
     random_points: int = Field(8_000, ge=0, le=1_000_000)
-    """Then it has so many points, LiDAR's included."""
+    """Number of points, LiDAR points included, up to which random points are added."""
     max_points: int = Field(20_000, ge=1, le=10_000_000)
-    """Most points of an actor; beyond it they are thinned at random."""
+    """Maximum number of seed points of an actor. Further points are dropped at random."""
     box_margin: float = Field(0.1, ge=0, le=2)
-    """LiDAR returns that are nearer than this (metres) to the box's sides or roof are the actor's, too."""
+    """LiDAR returns closer than this (metres) to the sides or the roof of a box belong to its actor."""
 
 
 class ActorSeedJob(Settings):
-    """Everything that decides the content of one actors.pkl, the scene aside."""
+    """All settings that determine the actors' seed of one scene."""
 
     actors: ActorSeedSettings
     holdout: HoldoutSettings

@@ -1,4 +1,4 @@
-"""How the actors of a training learn: Gaussians in the frames of moving boxes."""
+"""Training settings of actors: Gaussians in the frames of moving boxes."""
 
 from pydantic import Field
 
@@ -6,38 +6,37 @@ from drivesplat.settings import Settings
 
 
 class TrackSettings(Settings):
-    """Learned corrections of where actors are at their annotations, between which they are interpolated smoothly."""
+    """Learned corrections of the annotated poses of actors. Poses between annotations are interpolated smoothly."""
 
     corrected: bool = True
-    """Whether annotated positions and headings are corrected at all."""
+    """Correct annotated positions and headings."""
     lr_translation: float = Field(1e-3, gt=0)
-    """Learning rate of the corrections of position (metres)."""
+    """Learning rate of the position corrections (metres)."""
     lr_yaw: float = Field(5e-4, gt=0)
-    """Learning rate of the corrections of heading (radians)."""
+    """Learning rate of the heading corrections (radians)."""
     size_weight: float = Field(0.001, ge=0)
-    """Weight of the mean square of the corrections, in units of `sigma`s: annotations are trusted so far."""
+    """Loss weight of the mean square of the corrections, in units of `sigma_translation` and `sigma_yaw`."""
     bend_weight: float = Field(0.001, ge=0)
-    """Weight of the mean square of their second differences, in the same units: corrections change slowly, and carry
-    over to the held-out frames between. On scene 0061 what moves measures 25.1 dB with it, held out, 22 dB with a
-    hundred times as much, which allows no correction, and 20 dB with none, which lets them fit one image each."""
+    """Loss weight of the mean square of their second differences along a track, in the same units. It keeps corrections
+    smooth, so that they hold for the held-out frames in between (docs/street.md)."""
     sigma_translation: float = Field(0.1, gt=0)
-    """How far off (metres) an annotated position is expected to be."""
+    """Expected error of an annotated position (metres)."""
     sigma_yaw: float = Field(0.03, gt=0)
-    """How far off (radians) an annotated heading is expected to be."""
+    """Expected error of an annotated heading (radians)."""
 
 
 class ActorSettings(Settings):
-    """The part `actors`: the vehicles that move, each a set of Gaussians in its own box's frame."""
+    """The part `actors`: moving vehicles, each a set of Gaussians in the frame of its box."""
 
     cap_max: int = Field(200_000, ge=1, le=20_000_000)
-    """Most Gaussians of all actors together; each keeps four, however low this is."""
+    """Maximum number of Gaussians of all actors together. Each actor keeps at least four."""
     least: int = Field(500, ge=1)
-    """An actor may have so many Gaussians, however few pixels show it. Otherwise train.pixels_per_gaussian limits it by
-    the training pixels in its box: on scene 0061 twenty times as many Gaussians cost 1 dB on what moves, held out."""
+    """Number of Gaussians that every actor may have. Beyond it, train.pixels_per_gaussian limits an actor by the number
+    of training pixels in its box."""
     sh_degree: int = Field(1, ge=0, le=3)
-    """Highest degree of the spherical harmonics that hold their colours, in the object's frame."""
+    """Degree of the spherical harmonics of their colours, in the object's frame."""
     fourier: int = Field(5, ge=1, le=16)
-    """Fourier coefficients over an actor's time, of every coefficient of its colours: 1 = colours constant in time."""
+    """Number of Fourier coefficients over time of every colour coefficient. 1 = colours constant in time."""
     box_margin: float = Field(0.1, ge=0, le=2)
-    """Gaussians whose centres are farther than this (metres) outside their box are faded out."""
+    """Gaussians with centres farther than this (metres) outside their box are faded out."""
     tracks: TrackSettings = TrackSettings()

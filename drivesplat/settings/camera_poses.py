@@ -1,4 +1,4 @@
-"""Corrections of camera poses that are learned in training."""
+"""Settings of camera pose corrections that a training learns."""
 
 from pydantic import Field
 
@@ -6,23 +6,22 @@ from drivesplat.settings import Settings
 
 
 class CameraPoseSettings(Settings):
-    """Bounded, smooth corrections of every training image's camera pose, learned along with the Gaussians. Held-out
-    images, and all times between training images, get what lies between their neighbours' corrections.
+    """Bounded, smooth corrections of the camera poses of training images, learned along with the Gaussians. Held-out
+    images and all other times take interpolated corrections.
 
-    For what is left after `refine_poses`, or instead of it. Without bounds training images drift away from held-out
-    ones: better there, worse here.
+    Applies after `refine_poses`, or instead of it. Unbounded corrections raise training PSNR and lower held-out PSNR,
+    since training poses drift away from held-out poses.
     """
 
     corrected: bool = False
-    """Whether anything is corrected at all."""
+    """Correct camera poses during training."""
     max_shift: float = Field(0.05, gt=0, le=1)
-    """No camera is moved by more than this (metres) along any of its axes."""
+    """Maximum translation of a camera along each of its axes (metres)."""
     max_turn: float = Field(0.3, gt=0, le=10)
-    """None is turned by more than this (degrees) about any of them."""
+    """Maximum rotation of a camera about each of its axes (degrees)."""
     learning_rate: float = Field(2e-3, gt=0)
-    """Learning rate, in fractions of these bounds; decays exponentially to a hundredth."""
+    """Learning rate, in fractions of these bounds. Decays exponentially to a hundredth."""
     size_weight: float = Field(0.001, ge=0)
-    """Weight of the mean square of the corrections, in fractions of the bounds: given poses are trusted so far."""
+    """Loss weight of the mean square of the corrections, in fractions of the bounds."""
     bend_weight: float = Field(0.01, ge=0)
-    """Weight of the mean square of their second differences from image to image, in the same units: corrections change
-    slowly."""
+    """Loss weight of the mean square of their second differences from image to image, in the same units."""

@@ -1,4 +1,4 @@
-"""The settings of trainings that begin coarse."""
+"""Settings of the coarse-to-fine schedule."""
 
 from pydantic import Field
 
@@ -6,15 +6,15 @@ from drivesplat.settings import Settings
 
 
 class CoarseToFineSettings(Settings):
-    """Reduced images and fewer Gaussians at first: an iteration costs less, and what is large is found before what is
-    small (after DashGaussian, Chen et al. 2025, arXiv 2503.18402)."""
+    """Trains with reduced images and fewer Gaussians at first, so that early iterations are faster (after DashGaussian,
+    Chen et al. 2025, arXiv 2503.18402)."""
 
     quarter_until: float = Field(0.2, ge=0, le=1)
-    """Until this fraction of the iterations images are reduced to a quarter of their width and height."""
+    """Fraction of the iterations that use images of a quarter of the width and height."""
     half_until: float = Field(0.7, ge=0, le=1)
-    """From then on, until this fraction, to a half."""
+    """Fraction of the iterations after which images have full size. Before it they have half the width and height."""
     least_height: int = Field(225, ge=16)
-    """Pixels: no image is reduced to fewer rows. 900 rows are reduced to 225, 640x360 images are not reduced."""
+    """Minimum number of rows of a reduced image. 900 rows are reduced to 225; images of 640x360 are not reduced."""
     share: float = Field(0.6, gt=0, le=1)
-    """While images are reduced, with strategy: mcmc, the number of Gaussians grows to no more than this share of what
-    there may be; it is given up in time for them to grow to all before densification stops."""
+    """Fraction of the Gaussian limit that applies while images are reduced, with strategy: mcmc. The full limit
+    applies early enough for the number of Gaussians to reach it before densification stops."""

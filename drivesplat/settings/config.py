@@ -1,7 +1,7 @@
-"""The configuration: every stage's settings in one record, and what each stage of each scene and method gets of it.
+"""The configuration: the settings of all rules in one record, and the settings that hold for a scene and a method.
 
-Defaults, ranges and comments stand in `drivesplat.settings` alone; config.yaml and config.schema.json are generated
-from them (`python -m drivesplat.settings.config_document`). Importing this module is cheap: the Snakefile does.
+`drivesplat.settings` is the only source of defaults, ranges and comments; config.yaml and config.schema.json are
+generated from it (`make config`). This module imports quickly, since the Snakefile imports it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -49,23 +49,23 @@ def _default_methods() -> dict[str, MethodSettings]:
 
 class Config(Settings):
     datasets: dict[str, DatasetSettings] = Field(default_factory=default_datasets, min_length=1)
-    """Recorded drives, each under a name of your choice."""
+    """Datasets, each under a name of your choice."""
     accept_nuscenes_terms: bool = False
-    """Whether you accept nuScenes' terms, https://www.nuscenes.org/terms-of-use: non-commercial use, unless you have a
-    licence. Without it `snakemake download_nuscenes_mini` fetches nothing."""
+    """Accept nuScenes' terms, https://www.nuscenes.org/terms-of-use (non-commercial use without a licence). Until they
+    are accepted, `snakemake download_nuscenes_mini` downloads nothing."""
     nuscenes_mini: NuscenesMiniSettings = NuscenesMiniSettings()
     methods: dict[str, MethodSettings | None] = Field(default_factory=_default_methods, min_length=1)
-    """Methods to train and compare, each under a name of your choice; a result folder each. null = no such method: a
-    file laid over this one drops `street` by {street: null}."""
+    """Methods to train and compare, each under a name of your choice, which also names its result folder. null drops a
+    method: `methods: {street: null}` in a file laid over this one."""
     ablation: AblationSettings = AblationSettings()
-    """What each thing in a method is worth; trained for `snakemake results/{scene}/ablation.csv` alone."""
+    """Ablation of a method. Only `snakemake results/{scene}/ablation.csv` trains it."""
     cameras: tuple[str, ...] = Field(("CAM_FRONT",), min_length=1)
     """Cameras to train on."""
     eval_camera: str = "CAM_FRONT"
-    """The camera whose held-out images are measured; one of cameras."""
+    """The camera whose held-out images are evaluated. Must be one of `cameras`."""
     sweeps: bool = False
-    """Train on the 12 Hz images between key frames, too, but for those nearer than half a key-frame interval to a
-    held-out one. LiDAR between key frames: lidar_seed.sweeps. docs/real_logs.md"""
+    """Train on images between key frames, too, except those within half a key-frame interval of a held-out key frame.
+    For LiDAR between key frames see lidar_seed.sweeps. docs/real_logs.md"""
     images: ImageSettings = ImageSettings()
     holdout: HoldoutSettings = HoldoutSettings()
     extract: ExtractSettings = ExtractSettings()
@@ -76,21 +76,22 @@ class Config(Settings):
     free_space: FreeSpaceSettings = FreeSpaceSettings()
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
-    """Behind the Gaussians: 'cubemap' (learned, by direction), 'mask' (one learned colour, Gaussians kept out of sky
-    pixels) or 'none' (black). The cube map does best on nuScenes: without one, Gaussians fill the sky."""
+    """Sky model behind the Gaussians: 'cubemap' (learned colours by direction), 'mask' (one learned colour, opacity
+    penalised in sky pixels) or 'none' (black). Without a cube map, Gaussians fill the sky."""
     train: TrainSettings = TrainSettings()
     render: RenderSettings = RenderSettings()
     subjects: dict[str, SubjectSettings] = Field(default_factory=dict)
-    """Per scene the vehicle to look at, as {"0061": {track: 6e5c..., key_frame: 12}}; elsewhere it is chosen."""
+    """Vehicle of the ghost panel and of the removal, by scene: {"0061": {track: 6e5c..., key_frame: 12}}. Other scenes
+    take the moving vehicle that fills most pixels."""
     ghosts: GhostSettings = GhostSettings()
     removal: RemovalSettings = RemovalSettings()
     export: ExportSettings = ExportSettings()
     lpips: LpipsSettings = LpipsSettings()
     device: DeviceSettings = DeviceSettings()
     random_seed: int = Field(0, ge=0, lt=2**31)
-    """Seeds every random choice."""
+    """Random seed of all stages."""
     results_dir: str = Field("results", min_length=1)
-    """The folder of all output; keep experiments apart by giving each its own."""
+    """Folder of all results. Give each experiment a folder of its own."""
 
     @field_validator("accept_nuscenes_terms", mode="before")
     @classmethod
@@ -145,18 +146,18 @@ class Config(Settings):
 
     @cached_property
     def places(self) -> dict[tuple[str, str | None], "Config"]:
-        """What `for_scene` has found, by dataset and method: rules ask for it hundreds of times."""
+        """Cache of `for_scene`, by dataset and method: rules call it hundreds of times."""
         return {}
 
     @cached_property
     def ablated(self) -> dict[str, MethodSettings]:
-        """The methods of the ablation, by name; none where the method that it takes apart is not configured."""
+        """The methods of the ablation, by name; empty where the ablated method is not configured."""
         whole = self.methods.get(self.ablation.of)
         return self.ablation.methods(whole) if whole else {}
 
     @property
     def all_methods(self) -> dict[str, MethodSettings]:
-        """The methods to compare, and those of the ablation."""
+        """The configured methods and those of the ablation."""
         return {**self.methods, **self.ablated}
 
     @property
@@ -166,11 +167,11 @@ class Config(Settings):
 
     @property
     def batch_scenes(self) -> list[str]:
-        """The scenes of `snakemake` without a target, and of the report."""
+        """The scenes of a bare `snakemake` and of the report."""
         return [scene for dataset in self.datasets.values() if dataset.batch for scene in dataset.scenes]
 
     def dataset_of(self, scene: str) -> str:
-        """The name of the dataset a scene belongs to. Raises ConfigError listing the scenes there are."""
+        """The name of a scene's dataset. Raises ConfigError, with the list of scenes, for an unknown scene."""
         for name, dataset in self.datasets.items():
             if scene in dataset.scenes:
                 return name
@@ -181,7 +182,7 @@ class Config(Settings):
 
 
 def load(values: Mapping[str, Any]) -> Config:
-    """The validated config, overrides included. Raises ConfigError: one line, the key, its value, what is allowed."""
+    """Validates a config with its overrides. Raises ConfigError: one line with key, value and allowed range."""
     if "provenance" in values:
         raise ConfigError(
             "a result of this workflow is among the config files, where Snakemake takes what follows --configfile: "
@@ -201,7 +202,7 @@ def load(values: Mapping[str, Any]) -> Config:
 
 
 def for_scene(config: Config, scene: str, method: str | None = None) -> Config:
-    """The config as it holds for one scene, and one method where given. Raises ConfigError for an unknown scene."""
+    """The config of one scene, and of one method where given. Raises ConfigError for an unknown scene."""
     dataset, known = config.dataset_of(scene), config.places
     if (dataset, None) not in known:
         known[dataset, None] = _overridden(config, config.datasets[dataset].overrides, f"datasets.{dataset}.overrides")
@@ -218,7 +219,7 @@ def _overridden(config: Config, overrides: Mapping[str, Any], where: str) -> Con
 
 
 def require_known(overrides: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
-    """Raises ConfigError where the tree of overrides at `where` sets what it may not."""
+    """Raises ConfigError where the tree of overrides at `where` sets a key that is not `allowed`."""
     for key in overrides:
         if key not in allowed:
             raise ConfigError(f"'{where}.{key}' cannot be set there; what can: {', '.join(allowed)}")

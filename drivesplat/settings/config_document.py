@@ -44,7 +44,7 @@ def config_schema() -> str:
 
 
 def _mapping(record: BaseModel, indent: int, told: set[tuple[type, str]] | None = None) -> str:
-    """The record's fields; comments that have been `told` of an earlier record of its kind are left out."""
+    """The record's fields. Comments already `told` for an earlier record of the same class are left out."""
     told = set() if told is None else told
     lines = []
     for name, field in type(record).model_fields.items():

@@ -1,4 +1,4 @@
-"""What a recorded or synthetic drive may be told: where it lies, its scenes, and what differs for it."""
+"""Settings of a dataset, recorded or synthetic: its location, its scenes and its overrides."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -16,35 +16,33 @@ DEMO_OVERRIDES = {
     "render": {"fps": 15, "width": 800, "height": 450},
     "device": {"min_free_gb": 1.0},
 }
-"""What makes the demo world train, and its films render, in minutes on a CPU."""
+"""With these, the demo trains and renders within minutes on a CPU."""
 
 
 class DatasetSettings(Settings):
     reader: Literal["nuscenes"] = "nuscenes"
-    """The format."""
+    """Dataset format."""
     dataroot: str = "~/data/nuscenes/v1.0-mini"
-    """The folder that holds the folder of tables (or that folder itself, or its grandparent)."""
+    """Folder that contains the folder of tables (or that folder itself, or its grandparent)."""
     version: str = "v1.0-mini"
-    """The folder of tables: v1.0-mini, v1.0-trainval, ..."""
+    """Name of the folder of tables: v1.0-mini, v1.0-trainval, ..."""
     scenes: tuple[str, ...] = MINI_SCENES
-    """Scene numbers, quoted: bare YAML would read an octal number."""
+    """Scene numbers in quotes. YAML reads a bare 0061 as an octal number."""
     frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
-    """Per scene a range of key frames [first, last + 1) to use, which are then counted from 0.
-
-    Others are used whole.
-    """
+    """Range of key frames to use, by scene: [first, last + 1). They are then counted from 0. Other scenes are used
+    completely."""
     edits: dict[str, str] = Field(default_factory=dict)
-    """Per scene the file of its edits (docs/editing.md)."""
+    """Edits file, by scene (docs/editing.md)."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """Settings of this file that differ for this dataset, as a tree: {images: {width: 800}}."""
+    """Settings that differ for this dataset, as a tree: {images: {width: 800}}."""
     batch: bool = True
-    """Whether its scenes belong to `snakemake` without a target and to the report."""
+    """Include its scenes in a bare `snakemake` and in the report."""
     world: WorldSettings | None = None
-    """A synthetic street that is made at dataroot, with one scene. null = a recorded dataset, which is there."""
+    """Synthetic street with one scene, generated at dataroot. null = a recorded dataset that is already there."""
 
     @property
     def world_root(self) -> str:
-        """The folder where `world` is made."""
+        """The folder in which `world` is generated."""
         return str(Path(self.dataroot).expanduser())
 
     @field_validator("scenes", mode="before")

@@ -1,4 +1,4 @@
-"""Where the work runs."""
+"""Settings of the compute device."""
 
 from typing import Any, Literal
 
@@ -8,18 +8,19 @@ from drivesplat.settings import Settings
 
 
 class DeviceSettings(Settings):
-    """Where the work runs. Not part of any result's settings: moving to another machine reruns nothing."""
+    """The compute device. It is not part of the settings of a result: a run on another machine reruns nothing."""
 
     kind: Literal["auto", "any", "cuda", "cpu"] = "auto"
-    """'auto' takes the GPU and refuses real scenes without one; 'any' makes do with the CPU, as synthetic worlds do;
-    'cuda' insists on the GPU; 'cpu' is for the patient. `device: cpu` is short for `device: {kind: cpu}`."""
+    """'auto' takes the GPU and refuses recorded scenes without one; 'any' takes the CPU where there is no GPU, as
+    synthetic worlds do; 'cuda' requires a GPU; 'cpu' always takes the CPU. `device: cpu` is short for
+    `device: {kind: cpu}`."""
     min_free_gb: float = Field(8.0, ge=0, le=1000)
-    """A training does not start with less free GPU memory than this (GB)."""
+    """Minimum free GPU memory (GB) for a training to start."""
     max_gb: float | None = Field(None, gt=0, le=1000)
-    """A job takes no more GPU memory than this (GB), where others share the card. null = all there is."""
+    """Maximum GPU memory of a job (GB), for cards that jobs share. null = no limit."""
 
     jobs_per_card: int = Field(1, ge=1, le=64)
-    """How many jobs may share a GPU; further ones wait. Where it is more than 1, let Snakemake start as many, too:
+    """Maximum number of jobs on one GPU. Further jobs wait. For more than 1, set Snakemake's resource as well:
     `--resources gpu=<cards times this>`."""
 
     @model_validator(mode="before")

@@ -1,6 +1,6 @@
-"""Edits of a recorded drive: who moves otherwise, and from where it is watched.
+"""Edits of a recorded drive: changed motion of tracks and of the camera.
 
-Metres, degrees, m/s; seconds since the scene's first image, which are seconds of the film.
+Units: metres, degrees, m/s. Times are seconds since the scene's first image, which is the start of the film.
 """
 
 from collections.abc import Callable
@@ -24,19 +24,19 @@ def _in_quotes(value: Any) -> Any:
 
 
 Id = Annotated[str, Field(min_length=1), BeforeValidator(_in_quotes)]
-"""A track's id from tracks.csv, a beginning of it that no other track has, or the name of a duplicate."""
+"""A track's id from tracks.csv, a unique prefix of it, or the name of a duplicate."""
 
 
 class Gradual(Settings):
-    """A change that may come in smoothly."""
+    """A change with an optional transition."""
 
     USUAL: ClassVar[float] = 0.0
-    """The duration where only a start is given."""
+    """Duration in seconds where only a start is given."""
 
     start: float | None = Field(None, ge=0)
-    """The second at which the change begins. null = it holds from the beginning."""
+    """Start of the transition (seconds). null = the change holds from the beginning."""
     duration: float | None = Field(None, ge=0)
-    """How many seconds the change takes; 0: none, it jumps."""
+    """Length of the transition (seconds). 0 = a jump."""
 
     @model_validator(mode="after")
     def _a_duration_has_a_start(self) -> "Gradual":
@@ -46,21 +46,21 @@ class Gradual(Settings):
 
 
 class Remove(Settings):
-    """The track is not there."""
+    """Removes the track."""
 
     track: Id
 
 
 class Speed(Gradual):
-    """The track drives its way faster or slower; without `start` from when it is first there."""
+    """Changes the track's speed along its path; without `start`, from its first annotation on."""
 
     USUAL: ClassVar[float] = 1.0
 
     track: Id
     factor: float | None = Field(None, gt=0, le=10)
-    """Times its speed at the same place of its way."""
+    """Factor on the recorded speed at the same place of the path."""
     to: float | None = Field(None, gt=0, le=100)
-    """Its speed, whatever it was."""
+    """New speed (m/s)."""
 
     @model_validator(mode="after")
     def _factor_or_to(self) -> "Speed":
@@ -70,35 +70,35 @@ class Speed(Gradual):
 
 
 class Stop(Settings):
-    """The track comes to rest on its way, and stays there."""
+    """Stops the track on its path for the rest of the drive."""
 
     track: Id
     at: float = Field(ge=0)
-    """The second at which it begins to brake."""
+    """Start of braking (seconds)."""
     duration: float = Field(2.0, ge=0)
-    """How many seconds it brakes."""
+    """Length of braking (seconds)."""
 
 
 class Reverse(Settings):
-    """The track drives its way backwards: from where it is last to where it is first."""
+    """Reverses the track's motion along its path, from its last position to its first."""
 
     track: Id
     turn: bool = False
-    """Whether it is turned round, so that it faces where it drives."""
+    """Turn the vehicle round, so that it faces the direction of travel."""
 
 
 class Shift(Gradual):
-    """The track moves out of its way."""
+    """Moves the track off its path."""
 
     USUAL: ClassVar[float] = 3.0
 
     track: Id
     lateral: float = Field(0.0, ge=-50, le=50)
-    """Metres to its left."""
+    """Offset to its left (metres)."""
     longitudinal: float = Field(0.0, ge=-200, le=200)
-    """Metres further on along its way."""
+    """Offset forward along its path (metres)."""
     yaw: float = Field(0.0, ge=-360, le=360)
-    """Degrees to its left, about its own vertical axis."""
+    """Rotation to its left about its vertical axis (degrees)."""
 
     @model_validator(mode="after")
     def _shifts(self) -> "Shift":
@@ -108,7 +108,7 @@ class Shift(Gradual):
 
 
 class Swap(Settings):
-    """Two tracks drive each other's way."""
+    """Swaps the paths of two tracks."""
 
     model_config = ConfigDict(serialize_by_alias=True)
 
@@ -117,7 +117,7 @@ class Swap(Settings):
 
 
 class Duplicate(Settings):
-    """A copy of a track and of what it does so far, which later steps may name."""
+    """Copies a track with the effect of all earlier steps. Later steps may name the copy."""
 
     model_config = ConfigDict(serialize_by_alias=True)
 
@@ -125,29 +125,29 @@ class Duplicate(Settings):
     name: Id = Field(alias="as")
     """The copy's id: letters, digits, '_', '-' and '.'."""
     longitudinal: float = Field(0.0, ge=-200, le=200)
-    """Metres further on along the way."""
+    """Offset forward along the path (metres)."""
     lateral: float = Field(0.0, ge=-50, le=50)
-    """Metres to the left of the original."""
+    """Offset to the left of the original (metres)."""
     delay: float = Field(0.0, ge=-60, le=60)
-    """Seconds by which the copy does everything later."""
+    """Delay of the copy (seconds)."""
 
 
 class Rescale(Settings):
-    """The track is larger or smaller, standing where it stood."""
+    """Scales the track about the centre of its floor."""
 
     track: Id
     factor: float = Field(ge=0.1, le=10)
 
 
 class Ego(Gradual):
-    """The camera's car drives beside its way, faster or slower."""
+    """Changes the path and the speed of the ego vehicle, which carries the camera."""
 
     USUAL: ClassVar[float] = 3.0
 
     lateral: float = Field(0.0, ge=-50, le=50)
-    """Metres to the left of its way."""
+    """Offset to the left of its path (metres)."""
     speed: float = Field(1.0, ge=0, le=10)
-    """Times its speed at the same place of its way; 0: it stands."""
+    """Factor on the recorded speed at the same place of the path. 0 = it stands."""
 
     @model_validator(mode="after")
     def _changes(self) -> "Ego":
@@ -160,7 +160,7 @@ Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Rescale | 
 
 
 class Step(Settings):
-    """One step of an edit: exactly one of these."""
+    """One step of an edit. Exactly one field is set."""
 
     remove: Remove | None = None
     speed: Speed | None = None
@@ -189,11 +189,11 @@ class Step(Settings):
 
     @property
     def change(self) -> Change:
-        """What the step does."""
+        """The change of the step."""
         return getattr(self, self.kind)
 
 
 class Edit(Settings):
-    """Steps, each acting on what the steps before it made of the drive."""
+    """Steps that are applied in order, each to the result of the steps before it."""
 
     steps: tuple[Step, ...] = Field(min_length=1)

@@ -1,6 +1,6 @@
 """The edits of a scene, as a YAML file: named edits, each a list of steps. docs/editing.md describes it.
 
-Importing this module is cheap: the Snakefile does. What only the scene knows, `edited_cast` checks.
+This module imports quickly, since the Snakefile imports it. Checks that need the scene are in `edited_cast`.
 """
 
 import re
@@ -15,39 +15,41 @@ from drivesplat.settings.names import NAME
 from drivesplat.settings.yaml_file import read_yaml
 
 RESERVED = ("ego",)
-"""Names that no duplicate may have: it is the camera's car."""
+"""Names that a duplicate cannot have: `ego` is the ego vehicle."""
 
 
 def read_edits(path: str | Path) -> dict[str, Edit]:
-    """The edits of a file by their names, in its order.
+    """The edits of a file by name, in the file's order.
 
-    Raises ConfigError, one line with the file, the edit and the step, where it is missing or not what it should be.
+    Raises ConfigError, one line with the file, the edit and the step, where the file is missing or invalid.
     """
     content = read_yaml(path, "edits file")
     if not isinstance(content, dict) or set(content) != {"edits"}:
         raise ConfigError(f"{path}: an edits file holds the one key 'edits', under it a list of steps per name")
     edits = {} if content["edits"] is None else content["edits"]
     if not isinstance(edits, dict):
-        raise ConfigError(f"{path}: 'edits' is {_shown(edits)}; it holds a list of steps per name")
+        raise ConfigError(f"{path}: 'edits' is {_quoted(edits)}; it holds a list of steps per name")
     return {_name(name, f"{path}: edit"): _edit(steps, f"{path}: edit {name!r}") for name, steps in edits.items()}
 
 
 def _edit(steps: Any, where: str) -> Edit:
     if not isinstance(steps, list) or not steps:
-        raise ConfigError(f"{where} is {_shown(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}")
+        raise ConfigError(
+            f"{where} is {_quoted(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}"
+        )
     return Edit(steps=tuple(_step(step, f"{where}, step {number}") for number, step in enumerate(steps, start=1)))
 
 
 def _step(step: Any, where: str) -> Step:
     kinds = ", ".join(Step.model_fields)
     if not isinstance(step, dict) or len(step) != 1:
-        raise ConfigError(f"{where} is {_shown(step)}; a step has one key, one of {kinds}")
+        raise ConfigError(f"{where} is {_quoted(step)}; a step has one key, one of {kinds}")
     (kind, fields), *_ = step.items()
     if kind not in Step.model_fields:
         raise ConfigError(f"{where}: there is no step {kind!r}; there are: {kinds}")
     where = f"{where} ({kind})"
     if not isinstance(fields, dict):
-        raise ConfigError(f"{where} is {_shown(fields)}; it is a mapping: {kind}: {{{_example(kind)}}}")
+        raise ConfigError(f"{where} is {_quoted(fields)}; it is a mapping: {kind}: {{{_example(kind)}}}")
     for key in fields:
         if not isinstance(key, str):
             raise ConfigError(f"{where}: {key!r} stands where a key should; a decimal has a point: 3.5, not 3,5")
@@ -71,7 +73,7 @@ def _name(name: Any, what: str) -> str:
 
 
 def _keys(kind: str) -> list[str]:
-    """The keys of a step as they stand in the file."""
+    """The keys of a step as spelled in the file."""
     record = Step.model_fields[kind].annotation.__args__[0]
     return [field.alias or name for name, field in record.model_fields.items()]
 
@@ -81,7 +83,7 @@ def _example(kind: str) -> str:
 
 
 def _sentence(item: Any, kind: str) -> str:
-    """What pydantic found wrong with a step of a kind."""
+    """One pydantic error of a step as a sentence."""
     key = ".".join(str(part) for part in item["loc"][1:])
     message = item["msg"].removeprefix("Value error, ")
     if not key:
@@ -90,10 +92,10 @@ def _sentence(item: Any, kind: str) -> str:
         return f"unknown key {key!r}; there are: {', '.join(_keys(kind))}"
     if item["type"] == "missing":
         return f"{key!r} is missing; there are: {', '.join(_keys(kind))}"
-    return f"{key!r} is {_shown(item['input'])}: {message[:1].lower()}{message[1:]}"
+    return f"{key!r} is {_quoted(item['input'])}: {message[:1].lower()}{message[1:]}"
 
 
-def _shown(value: Any) -> str:
-    """A value of the file, not too long for a line."""
+def _quoted(value: Any) -> str:
+    """A value of the file, truncated to 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

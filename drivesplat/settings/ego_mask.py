@@ -1,25 +1,25 @@
-"""What the stage `own_car` may be told."""
+"""Settings of the rule `own_car`, which finds the ego vehicle's body in images."""
 
 from typing import Literal
 
 from drivesplat.settings import Settings
 from drivesplat.settings.holdout import HoldoutSettings
 
-OwnCarKind = Literal["none", "polygons", "auto", "auto_measured"]
+EgoMaskKind = Literal["none", "polygons", "auto", "auto_measured"]
 
 
-class OwnCarSearch(Settings):
-    """How the own car's body is looked for in the images of `cameras`."""
+class EgoMaskSearch(Settings):
+    """Search for the ego vehicle's body in the images of `cameras`."""
 
     cameras: tuple[str, ...]
     holdout: HoldoutSettings
     own_car_radius: float
-    """LiDAR returns nearer to the sensor than this (metres, horizontally) are the own car's."""
+    """Horizontal distance from the LiDAR (metres) within which returns belong to the ego vehicle."""
 
 
-class OwnCarJob(Settings):
-    """Everything that decides the content of one own_car.json, the scene aside."""
+class EgoMaskJob(Settings):
+    """All settings that determine the own_car.json of one scene."""
 
     polygons: dict[str, tuple[tuple[float, float], ...]]
-    search: OwnCarSearch | None
-    """None: nothing is looked for."""
+    search: EgoMaskSearch | None
+    """None: polygons only."""

@@ -1,4 +1,4 @@
-"""What the stages `lpips_backbone` and `evaluate` may be told."""
+"""Settings of the rules `lpips_backbone` and `evaluate`."""
 
 from pydantic import Field
 
@@ -8,31 +8,31 @@ from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 
 BACKBONE = "resources/lpips/alexnet.pth"
-"""Where LPIPS's AlexNet backbone is kept; users without network put it there themselves."""
+"""Path of LPIPS's AlexNet backbone. Without a network, users put the file there."""
 BACKBONE_RECORD = "resources/lpips/backbone.json"
-"""What is known of that file."""
+"""State of that file: its digest, or why it is missing."""
 
 
 class LpipsSettings(Settings):
     enabled: bool = True
-    """Measure LPIPS. Needs the AlexNet backbone, fetched once; false = null, and nothing is fetched."""
+    """Compute LPIPS. Downloads the AlexNet backbone once. false: LPIPS is null and nothing is downloaded."""
     url: str = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
-    """Where the backbone is fetched from. Without network: put the file into resources/lpips yourself."""
+    """URL of the backbone. Without a network, put the file into resources/lpips."""
     sha256: str = Field("7be5be79", pattern="^[0-9a-f]{8,64}$")
-    """The file's SHA-256, or its first digits, as in PyTorch's file names."""
+    """SHA-256 of the file, or its first digits, as in PyTorch's file names."""
     timeout_s: float = Field(60.0, gt=0, le=3600)
-    """Longest silence of the server in seconds."""
+    """Timeout of a silent connection (seconds)."""
 
 
 class EvaluateJob(Settings):
-    """Everything that decides the content of one eval.json, its inputs aside."""
+    """All settings that determine one eval.json."""
 
     eval_camera: str
     cameras: tuple[str, ...]
     sweeps: bool
     holdout: HoldoutSettings
     lidar: LidarDepthJob
-    """What LiDAR of held-out sweeps says of depth is found out as it is for training images."""
+    """Settings of the LiDAR depth of held-out images, the same as for training images."""
     lpips: bool
     removal: RemovalSettings | None
-    """For synthetic worlds: recorded drives have no truth that a removal could be held to."""
+    """Only for synthetic worlds: recorded drives have no ground truth without the vehicle."""

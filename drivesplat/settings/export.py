@@ -1,4 +1,4 @@
-"""What leaves the workflow: splats for other programs."""
+"""Settings of exports."""
 
 from pydantic import Field
 
@@ -7,20 +7,20 @@ from drivesplat.settings import Settings
 
 class ExportSettings(Settings):
     usd_gaussians: int = Field(1_000_000, ge=1)
-    """At most so many Gaussians in scene.usdz: those that cover most."""
+    """Maximum number of Gaussians in scene.usdz. Those with the largest opacity times area are kept."""
     viewer_gaussians: int = Field(300_000, ge=1)
-    """At most so many Gaussians in viewer.html: those that cover most. A browser's memory is the limit."""
+    """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
 
 
 class UsdJob(Settings):
-    """Everything that decides the content of one scene.usdz, its inputs aside."""
+    """All settings that determine one scene.usdz."""
 
     eval_camera: str
     gaussians: int
 
 
 class ViewerJob(Settings):
-    """Everything that decides the content of one viewer.html, its inputs aside."""
+    """All settings that determine one viewer.html."""
 
     eval_camera: str
     gaussians: int

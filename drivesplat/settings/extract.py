@@ -1,4 +1,4 @@
-"""What the stage `extract` may be told."""
+"""Settings of the rule `extract`."""
 
 from typing import Literal
 
@@ -9,12 +9,11 @@ OnMissing = Literal["stop", "warn"]
 
 class ExtractSettings(Settings):
     on_missing: OnMissing = "stop"
-    """A missing or corrupt image, of a key frame or between two: 'stop' names it and fails; 'warn' leaves it out and
-    counts it."""
+    """Action for a missing or corrupt image: 'stop' fails and names it; 'warn' leaves it out and counts it."""
 
 
 class SceneSource(Settings):
-    """Everything that decides the content of one scene.json, dataroot aside."""
+    """All settings that determine one scene.json, except the dataroot."""
 
     dataset: str
     reader: str

@@ -1,4 +1,4 @@
-"""What the stage `free_space` may be told."""
+"""Settings of the rule `free_space`."""
 
 from pydantic import Field
 
@@ -7,28 +7,28 @@ from drivesplat.settings.holdout import HoldoutSettings
 
 
 class FreeSpaceSettings(Settings):
-    """The space that rays prove empty, for trainings that ask for it (`train.floaters.free_space`)."""
+    """Space that rays prove empty, for trainings with `train.floaters.free_space`."""
 
     triangulated: bool = True
-    """Whether rays from training images to the points that refine_poses triangulated count, beside LiDAR's."""
+    """Use rays from training images to the points that refine_poses triangulated, in addition to LiDAR rays."""
     voxel: float = Field(0.3, ge=0.05, le=5)
-    """Edge in metres of the voxels that are told empty."""
+    """Edge length of the voxels (metres)."""
     range: float = Field(30.0, gt=0, le=200)
-    """A ray proves nothing farther than this (metres) from where it starts: half a degree that a pose is off is 0.3 m
-    there."""
+    """Maximum distance from the sensor (metres) up to which a ray marks space as empty. A pose error of half a degree
+    shifts a point by 0.3 m at 30 m."""
     margin: float = Field(0.3, ge=0, le=10)
-    """A ray proves nothing of its last metres: so many, ..."""
+    """Distance before the end of a ray (metres) that is not marked as empty. margin_share is added to it."""
     margin_share: float = Field(0.02, ge=0, le=1)
-    """... and this fraction of its length."""
+    """Fraction of the ray's length before its end that is not marked as empty, in addition to margin."""
     min_rays: int = Field(3, ge=1, le=254)
-    """A voxel is empty only if so many rays passed it: one that just misses a wire is no proof."""
+    """Minimum number of rays that must pass a voxel for it to be empty."""
 
 
 class FreeSpaceJob(Settings):
-    """Everything that decides the content of one free_space.pkl, the scene aside."""
+    """All settings that determine the free space of one scene."""
 
     free_space: FreeSpaceSettings
     holdout: HoldoutSettings
     own_car_radius: float
     box_margin: float
-    """Returns nearer than this (metres) to the box of something that moves do not stand still."""
+    """Returns within this distance (metres) of the box of a moving object are dynamic."""

@@ -1,4 +1,4 @@
-"""What is held out; the measuring protocol fixes the meaning."""
+"""Settings of the held-out key frames."""
 
 from pydantic import Field, model_validator
 
@@ -7,11 +7,11 @@ from drivesplat.settings import Settings
 
 class HoldoutSettings(Settings):
     every_nth: int = Field(8, ge=0)
-    """Hold out the key frames i with i % every_nth == offset: group 'interpolation'. 0 = none."""
+    """Hold out key frames i with i % every_nth == offset: group 'interpolation'. 0 = none."""
     offset: int = Field(4, ge=0)
-    """See every_nth. 0 would hold out the first key frame, which nothing surrounds."""
+    """See every_nth. Must be less than every_nth. 0 would hold out the first key frame, which has no predecessor."""
     last_block: int = Field(4, ge=0)
-    """Hold out the last so many key frames: group 'extrapolation'. 0 = none."""
+    """Number of key frames held out at the end of the drive: group 'extrapolation'. 0 = none."""
 
     @model_validator(mode="after")
     def _offset_within_period(self) -> "HoldoutSettings":

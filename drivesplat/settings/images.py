@@ -1,4 +1,4 @@
-"""The size at which images are used."""
+"""Size of the images for training and evaluation."""
 
 from pydantic import Field
 
@@ -7,5 +7,5 @@ from drivesplat.settings import Settings
 
 class ImageSettings(Settings):
     width: int | None = Field(None, ge=16, le=10_000)
-    """Width in pixels to which images are resized (INTER_AREA, keeping the aspect) for training and evaluation. null
-    = as recorded."""
+    """Width (pixels) to which images are resized for training and evaluation (INTER_AREA, aspect ratio kept). null =
+    recorded size."""

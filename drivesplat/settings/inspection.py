@@ -1,4 +1,4 @@
-"""The vehicle that is looked at: its ghosts, and what is left when it is removed."""
+"""Settings of the track table, the ghost panel and the removal of a vehicle."""
 
 from pydantic import Field
 
@@ -6,37 +6,37 @@ from drivesplat.settings import Settings
 
 
 class SubjectSettings(Settings):
-    """The vehicle of a scene that the ghost panel shows and that is removed."""
+    """The vehicle of the ghost panel and of the removal."""
 
     track: str | None = None
-    """The id of its track (scene.json lists them). null = of what moves, the one that fills most pixels."""
+    """Id of its track (tracks.csv lists them). null = the moving vehicle that fills most pixels."""
     key_frame: int | None = Field(None, ge=0)
-    """The key frame at which it is looked at. null = the one in which it fills most pixels."""
+    """Key frame to show. null = the key frame in which the vehicle fills most pixels."""
 
 
 class GhostSettings(Settings):
-    """Ghosts: Gaussians in the volume that a moving box swept, outside the box at the moment looked at."""
+    """Ghosts: Gaussians in the volume that a moving box sweeps, but outside the box at the time of the image."""
 
     clearance: float = Field(0.2, ge=0, le=2)
-    """What lies lower over the box's floor than this (metres) is road, not ghost."""
+    """Height above the floor of the box (metres) below which Gaussians count as road, not as ghosts."""
 
 
 class RemovalSettings(Settings):
-    """The removal of a vehicle from a trained model that does not know it as an object: by its box."""
+    """Removal of a vehicle from a model without actors: the Gaussians in its box are removed."""
 
     margin: float = Field(0.1, ge=0, le=2)
-    """Gaussians whose centres are nearer than this (metres) to the box's sides or roof are removed, too; its floor
-    stays where it is, since below it is road."""
+    """Margin around the sides and the roof of the box (metres) in which Gaussians are removed, too. The floor has no
+    margin, since the road is below it."""
 
 
 class TracksJob(Settings):
-    """Everything that decides the content of one tracks.csv, its inputs aside."""
+    """All settings that determine one tracks.csv."""
 
     eval_camera: str
 
 
 class PanelJob(Settings):
-    """Everything that decides the content of one ghost panel, its inputs aside."""
+    """All settings that determine one ghost panel."""
 
     eval_camera: str
     subject: SubjectSettings
@@ -44,7 +44,7 @@ class PanelJob(Settings):
 
 
 class RemovalJob(Settings):
-    """Everything that decides the content of one removal, its inputs aside."""
+    """All settings that determine one removal."""
 
     eval_camera: str
     subject: SubjectSettings

@@ -1,4 +1,4 @@
-"""What the stage `lidar_depth` may be told."""
+"""Settings of the rule `lidar_depth`."""
 
 from typing import Annotated
 
@@ -12,20 +12,20 @@ Degrees = Annotated[float, Field(ge=0, le=10)]
 
 
 class LidarDepthSettings(Settings):
-    """LiDAR's depth in images, which trainings are held to (`train.depth_weight`) and renderings measured by."""
+    """LiDAR depth in images, for supervision (`train.depth_weight`) and for evaluation."""
 
     ray_spacing: tuple[Degrees, Degrees] = (0.33, 1.33)
-    """Degrees between neighbouring rays, in azimuth and elevation (nuScenes': 0.33 and 1.33). A return hides what lies
-    clearly behind it in the window of the image between its rays: LiDAR looks over what is before the camera. [0, 0] =
-    only in its own four pixels."""
+    """Angle between neighbouring LiDAR rays (degrees), in azimuth and elevation. nuScenes: 0.33 and 1.33. A return
+    occludes returns that are clearly behind it within one ray spacing, since the LiDAR sees over objects that hide the
+    background from the camera. [0, 0] = a return occludes its own four pixels only."""
 
 
 class LidarDepthJob(Settings):
-    """Everything that decides what LiDAR's depth in the images of a scene is: the content of lidar_depth.pkl."""
+    """All settings that determine the LiDAR depth in the images of one scene."""
 
     holdout: HoldoutSettings
     images: ImageSettings
     own_car_radius: float
     ray_spacing: tuple[Degrees, Degrees]
     box_margin: float
-    """Returns nearer than this (metres) to the box of something that moves do not stand still."""
+    """Returns within this distance (metres) of the box of a moving object are dynamic."""

@@ -1,4 +1,4 @@
-"""What the stage `lidar_seed` may be told."""
+"""Settings of the rule `lidar_seed`."""
 
 from typing import Annotated
 
@@ -12,27 +12,28 @@ from drivesplat.settings.images import ImageSettings
 
 class LidarSeedSettings(Settings):
     on_missing: OnMissing = "stop"
-    """A missing or corrupt LiDAR file: 'stop' names it and fails; 'warn' goes on without it and counts it."""
+    """Action for a missing or corrupt LiDAR file: 'stop' fails and names it; 'warn' skips it and counts it."""
     sweeps: bool = False
-    """Use the LiDAR sweeps between key frames, too (nuScenes: at 20 Hz, ten times the returns): for this seed, for what
-    actors start from, and for LiDAR's depth in training images, which then see the sweep of their own moment. Those
-    nearer than half a key-frame interval to a held-out key frame contribute nothing. docs/real_logs.md"""
+    """Use LiDAR sweeps between key frames, too (nuScenes: 20 Hz, ten times the returns): for this seed, for the seeds
+    of actors, and for the LiDAR depth of training images, which then comes from the sweep nearest in time. Sweeps
+    within half a key-frame interval of a held-out key frame are excluded. docs/real_logs.md"""
     points_file: str | None = None
-    """A PLY of extra points in the dataset's global frame (metres), recoloured from training images. null = none."""
+    """PLY file with additional seed points in the dataset's global frame (metres), coloured from training images. null
+    = none."""
     triangulated: bool = True
-    """Whether points that refine_poses triangulated, and two training images see, join the seed."""
+    """Add points that refine_poses triangulated and at least two training images see."""
     max_points: int = Field(400_000, ge=100, le=10_000_000)
-    """Most points from LiDAR, triangulation and the points file; beyond it they are thinned at random."""
+    """Maximum number of points from LiDAR, triangulation and the points file. Further points are dropped at random."""
     voxel_size: float = Field(0.1, ge=0, le=10)
-    """Edge in metres of the voxels that keep one LiDAR point each. 0 = no thinning."""
+    """Edge length (metres) of the voxels that keep one LiDAR point each. 0 = no thinning."""
     own_car_radius: float = Field(2.5, ge=0, le=10)
-    """LiDAR returns nearer to the sensor than this (metres, horizontally) are the own car's and are left out."""
+    """Horizontal distance from the LiDAR (metres) within which returns belong to the ego vehicle and are left out."""
     box_margin: float = Field(0.2, ge=0, le=2)
-    """Boxes of moving objects are grown by this (metres) before the points in them are left out."""
+    """Margin (metres) around boxes of moving objects in which points are left out."""
     far_points: int = Field(80_000, ge=0, le=2_000_000)
-    """Random points along pixels that no other seed point covers (sky, tall buildings, missing LiDAR). 0 = none."""
+    """Number of random points along pixels that no other seed point covers (sky, tall buildings, missing LiDAR)."""
     far_depths: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (3.0, 300.0)
-    """Nearest and farthest depth of far points in metres (log-uniform between; never under the road)."""
+    """Minimum and maximum depth of far points (metres), log-uniformly distributed and never below the road."""
 
     @field_validator("far_depths")
     @classmethod
@@ -43,7 +44,7 @@ class LidarSeedSettings(Settings):
 
 
 class SeedJob(Settings):
-    """Everything that decides the content of one seed.ply, the scene aside."""
+    """All settings that determine the seed.ply of one scene."""
 
     lidar_seed: LidarSeedSettings
     holdout: HoldoutSettings

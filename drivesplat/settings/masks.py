@@ -1,32 +1,32 @@
-"""What the stage `masks` may be told."""
+"""Settings of the rule `masks`."""
 
 from pydantic import Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.ego_mask import OwnCarKind
+from drivesplat.settings.ego_mask import EgoMaskKind
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 
 
 class MaskSettings(Settings):
     regions_folder: str | None = None
-    """Your own label images (labels as in drivesplat/scene/regions.py), named {camera}/{image name}.png. null = from
-    the annotated boxes."""
+    """Folder of your own label images, {camera}/{image name}.png (labels as in drivesplat/scene/regions.py). null =
+    regions from the annotated boxes."""
     sky_folder: str | None = None
-    """Your own sky masks (255 = sky), named {camera}/{image name}.png. null = a heuristic."""
+    """Folder of your own sky masks (255 = sky), {camera}/{image name}.png. null = a heuristic."""
     semantic_folder: str | None = None
-    """Your own maps of classes (0, 1, 2, ...; 255 = unlabelled), named {camera}/{image name}.png: what
-    train.semantic_weight holds trainings to. null = there are none."""
-    own_car: OwnCarKind = "auto"
-    """Where the own car's body is seen, which no region holds and no training learns: 'polygons' (where
-    own_car_polygons says), 'auto' (there; for cameras without an outline where images stay as they are while the car
-    drives, but for eval_camera, whose figures hang on no guess), 'auto_measured' (for eval_camera, too) or 'none'."""
+    """Folder of your own class maps (0, 1, 2, ...; 255 = unlabelled), {camera}/{image name}.png, for
+    train.semantic_weight. null = none."""
+    own_car: EgoMaskKind = "auto"
+    """Mask of the ego vehicle's body, which is excluded from training and from all regions. 'polygons': the outlines of
+    own_car_polygons. 'auto': these, and for cameras without an outline, except eval_camera, the image area that does
+    not change while the vehicle drives. 'auto_measured': the same with eval_camera. 'none': no mask. docs/cameras.md"""
     own_car_polygons: dict[str, tuple[tuple[float, float], ...]] = Field(default_factory=dict)
-    """Per camera the outline of the own car's body, as x, y in fractions of the image's width and height."""
+    """Outline of the ego vehicle's body, by camera: points x, y in fractions of the image's width and height."""
 
 
 class MaskJob(Settings):
-    """Everything that decides the content of one masks folder, the scene aside."""
+    """All settings that determine the masks of one scene."""
 
     masks: MaskSettings
     holdout: HoldoutSettings

@@ -1,4 +1,4 @@
-"""What things may be called: folders bear the names of scenes and methods, and YAML reads scene numbers as numbers."""
+"""Checks of names: scenes and methods name folders, and scene numbers need quotes in YAML."""
 
 import re
 from typing import Any
@@ -7,7 +7,7 @@ NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
 
 
 def require_text(scene: Any) -> None:
-    """Raises ValueError, with what to write, where a scene number stands without quotes."""
+    """Raises ValueError, with the correct spelling, for a scene number without quotes."""
     if not isinstance(scene, str):
         octal = f'"{scene:04o}" or ' if isinstance(scene, int) else ""
         raise ValueError(
@@ -16,6 +16,6 @@ def require_text(scene: Any) -> None:
 
 
 def require_name(name: str, kind: str) -> None:
-    """Raises ValueError where `name`, of some `kind` of thing, cannot name a folder."""
+    """Raises ValueError where `name`, of a scene or another `kind`, cannot name a folder."""
     if not re.match(NAME, name) or name in ("logs", "benchmarks"):
         raise ValueError(f"{kind} {name!r} cannot name a folder: use letters, digits, '_', '-' and '.'")

@@ -1,4 +1,4 @@
-"""Settings that were given and do not hold, since a dataset or a method sets something else for itself."""
+"""Settings without effect, since an override of a dataset or a method replaces them."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
@@ -7,8 +7,8 @@ from drivesplat.settings.config import Config, for_scene
 
 
 def without_effect(config: Config, places: Iterable[tuple[str, str]]) -> list[str]:
-    """A sentence for every setting of a `config` that is not its default and that is another one where it would count:
-    in `places`, a scene each and a method or an empty name. What variants of an ablation set is meant to differ."""
+    """One sentence for every setting that is not at its default and that an override replaces in one of `places`: pairs
+    of a scene and a method, or of a scene and an empty name. Overrides of ablation variants are not reported."""
     given, defaults = dict(_leaves(config.model_dump())), dict(_leaves(Config().model_dump()))
     told = {key: value for key, value in given.items() if defaults.get(key) != value}
     sentences: dict[str, None] = {}
@@ -30,7 +30,7 @@ def without_effect(config: Config, places: Iterable[tuple[str, str]]) -> list[st
 
 
 def _leaves(tree: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value of a tree of settings that is no tree itself, with its path."""
+    """The leaves of a settings tree with their paths."""
     for key, value in tree.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{above}{key}.")

@@ -1,4 +1,4 @@
-"""What the stage `parser` may be told."""
+"""Settings of the rule `parser`."""
 
 from drivesplat.settings import Settings
 from drivesplat.settings.holdout import HoldoutSettings
@@ -6,7 +6,7 @@ from drivesplat.settings.images import ImageSettings
 
 
 class ParserJob(Settings):
-    """Everything that decides the content of one parser.pkl, scene and seed aside."""
+    """All settings that determine the parser.pkl of one scene."""
 
     holdout: HoldoutSettings
     images: ImageSettings

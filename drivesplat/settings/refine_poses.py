@@ -1,4 +1,4 @@
-"""What the stage `refine_poses` may be told."""
+"""Settings of the rule `refine_poses`."""
 
 from typing import Literal
 
@@ -9,92 +9,93 @@ from drivesplat.settings.lidar_depth import Degrees
 
 
 class FeatureSettings(Settings):
-    """SIFT features of the key frames' images, and which images they are looked for in."""
+    """Detection and matching of SIFT features in key-frame images."""
 
     max_image_size: int = Field(1600, ge=64, le=8192)
-    """Images larger than this (pixels, the longer side) are reduced before features are looked for."""
+    """Maximum length of the longer image side (pixels). Larger images are reduced before detection."""
     max_features: int = Field(4096, ge=64, le=65_536)
-    """Most features of an image."""
+    """Maximum number of features per image."""
     neighbours: int = Field(6, ge=1, le=100)
-    """Features are matched with those of so many key frames that follow, seen by the same camera."""
+    """Number of following key frames of the same camera that an image is matched with."""
     across: int = Field(2, ge=0, le=100)
-    """Of cameras whose views overlap, key frames up to so far apart are matched as well."""
+    """Maximum distance in key frames between matched images of different cameras with overlapping views."""
     box_margin: float = Field(0.3, ge=0, le=5)
-    """Boxes of what moves are grown by this (metres) before the features in them are left out."""
+    """Margin (metres) around boxes of moving objects in which features are left out."""
 
 
 class PriorSettings(Settings):
-    """How far off the given poses are expected to be. Standard deviations."""
+    """Expected errors (standard deviations) of the given poses."""
 
     position: float = Field(0.05, gt=0)
-    """Of horizontal positions, in metres."""
+    """Horizontal position (metres)."""
     height: float = Field(0.1, gt=0)
-    """Of heights, in metres: nuScenes gives none."""
+    """Height (metres). nuScenes' ego poses have none."""
     tilt: float = Field(0.02, gt=0)
-    """Of roll and pitch, in radians."""
+    """Roll and pitch (radians)."""
     heading: float = Field(0.005, gt=0)
-    """Of the heading, in radians."""
+    """Heading (radians)."""
     drift: float = Field(0.25, gt=0)
-    """How much of these the error changes by within a second: what is wrong with poses changes slowly."""
+    """Change of the error within one second, as a fraction of the above: pose errors change slowly."""
 
 
 class LimitSettings(Settings):
-    """When a refinement is not believed, and the given poses are kept, with a warning that says which limit it was. Of
-    these, `start: images` knows min_points, min_images and max_scale_drift, and stops there."""
+    """Limits beyond which a refinement is rejected: the given poses are kept and a warning names the limit. With
+    `start: images` only min_points, min_images and max_scale_drift apply, and the rule fails."""
 
     max_shift: float = Field(0.5, gt=0)
-    """Largest correction of a position, in metres."""
+    """Maximum correction of a position (metres)."""
     max_turn: float = Field(3.0, gt=0)
-    """Largest correction of a rotation, in degrees."""
+    """Maximum correction of a rotation (degrees)."""
     min_points: int = Field(30, ge=3)
-    """An image that sees fewer triangulated points than this has nothing to hold on to."""
+    """Minimum number of triangulated points for an image to count as constrained."""
     min_images: float = Field(0.7, ge=0, le=1)
-    """So large a share of the images must have something to hold on to; the others follow their neighbours. With
-    `start: images`, of the key frames."""
+    """Minimum fraction of images (with `start: images`, of key frames) that must be constrained. The others are
+    interpolated from their neighbours."""
     min_gain: float = Field(0.05, ge=0, lt=1)
-    """By so large a share the median error of points that took no part must fall: less is the features' noise."""
+    """Minimum relative decrease of the median reprojection error of withheld points."""
     max_scale_drift: float = Field(1.2, ge=1)
-    """With `start: images`, the largest factor by which the scale may change along the drive; images whose own differs
-    more from those around them follow these."""
+    """Maximum factor by which the scale may change along the drive, with `start: images`. Images whose scale deviates
+    more from their neighbours' are interpolated."""
 
 
 class RefinePosesSettings(Settings):
-    """Poses corrected by what the images show: features matched between neighbouring images and triangulated, then
-    bundle adjustment with the given poses as priors, all cameras as one rig, intrinsics fixed."""
+    """Refinement of the recorded poses from images: features of neighbouring images are matched and triangulated, then
+    bundle adjustment corrects the poses with the given poses as priors, all cameras as one rig, and fixed intrinsics.
+    """
 
     enabled: Literal["auto", True, False] = "auto"
-    """Whether every later stage takes the refined poses. 'auto': those of recorded drives, and of synthetic worlds with
-    pose_noise; where they cannot be refined, the given ones are kept, with a warning. true insists on pycolmap."""
+    """Use refined poses in all later stages. 'auto': for recorded drives and for synthetic worlds with pose_noise;
+    where refinement is impossible or rejected, the given poses are kept with a warning. true: fail without pycolmap."""
     start: Literal["recorded", "images"] = "recorded"
-    """Where poses start from: 'recorded' corrects those of the dataset; 'images' makes poses from images alone, for
-    drives that have none, and stops where the drive does not allow it. docs/poses.md"""
+    """Initial poses: 'recorded' corrects the dataset's poses; 'images' estimates poses from the images alone, for
+    drives without poses, and fails where the drive does not allow it. docs/poses.md"""
     features: FeatureSettings = FeatureSettings()
     priors: PriorSettings = PriorSettings()
     limits: LimitSettings = LimitSettings()
     min_angle: float = Field(1.0, gt=0, le=90)
-    """Rays that meet under a smaller angle than this (degrees) make no point."""
+    """Minimum angle between the rays of a triangulated point (degrees)."""
     feature_noise: float = Field(0.3, gt=0)
-    """How far off (pixels of the recorded image) features are found: what images are trusted by against the priors."""
+    """Expected error of feature positions (pixels of the recorded image). It weighs images against the priors."""
     robust_pixels: float = Field(1.0, gt=0)
-    """Reprojection errors well beyond this (pixels) hardly count (Cauchy's loss)."""
+    """Scale of the Cauchy loss of reprojection errors (pixels)."""
     rounds: int = Field(3, ge=1, le=20)
-    """How often points are triangulated anew with the poses so far, and both adjusted."""
+    """Number of rounds of triangulation and adjustment."""
     withheld: float = Field(0.1, ge=0.01, le=0.5)
-    """So large a share of the points takes no part in a trial adjustment, which is judged by them: where poses do not
-    serve them better than the given ones, the given ones are kept."""
+    """Fraction of the points that are withheld from a trial adjustment and then judge it: unless their error falls by
+    limits.min_gain, the given poses are kept."""
 
 
 class LidarRays(Settings):
-    """What LiDAR's returns in an image are read by."""
+    """Settings for LiDAR depth at image points."""
 
     ray_spacing: tuple[Degrees, Degrees]
     own_car_radius: float
 
 
 class RefinePosesJob(Settings):
-    """Everything that decides the content of one scene_refined.json, the scene aside."""
+    """All settings that determine the scene_refined.json of one scene."""
 
     refine_poses: RefinePosesSettings
     random_seed: int
     lidar: LidarRays | None = None
-    """None where poses start from the recorded ones: nothing is asked of LiDAR."""
+    """None with `start: recorded`, which does not use LiDAR."""

@@ -1,24 +1,24 @@
-"""What the report across scenes is told."""
+"""Settings of the report across scenes."""
 
 from typing import Any
 
 from drivesplat.settings import Settings
 
 HELD_OUT_PAIR = {"recorded": "held_out_recorded.png", "rendered": "held_out_rendered.png"}
-"""A held-out image as it was recorded and as a method renders it, which come with the method's figures."""
+"""One held-out image, recorded and rendered, written by the evaluation of a method."""
 LOOKS = {"panel": "ghost_panel.png", "with_car": "with_car.png", "without_car": "without_car.png"}
-"""Further pictures of a method."""
+"""Further images of a method."""
 PICTURES = {**HELD_OUT_PAIR, **LOOKS}
-"""What the page shows of a method on a scene, and where it lies in its folder."""
+"""Images that the report shows of a method on a scene, and their paths in its folder."""
 
 
 class ReportJob(Settings):
-    """Everything that decides the report of given results."""
+    """All settings that determine the report of given results."""
 
     expected: dict[str, dict[str, Any]]
-    """For every configured scene, in order, the settings and code of the stages that its metrics.json should come
-    from: what else is stale."""
+    """For every configured scene, in order, the settings and code digests of the stages that its metrics.json should
+    come from. Other results are stale."""
     reference: str | None
-    """The method whose gap others close: the first without parts that move. None where there is no such method."""
+    """The method whose gap others close: the first without moving parts. None where there is none."""
     random_seed: int
-    """Seeds the resampling of scenes."""
+    """Random seed of the bootstrap over scenes."""

@@ -1,4 +1,4 @@
-"""The road that was driven on, for trainings that are held to it."""
+"""Settings of the road loss."""
 
 from pydantic import Field
 
@@ -6,10 +6,10 @@ from drivesplat.settings import Settings
 
 
 class RoadSettings(Settings):
-    """Where background Gaussians are the road's, for train.road_weight."""
+    """Selection of the background Gaussians that train.road_weight acts on."""
 
     half_width: float = Field(1.2, gt=0, le=10)
-    """Within so many metres to either side of the car's middle, and the less the farther out: a car is 1.7 to 1.9
-    metres wide, and beside it are kerbs and grass."""
+    """Maximum lateral distance from the path of the vehicle's centre (metres). The weight falls with this distance,
+    since kerbs and grass may begin beside the vehicle."""
     reach: float = Field(0.3, gt=0, le=2)
-    """Centres within so many metres above or below the road's surface."""
+    """Maximum height of a centre above or below the road surface (metres)."""

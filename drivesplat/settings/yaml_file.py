@@ -1,4 +1,4 @@
-"""YAML files that users write, read strictly. Importing this module is cheap: the Snakefile does."""
+"""Strict reading of users' YAML files. This module imports quickly, since the Snakefile imports it."""
 
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,8 @@ from drivesplat.errors import ConfigError
 def read_yaml(path: str | Path, what: str) -> Any:
     """The content of a YAML file.
 
-    Raises ConfigError, one line with the file and `what` it is, where it cannot be read, is no YAML, or holds a key
-    twice.
+    Raises ConfigError, one line with the file and `what` it is, where it cannot be read, is not YAML, or has a
+    duplicate key.
     """
     try:
         return yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_EveryKeyOnce)  # a SafeLoader
@@ -25,7 +25,7 @@ def read_yaml(path: str | Path, what: str) -> Any:
 
 
 class _EveryKeyOnce(yaml.SafeLoader):
-    """A safe loader that refuses a key which stands twice in a mapping: plain YAML drops the first in silence."""
+    """A safe loader that refuses duplicate keys, of which plain YAML silently drops the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         known: list[Any] = []

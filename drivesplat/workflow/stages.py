@@ -16,7 +16,7 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
-from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
+from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import UsdJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
@@ -126,13 +126,13 @@ def _refine_poses(place: Place) -> RefinePosesJob:
     return RefinePosesJob(refine_poses=config.refine_poses, random_seed=config.random_seed, lidar=lidar)
 
 
-def _own_car(place: Place) -> OwnCarJob:
+def _own_car(place: Place) -> EgoMaskJob:
     config, kind = place.config, place.config.masks.own_car
     polygons = config.masks.own_car_polygons if kind != "none" else {}
     spared = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
     cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *spared})
-    search = OwnCarSearch(cameras=cameras, holdout=config.holdout, own_car_radius=config.lidar_seed.own_car_radius)
-    return OwnCarJob(polygons=polygons, search=search if cameras else None)
+    search = EgoMaskSearch(cameras=cameras, holdout=config.holdout, own_car_radius=config.lidar_seed.own_car_radius)
+    return EgoMaskJob(polygons=polygons, search=search if cameras else None)
 
 
 def _lidar_seed(place: Place) -> SeedJob:
@@ -176,7 +176,7 @@ def _free_space(place: Place) -> FreeSpaceJob:
 
 def _train(place: Place) -> TrainJob:
     config, parts = place.config, place.config.all_methods[place.method].parts
-    train = config.train if set(parts) & MOVING_PARTS else config.train.of_what_stands_still()
+    train = config.train if set(parts) & MOVING_PARTS else config.train.without_moving_parts()
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
     return TrainJob(
         parts=parts, sky=config.sky, train=train, random_seed=config.random_seed, reference_camera=reference

@@ -29,7 +29,7 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import load
-from drivesplat.settings.ego_mask import OwnCarJob
+from drivesplat.settings.ego_mask import EgoMaskJob
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -129,7 +129,7 @@ def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
         "actors": actors_record(scene, job("actors", ActorSeedJob, holdout)),
         "lidar_depth": lidar_depths(scene, job("lidar_depth", LidarDepthJob, holdout)),
         "free_space": free_space_record(scene, job("free_space", FreeSpaceJob, holdout)),
-        "own_car": own_car_record(scene, job("own_car", OwnCarJob, holdout)),
+        "own_car": own_car_record(scene, job("own_car", EgoMaskJob, holdout)),
         "sky": [read_sky_mask(folder, f.camera, f.timestamp, (f.width, f.height)) for f in training],
         "images": [Path(parser.image_paths[i]).read_bytes() for i in parser.splits["train"]],
     }

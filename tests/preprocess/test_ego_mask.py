@@ -18,7 +18,7 @@ from drivesplat.scene.ego_mask import OwnCar, enclosed, read_own_car
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.config import load
-from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
+from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.workflow.stages import stage_settings
@@ -26,8 +26,8 @@ from drivesplat.workflow.stages import stage_settings
 CAMERAS = ("CAM_BACK", "CAM_BACK_RIGHT", "CAM_FRONT")
 SIZE = (160, 90)
 NOTHING_HELD_OUT = HoldoutSettings(every_nth=0, last_block=0)
-LOOKING = OwnCarSearch(cameras=CAMERAS, holdout=NOTHING_HELD_OUT, own_car_radius=2.5)
-JOB = OwnCarJob(polygons={}, search=LOOKING)
+LOOKING = EgoMaskSearch(cameras=CAMERAS, holdout=NOTHING_HELD_OUT, own_car_radius=2.5)
+JOB = EgoMaskJob(polygons={}, search=LOOKING)
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +55,9 @@ def painted(scene: Scene, folder: Path, paint: Callable[[np.ndarray, int], np.nd
     return dataclasses.replace(scene, frames=tuple(frames))
 
 
-def body_in(scene: Scene, camera: str = "CAM_BACK", search: OwnCarSearch = LOOKING) -> np.ndarray:
+def body_in(scene: Scene, camera: str = "CAM_BACK", search: EgoMaskSearch = LOOKING) -> np.ndarray:
     """The pixels (h, w) bool that are taken for the own car's body."""
-    outlines, _, why = known(scene, camera, OwnCarJob(polygons={}, search=search))
+    outlines, _, why = known(scene, camera, EgoMaskJob(polygons={}, search=search))
     assert (why is None) == bool(outlines)
     return enclosed(outlines, SIZE)
 
@@ -209,7 +209,7 @@ def test_what_varies_ever_more_has_no_end(unseen):
 
 def test_the_users_outline_wins_and_other_cameras_are_looked_at(seen):
     outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0))
-    job = OwnCarJob(polygons={"CAM_BACK": outline}, search=LOOKING.model_copy(update={"cameras": ("CAM_FRONT",)}))
+    job = EgoMaskJob(polygons={"CAM_BACK": outline}, search=LOOKING.model_copy(update={"cameras": ("CAM_FRONT",)}))
     cameras = own_car_record(seen, job)["cameras"]
     assert (cameras["CAM_BACK"]["source"], cameras["CAM_BACK"]["outlines"]) == ("polygons", (outline,))
     assert cameras["CAM_BACK"]["share"] == pytest.approx(0.05, abs=0.002) and cameras["CAM_BACK"]["why_null"] is None
@@ -229,7 +229,7 @@ def test_a_setting_says_where_it_is_looked_for(kind, outlined, searched):
     """CAM_FRONT is measured; of CAM_BACK an outline is given."""
     masks = {"own_car": kind, "own_car_polygons": {"CAM_BACK": [[0, 1], [1, 1], [0.5, 0.9]]}}
     values = {"cameras": ["CAM_FRONT", "CAM_BACK", "CAM_BACK_RIGHT"], "masks": masks}
-    job = OwnCarJob.model_validate_json(stage_settings(load(values), "own_car", "0061"))
+    job = EgoMaskJob.model_validate_json(stage_settings(load(values), "own_car", "0061"))
     assert list(job.polygons) == outlined
     assert (job.search.cameras if job.search else None) == searched
 

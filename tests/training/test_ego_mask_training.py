@@ -34,7 +34,7 @@ from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.training_record import write_training_record
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.ego_mask import OwnCarJob, OwnCarSearch
+from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
@@ -143,8 +143,8 @@ def prepared(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("prepared")
     scene, images = rig_drive(folder, ["CAM_FRONT", "CAM_BACK"], own_car=True), ImageSettings()
     holdout = HoldoutSettings(every_nth=6, offset=3, last_block=0)
-    search = OwnCarSearch(cameras=("CAM_BACK",), holdout=holdout, own_car_radius=2.5)
-    record = own_car_record(scene, OwnCarJob(polygons={}, search=search))
+    search = EgoMaskSearch(cameras=("CAM_BACK",), holdout=holdout, own_car_radius=2.5)
+    record = own_car_record(scene, EgoMaskJob(polygons={}, search=search))
     write_json(folder / "own_car.json", {**record, "provenance": {"made": "own_car"}})
     own_car, _ = read_own_car(folder / "own_car.json")
     made = make_masks(scene, MaskJob(masks=MaskSettings(), holdout=holdout, images=images), folder / "masks", own_car)

@@ -220,8 +220,8 @@ def test_what_stands_still_knows_no_settings_of_what_moves():
     changed = {"iterations": 70, "depth_weight": 0.2, "sky_bce_weight": 0.3, "opacity_reg": 0.5}
     moving = {"actors": ActorSettings(fourier=2), "entropy_weight": 0.7, "dynamic_weight": 0.9}
     settings = settings_of(**changed, **moving)
-    assert settings.of_what_stands_still() == settings_of(**changed)
-    assert {name for name, value in settings if getattr(settings.of_what_stands_still(), name) != value} == set(moving)
+    assert settings.without_moving_parts() == settings_of(**changed)
+    assert {name for name, value in settings if getattr(settings.without_moving_parts(), name) != value} == set(moving)
 
 
 @pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (50, 0.1), (100, 0.01)])
