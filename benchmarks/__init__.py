@@ -1,0 +1,1 @@
+"""Measurements of the workflow: quality of recipes, training speed, and rendering speed."""

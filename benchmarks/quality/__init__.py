@@ -1,1 +1,1 @@
-"""Recipes trained on one scene with several random seeds, and the table that says what each is worth."""
+"""Comparison of recipes: each trained on one scene with several random seeds, in one table."""

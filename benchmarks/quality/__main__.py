@@ -1,68 +1,53 @@
-"""What recipes are worth on one scene: each trained with several random seeds, measured, and put into a table.
+"""Compares recipes on one scene: each is trained with several random seeds and measured on held-out frames.
 
     python -m benchmarks.quality benchmarks/recipes/demo.yaml -- --cores 4
     python -m benchmarks.quality mine.yaml --out results/quality/mine -- --cores 16 --resources gpu=4 --scheduler greedy
 
-Everything after `--` is Snakemake's. What is measured stays: an interrupted call is repeated as it was. Writes
-quality.md and quality.json; ends with 1 where a recipe has no result with some seed. docs/quality.md says more.
+Arguments after `--` are Snakemake's. Finished results stay: repeat an interrupted command as it was. Writes quality.md
+and quality.json, and ends with status 1 if a recipe has no result for some seed. See docs/quality.md.
 """
 
-import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.command import argument_parser, print_page, require_workflow, run_command, split_arguments, write_record
 from benchmarks.quality.compare import quality
-from benchmarks.quality.groups import groups_of, read_recipes
-from benchmarks.quality.results import results_of
-from benchmarks.quality.runs import passed_on, run
+from benchmarks.quality.recipes import plan_runs, read_recipes
+from benchmarks.quality.results import collect_results
 from benchmarks.quality.table import markdown
-from drivesplat.errors import ConfigError, DriveSplatError
-from drivesplat.io.storage import atomic_write, write_json
+from benchmarks.snakemake_run import is_dry_run
 
 
-def measure(file: Path, out: Path, arguments: Sequence[str], workflow: Path) -> int:
+def measure(path: Path, out: Path, arguments: Sequence[str], workflow: Path) -> int:
     """Trains and measures the recipes of a file, with `arguments` for Snakemake, and writes and prints their table.
 
-    Returns the exit status: 0 where every recipe has a result with every seed. Raises DriveSplatError where the file or
-    the arguments are not what they should be.
+    Returns the exit status: 0 if every recipe has a result for every seed. Raises DriveSplatError if the file or the
+    arguments are invalid.
     """
-    if not (workflow / "Snakefile").is_file():
-        raise ConfigError(f"there is no Snakefile in {workflow.resolve()}: call it where Snakemake is called")
-    recipes = read_recipes(file)
-    groups, training = groups_of(recipes, out, workflow), passed_on(arguments)
-    ended = [(group, run(group, arguments, workflow)) for group in groups]
+    require_workflow(workflow)
+    file = read_recipes(path)
+    runs, dry_run = plan_runs(file, out, workflow), is_dry_run(arguments)
+    ended = [(run, run.start(arguments, workflow)) for run in runs]
     status = max(outcome.status for _, outcome in ended)
-    if not training:
+    if dry_run:
         return status
-    record = quality(recipes, results_of(ended))
+    record = quality(file, collect_results(ended))
     page = markdown(record)
-    write_json(out / "quality.json", record)
-    with atomic_write(out / "quality.md") as written:
-        written.write(page.encode())
-    print(f"\n{page}\nWritten: {out / 'quality.md'} and {out / 'quality.json'}", flush=True)
+    write_record(record, page, out, "quality")
+    print_page(page, out, "quality")
     return 1 if record["failed"] else status
 
 
-def main(words: Sequence[str]) -> int:
-    """The command with these words; returns its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.quality", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("recipes", type=Path, help="the file of recipes (docs/quality.md)")
-    parser.add_argument(
-        "--out", type=Path, help="the folder of all results; as a default results/quality/{the file's name}"
-    )
-    split = words.index("--") if "--" in words else len(words)
-    told = parser.parse_args(words[:split])
-    out = told.out or Path("results/quality") / told.recipes.stem
-    return measure(told.recipes, out, words[split + 1 :], Path())
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command with these arguments; returns its exit status."""
+    parser = argument_parser("quality", __doc__)
+    parser.add_argument("recipes", type=Path, help="the recipe file (docs/quality.md)")
+    parser.add_argument("--out", type=Path, help="the results folder; default: results/quality/{the file's name}")
+    own, snakemake = split_arguments(arguments)
+    options = parser.parse_args(own)
+    out = options.out or Path("results/quality") / options.recipes.stem
+    return measure(options.recipes, out, snakemake, Path())
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except DriveSplatError as error:
-        sys.exit(f"drivesplat: {error}")
-    except KeyboardInterrupt:
-        sys.exit(130)
+    run_command(main)

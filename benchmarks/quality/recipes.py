@@ -1,56 +1,135 @@
-"""Recipes that are compared on one scene: what a file for `python -m benchmarks.quality` may hold (docs/quality.md)."""
+"""Recipe files (docs/quality.md). Recipes become methods; those with the same scene settings share a Snakemake run."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field, field_validator
 
+from benchmarks.files import SHARED_SETTINGS, BenchmarkFile, error_prefix, read_file
+from benchmarks.snakemake_run import ConfigLayers, SnakemakeRun
+from drivesplat.errors import ConfigError
+from drivesplat.io.storage import canonical_json, sha256_text
 from drivesplat.settings import Settings
-from drivesplat.settings.method import MethodSettings, Seeds
-from drivesplat.settings.names import require_text
+from drivesplat.settings.config import load, require_known
+from drivesplat.settings.dataset import DatasetSettings
+from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, with_seed
+from drivesplat.settings.names import require_name
 from drivesplat.settings.train import Parts
+
+SCENE_SETTINGS = tuple(key for key in SHARED_SETTINGS if key not in (*VARIATION_OVERRIDES, "methods"))
+"""The sections that `config` of one recipe may set; its `overrides` set the others."""
 
 
 class Recipe(Settings):
     of: str | None = None
-    """A method of the config that the recipe starts from. null = a background with the settings of the config."""
+    """The method of the config to start from. null = a background with the settings of the config."""
     parts: Parts | None = None
-    """What its model is made of. null = what that method's is."""
+    """The parts of the model. null = those of that method."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings laid over that method's own overrides, as a tree; `sky` and `train` may."""
     config: dict[str, Any] = Field(default_factory=dict)
-    """Settings of the whole scene that differ for this recipe, as a tree: lidar_seed, sweeps, cameras, datasets, ...
-    Recipes with the same tree share what is made of the scene."""
+    """Scene settings that differ for this recipe, as a tree: lidar_seed, sweeps, cameras, datasets, ... Recipes with
+    equal trees share the preprocessed scene."""
 
-    def method(self, methods: Mapping[str, MethodSettings]) -> MethodSettings:
-        """The recipe as a method; `methods` are those of the config. Raises KeyError where `of` is none of them."""
+    def method(self, name: str, methods: Mapping[str, MethodSettings]) -> MethodSettings:
+        """The recipe `name` as a method; `methods` are those of the config. Raises ConfigError if `of` is not one."""
+        if self.of is not None and self.of not in methods:
+            raise ConfigError(f"{name!r} is of {self.of!r}, which is no method of the config: {', '.join(methods)}")
         start = MethodSettings() if self.of is None else methods[self.of]
         return start.varied(self.parts, self.overrides)
 
 
-class RecipeFile(Settings):
-    base: tuple[str, ...] = ()
-    """Config files laid over config.yaml, each over those before it, as with Snakemake's --configfile."""
-    config: dict[str, Any] = Field(default_factory=dict)
-    """Settings for all recipes, as a tree, laid over these; they hold over what a dataset sets for itself, too."""
-    scene: str
-    """The scene that all recipes are trained on; quoted."""
-    seeds: Seeds = (0, 1, 2)
-    """Random seeds of the trainings: every recipe is trained with each."""
+class RecipeFile(BenchmarkFile):
     recipes: dict[str, Recipe | None] = Field(min_length=1)
-    """The recipes, under names of your choice, in the order of the table; others are held to the first. null = no such
-    recipe."""
-
-    @field_validator("scene", mode="before")
-    @classmethod
-    def _is_quoted(cls, value: Any) -> Any:
-        require_text(value)
-        return value
+    """The recipes by name, in the order of the table; the first is the reference. null = no such recipe."""
 
     @field_validator("recipes")
     @classmethod
-    def _none_is_no_recipe(cls, value: dict[str, Recipe | None]) -> dict[str, Recipe | None]:
+    def _null_is_no_recipe(cls, value: dict[str, Recipe | None]) -> dict[str, Recipe | None]:
         wanted = {name: recipe for name, recipe in value.items() if recipe is not None}
         if not wanted:
             raise ValueError("no recipe is left; keep one")
         return wanted
+
+
+def read_recipes(path: str | Path) -> RecipeFile:
+    """The recipes of a file. Raises ConfigError, in one line that names the file, if it is missing or invalid."""
+    file = read_file(path, RecipeFile, "docs/quality.md")
+    with error_prefix(str(path)):
+        for name, recipe in file.recipes.items():
+            require_name(name, "recipe")
+            require_known(recipe.overrides, VARIATION_OVERRIDES, f"recipes.{name}.overrides")
+            require_known(recipe.config, SCENE_SETTINGS, f"recipes.{name}.config")
+    return file
+
+
+def plan_runs(file: RecipeFile, out: Path, workflow: Path) -> list[SnakemakeRun]:
+    """A run for every set of recipes with equal scene settings, in the order of their first ones, with results below
+    `out`; `workflow` is the Snakefile's folder.
+
+    Raises ConfigError if a recipe is invalid or trains the same as another, or if two make different synthetic worlds
+    in one folder.
+    """
+    layers = ConfigLayers.of(file, workflow)
+    by_settings: dict[str, dict[str, Recipe]] = {}
+    for name, recipe in file.recipes.items():
+        by_settings.setdefault(canonical_json(recipe.config), {})[name] = recipe
+    runs = []
+    for recipes in by_settings.values():
+        with error_prefix(f"recipe{'s' * (len(recipes) > 1)} {', '.join(recipes)}"):
+            runs.append(_planned(file, recipes, layers, out, workflow))
+    _refuse_twins(runs)
+    _refuse_two_worlds(runs)
+    return runs
+
+
+def _planned(
+    file: RecipeFile, recipes: Mapping[str, Recipe], layers: ConfigLayers, out: Path, workflow: Path
+) -> SnakemakeRun:
+    """The run of `recipes`, whose scene settings are equal."""
+    tree = next(iter(recipes.values())).config
+    layers = layers.with_scene_settings(tree, file.scene)
+    known = load(layers.values).methods
+    methods = {name: recipe.method(name, known) for name, recipe in recipes.items()}
+    return SnakemakeRun.of(layers, file, methods, out / _folder_name(tree), workflow)
+
+
+def _folder_name(tree: Mapping[str, Any]) -> str:
+    """The folder of recipes with these scene settings; it does not depend on other recipes."""
+    return "-".join([*sorted(tree), sha256_text(canonical_json(tree))[:6]]) if tree else "plain"
+
+
+def _dataset(run: SnakemakeRun) -> DatasetSettings:
+    return run.plan.config.datasets[run.plan.config.dataset_of(run.scene)]
+
+
+def _refuse_twins(runs: list[SnakemakeRun]) -> None:
+    """Raises ConfigError if two recipes would train the same."""
+    known: dict[str, str] = {}
+    for run in runs:
+        source = _dataset(run).model_dump(mode="json", include={"dataroot", "world"})
+        for recipe in run.methods:
+            stages = run.plan.evaluation_stages(run.scene, [with_seed(recipe, run.seeds[0])])
+            settings = {name.rpartition("/")[2]: stage["settings"] for name, stage in stages.items()}
+            other = known.setdefault(canonical_json([settings, source]), recipe)
+            if other != recipe:
+                raise ConfigError(
+                    f"recipes {other!r} and {recipe!r} train the same on scene {run.scene}; drop one, or check whether "
+                    "what it sets is the default already"
+                )
+
+
+def _refuse_two_worlds(runs: list[SnakemakeRun]) -> None:
+    """Raises ConfigError if two runs would make different synthetic worlds in one folder, in turns."""
+    makers: dict[Path, SnakemakeRun] = {}
+    for run in runs:
+        dataset = _dataset(run)
+        if dataset.world is None:
+            continue
+        first = makers.setdefault(Path(dataset.world_root).resolve(), run)
+        if _dataset(first).world != dataset.world:
+            raise ConfigError(
+                f"recipes {first.methods[0]!r} and {run.methods[0]!r} make different worlds in {dataset.dataroot}; "
+                "give each a dataroot of its own"
+            )

@@ -1,4 +1,4 @@
-"""What there is of a group's recipes once Snakemake has ended: figures that belong to them, or why there are none."""
+"""The results of recipes after Snakemake has ended: figures of the current settings, or why there are none."""
 
 import dataclasses
 import re
@@ -8,111 +8,120 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from benchmarks.quality.groups import Group
-from benchmarks.quality.runs import Outcome, unexplained
+from benchmarks.snakemake_run import Outcome, SnakemakeRun
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.record import differences
 from drivesplat.settings.method import with_seed
+from drivesplat.workflow.job_logs import failures
 
-ON_CARDS = ("train", "evaluate")
-"""The stages that take a card."""
+GPU_STAGES = ("train", "evaluate")
 PROCESSORS = "the processors"
 _TIME = r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3}) "
 TIME_FORMAT = "%Y-%m-%d %H:%M:%S,%f"
-"""How logs tell the time (`drivesplat.workflow.job`)."""
+"""The time stamps of logs (`drivesplat.workflow.job`)."""
 _LINE = re.compile(_TIME, re.MULTILINE)
-_CARD = re.compile(_TIME + r"INFO drivesplat\.workflow\.gpus: runs on the GPU \S+ \((\S+)\)$", re.MULTILINE)
+_GPU = re.compile(_TIME + r"INFO drivesplat\.workflow\.gpus: runs on the GPU \S+ \((\S+)\)$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Result:
-    """A recipe trained with a seed: its eval.json, with its path, or why there is none; and whether another job was
-    seen to run on the same card, or on the same processors, while it was trained."""
+    """A recipe trained with a seed: the path and content of its eval.json, or `reason` why there is none; `shared` if
+    another job ran on the same GPU, or the same processors, during its training."""
 
     recipe: str
     seed: int
     path: Path
     evaluation: dict[str, Any] | None = None
-    why: str = ""
+    reason: str = ""
     shared: bool = False
 
     @property
-    def result(self) -> dict[str, Any] | None:
-        """Its figures."""
+    def figures(self) -> dict[str, Any] | None:
         return self.evaluation["result"] if self.evaluation else None
 
 
 @dataclass(frozen=True)
-class Occupation:
-    """A job on a card, from when it has it to when it ends."""
+class DeviceUse:
+    """The time during which a job held a GPU (by its identity) or the processors."""
 
-    card: str
-    began: datetime
-    ended: datetime
+    device: str
+    start: datetime
+    end: datetime
 
-    def meets(self, other: "Occupation") -> bool:
-        """Whether both were on one card at one time."""
-        return self.card == other.card and self.began < other.ended and other.began < self.ended
+    def overlaps(self, other: "DeviceUse") -> bool:
+        """Whether both held the same device at the same time."""
+        return self.device == other.device and self.start < other.end and other.start < self.end
 
 
-def results_of(ended: Sequence[tuple[Group, Outcome]]) -> list[Result]:
-    """What there is of every recipe with every seed of groups whose runs of Snakemake have ended, recipe by recipe."""
+def collect_results(ended: Sequence[tuple[SnakemakeRun, Outcome]]) -> list[Result]:
+    """The result of every recipe with every seed, of runs that have ended."""
     found = [
-        (group, _result(group, recipe, seed, outcome))
-        for group, outcome in ended
-        for recipe in group.recipes
-        for seed in group.seeds
+        (run, _result(run, recipe, seed, outcome))
+        for run, outcome in ended
+        for recipe in run.methods
+        for seed in run.seeds
     ]
-    held = {
-        (result.recipe, result.seed, stage): span
-        for group, result in found
-        for stage in ON_CARDS
-        if (span := _occupation(group, result, stage)) is not None
+    uses = {
+        (result.recipe, result.seed, stage): use
+        for run, result in found
+        for stage in GPU_STAGES
+        if (use := _device_use(run, result, stage)) is not None
     }
-    return [dataclasses.replace(result, shared=_shared(result, held)) for _, result in found]
+    return [dataclasses.replace(result, shared=_is_shared(result, uses)) for _, result in found]
 
 
-def _result(group: Group, recipe: str, seed: int, outcome: Outcome) -> Result:
-    """The result of a recipe with a seed; none where what lies there was made otherwise than the group's plan says: a
-    training that failed leaves the figures of an earlier one in place."""
-    path, method = group.evaluation(recipe, seed), with_seed(recipe, seed)
-    missing = Result(recipe, seed, path, why=outcome.why(method) or unexplained(group, recipe, seed))
+def _result(run: SnakemakeRun, recipe: str, seed: int, outcome: Outcome) -> Result:
+    """The result of a recipe with a seed. An eval.json that was made otherwise than the run's plan says does not count:
+    a failed training leaves the figures of an earlier one in place."""
+    path, method = run.evaluation(recipe, seed), with_seed(recipe, seed)
+    missing = Result(recipe, seed, path, reason=missing_reason(run, recipe, seed, outcome))
     if not path.is_file():
         return missing
     try:
         evaluation = read_json(path, rule="evaluate")
-        stale = differences(group.plan.evaluation_stages(group.scene, [method]), evaluation["provenance"]["stages"])
+        stale = differences(run.plan.evaluation_stages(run.scene, [method]), evaluation["provenance"]["stages"])
     except ResultError as error:
-        return dataclasses.replace(missing, why=str(error))
+        return dataclasses.replace(missing, reason=str(error))
     except (AttributeError, KeyError, TypeError) as error:
-        why = unreadable(path, "evaluate", f"not the figures of a method ({type(error).__name__}: {error})")
-        return dataclasses.replace(missing, why=str(why))
+        reason = unreadable(path, "evaluate", f"not the figures of a method ({type(error).__name__}: {error})")
+        return dataclasses.replace(missing, reason=str(reason))
     if stale:
-        return dataclasses.replace(missing, why=f"{missing.why} (an earlier result does not count: {stale[0]})")
+        return dataclasses.replace(missing, reason=f"{missing.reason} (an earlier result does not count: {stale[0]})")
     return Result(recipe, seed, path, evaluation)
 
 
-def occupation(log: str, on_processors: bool) -> Occupation | None:
-    """When a job ran on which card, as its log says; one whose log names none may be known to have run `on_processors`.
-    None where it is not known."""
-    times, card = [datetime.strptime(time, TIME_FORMAT) for time in _LINE.findall(log)], _CARD.search(log)
-    if card:
-        return Occupation(card[2], datetime.strptime(card[1], TIME_FORMAT), times[-1])
-    return Occupation(PROCESSORS, times[0], times[-1]) if on_processors and times else None
+def missing_reason(run: SnakemakeRun, recipe: str, seed: int, outcome: Outcome) -> str:
+    """Why a recipe with a seed has no result: a failure in a log of this run, of one of the method's own stages or of
+    one that prepares the scene, else the refusal of the whole run."""
+    folder = run.logs / run.scene
+    own = (folder / with_seed(recipe, seed)).glob("*.log")
+    for files in (own, folder.glob("*.log"), (run.logs / "demo_world").glob("*.log")):
+        for file in files:
+            if file.stat().st_mtime >= outcome.start:
+                for stage, why in failures(file.read_text(encoding="utf-8", errors="replace")).items():
+                    return f"{stage.rpartition('/')[2]}: {why}"
+    return outcome.refusal or f"no result, and no reason given; see {run.log(recipe, seed, 'train')}"
 
 
-def _occupation(group: Group, result: Result, stage: str) -> Occupation | None:
-    """When a stage of a recipe ran on which card; None where that is not known."""
+def device_use(log: str, on_processors: bool) -> DeviceUse | None:
+    """The device that a job held, by its log. A job whose log names no GPU may be known to have run `on_processors`;
+    otherwise None."""
+    times, gpu = [datetime.strptime(time, TIME_FORMAT) for time in _LINE.findall(log)], _GPU.search(log)
+    if gpu:
+        return DeviceUse(gpu[2], datetime.strptime(gpu[1], TIME_FORMAT), times[-1])
+    return DeviceUse(PROCESSORS, times[0], times[-1]) if on_processors and times else None
+
+
+def _device_use(run: SnakemakeRun, result: Result, stage: str) -> DeviceUse | None:
     try:
-        log = group.log(result.recipe, result.seed, stage).read_text(encoding="utf-8")
+        log = run.log(result.recipe, result.seed, stage).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return None
-    return occupation(log, on_processors=result.result is not None and result.result["device"].startswith("cpu"))
+    return device_use(log, on_processors=result.figures is not None and result.figures["device"].startswith("cpu"))
 
 
-def _shared(result: Result, held: Mapping[tuple[str, int, str], Occupation]) -> bool:
-    """Whether the training of a result met another's job on its card."""
-    own = held.get((result.recipe, result.seed, "train"))
-    others = (occupation for key, occupation in held.items() if key[:2] != (result.recipe, result.seed))
-    return own is not None and any(own.meets(other) for other in others)
+def _is_shared(result: Result, uses: Mapping[tuple[str, int, str], DeviceUse]) -> bool:
+    own = uses.get((result.recipe, result.seed, "train"))
+    others = (use for key, use in uses.items() if key[:2] != (result.recipe, result.seed))
+    return own is not None and any(own.overlaps(other) for other in others)

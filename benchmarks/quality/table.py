@@ -1,22 +1,30 @@
-"""quality.json in Markdown: tables ready for the documentation, with what they must be read with."""
+"""quality.json in Markdown: tables for the documentation, each with its protocol."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import yaml
 
-from benchmarks.quality.compare import COSTS, FIGURES, MEASURED_BY
-from drivesplat.evaluation.comparison import WHERE, markdown_table, mean_as, measured_groups, with_error, with_spread
+from benchmarks.quality.compare import COSTS, FIGURES, MEASURING_PROTOCOL
+from drivesplat.evaluation.comparison import (
+    GROUP_PLACES,
+    PSNR_COLUMNS,
+    format_mean,
+    group_table,
+    markdown_table,
+    measured_groups,
+    psnr_cells,
+)
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 
-HOW_TO_READ = (
-    "PSNR in dB: mean over the seeds (least to greatest). Difference from {reference}: mean of the differences seed by "
-    "seed ± its standard error."
+LEGEND = (
+    "PSNR in dB: mean over the seeds (minimum to maximum). Difference from {reference}: mean of the paired differences "
+    "± its standard error."
 )
-APART = "Measured otherwise than the first table, its figures do not compare with that one's: {differences}."
-SHARED = "Shared: while it was trained another job ran on the same card or processors; alone it takes less time."
+OTHER_PROTOCOL = "The protocol differs from that of the first table, so the figures do not compare: {differences}."
+SHARED = "Shared: during training another job ran on the same GPU or processors; without it training takes less time."
 OPTIONAL = {"ssim": ("SSIM", 3), "lpips": ("LPIPS", 3), "depth_error": ("depth error", None)}
-"""Columns that are there where any row has the figure: their headings, and decimals (None: per cent)."""
+"""Columns for figures that at least one row has: their headings, and decimals (None: percent)."""
 
 
 def markdown(record: dict[str, Any]) -> str:
@@ -29,9 +37,9 @@ def markdown(record: dict[str, Any]) -> str:
     if record["failed"]:
         lines = [f"- `{item['recipe']}`, seed {item['seed']}: {item['why']}" for item in record["failed"]]
         parts += ["## What failed", "\n".join(lines)]
-    told = [f"- `{name}`: {_told(recipe)}" for name, recipe in record["recipes"].items()]
-    common = [f"All: {_told({'base': record['base'], 'config': record['config']})}."]
-    parts += ["## The recipes", "\n".join(told), *(common if record["base"] or record["config"] else [])]
+    lines = [f"- `{name}`: {_settings(recipe)}" for name, recipe in record["recipes"].items()]
+    common = [f"All: {_settings({'base': record['base'], 'config': record['config']})}."]
+    parts += ["## The recipes", "\n".join(lines), *(common if record["base"] or record["config"] else [])]
     return "\n\n".join(parts) + "\n"
 
 
@@ -40,24 +48,23 @@ def _page(table: dict[str, Any], record: dict[str, Any], first: bool) -> list[st
     rows, parts = table["rows"], []
     if not first:
         reference = record["tables"][0]["protocol"]
-        unlike = [key for key in MEASURED_BY if table["protocol"][key] != reference[key]]
+        differing = [key for key in MEASURING_PROTOCOL if table["protocol"][key] != reference[key]]
         differences = "; ".join(
-            f"{key} {_spelled(table['protocol'][key])}, there {_spelled(reference[key])}" for key in unlike
+            f"{key} {_yaml(table['protocol'][key])}, there {_yaml(reference[key])}" for key in differing
         )
-        parts += ["## Measured otherwise", APART.format(differences=differences)]
-    parts += [_protocol(table, record), HOW_TO_READ.format(reference=f"`{table['reference']}`")]
+        parts += ["## Other protocol", OTHER_PROTOCOL.format(differences=differences)]
+    parts += [_protocol(table, record), LEGEND.format(reference=f"`{table['reference']}`")]
     failed = _failed(record) if first else []
-    for group in measured_groups(rows, FIGURES):
-        parts += [f"{WHERE[group].capitalize()}:", _figures(rows, group, failed)]
-    parts += ["What they are trained on, and what they cost:", _costs(rows)]
+    parts += [_figures(rows, group, failed) for group in measured_groups(rows, FIGURES)]
+    parts += ["Training data and costs:", _costs(rows)]
     return [*parts, SHARED] if any(row["shared"] for row in rows) else parts
 
 
 def _protocol(table: dict[str, Any], record: dict[str, Any]) -> str:
-    """The line without which the figures say nothing."""
+    """The protocol in one line."""
     protocol, rows = table["protocol"], table["rows"]
     held_out = [
-        f"{_numbers(frames)} {WHERE[group]}"
+        f"{_numbers(frames)} {GROUP_PLACES[group]}"
         for group in HELD_OUT_GROUPS
         if (frames := protocol["held_out_frames"][group])
     ]
@@ -73,29 +80,18 @@ def _protocol(table: dict[str, Any], record: dict[str, Any]) -> str:
 
 
 def _figures(rows: Sequence[dict[str, Any]], group: str, failed: list[list[str]]) -> str:
-    """The figures of a group of held-out frames, and the rows of recipes that have none."""
+    """The figures of a group of held-out frames, and the rows of recipes without any."""
     optional = [name for name in OPTIONAL if any(row[group][name] for row in rows)]
-    header = [
-        "recipe",
-        "static",
-        "difference",
-        "moving vehicles",
-        "difference",
-        "gap",
-        *(OPTIONAL[o][0] for o in optional),
+    header = ["recipe", *PSNR_COLUMNS, *(OPTIONAL[name][0] for name in optional)]
+    lines = [
+        [f"`{row['recipe']}`", *psnr_cells(row, group), *(_optional(row[group][o], OPTIONAL[o][1]) for o in optional)]
+        for row in rows
     ]
-    lines = []
-    for row in rows:
-        cells = [f"`{row['recipe']}`"]
-        for name in ("static", "moving_vehicle"):
-            cells += [with_spread(row[group][name]), with_error(row[group]["difference"][name])]
-        cells += [mean_as(row[group]["gap_db"], "{:.1f}")]
-        lines.append([*cells, *(_optional(row[group][name], OPTIONAL[name][1]) for name in optional)])
-    return markdown_table(header, [*lines, *(cells + [""] * (len(header) - len(cells)) for cells in failed)])
+    return group_table(group, header, [*lines, *(cells + [""] * (len(header) - len(cells)) for cells in failed)])
 
 
 def _optional(found: dict[str, Any] | None, digits: int | None) -> str:
-    return mean_as(found, "{:.1%}" if digits is None else f"{{:.{digits}f}}")
+    return format_mean(found, "{:.1%}" if digits is None else f"{{:.{digits}f}}")
 
 
 def _costs(rows: Sequence[dict[str, Any]]) -> str:
@@ -108,40 +104,43 @@ def _costs(rows: Sequence[dict[str, Any]]) -> str:
         on, (gaussians, seconds, memory) = row["trained_on"], (row[name] for name in COSTS)
         cells = [f"`{row['recipe']}`", ", ".join(map(str, row["seeds"])), f"{on['train_images']:,}"]
         cells += ["yes" if on["sweeps"] else "no", on["poses"], f"{row['train_iterations']:,}"]
-        cells += [mean_as(gaussians, "{:,.0f}"), mean_as(seconds, "{:.0f} s") + (", shared" if row["shared"] else "")]
-        lines.append([*cells, mean_as(memory, "{:.1f} GB"), _each(row["devices"])])
+        cells += [
+            format_mean(gaussians, "{:,.0f}"),
+            format_mean(seconds, "{:.0f} s") + (", shared" if row["shared"] else ""),
+        ]
+        lines.append([*cells, format_mean(memory, "{:.1f} GB"), _each(row["devices"])])
     return markdown_table(header, lines)
 
 
 def _failed(record: dict[str, Any]) -> list[list[str]]:
-    """The first cells of rows of recipes without any result: their names, and why."""
+    """The first cells of rows of recipes without any result: name and reason."""
     measured = {row["recipe"] for table in record["tables"] for row in table["rows"]}
-    whys: dict[str, str] = {}
+    reasons: dict[str, str] = {}
     for item in record["failed"]:
         if item["recipe"] not in measured:
-            whys.setdefault(item["recipe"], item["why"])
-    return [[f"`{name}`", f"failed: {why}".replace("|", "\\|")] for name, why in whys.items()]
+            reasons.setdefault(item["recipe"], item["why"])
+    return [[f"`{name}`", f"failed: {reason}".replace("|", "\\|")] for name, reason in reasons.items()]
 
 
-def _told(tree: dict[str, Any]) -> str:
-    """What a recipe sets, in a line."""
-    there = {key: value for key, value in tree.items() if value}
-    return ", ".join(f"{key} {_spelled(value)}" for key, value in there.items()) or "the settings of the config"
+def _settings(tree: dict[str, Any]) -> str:
+    """The settings of a recipe in one line."""
+    given = {key: value for key, value in tree.items() if value}
+    return ", ".join(f"{key} {_yaml(value)}" for key, value in given.items()) or "the settings of the config"
 
 
-def _spelled(value: Any) -> str:
-    """A value as a recipe file or a config file holds it."""
+def _yaml(value: Any) -> str:
+    """A value in YAML, on one line."""
     text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000)
     return f"`{text.strip().removesuffix('...').strip()}`"
 
 
 def _each(values: Iterable[str]) -> str:
-    """Every value once."""
+    """The distinct values."""
     return ", ".join(dict.fromkeys(values))
 
 
 def _numbers(numbers: Sequence[int]) -> str:
-    """Numbers in rising order, runs of three and more shortened: 4, 12, 35 to 38."""
+    """Rising numbers, with three or more consecutive ones as a range: 4, 12, 35 to 38."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][-1] + 1:

@@ -1,1 +1,1 @@
-"""How fast the workflow trains, held to the plain recipe: gsplat's example trainer as users write it."""
+"""Training speed of the workflow, compared with the plain recipe: gsplat's example trainer as users run it."""

@@ -1,11 +1,11 @@
-"""Timed trainings into the content of speed.json: for every length both recipes side by side, time and quality."""
+"""Timed trainings into the content of speed.json: time and quality of both recipes for every length."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from benchmarks.speed.plan import RECIPES
 from benchmarks.speed.settings import SpeedFile
-from drivesplat.evaluation.comparison import Figures, compared, figure
+from drivesplat.evaluation.comparison import Figures, compare_runs, summarize
 
 SCHEMA = 1
 FIGURES: Figures = {
@@ -20,8 +20,8 @@ Record = dict[str, Any]
 
 
 def speed(file: SpeedFile, runs: Sequence[Record], profiles: Sequence[Record]) -> Record:
-    """The content of speed.json, of the runs that there are: a table for every length of which both recipes have been
-    run with a seed, and every run whole."""
+    """The content of speed.json: a table for every length for which both recipes have run with some seed, and the
+    complete record of every run."""
     tables = [_table(file, iterations, runs, profiles) for iterations in file.iterations]
     return {
         "schema": SCHEMA,
@@ -32,12 +32,12 @@ def speed(file: SpeedFile, runs: Sequence[Record], profiles: Sequence[Record]) -
 
 
 def _table(file: SpeedFile, iterations: int, runs: Sequence[Record], profiles: Sequence[Record]) -> Record | None:
-    """Both recipes at one length, over the seeds that both have been run with; None where there is none."""
-    found = {(run["recipe"], run["seed"]): run for run in runs if run["iterations"] == iterations}
-    seeds = [seed for seed in file.seeds if all((recipe, seed) in found for recipe in RECIPES)]
+    """Both recipes at one length, over the seeds that both have; None if there is none."""
+    by_key = {(run["recipe"], run["seed"]): run for run in runs if run["iterations"] == iterations}
+    seeds = [seed for seed in file.seeds if all((recipe, seed) in by_key for recipe in RECIPES)]
     if not seeds:
         return None
-    by_recipe = {recipe: [found[recipe, seed] for seed in seeds] for recipe in RECIPES}
+    by_recipe = {recipe: [by_key[recipe, seed] for seed in seeds] for recipe in RECIPES}
     every = [run for of_recipe in by_recipe.values() for run in of_recipe]
     return {
         "iterations": iterations,
@@ -56,16 +56,16 @@ def _table(file: SpeedFile, iterations: int, runs: Sequence[Record], profiles: S
 
 
 def _row(recipe: str, runs: Sequence[Record], plain: Sequence[Record]) -> Record:
-    """A recipe's costs and figures over its seeds, with differences from those of the plain recipe."""
+    """A recipe's costs and figures over its seeds, compared with the plain recipe."""
     reference = None if recipe == "plain" else [run["result"] for run in plain]
     return {
         "recipe": recipe,
-        **{name: figure([run[name] for run in runs]) for name in COSTS},
-        "iterations_per_second": figure([run["iterations"] / run["loop"] for run in runs]),
-        **compared([run["result"] for run in runs], reference, FIGURES),
+        **{name: summarize([run[name] for run in runs]) for name in COSTS},
+        "iterations_per_second": summarize([run["iterations"] / run["loop"] for run in runs]),
+        **compare_runs([run["result"] for run in runs], reference, FIGURES),
     }
 
 
 def _times_as_fast(name: str, plain: Iterable[Record], ours: Iterable[Record]) -> Record | None:
-    """How many times as fast ours is as the plain recipe with the same seed."""
-    return figure([slow[name] / fast[name] for slow, fast in zip(plain, ours, strict=True)])
+    """The speed-up of ours over the plain recipe, paired by seed."""
+    return summarize([slow[name] / fast[name] for slow, fast in zip(plain, ours, strict=True)])

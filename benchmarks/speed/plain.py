@@ -1,7 +1,7 @@
 """The plain recipe: the settings of gsplat's example trainer in its configuration `mcmc` (gsplat 1.5, examples/
-simple_trainer.py), and what its training begins with.
+simple_trainer.py), and its initial Gaussians.
 
-It is what this workflow's training is held to, so nothing here follows what is improved there.
+It is the baseline of this workflow's training, so improvements there are not adopted here.
 """
 
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.gaussians import GaussianSettings
 
 FULL_LENGTH = 30_000
-"""The length that the example's schedule is made for."""
+"""The length of the example's schedule."""
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
-"""Learning rates; that of means counts in units of the scene's scale."""
+"""Learning rates; that of means is in units of the scene's scale."""
 DECAY = 0.01
-"""Means learn at the end at this fraction of their first rate."""
+"""The last learning rate of means, as a fraction of their first."""
 SCALE_MARGIN = 1.1
-"""The scene's scale is that of its cameras times this."""
+"""Factor from the extent of the cameras to the scene's scale."""
 SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
 INIT_OPACITY, INIT_SCALE = 0.5, 0.1
@@ -34,8 +34,8 @@ WORKERS = 4
 """Processes that decode images."""
 LOGGED_EVERY = 100
 SAVED_AT = (7_000, 30_000)
-LEAST_SPACING = 1e-7
-"""Seed points in one place are taken to be so far apart (metres): a scale has to have a logarithm."""
+MIN_SPACING = 1e-7
+"""Minimum distance in metres that is assumed between seed points: the logarithm of a scale must be finite."""
 
 Splats = nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
@@ -43,8 +43,8 @@ Optimizers = dict[str, torch.optim.Optimizer]
 
 @dataclass(frozen=True)
 class Schedule:
-    """When what happens in a training of so many iterations: the spherical harmonics gain a degree, Gaussians are moved
-    and added after `refine_start` and before `refine_stop`, every hundredth iteration."""
+    """The schedule of a training: the spherical harmonics gain a degree every `sh_every` iterations; between
+    `refine_start` and `refine_stop` Gaussians are moved and added every hundredth iteration."""
 
     iterations: int
     sh_every: int
@@ -53,18 +53,18 @@ class Schedule:
 
     @classmethod
     def of(cls, iterations: int) -> "Schedule":
-        """The example's schedule, shortened as its `steps_scaler` does, but for the hundred iterations between two
-        refinements, which stay as they are in every training of this workflow, too."""
+        """The example's schedule, shortened as its `steps_scaler` does, except for the hundred iterations between two
+        refinements, which this workflow's trainings keep as well."""
         done = iterations / FULL_LENGTH
         return cls(iterations, max(1, int(1_000 * done)), int(500 * done), int(25_000 * done))
 
     @classmethod
-    def of_trained(cls, iterations: int) -> "Schedule":
-        """For what goes on from a trained model: all degrees from the beginning, refined to the end."""
+    def continued(cls, iterations: int) -> "Schedule":
+        """The schedule that continues a trained model: all degrees from the start, refinement to the end."""
         return cls(iterations, 1, 0, iterations)
 
     def sh_degree(self, step: int) -> int:
-        """The degree that a step renders with."""
+        """The degree of the spherical harmonics in a step."""
         return min(step // self.sh_every, SH_DEGREE)
 
 
@@ -87,16 +87,16 @@ class PlainRecipe:
 
 
 def scene_scale(record: TrainingRecord) -> float:
-    """What the rate of means counts in, in metres."""
+    """The unit of the learning rate of means, in metres."""
     return SCALE_MARGIN * record.scene_scale
 
 
-def started(points: np.ndarray, colors: np.ndarray, seed: int) -> Splats:
-    """Gaussians at seed points (n, 3) metres with their colours (n, 3) uint8, on the CPU; turned at random."""
+def init_splats(points: np.ndarray, colors: np.ndarray, seed: int) -> Splats:
+    """Gaussians at seed points (n, 3) in metres with colours (n, 3) uint8, on the CPU, with random rotations."""
     torch.manual_seed(seed)
     count = len(points)
     distances = cKDTree(points).query(points, k=4, workers=-1)[0][:, 1:]
-    spacing = np.maximum(np.sqrt((distances**2).mean(axis=1)), LEAST_SPACING)
+    spacing = np.maximum(np.sqrt((distances**2).mean(axis=1)), MIN_SPACING)
     coefficients = torch.zeros(count, (SH_DEGREE + 1) ** 2, 3)
     coefficients[:, 0] = (torch.from_numpy(colors / 255.0).float() - 0.5) / SH_C0
     values = {
@@ -111,12 +111,12 @@ def started(points: np.ndarray, colors: np.ndarray, seed: int) -> Splats:
 
 
 def as_splats(values: dict[str, Tensor]) -> Splats:
-    """Tensors under gsplat's names as what is optimised."""
+    """Tensors under gsplat's names as parameters."""
     return nn.ParameterDict({name: nn.Parameter(value) for name, value in values.items()})
 
 
 def make_optimizers(splats: Splats, scale: float) -> Optimizers:
-    """An Adam for each parameter, as gsplat's strategies need it; fused, as later versions of the example have it."""
+    """An Adam for each parameter, as gsplat's strategies require; fused, as in later versions of the example."""
     units = {"means": scale}
     return {
         name: torch.optim.Adam([splats[name]], lr=rate * units.get(name, 1.0), eps=1e-15, fused=True)
@@ -125,5 +125,5 @@ def make_optimizers(splats: Splats, scale: float) -> Optimizers:
 
 
 def as_model(splats: dict[str, Tensor], record: TrainingRecord) -> SplatModel:
-    """What was trained, as a model that this workflow measures: a background before black."""
+    """The trained Gaussians as a model of this workflow: a background before black."""
     return SplatModel([Background(dict(splats), GaussianSettings(), record.scene_scale)], sky=None)

@@ -1,4 +1,4 @@
-"""The training images as the plain recipe reads them: files that are decoded whenever they are looked at."""
+"""The training images as the plain recipe reads them: files that are decoded for every use."""
 
 import warnings
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from drivesplat.scene.images import read_image, write_png
 from drivesplat.scene.training_record import TrainingRecord
 
 MANY_WORKERS = "This DataLoader will create"
-"""How torch warns of more processes than processors, of which gsplat's example has so many nonetheless."""
+"""Torch's warning of more processes than processors; gsplat's example ignores it."""
 
 
 class ImageFiles(Dataset):
@@ -43,7 +43,7 @@ class ImageFiles(Dataset):
 
 
 def files_of_size(record: TrainingRecord, folder: Path) -> list[str]:
-    """Files of the training images at the size they are trained at: the recorded ones where they have it, else PNGs in
+    """Files of the training images at their training size: the recorded files if they have that size, else PNGs in
     `folder`, made once, as the example keeps reduced copies of a scene's images."""
 
     def file_of(index: int) -> str:
@@ -60,7 +60,7 @@ def files_of_size(record: TrainingRecord, folder: Path) -> list[str]:
 
 
 def loader_of(images: Dataset, workers: int, device: torch.device) -> DataLoader:
-    """One image at a time in random order, decoded by `workers` processes (0: by this one)."""
+    """Single images in random order, decoded by `workers` processes (0: by this one)."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", MANY_WORKERS)
         return DataLoader(
@@ -68,14 +68,14 @@ def loader_of(images: Dataset, workers: int, device: torch.device) -> DataLoader
             batch_size=1,
             shuffle=True,
             num_workers=workers,
-            multiprocessing_context="fork" if workers else None,  # as users have it, whose program nothing spawned
+            multiprocessing_context="fork" if workers else None,  # the default for users' programs on Linux
             persistent_workers=workers > 0,
             pin_memory=device.type == "cuda",
         )
 
 
 def endless(loader: DataLoader) -> Iterator[dict[str, Tensor]]:
-    """Its images, epoch after epoch; the processes that decode them start now."""
+    """Its images, epoch after epoch. The processes that decode them start with this call."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", MANY_WORKERS)
         return chain(iter(loader), chain.from_iterable(repeat(loader)))

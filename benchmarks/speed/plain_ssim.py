@@ -1,5 +1,4 @@
-"""The structural similarity that the plain recipe trains with: the fused kernel of gsplat's example where it is
-installed, else the same in torch."""
+"""The SSIM of the plain recipe's loss: the fused kernel of gsplat's example if it is installed, else torch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,14 +16,14 @@ FUSED = "fused_ssim"
 
 @dataclass(frozen=True)
 class Ssim:
-    """A mean structural similarity of images (1, 3, h, w), and what it is called."""
+    """A mean structural similarity of images (1, 3, h, w), and its name."""
 
     name: str
     of: Callable[[Tensor, Tensor], Tensor]
 
 
 def chosen_ssim(device: torch.device) -> Ssim:
-    """What the example takes on a device: the package `fused_ssim` on a GPU, where it is installed."""
+    """The example's choice for a device: the package `fused_ssim` on a GPU if it is installed."""
     if device.type == "cuda" and find_spec(FUSED) is not None:
         from fused_ssim import fused_ssim
 
@@ -33,8 +32,7 @@ def chosen_ssim(device: torch.device) -> Ssim:
 
 
 def torch_ssim(image: Float[Tensor, "1 3 h w"], target: Float[Tensor, "1 3 h w"]) -> Float[Tensor, ""]:
-    """Mean structural similarity (Wang et al. 2004) of what windows of 11 Gaussian taps see that lie in the image
-    whole."""
+    """Mean structural similarity (Wang et al. 2004) over all windows of 11 Gaussian taps that lie inside the image."""
     maps = torch.cat([image, target, image * image, target * target, image * target], dim=1)
     offsets = torch.arange(TAPS, device=image.device, dtype=image.dtype) - TAPS // 2
     taps = torch.exp(-(offsets**2) / (2 * SIGMA**2))

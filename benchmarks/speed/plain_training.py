@@ -1,4 +1,4 @@
-"""The plain recipe's training: the loop of gsplat's example trainer, with what it does beside learning."""
+"""The plain recipe's training: the loop of gsplat's example trainer, with its logging and checkpoints."""
 
 import sys
 import time
@@ -40,9 +40,8 @@ CHECKPOINT = "ckpt.pt"
 
 @dataclass(frozen=True)
 class PlainSummary:
-    """What there is to say of a training that ended: the seconds of its loop, when its files were there (by
-    `time.monotonic`), the Gaussians, what torch held at its peak (GB; None on the CPU), and which SSIM it trained
-    with."""
+    """The outcome of a training: the seconds of its loop, the time when its files were complete (`time.monotonic`), the
+    number of Gaussians, torch's peak memory (GB; None on the CPU), and the name of its SSIM."""
 
     seconds: float
     ended: float
@@ -54,8 +53,8 @@ class PlainSummary:
 def fit(
     splats: Splats, images: Dataset, scale: float, recipe: PlainRecipe, folder: Path, clock: Clock = UNTIMED
 ) -> PlainSummary:
-    """Fits Gaussians, on the device where they lie, to `images`; `scale` is the scene's, `folder` where scalars and
-    checkpoints go. `clock` times the stages of an iteration."""
+    """Fits Gaussians to `images` on their device; `scale` is the scene's. Scalars and checkpoints go to `folder`.
+    `clock` times the stages of an iteration."""
     device = splats["means"].device
     on_gpu = device.type == "cuda"
     torch.manual_seed(recipe.seed)
@@ -71,7 +70,7 @@ def fit(
             torch.cuda.synchronize(device)
         seconds = time.monotonic() - began
     save(folder / CHECKPOINT, training.state())
-    ended = time.monotonic()  # the processes that decode images take up to seconds to leave: no part of a training
+    ended = time.monotonic()  # without the seconds that the decoding processes take to exit
     peak = torch.cuda.max_memory_reserved(device) / 1e9 if on_gpu else None
     return PlainSummary(seconds, ended, len(splats["means"]), peak, training.ssim.name)
 
@@ -110,8 +109,8 @@ class PlainTraining:
                 self.learn(info)
 
     def fit_one(self, data: Iterator[dict[str, Tensor]]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """The first half of an iteration: the next image, rendered, compared, and the gradients of that. Returns the
-        terms of the loss, and what the rasterizer tells densification."""
+        """The first half of an iteration: renders the next image and computes gradients. Returns the terms of the loss,
+        and the rasterizer's output for densification."""
         with self.clock.stage("data"):
             batch = next(data)
             camtoworlds, intrinsics = batch["camtoworld"].to(self.device), batch["K"].to(self.device)
@@ -125,7 +124,7 @@ class PlainTraining:
         return terms, info
 
     def learn(self, info: dict[str, Any]) -> None:
-        """The second half: the optimizers step, and Gaussians are moved and added."""
+        """The second half: optimizer steps and densification."""
         with self.clock.stage("optimizer"):
             for optimizer in self.optimizers.values():
                 optimizer.step()
@@ -143,7 +142,7 @@ class PlainTraining:
         return {"step": self.step, "splats": {name: value.detach() for name, value in self.splats.items()}}
 
     def _render(self, camtoworlds: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, dict[str, Any]]:
-        """The image (1, h, w, 3) before black, and what densification reads."""
+        """The image (1, h, w, 3) before black, and the rasterizer's output for densification."""
         gaussians = (
             self.splats["means"],
             self.splats["quats"],
@@ -175,5 +174,5 @@ class PlainTraining:
         writer.flush()
 
     def _kernels(self) -> AbstractContextManager[None]:
-        """What gsplat's strategies compute with: on a CPU, torch's twins of the two CUDA kernels they call."""
+        """On a CPU, replaces the two CUDA kernels that gsplat's strategies call by torch functions."""
         return nullcontext() if self.device.type == "cuda" else torch_twins()

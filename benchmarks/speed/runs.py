@@ -1,4 +1,4 @@
-"""One training, timed and measured: by the plain recipe, or as the rule `train` does it."""
+"""One training, timed and evaluated: by the plain recipe, or by the function of the rule `train`."""
 
 import json
 import os
@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed.bystanders import Moment, busy_elsewhere
-from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, as_splats, scene_scale, started
+from benchmarks.speed.cpu_load import CpuSample, busy_elsewhere
+from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, as_splats, init_splats, scene_scale
 from benchmarks.speed.plain_images import ImageFiles, files_of_size
 from benchmarks.speed.plain_training import CHECKPOINT, fit
 from benchmarks.speed.plan import Task
@@ -39,23 +39,23 @@ from drivesplat.workflow.gpus import hold_card
 Times = dict[str, Any]
 WHOLE_IMAGES = CoarseToFineSettings(quarter_until=0.0, half_until=0.0)
 WARM_UP = 20
-"""So many iterations pass before stages are timed."""
+"""Iterations before stages are timed."""
 
 
 def run(task: Task) -> dict[str, Any]:
-    """Trains and measures. `loop` are the seconds of the training's loop, `whole` those from reading parser.pkl to the
-    files it leaves; `busy_elsewhere` says how many of the `processors` on average had other work meanwhile (None where
-    that is not known); `result` are the metrics per group of held-out frames, measured as `protocol` says.
+    """Trains and evaluates. Returns `loop`, the seconds of the training loop; `whole`, the seconds from reading
+    parser.pkl to the written files; `busy_elsewhere`, the mean number of `processors` that other programs kept busy
+    (None if unknown); `result`, the metrics per group of held-out frames under `protocol`; and more.
 
-    What both recipes need once, the rasterizer's kernels and a copy of the images at their size, is there beforehand.
+    The rasterizer's kernels and the reduced images, which both recipes need once, are prepared before timing.
     """
     shutil.rmtree(task.folder, ignore_errors=True)
     with held_device(task.device) as device:
         record = read_training_record(task.files.parser)
         paths = files_of_size(record, task.images)
-        before = Moment.now()
+        before = CpuSample.now()
         times, model = plain(task, device, paths) if task.recipe == "plain" else ours(task, device)
-        elsewhere = busy_elsewhere(before, Moment.now())
+        elsewhere = busy_elsewhere(before, CpuSample.now())
         recording, _ = read_recording(task.files.scene, task.files.parser, task.files.masks)
         masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
         groups = evaluate_groups(model.to(device).requires_grad_(False), recording, camera, None, device)
@@ -75,12 +75,12 @@ def run(task: Task) -> dict[str, Any]:
 
 
 def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, SplatModel]:
-    """A training by the plain recipe, and its model."""
+    """Times of a training by the plain recipe, and its model."""
     began = time.monotonic()
     record = read_training_record(task.files.parser)
     cap = gaussian_cap(record, task.train.train)
     kept = some_of(len(record.points), cap)
-    splats = started(record.points[kept], record.points_rgb[kept], task.seed).to(device)
+    splats = init_splats(record.points[kept], record.points_rgb[kept], task.seed).to(device)
     recipe = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers)
     summary = fit(splats, ImageFiles(record, paths), scene_scale(record), recipe, task.folder)
     costs = {key: getattr(summary, key) for key in ("gaussians", "peak_gpu_memory_gb", "ssim")}
@@ -89,8 +89,9 @@ def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, Sp
 
 
 def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
-    """A training by what the rule `train` calls, and its model. Its kernels are loaded by two iterations before it."""
-    _go_on(task, device, 2)
+    """Times of a training by the function of the rule `train`, and its model. Two iterations before it load its
+    kernels."""
+    _continue(task, device, 2)
     began = time.monotonic()
     inputs, upstream = _inputs(task)
     settings = json.loads(task.train.model_dump_json())
@@ -104,13 +105,13 @@ def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
 
 
 def training_files(task: Task) -> TrainingFiles:
-    """What a training of ours writes."""
+    """The output files of a training of ours."""
     return TrainingFiles(task.folder / "checkpoint.pt", task.folder / "train.json")
 
 
 def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:
-    """Milliseconds an iteration by stage, over so many iterations that go on from where a task's training ended:
-    per stage `device_ms` and `host_ms` (`drivesplat.training.clock`). What is trained here is thrown away."""
+    """`device_ms` and `host_ms` of each stage (`drivesplat.training.clock`) in milliseconds per iteration, over
+    iterations that continue a task's training. The continued model is discarded."""
     profiled = _profile_plain if task.recipe == "plain" else _profile_ours
     with held_device(task.device) as device:
         clock = StageClock(device, WARM_UP)
@@ -122,29 +123,29 @@ def _profile_plain(task: Task, device: torch.device, iterations: int, clock: Sta
     record = read_training_record(task.files.parser)
     splats = as_splats(load(task.folder / CHECKPOINT, rule="train")["splats"]).to(device)
     cap = gaussian_cap(record, task.train.train)
-    recipe = PlainRecipe(Schedule.of_trained(iterations), cap, task.seed, task.workers)
+    recipe = PlainRecipe(Schedule.continued(iterations), cap, task.seed, task.workers)
     images = ImageFiles(record, files_of_size(record, task.images))
-    fit(splats, images, scene_scale(record), recipe, _aside(task), clock)
-    shutil.rmtree(_aside(task))
+    fit(splats, images, scene_scale(record), recipe, _profile_folder(task), clock)
+    shutil.rmtree(_profile_folder(task))
 
 
 def _profile_ours(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
     model, _ = trained_model(read_checkpoint(training_files(task).checkpoint))
-    _go_on(task, device, iterations, model, clock)
+    _continue(task, device, iterations, model, clock)
 
 
-def _go_on(
+def _continue(
     task: Task, device: torch.device, iterations: int, model: SplatModel | None = None, clock: Clock = UNTIMED
 ) -> None:
-    """Iterations with all degrees of harmonics of a model (None: a new one), whole images and densification."""
+    """Trains a model (None: a new one) with all degrees of harmonics, full-size images and densification."""
     inputs, _ = _inputs(task)
     begun = prepare(inputs, task.train, device)
-    goes_on = {"iterations": iterations, "sh_every": 0.0, "refine_start": 0.0, "refine_stop": 1.0}
-    settings = begun.settings.model_copy(update={**goes_on, "coarse_to_fine": WHOLE_IMAGES})
-    workspace = Workspace(_aside(task) / "resume", _aside(task) / "tensorboard", "", task.label)
+    continued = {"iterations": iterations, "sh_every": 0.0, "refine_start": 0.0, "refine_stop": 1.0}
+    settings = begun.settings.model_copy(update={**continued, "coarse_to_fine": WHOLE_IMAGES})
+    workspace = Workspace(_profile_folder(task) / "resume", _profile_folder(task) / "tensorboard", "", task.label)
     trained = begun.model if model is None else model
     train(trained, begun.views, settings, task.seed, device, workspace, begun.surroundings, clock)
-    shutil.rmtree(_aside(task))
+    shutil.rmtree(_profile_folder(task))
 
 
 def _inputs(task: Task) -> tuple[TrainingInputs, list[dict[str, Any]]]:
@@ -152,25 +153,25 @@ def _inputs(task: Task) -> tuple[TrainingInputs, list[dict[str, Any]]]:
     return read_inputs(files.parser, files.masks, files.actors, files.lidar_depth, files.free_space)
 
 
-def _aside(task: Task) -> Path:
+def _profile_folder(task: Task) -> Path:
     return task.folder / "profile"
 
 
 @contextmanager
 def held_device(settings: DeviceSettings) -> Iterator[torch.device]:
-    """The device that the settings choose, with no other job of this workflow on it, and awake."""
+    """The device that the settings choose, with no other job of this workflow on it and with its kernels loaded."""
     card = hold_card(1) if settings.kind != "cpu" else None
     try:
         device = choose_device(settings)
-        wake(device)
+        load_kernels(device)
         yield device
     finally:
         if card is not None:
             card.close()
 
 
-def wake(device: torch.device) -> None:
-    """Loads the rasterizer's kernels and, on a GPU, what torch starts with: neither recipe pays for it."""
+def load_kernels(device: torch.device) -> None:
+    """Loads the rasterizer's kernels and, on a GPU, torch's CUDA context, so that no timing includes them."""
     means = torch.tensor([[0.0, 0.0, 2.0]] * 8, device=device, requires_grad=True)
     quats, scales = torch.ones(8, 4, device=device), torch.full((8, 3), 0.1, device=device)
     opacities, coefficients = torch.full((8,), 0.5, device=device), torch.zeros(8, 16, 3, device=device)

@@ -1,27 +1,35 @@
-"""speed.json in Markdown: tables ready for the documentation, with what they must be read with."""
+"""speed.json in Markdown: tables for the documentation, each with its protocol."""
 
 from typing import Any
 
 from benchmarks.speed.compare import FIGURES
 from benchmarks.speed.plan import RECIPES
-from drivesplat.evaluation.comparison import WHERE, markdown_table, mean_as, measured_groups, with_error, with_spread
+from drivesplat.evaluation.comparison import (
+    GROUP_PLACES,
+    format_difference,
+    format_mean,
+    format_spread,
+    group_table,
+    markdown_table,
+    measured_groups,
+)
 from drivesplat.training.clock import ITERATION, OTHER
 
-HOW_TO_READ = (
-    "Seconds of the training loop, and of the whole from parser.pkl to the files it leaves; PSNR in dB on held-out "
-    "frames {where}. Means over the seeds (least to greatest). Difference from `plain`: mean of the differences seed "
-    "by seed ± its standard error."
+LEGEND = (
+    "Loop: seconds of the training loop. Whole: seconds from parser.pkl to the written files. PSNR in dB on held-out "
+    "frames {where}. Means over the seeds (minimum to maximum). Difference from `plain`: mean of the paired "
+    "differences ± its standard error."
 )
 STAGES = (
-    "Milliseconds an iteration, over {profiled} iterations that go on from the trained models of seed {seed}, not part "
-    "of the runs above:"
+    "Milliseconds per iteration, over {profiled} iterations that continue from the trained models of seed {seed} after "
+    "the runs above:"
 )
 BUSY = (
-    "Meanwhile up to {busy_elsewhere:.1f} of the {processors} processors had other work: alone it takes less time, and "
-    "ratios of such times say little."
+    "Other programs kept up to {busy_elsewhere:.1f} of the {processors} processors busy: without them training takes "
+    "less time, and ratios of these times say little."
 )
-MUCH = 0.2
-"""So large a share of the processors with other work is told."""
+MIN_BUSY_SHARE = 0.2
+"""The page mentions other programs if they kept at least this share of the processors busy."""
 
 
 def markdown(record: dict[str, Any]) -> str:
@@ -35,23 +43,22 @@ def markdown(record: dict[str, Any]) -> str:
 
 
 def _page(table: dict[str, Any], record: dict[str, Any]) -> list[str]:
-    """A length: the protocol, times beside quality, further quality, and where the time goes."""
+    """A training length: the protocol, times with quality, quality of further groups, and time per stage."""
     groups = measured_groups(table["rows"], FIGURES)
     first = groups[0] if groups else "interpolation"
     parts = [f"## {table['iterations']:,} iterations", _protocol(table, record)]
-    parts += [HOW_TO_READ.format(where=WHERE[first]), _times(table, record, first)]
-    for group in groups[1:]:
-        parts += [f"{WHERE[group].capitalize()}:", _quality(table, record, group)]
+    parts += [LEGEND.format(where=GROUP_PLACES[first]), _times(table, record, first)]
+    parts += [_quality(table, record, group) for group in groups[1:]]
     if table["stages"]:
-        told = STAGES.format(profiled=record["profiled"], seed=record["seeds"][0])
-        parts += [told, _stages(table["stages"], record["method"])]
-    if table["busy_elsewhere"] >= MUCH * table["processors"]:
+        title = STAGES.format(profiled=record["profiled"], seed=record["seeds"][0])
+        parts += [title, _stages(table["stages"], record["method"])]
+    if table["busy_elsewhere"] >= MIN_BUSY_SHARE * table["processors"]:
         parts.append(BUSY.format(**table))
     return parts
 
 
 def _protocol(table: dict[str, Any], record: dict[str, Any]) -> str:
-    """The line without which the figures say nothing."""
+    """The protocol in one line."""
     protocol = table["protocol"]
     return (
         f"Scene {record['scene']} of {table['dataset']} ({protocol['version']}), {', '.join(protocol['cameras'])} at "
@@ -62,7 +69,7 @@ def _protocol(table: dict[str, Any], record: dict[str, Any]) -> str:
 
 
 def _times(table: dict[str, Any], record: dict[str, Any], group: str) -> str:
-    """What each recipe costs, with the quality that it buys."""
+    """The costs of each recipe, with its quality."""
     header = [
         *("recipe", "loop", "whole", "iterations/s", "times as fast", "Gaussians", "GPU memory"),
         *("static", "difference", "all", "difference"),
@@ -71,20 +78,20 @@ def _times(table: dict[str, Any], record: dict[str, Any], group: str) -> str:
     for row in table["rows"]:
         fast = None if row["recipe"] == "plain" else table["times_as_fast"]["loop"]
         cells = [_name(row["recipe"], record["method"])]
-        cells += [_seconds(row["loop"]), _seconds(row["whole"]), mean_as(row["iterations_per_second"], "{:.1f}")]
-        cells += [_spread(fast, 2), mean_as(row["gaussians"], "{:,.0f}")]
-        cells += [mean_as(row["peak_gpu_memory_gb"], "{:.1f} GB"), *_psnrs(row[group])]
+        cells += [_seconds(row["loop"]), _seconds(row["whole"]), format_mean(row["iterations_per_second"], "{:.1f}")]
+        cells += [_spread(fast, 2), format_mean(row["gaussians"], "{:,.0f}")]
+        cells += [format_mean(row["peak_gpu_memory_gb"], "{:.1f} GB"), *_psnrs(row[group])]
         lines.append(cells)
     return markdown_table(header, lines)
 
 
 def _quality(table: dict[str, Any], record: dict[str, Any], group: str) -> str:
     lines = [[_name(row["recipe"], record["method"]), *_psnrs(row[group])] for row in table["rows"]]
-    return markdown_table(["recipe", "static", "difference", "all", "difference"], lines)
+    return group_table(group, ["recipe", "static", "difference", "all", "difference"], lines)
 
 
 def _stages(stages: dict[str, Any], method: str) -> str:
-    """Where the time of an iteration goes; on a GPU also how long Python was at it, where that is something else."""
+    """The time of an iteration per stage; on a GPU also the time in Python, if it differs."""
     in_order = [name for recipe in reversed(RECIPES) for name in stages.get(recipe, ())]
     names = dict.fromkeys(name for name in in_order if name not in (OTHER, ITERATION))
     kinds = {"device_ms": "", "host_ms": ", Python"} if _apart(stages) else {"device_ms": ""}
@@ -98,12 +105,12 @@ def _stages(stages: dict[str, Any], method: str) -> str:
 
 
 def _apart(stages: dict[str, Any]) -> bool:
-    """Whether device and host were timed apart: on a CPU they are one."""
+    """Whether device and host times differ; on a CPU they are equal."""
     return any(share["device_ms"] != share["host_ms"] for shares in stages.values() for share in shares.values())
 
 
 def _milliseconds(shares: dict[str, Any], name: str, kind: str) -> str:
-    """A stage's milliseconds, and how much of the iteration that is; a dash where there is no such stage."""
+    """A stage's milliseconds and its share of the iteration; a dash if the recipe has no such stage."""
     if name not in shares:
         return "-"
     spelled, part = f"{shares[name][kind]:.2f}", shares[name][kind] / shares[ITERATION][kind]
@@ -112,14 +119,16 @@ def _milliseconds(shares: dict[str, Any], name: str, kind: str) -> str:
 
 def _psnrs(group: dict[str, Any]) -> list[str]:
     return [
-        cell for name in ("static", "all") for cell in (_spread(group[name]), with_error(group["difference"][name]))
+        cell
+        for name in ("static", "all")
+        for cell in (_spread(group[name]), format_difference(group["difference"][name]))
     ]
 
 
 def _spread(found: dict[str, Any] | None, digits: int = 1) -> str:
-    """A figure with its spread, where there are several."""
-    alone = found is not None and len(found["by_seed"]) == 1
-    return mean_as(found, f"{{:.{digits}f}}") if alone else with_spread(found, digits)
+    """A figure, with its spread if there are several seeds."""
+    single = found is not None and len(found["by_seed"]) == 1
+    return format_mean(found, f"{{:.{digits}f}}") if single else format_spread(found, digits)
 
 
 def _seconds(found: dict[str, Any]) -> str:
@@ -127,5 +136,5 @@ def _seconds(found: dict[str, Any]) -> str:
 
 
 def _name(recipe: str, method: str) -> str:
-    """What a recipe is called in tables: ours by its method."""
+    """The name of a recipe in tables; ours has that of its method."""
     return f"`{method if recipe == 'ours' else recipe}`"

@@ -1,20 +1,19 @@
-"""The stage `ablation`: what each thing in a method is worth, from trainings of the method without it."""
+"""The stage `ablation`: the contribution of each component of a method, from trainings without it."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from drivesplat.evaluation.comparison import (
+    PSNR_COLUMNS,
     PSNRS,
-    WHERE,
-    compared,
-    figure,
-    markdown_table,
-    mean_as,
+    compare_runs,
+    format_mean,
+    group_table,
     measured_groups,
+    psnr_cells,
+    summarize,
     values_at,
-    with_error,
-    with_spread,
 )
 from drivesplat.evaluation.scene_metrics import side_by_side
 from drivesplat.io import storage
@@ -25,10 +24,10 @@ COSTS = ("gaussians", "train_seconds")
 
 
 def ablation(evals: dict[str, dict[str, Any]], job: AblationJob) -> dict[str, Any]:
-    """The content of ablation.json from the eval.json of every method of the ablation, by name, provenance aside.
+    """The content of ablation.json, without provenance, from the eval.json of every method of the ablation by name.
 
-    A row for the whole method (`without` is null), then one for every variant. Raises ResultError where two were
-    measured under different protocols.
+    The first row is the complete method (`without` is null); one row follows for every variant. Raises ResultError if
+    two methods were measured under different protocols.
     """
     measured = side_by_side(evals)
     results = measured.pop("methods")
@@ -40,52 +39,53 @@ def ablation(evals: dict[str, dict[str, Any]], job: AblationJob) -> dict[str, An
     return {**measured, **job.model_dump(mode="json", include={"of", "seeds"}), "rows": rows}
 
 
-def _row(runs: list[dict[str, Any]], whole: list[dict[str, Any]] | None) -> dict[str, Any]:
-    """The figures of a variant's runs, one a seed, beside those of the whole method (None: these are the whole's)."""
-    costs = {name: figure(values_at(runs, name)) for name in COSTS}
-    return {"seeds": len(runs), **compared(runs, whole, PSNRS), **costs}
+def _row(runs: list[dict[str, Any]], complete: list[dict[str, Any]] | None) -> dict[str, Any]:
+    """The figures of a variant's runs, one per seed, compared with those of the complete method (None for itself)."""
+    costs = {name: summarize(values_at(runs, name)) for name in COSTS}
+    return {"seeds": len(runs), **compare_runs(runs, complete, PSNRS), **costs}
 
 
 def write_csv(path: str | Path, record: dict[str, Any]) -> None:
-    """The rows of an ablation as a table; empty cells where a figure is null."""
+    """Writes the rows of an ablation as CSV; null figures are empty cells."""
     lines = [dict(_cells(row, record)) for row in record["rows"]]
     storage.write_csv(path, list(lines[0]), lines)
 
 
 def _cells(row: dict[str, Any], record: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """The columns of a row and what stands there."""
+    """The columns of a row with their values."""
     yield from (("scene", record["scene"]), ("variant", row["variant"]), ("seeds", row["seeds"]))
     for group in HELD_OUT_GROUPS:
         for name in PSNRS:
-            found, off = row[group][name] or {}, row[group]["difference"][name] or {}
-            yield from ((f"{group}_{name}{of}", found.get(key)) for of, key in _SPREAD.items())
-            yield f"{group}_{name}_difference", off.get("mean")
-            yield f"{group}_{name}_difference_standard_error", off.get("standard_error")
+            figure, difference = row[group][name] or {}, row[group]["difference"][name] or {}
+            yield from ((f"{group}_{name}{suffix}", figure.get(key)) for suffix, key in _SPREAD.items())
+            yield f"{group}_{name}_difference", difference.get("mean")
+            yield f"{group}_{name}_difference_standard_error", difference.get("standard_error")
     for name in COSTS:
-        yield from ((f"{name}{of}", (row[name] or {}).get(key)) for of, key in _SPREAD.items())
+        yield from ((f"{name}{suffix}", (row[name] or {}).get(key)) for suffix, key in _SPREAD.items())
 
 
 _SPREAD = {"": "mean", "_min": "min", "_max": "max"}
 
 
 def markdown(record: dict[str, Any]) -> str:
-    """An ablation in Markdown: how to read it, and a table for each group of held-out frames that was measured."""
+    """An ablation in Markdown: a legend, and a table for each group of held-out frames with figures."""
     rows, seeds = record["rows"], ", ".join(map(str, record["seeds"]))
-    head = (
-        f"`{record['of']}` on scene {record['scene']}, random seeds {seeds}. PSNR in dB: mean over the seeds (least to "
-        "greatest).\nDifference from the whole: mean of the differences seed by seed ± its standard error."
+    legend = (
+        f"`{record['of']}` on scene {record['scene']}, random seeds {seeds}. PSNR in dB: mean over the seeds (minimum "
+        "to maximum).\nDifference from the complete method: mean of the paired differences ± its standard error."
     )
-    return "\n\n".join([head, *(_table(rows, group) for group in measured_groups(rows, PSNRS))])
+    header = ("without", *PSNR_COLUMNS, "Gaussians", "training")
+    tables = [group_table(group, header, _lines(rows, group)) for group in measured_groups(rows, PSNRS)]
+    return "\n\n".join([legend, *tables])
 
 
-def _table(rows: list[dict[str, Any]], group: str) -> str:
-    """The table of a group of held-out frames."""
-    header = ["without", "static", "difference", "moving vehicles", "difference", "gap", "Gaussians", "training"]
-    lines = []
-    for row in rows:
-        cells = [f"`{row['without']}`" if row["without"] else "nothing"]
-        for name in ("static", "moving_vehicle"):
-            cells += [with_spread(row[group][name]), with_error(row[group]["difference"][name])]
-        cells += [mean_as(row[group]["gap_db"], "{:.1f}")]
-        lines.append([*cells, mean_as(row["gaussians"], "{:,.0f}"), mean_as(row["train_seconds"], "{:.0f} s")])
-    return f"{WHERE[group].capitalize()}:\n\n{markdown_table(header, lines)}"
+def _lines(rows: list[dict[str, Any]], group: str) -> list[list[str]]:
+    return [
+        [
+            f"`{row['without']}`" if row["without"] else "nothing",
+            *psnr_cells(row, group),
+            format_mean(row["gaussians"], "{:,.0f}"),
+            format_mean(row["train_seconds"], "{:.0f} s"),
+        ]
+        for row in rows
+    ]

@@ -1,7 +1,7 @@
-"""Methods that were trained with several random seeds, compared: figures with their spread, differences with their
-standard error, and how both are spelled in tables.
+"""Comparison of methods trained with several random seeds: means with their spread, paired differences with their
+standard error, and Markdown tables of both.
 
-A run is the `result` of an eval.json, None where there is none. Figures that are null count in no mean.
+A run is the `result` of an eval.json, or None where a training has none. Null figures are left out of every mean.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,48 +13,54 @@ from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 Run = dict[str, Any] | None
 Figures = Mapping[str, tuple[str, ...]]
-"""What is compared in a group of held-out frames, and the keys that lead to it from the group."""
+"""The figures to compare in a group of held-out frames, each with its keys below the group."""
 PSNRS: Figures = {"static": ("static", "psnr"), "moving_vehicle": ("moving_vehicle", "psnr"), "gap_db": ("gap_db",)}
-"""The PSNR of two regions, and the gap; all in dB."""
-WHERE = {"interpolation": "between training frames", "extrapolation": "beyond the last training frame"}
+"""The PSNR of two regions, and the gap between them, in dB."""
+PSNR_COLUMNS = ("static", "difference", "moving vehicles", "difference", "gap")
+"""The headings of `psnr_cells`."""
+GROUP_PLACES = {"interpolation": "between training frames", "extrapolation": "beyond the last training frame"}
+"""Where the frames of a held-out group lie, for tables and sentences."""
 
 
-def figure(values: Sequence[int | float | None]) -> dict[str, Any] | None:
-    """Mean and spread (`min` to `max`) of a figure over the seeds in whose results it is not null; None where it is in
-    all of them. `by_seed` are the values themselves."""
-    there = [value for value in values if value is not None]
-    if not there:
+def summarize(values: Sequence[int | float | None]) -> dict[str, Any] | None:
+    """`mean`, `min` and `max` over the values that are not null, and all values as `by_seed`; None if all are null.
+
+    >>> summarize([2.0, None, 4.0])
+    {'mean': 3.0, 'min': 2.0, 'max': 4.0, 'by_seed': [2.0, None, 4.0]}
+    """
+    known = [value for value in values if value is not None]
+    if not known:
         return None
-    return {"mean": mean(there), "min": min(there), "max": max(there), "by_seed": list(values)}
+    return {"mean": mean(known), "min": min(known), "max": max(known), "by_seed": list(values)}
 
 
-def difference(values: Sequence[float | None], reference: Sequence[float | None]) -> dict[str, Any] | None:
-    """By how much a figure is above the reference's: the `mean` of the differences between trainings with one seed, and
-    its `standard_error` (None for a single seed); None where no seed has both."""
+def paired_difference(values: Sequence[float | None], reference: Sequence[float | None]) -> dict[str, Any] | None:
+    """The `mean` of value minus reference, paired by seed, and its `standard_error` (None for a single pair); None if
+    no seed has both."""
     differences = [None if a is None or b is None else a - b for a, b in zip(values, reference, strict=True)]
-    there = [value for value in differences if value is not None]
-    if not there:
+    known = [value for value in differences if value is not None]
+    if not known:
         return None
-    error = stdev(there) / sqrt(len(there)) if len(there) > 1 else None
-    return {"mean": mean(there), "standard_error": error, "by_seed": differences}
+    error = stdev(known) / sqrt(len(known)) if len(known) > 1 else None
+    return {"mean": mean(known), "standard_error": error, "by_seed": differences}
 
 
-def compared(runs: Sequence[Run], reference: Sequence[Run] | None, figures: Figures) -> dict[str, Any]:
-    """Per group of held-out frames the figures of runs, one a seed, and under `difference` by how much they are above
-    those of the reference's runs (None: these are the reference)."""
+def compare_runs(runs: Sequence[Run], reference: Sequence[Run] | None, figures: Figures) -> dict[str, Any]:
+    """The figures of a method's runs, one run per seed, for each group of held-out frames. `difference` in each group
+    holds the paired differences from the reference's runs (None: these are the reference)."""
     row: dict[str, Any] = {}
     for group in HELD_OUT_GROUPS:
         found = {name: values_at(runs, group, *keys) for name, keys in figures.items()}
-        beside = {
-            name: None if reference is None else difference(found[name], values_at(reference, group, *keys))
+        differences = {
+            name: None if reference is None else paired_difference(found[name], values_at(reference, group, *keys))
             for name, keys in figures.items()
         }
-        row[group] = {**{name: figure(values) for name, values in found.items()}, "difference": beside}
+        row[group] = {**{name: summarize(values) for name, values in found.items()}, "difference": differences}
     return row
 
 
 def values_at(runs: Sequence[Run], *keys: str) -> list[Any]:
-    """What `keys` lead to in every run; None where it is null or missing, or what it stands in is."""
+    """The value below `keys` in every run; None where it, or a record above it, is null or missing."""
     return [_value_at(run, keys) for run in runs]
 
 
@@ -67,30 +73,49 @@ def _value_at(record: Any, keys: Sequence[str]) -> Any:
 
 
 def measured_groups(rows: Sequence[dict[str, Any]], figures: Figures) -> list[str]:
-    """The groups of held-out frames in which any of the rows has a figure."""
+    """The groups of held-out frames in which any row has a figure."""
     return [group for group in HELD_OUT_GROUPS if any(row[group][name] for row in rows for name in figures)]
 
 
-def with_spread(found: dict[str, Any] | None, digits: int = 1) -> str:
-    """A figure as a table holds it: its mean, least and greatest; a dash where it is null."""
-    if found is None:
+def psnr_cells(row: dict[str, Any], group: str) -> list[str]:
+    """The cells of a row for the columns `PSNR_COLUMNS`."""
+    return [*figure_cells(row[group], "static", "moving_vehicle"), format_mean(row[group]["gap_db"], "{:.1f}")]
+
+
+def figure_cells(figures: dict[str, Any], *names: str) -> list[str]:
+    """Two cells for each figure of a group: its spread, and its difference from the reference."""
+    return [
+        cell
+        for name in names
+        for cell in (format_spread(figures[name]), format_difference(figures["difference"][name]))
+    ]
+
+
+def format_spread(figure: dict[str, Any] | None, digits: int = 1) -> str:
+    """Mean, minimum and maximum; a dash for null."""
+    if figure is None:
         return "-"
-    return f"{found['mean']:.{digits}f} ({found['min']:.{digits}f} to {found['max']:.{digits}f})"
+    return f"{figure['mean']:.{digits}f} ({figure['min']:.{digits}f} to {figure['max']:.{digits}f})"
 
 
-def with_error(found: dict[str, Any] | None, digits: int = 2) -> str:
-    """A difference as a table holds it: with its sign, and its standard error where there is one."""
-    if found is None:
+def format_difference(difference: dict[str, Any] | None, digits: int = 2) -> str:
+    """A signed mean with its standard error, if there is one; a dash for null."""
+    if difference is None:
         return "-"
-    error = found["standard_error"]
-    return f"{found['mean']:+.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
+    error = difference["standard_error"]
+    return f"{difference['mean']:+.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
 
 
-def mean_as(found: dict[str, Any] | None, spelling: str) -> str:
-    """The mean of a figure in a spelling of `str.format`; a dash where the figure is null."""
-    return "-" if found is None else spelling.format(found["mean"])
+def format_mean(figure: dict[str, Any] | None, template: str) -> str:
+    """The mean of a figure through a template of `str.format`; a dash for null."""
+    return "-" if figure is None else template.format(figure["mean"])
 
 
 def markdown_table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """A Markdown table."""
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *lines))
+
+
+def group_table(group: str, header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """The Markdown table of a group of held-out frames, below a line that names the group."""
+    return f"{GROUP_PLACES[group].capitalize()}:\n\n{markdown_table(header, lines)}"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.evaluation.comparison import WHERE
+from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io.storage import read_json
 from drivesplat.scene.scene_warnings import DARK
 
@@ -18,7 +18,7 @@ def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
     """A sentence per method and group of held-out frames, more where there is truth, and where to look."""
     lines = _circumstances(metrics["drive"]) if "drive" in metrics else []
     for name, method in metrics["methods"].items():
-        for group, where in WHERE.items():
+        for group, where in GROUP_PLACES.items():
             gap = method[group].get("gap_db")
             if (static := _psnr(method[group], "static")) is not None:
                 lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_movers(method[group], gap)}")
@@ -47,7 +47,7 @@ def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
 def _circumstances(drive: dict[str, Any]) -> list[str]:
     """What makes the figures say less than they seem to, a sentence each."""
     lines = []
-    for group, where in WHERE.items():
+    for group, where in GROUP_PLACES.items():
         held_out = drive[group] or {}
         distance, flat = held_out.get("from_training_m"), held_out.get("flat_psnr")
         if distance is not None and distance < SAME_PLACE:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ResultError
-from drivesplat.evaluation.comparison import WHERE
+from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io import storage
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.record import differences
@@ -176,7 +176,7 @@ def in_words(report: dict[str, Any]) -> list[str]:
                 continue
             scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
             width = _with_interval(gap, gap["mean"], "{:.1f}")
-            line = f"{mean['method']}, {WHERE[group]}: a gap of {width} dB, {scenes}"
+            line = f"{mean['method']}, {GROUP_PLACES[group]}: a gap of {width} dB, {scenes}"
             part = closed.get(mean["method"], {}).get(group)
             if part:
                 share = _with_interval(part, part["fraction"], "{:.0%}")

@@ -5,7 +5,7 @@ from html import escape
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from drivesplat.evaluation.comparison import WHERE
+from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io.storage import canonical_json
 from drivesplat.report.costs import costs_table
 from drivesplat.report.gaps import in_words
@@ -63,7 +63,8 @@ def _table(report: dict[str, Any]) -> str:
         return f"<p>{NOTHING}</p>"
     names, fields = ["scene", "method"], [(f"{g}_{key}", how) for g in HELD_OUT_GROUPS for key, how in COLUMNS.items()]
     fields += list(COSTS.items())
-    groups = "".join(f'<th class="group" colspan="{len(COLUMNS)}">{WHERE[group]}</th>' for group in HELD_OUT_GROUPS)
+    span = f'<th class="group" colspan="{len(COLUMNS)}">'
+    groups = "".join(f"{span}{GROUP_PLACES[group]}</th>" for group in HELD_OUT_GROUPS)
     heads = [_head(i, name, "name") for i, name in enumerate(names)]
     heads += [_head(i, how[0], _border(key)) for i, (key, how) in enumerate(fields, start=len(names))]
     lines = [
@@ -152,7 +153,7 @@ def _method(row: dict[str, Any], looks: Looks) -> str:
         )
     links = "".join(f'<a href="{escape(link)}">{escape(_link_name(link))}</a>' for link in looks.links)
     figures = [
-        f"{WHERE[g]}: static {_spelled(row[f'{g}_static'], '{:.1f}')}, moving "
+        f"{GROUP_PLACES[g]}: static {_spelled(row[f'{g}_static'], '{:.1f}')}, moving "
         f"{_spelled(row[f'{g}_moving_vehicle'], '{:.1f}')} dB"
         for g in HELD_OUT_GROUPS
     ]
@@ -167,7 +168,7 @@ def _where(shown: dict[str, Any] | None) -> str:
         return "an image"
     if shown["group"] == "train":
         return f"key frame {shown['key_frame']}, which was trained on"
-    return f"key frame {shown['key_frame']}, held out {WHERE[shown['group']]}"
+    return f"key frame {shown['key_frame']}, held out {GROUP_PLACES[shown['group']]}"
 
 
 def _compared(below: Path, above: Path, left: str, right: str, what: str) -> str:
@@ -199,7 +200,9 @@ def _protocol(report: dict[str, Any]) -> str:
 
 def _measured(protocol: dict[str, Any]) -> str:
     held_out = protocol["held_out_frames"]
-    frames = "; ".join(f"{WHERE[group]} {', '.join(map(str, held_out[group])) or 'none'}" for group in HELD_OUT_GROUPS)
+    frames = "; ".join(
+        f"{GROUP_PLACES[group]} {', '.join(map(str, held_out[group])) or 'none'}" for group in HELD_OUT_GROUPS
+    )
     return (
         f"{protocol['version']}, {protocol['eval_camera']} at {protocol['width']}x{protocol['height']}, "
         f"{protocol['train_images']} training images of {len(protocol['cameras'])} "

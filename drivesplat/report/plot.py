@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from drivesplat.evaluation.comparison import WHERE
+from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.report.gaps import counted_gap
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -19,7 +19,7 @@ _STYLE = {"svg.fonttype": "none", "svg.hashsalt": "drivesplat", "font.family": "
 def gap_plot(report: dict[str, Any]) -> str:
     """The gap in dB as an SVG: for each group of held-out frames in which vehicles move a dot for every scene, by
     method, and the mean with its interval. Empty where there is no gap to draw."""
-    drawn = [g for g in WHERE if any(mean["figures"][f"{g}_gap_db"] for mean in report["means"])]
+    drawn = [g for g in GROUP_PLACES if any(mean["figures"][f"{g}_gap_db"] for mean in report["means"])]
     if not drawn:
         return ""
     with mpl.rc_context(_STYLE):
@@ -50,7 +50,7 @@ def _draw(axes: Axes, report: dict[str, Any], group: str) -> None:
     axes.axhline(0.0, color="#888888", linewidth=0.8)
     axes.set_xticks(range(len(methods)), methods)
     axes.set_xlim(-0.6, len(methods) - 0.4)
-    axes.set_title(WHERE[group], fontsize=11)
+    axes.set_title(GROUP_PLACES[group], fontsize=11)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

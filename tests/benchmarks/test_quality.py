@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 import yaml
 from helpers import REPOSITORY
-from helpers.hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_evaluation
+from helpers.hand_made_recipes import PROTOCOL, evaluation, recipe_file, write_evaluation, write_failure
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from benchmarks.quality.__main__ import main, measure
 from benchmarks.quality.compare import quality
-from benchmarks.quality.results import Result, results_of
-from benchmarks.quality.runs import Outcome
+from benchmarks.quality.results import Result, collect_results
 from benchmarks.quality.table import markdown
+from benchmarks.snakemake_run import Outcome, SnakemakeRun
 from drivesplat.errors import ConfigError
 
 BAD = {"overrides": {"sky": "none"}}
@@ -30,15 +30,17 @@ def compared(tmp_path):
     """Makes a record of recipes whose eval.json files hold what is given by name and seed; the rest has failed."""
 
     def compare(evals: dict[str, list[dict[str, Any] | None]], recipes: dict[str, Any]) -> dict[str, Any]:
-        file, groups = recipe_file(tmp_path, recipes=recipes)
-        for group in groups:
-            for recipe in group.recipes:
+        file, runs = recipe_file(tmp_path, recipes=recipes)
+        for run in runs:
+            for recipe in run.methods:
                 for seed, content in enumerate(evals[recipe]):
                     if content:
-                        write_evaluation(group, recipe, seed, content)
-        lacking = [f"{name}-seed{seed}" for name, found in evals.items() for seed in (0, 1) if not found[seed]]
-        failures = {f"{method}/train": "a loss | no number" for method in lacking}
-        return quality(file, results_of([(group, Outcome(int(bool(failures)), None, failures)) for group in groups]))
+                        write_evaluation(run, recipe, seed, content)
+                    else:
+                        write_failure(
+                            run.log(recipe, seed, "train"), f"{recipe}-seed{seed}/train 0061", "a loss | no number"
+                        )
+        return quality(file, collect_results([(run, Outcome(0)) for run in runs]))
 
     return compare
 
@@ -139,7 +141,7 @@ def test_what_was_measured_otherwise_stands_in_a_table_of_its_own(compared, key)
     assert [[row["recipe"] for row in table["rows"]] for table in record["tables"]] == [["plain", "street"], ["other"]]
     assert record["tables"][1]["rows"][0]["interpolation"]["difference"]["static"] is None, "to itself alone"
     text = markdown(record)
-    (note,) = (line for line in text.splitlines() if line.startswith("Measured otherwise than the first table"))
+    (note,) = (line for line in text.splitlines() if line.startswith("The protocol differs from"))
     assert f"{key} " in note and spelled(PROTOCOL[key]) in note
     assert len(re.findall("^Difference|Difference from `other`", text)) == 1
 
@@ -171,7 +173,7 @@ def test_seconds_of_trainings_that_shared_a_card_say_so(tmp_path):
     ]
     text = markdown(quality(file, results))
     assert [line[7] for line in rows(text)[2][2:]] == ["60 s", "110 s, shared"]
-    assert "\n\nShared: while it was trained another job ran on the same card" in text
+    assert "\n\nShared: during training another job ran on the same GPU" in text
 
 
 def test_a_recipe_that_failed_is_named_with_its_reason_and_the_others_stand(compared):
@@ -232,14 +234,14 @@ def called(tmp_path, monkeypatch):
         recipe_file(tmp_path, recipes=TWO)
         told: list[str] = []
 
-        def run(group, arguments, workflow) -> Outcome:
+        def start(run: SnakemakeRun, arguments: list[str], workflow: Path) -> Outcome:
             told.extend(arguments)
             for recipe in done:
                 for seed, content in enumerate(EVALS[recipe]):
-                    write_evaluation(group, recipe, seed, content)
-            return Outcome(status, None, {})
+                    write_evaluation(run, recipe, seed, content)
+            return Outcome(status)
 
-        monkeypatch.setattr("benchmarks.quality.__main__.run", run)
+        monkeypatch.setattr(SnakemakeRun, "start", start)
         monkeypatch.chdir(REPOSITORY)
         return main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), *words]), told
 

@@ -14,13 +14,13 @@ import yaml
 from helpers import REPOSITORY
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
-from benchmarks.quality.runs import Outcome
+from benchmarks.snakemake_run import Outcome, SnakemakeRun
 from benchmarks.speed import __main__ as command
 from benchmarks.speed import runs
-from benchmarks.speed.alone import in_own_process
-from benchmarks.speed.bystanders import Moment, busy_elsewhere
 from benchmarks.speed.compare import speed
-from benchmarks.speed.plan import Task, group_of, read_speed_file, targets_of, tasks_of
+from benchmarks.speed.cpu_load import CpuSample, busy_elsewhere
+from benchmarks.speed.own_process import run_in_process
+from benchmarks.speed.plan import Task, plan_run, read_speed_file, targets_of, tasks_of
 from benchmarks.speed.settings import SpeedFile
 from benchmarks.speed.table import markdown
 from drivesplat.errors import ConfigError, TrainingError
@@ -35,7 +35,7 @@ DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8
 
 def planned(tmp_path: Path, **content: Any) -> tuple[SpeedFile, list[Task]]:
     file = SpeedFile.model_validate({"scene": "0061", **content})
-    return file, list(tasks_of(file, group_of(file, tmp_path, REPOSITORY), tmp_path))
+    return file, list(tasks_of(file, plan_run(file, tmp_path, REPOSITORY), tmp_path))
 
 
 # --- files ---
@@ -52,17 +52,17 @@ def test_both_recipes_are_trained_with_every_seed_and_length_and_begin_by_turns(
 def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path):
     """`street`: with what only that method reads."""
     file, tasks = planned(tmp_path, method="street", iterations=[77], seeds=[5])
-    group, config = group_of(file, tmp_path, REPOSITORY), load(DEFAULTS)
+    run, config = plan_run(file, tmp_path, REPOSITORY), load(DEFAULTS)
     expected = json.loads(stage_settings(config, "train", "0061", "street"))
     task = tasks[1]
     assert task.train.model_dump(mode="json") == merged(expected, {"random_seed": 5, "train": {"iterations": 77}})
     at = SimpleNamespace(scene="0061", method="street-77-seed5")
-    assert json.loads(group.plan.settings("train")(at)) == task.train.model_dump(mode="json")
-    assert (task.code, task.stage) == (group.plan.code("train"), "street-77-seed5/train")
+    assert json.loads(run.plan.settings("train")(at)) == task.train.model_dump(mode="json")
+    assert (task.code, task.stage) == (run.plan.code("train"), "street-77-seed5/train")
     assert [[*paths] for paths in (task.files.actors, task.files.lidar_depth, task.files.free_space)] == [
-        group.plan.actors(at), group.plan.lidar_depth(at), group.plan.free_space(at)
+        run.plan.actors(at), run.plan.lidar_depth(at), run.plan.free_space(at)
     ]  # fmt: skip
-    assert {Path(path).name for path in targets_of(group)} == {
+    assert {Path(path).name for path in targets_of(run)} == {
         "scene_refined.json", "parser.pkl", "masks.json", "actors.pkl", "lidar_depth.pkl"
     }  # fmt: skip
 
@@ -95,7 +95,7 @@ def test_what_is_wrong_is_told_in_one_line(tmp_path, content, words):
     text = content if isinstance(content, str) else yaml.safe_dump({"scene": "0061", **content})
     path.write_text(text)
     with pytest.raises(ConfigError) as failure:
-        group_of(read_speed_file(path, {}), tmp_path / "out", REPOSITORY)
+        plan_run(read_speed_file(path, {}), tmp_path / "out", REPOSITORY)
     message = str(failure.value)
     assert "\n" not in message and all(word in message for word in words), message
 
@@ -116,7 +116,7 @@ def test_what_the_command_is_told_stands_in_place_of_the_file(tmp_path, monkeypa
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks/speed").glob("*.yaml")), ids=lambda path: path.name)
 def test_the_files_that_come_along_are_valid(path, tmp_path):
     file = read_speed_file(path, {})
-    assert list(tasks_of(file, group_of(file, tmp_path, REPOSITORY), tmp_path))
+    assert list(tasks_of(file, plan_run(file, tmp_path, REPOSITORY), tmp_path))
 
 
 # --- tables ---
@@ -229,34 +229,34 @@ def test_on_a_gpu_the_table_also_says_when_python_went_on():
 
 def test_how_busy_processors_are_with_other_work():
     """In 10 s two processors had 18 s of work, 6 s of it one's own; the rest is 1.2 processors' work."""
-    assert busy_elsewhere(Moment(5.0, 100.0, 2.0), Moment(15.0, 118.0, 8.0)) == pytest.approx(1.2)
-    assert busy_elsewhere(Moment(5.0, None, 2.0), Moment(15.0, None, 8.0)) is None
-    assert busy_elsewhere(Moment(5.0, 100.0, 2.0), Moment(15.0, 101.0, 8.0)) == 0.0, "its own, counted twice"
+    assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 118.0, 8.0)) == pytest.approx(1.2)
+    assert busy_elsewhere(CpuSample(5.0, None, 2.0), CpuSample(15.0, None, 8.0)) is None
+    assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 101.0, 8.0)) == 0.0, "its own, counted twice"
 
 
 def test_ones_own_work_is_not_other_work(tmp_path, monkeypatch):
     """Work of this process shows in its own seconds; what the kernel says is read as processors' ticks."""
-    before = Moment.now()
+    before = CpuSample.now()
     sum(i * i for i in range(3_000_000))
-    assert Moment.now().own - before.own > 0.05
+    assert CpuSample.now().own - before.own > 0.05
     statistics = tmp_path / "stat"
     statistics.write_text("cpu  200 100 300 5000 700 10 90 0 0 0\ncpu0 1 1 1 1 1 1 1 0 0 0\n")
-    monkeypatch.setattr("benchmarks.speed.bystanders.STATISTICS", statistics)
+    monkeypatch.setattr("benchmarks.speed.cpu_load.STATISTICS", statistics)
     monkeypatch.setattr("os.sysconf", lambda name: 100)
-    assert Moment.now().busy == 7.0, "neither idle nor waiting for disks"
-    monkeypatch.setattr("benchmarks.speed.bystanders.STATISTICS", tmp_path / "none")
-    assert Moment.now().busy is None
+    assert CpuSample.now().busy == 7.0, "neither idle nor waiting for disks"
+    monkeypatch.setattr("benchmarks.speed.cpu_load.STATISTICS", tmp_path / "none")
+    assert CpuSample.now().busy is None
 
 
 def test_work_in_a_process_of_its_own_returns_and_raises():
-    assert in_own_process(divmod, 7, 2) == (3, 1)
+    assert run_in_process(divmod, 7, 2) == (3, 1)
     with pytest.raises(ConfigError, match="cannot be read"):
-        in_own_process(read_speed_file, "nowhere.yaml", {})
+        run_in_process(read_speed_file, "nowhere.yaml", {})
 
 
 def test_a_training_that_is_killed_is_told_in_a_line():
     with pytest.raises(TrainingError, match=r"was killed, .* lower train\.cap_max"):
-        in_own_process(os._exit, 1)
+        run_in_process(os._exit, 1)
 
 
 TINY = {
@@ -277,7 +277,7 @@ def measured(tmp_path_factory):
     (copy.folder / "tiny.yaml").write_text(yaml.safe_dump(TINY))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(copy.folder)
-        patch.setattr(command, "in_own_process", lambda function, *told: function(*told))
+        patch.setattr(command, "run_in_process", lambda function, *told: function(*told))
         status = command.main(["tiny.yaml", "--", "--cores", "2"])
     assert status == 0
     return copy
@@ -315,7 +315,7 @@ def test_what_is_timed_is_what_the_rule_trains(measured, tmp_path, monkeypatch):
     monkeypatch.chdir(measured.folder)
     file = read_speed_file("tiny.yaml", {})
     out = Path("results/speed/tiny")
-    _, task = tasks_of(file, group_of(file, out, Path()), out)
+    _, task = tasks_of(file, plan_run(file, out, Path()), out)
     timed = read_checkpoint(task.folder / "checkpoint.pt")
     inputs, _ = read_inputs(task.files.parser, task.files.masks, (), (), ())
     files = TrainingFiles(tmp_path / "again/checkpoint.pt", tmp_path / "again/train.json")
@@ -330,7 +330,7 @@ def test_where_snakemake_only_plans_or_fails_nothing_is_trained(tmp_path, monkey
     monkeypatch.chdir(REPOSITORY)
     file = SpeedFile(scene="demo", iterations=(3,), seeds=(0,))
     for arguments, status in ((["-n"], 0), (["--cores", "1"], 7)):
-        monkeypatch.setattr(command, "run", lambda *told, status=status: Outcome(status, None, {}))
+        monkeypatch.setattr(SnakemakeRun, "start", lambda *_, status=status: Outcome(status))
         assert command.measure(file, tmp_path / "out", arguments, Path()) == status
     assert not (tmp_path / "out").exists()
 
@@ -340,7 +340,7 @@ def test_seeds_are_trained_side_by_side_where_there_are_cards(tmp_path, monkeypa
     assert command.in_series(tasks, 1) == [tasks]
     assert [{task.seed for task in series} for series in command.in_series(tasks, 2)] == [{4}, {5}]
     monkeypatch.setattr(command, "visible_cards", lambda: 2)
-    monkeypatch.setattr(command, "run", lambda *_: Outcome(0, None, {}))
+    monkeypatch.setattr(SnakemakeRun, "start", lambda *_: Outcome(0))
     monkeypatch.setattr(command, "write", lambda record, _: record["runs"])
     monkeypatch.setattr(command, "speed", lambda _, measured, profiles: {"runs": list(measured)})
     both, trained = Barrier(2, timeout=60), []
@@ -351,7 +351,7 @@ def test_seeds_are_trained_side_by_side_where_there_are_cards(tmp_path, monkeypa
         trained.append((task.seed, task.iterations, task.recipe))
         return {"loop": 1.0} if function is runs.run else {}
 
-    monkeypatch.setattr(command, "in_own_process", in_turn)
+    monkeypatch.setattr(command, "run_in_process", in_turn)
     assert command.measure(file, tmp_path, (), REPOSITORY, cards=2) == 0
     order = [(task.seed, task.iterations, task.recipe) for task in tasks]
     assert [it for it in trained[:8] if it[0] == 5] == [it for it in order if it[0] == 5]

@@ -13,7 +13,7 @@ from helpers.records import training_record_of
 from PIL import Image
 from skimage.metrics import structural_similarity
 
-from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, make_optimizers, scene_scale, started
+from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, init_splats, make_optimizers, scene_scale
 from benchmarks.speed.plain_images import ImageFiles, endless, files_of_size, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
 from benchmarks.speed.plain_training import PlainTraining, fit
@@ -49,7 +49,7 @@ def record(tmp_path) -> TrainingRecord:
 
 
 def begun(record: TrainingRecord, recipe: PlainRecipe, ssim: Ssim | None = None) -> PlainTraining:
-    splats = started(record.points, record.points_rgb, recipe.seed)
+    splats = init_splats(record.points, record.points_rgb, recipe.seed)
     optimizers = make_optimizers(splats, scene_scale(record))
     return PlainTraining(splats, optimizers, recipe, CPU, ssim or chosen_ssim(CPU))
 
@@ -93,7 +93,7 @@ def test_learning_rates_are_the_examples(record):
 
 def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(record):
     """Opacity 0.5; a tenth of the root mean square distance to three neighbours; the colour at degree 0."""
-    splats = started(record.points, record.points_rgb, seed=0)
+    splats = init_splats(record.points, record.points_rgb, seed=0)
     distances = np.linalg.norm(record.points[:, None] - record.points[None], axis=2)
     nearest = np.sort(distances, axis=1)[:, 1:4]
     assert torch.allclose(splats["means"], torch.from_numpy(record.points).float())
@@ -106,7 +106,7 @@ def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(record):
 
 
 def test_seed_points_in_one_place_do_no_harm(record):
-    splats = started(np.zeros((6, 3)), record.points_rgb[:6], seed=0)
+    splats = init_splats(np.zeros((6, 3)), record.points_rgb[:6], seed=0)
     assert torch.isfinite(splats["scales"]).all()
 
 
@@ -217,7 +217,7 @@ def test_means_learn_ever_slower_and_the_noise_goes_with_them(record, monkeypatc
 
 
 def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(record, tmp_path):
-    splats = started(record.points, record.points_rgb, seed=0)
+    splats = init_splats(record.points, record.points_rgb, seed=0)
     schedule = Schedule(220, sh_every=1, refine_start=0, refine_stop=220)
     before = as_model({name: value.detach().clone() for name, value in splats.items()}, record)
     recipe = PlainRecipe(schedule, 64, 0, workers=0)
@@ -233,7 +233,7 @@ def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(record
 
 @pytest.mark.gpu
 def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(record, tmp_path):
-    splats = started(record.points, record.points_rgb, seed=0).to("cuda")
+    splats = init_splats(record.points, record.points_rgb, seed=0).to("cuda")
     recipe = PlainRecipe(Schedule(120, sh_every=1, refine_start=0, refine_stop=120), 64, 0, workers=2)
     before = torch.cuda.memory_reserved() / 1e9  # by other tests' recordings, whose memory torch does not give back
     summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path)

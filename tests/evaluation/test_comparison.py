@@ -2,37 +2,38 @@
 
 from drivesplat.evaluation.comparison import (
     PSNRS,
-    compared,
-    difference,
-    figure,
+    compare_runs,
+    format_difference,
+    format_mean,
+    format_spread,
     markdown_table,
-    mean_as,
     measured_groups,
+    paired_difference,
+    summarize,
     values_at,
-    with_error,
-    with_spread,
 )
 
 
 def test_differences_are_of_trainings_with_one_seed():
     """What all trainings of a seed have in common cancels: the spread of the figures is not that of the difference."""
-    assert difference([10.0, 20.0, 30.0], [11.0, 21.0, 31.0]) == {
+    assert paired_difference([10.0, 20.0, 30.0], [11.0, 21.0, 31.0]) == {
         "mean": -1.0, "standard_error": 0.0, "by_seed": [-1.0] * 3
     }  # fmt: skip
-    shuffled = difference([10.0, 20.0, 30.0], [31.0, 11.0, 21.0])
+    shuffled = paired_difference([10.0, 20.0, 30.0], [31.0, 11.0, 21.0])
     assert shuffled["mean"] == -1.0 and shuffled["standard_error"] > 5.0
 
 
 def test_a_single_seed_has_no_standard_error():
-    assert difference([1.0], [3.0]) == {"mean": -2.0, "standard_error": None, "by_seed": [-2.0]}
-    assert figure([1.0]) == {"mean": 1.0, "min": 1.0, "max": 1.0, "by_seed": [1.0]}
+    assert paired_difference([1.0], [3.0]) == {"mean": -2.0, "standard_error": None, "by_seed": [-2.0]}
+    assert summarize([1.0]) == {"mean": 1.0, "min": 1.0, "max": 1.0, "by_seed": [1.0]}
 
 
 def test_null_figures_count_in_no_mean_and_no_difference():
-    assert figure([None, None]) is None and difference([None, 1.0], [1.0, None]) is None
-    assert figure([0.0, 2.0])["mean"] == 1.0 and difference([1.0, 4.0], [1.0, 2.0])["mean"] == 1.0, "0 is not null"
-    assert figure([2.0, None, 4.0]) == {"mean": 3.0, "min": 2.0, "max": 4.0, "by_seed": [2.0, None, 4.0]}
-    assert difference([2.0, None, 4.0], [1.0, 1.0, None]) == {
+    assert summarize([None, None]) is None and paired_difference([None, 1.0], [1.0, None]) is None
+    assert summarize([0.0, 2.0])["mean"] == 1.0, "0 is not null"
+    assert paired_difference([1.0, 4.0], [1.0, 2.0])["mean"] == 1.0
+    assert summarize([2.0, None, 4.0]) == {"mean": 3.0, "min": 2.0, "max": 4.0, "by_seed": [2.0, None, 4.0]}
+    assert paired_difference([2.0, None, 4.0], [1.0, 1.0, None]) == {
         "mean": 1.0, "standard_error": None, "by_seed": [1.0, None, None]
     }  # fmt: skip
 
@@ -49,7 +50,7 @@ def test_a_run_that_is_missing_counts_in_no_figure_and_no_difference():
         {"interpolation": group(24.0, gap=0.0), "extrapolation": group(None)},
     ]
     reference = [{"interpolation": group(19.0), "extrapolation": group(12.0)}] * 3
-    row = compared(runs, reference, PSNRS)
+    row = compare_runs(runs, reference, PSNRS)
     assert row["interpolation"]["static"] == {"mean": 22.0, "min": 20.0, "max": 24.0, "by_seed": [20.0, None, 24.0]}
     assert row["interpolation"]["difference"]["static"]["by_seed"] == [1.0, None, 5.0]
     assert row["interpolation"]["gap_db"]["by_seed"] == [None, None, 0.0], "0 is not null"
@@ -57,7 +58,7 @@ def test_a_run_that_is_missing_counts_in_no_figure_and_no_difference():
         "mean": -2.0, "standard_error": None, "by_seed": [-2.0, None, None]
     }  # fmt: skip
     assert row["interpolation"]["moving_vehicle"] is None
-    assert compared(runs, None, PSNRS)["interpolation"]["difference"] == dict.fromkeys(PSNRS)
+    assert compare_runs(runs, None, PSNRS)["interpolation"]["difference"] == dict.fromkeys(PSNRS)
 
 
 def test_keys_lead_into_records_as_far_as_these_go():
@@ -67,15 +68,16 @@ def test_keys_lead_into_records_as_far_as_these_go():
 
 
 def test_a_group_is_measured_where_any_row_has_a_figure_of_it():
-    rows = [compared([{"interpolation": group(None), "extrapolation": group(psnr)}], None, PSNRS) for psnr in (None, 0)]
+    runs = [{"interpolation": group(None), "extrapolation": group(psnr)} for psnr in (None, 0)]
+    rows = [compare_runs([run], None, PSNRS) for run in runs]
     assert measured_groups(rows, PSNRS) == ["extrapolation"] and measured_groups(rows[:1], PSNRS) == []
 
 
 def test_figures_are_spelled_with_spread_and_error():
     found = {"mean": 25.04, "min": 24.0, "max": 26.26}
-    assert with_spread(found) == "25.0 (24.0 to 26.3)" and with_spread(found, digits=2) == "25.04 (24.00 to 26.26)"
-    assert with_error({"mean": 0.5, "standard_error": 0.123}) == "+0.50 ± 0.12"
-    assert with_error({"mean": -1.0, "standard_error": None}) == "-1.00"
-    assert mean_as({"mean": 1234.4}, "{:,.0f} s") == "1,234 s"
-    assert with_spread(None) == with_error(None) == mean_as(None, "{:.1f}") == "-"
+    assert format_spread(found) == "25.0 (24.0 to 26.3)" and format_spread(found, digits=2) == "25.04 (24.00 to 26.26)"
+    assert format_difference({"mean": 0.5, "standard_error": 0.123}) == "+0.50 ± 0.12"
+    assert format_difference({"mean": -1.0, "standard_error": None}) == "-1.00"
+    assert format_mean({"mean": 1234.4}, "{:,.0f} s") == "1,234 s"
+    assert format_spread(None) == format_difference(None) == format_mean(None, "{:.1f}") == "-"
     assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"

@@ -1,4 +1,4 @@
-"""Recipes whose figures were never measured: eval.json files as a test wants them."""
+"""Hand-made results of recipes: eval.json files with given figures, and logs of failed jobs."""
 
 import json
 from pathlib import Path
@@ -6,8 +6,8 @@ from typing import Any
 
 import yaml
 
-from benchmarks.quality.groups import Group, groups_of, read_recipes
-from benchmarks.quality.recipes import RecipeFile
+from benchmarks.quality.recipes import RecipeFile, plan_runs, read_recipes
+from benchmarks.snakemake_run import SnakemakeRun
 from drivesplat.settings.method import with_seed
 from helpers import REPOSITORY
 
@@ -20,12 +20,12 @@ PROTOCOL = {
 }  # fmt: skip
 
 
-def recipe_file(folder: Path, **content: Any) -> tuple[RecipeFile, list[Group]]:
-    """Recipes on scene 0061 with seeds 0 and 1, written and read, and their groups with results in `folder`."""
+def recipe_file(folder: Path, **content: Any) -> tuple[RecipeFile, list[SnakemakeRun]]:
+    """Recipes on scene 0061 with seeds 0 and 1, written and read, and their runs with results in `folder`."""
     path = folder / "recipes.yaml"
     path.write_text(yaml.safe_dump({"scene": "0061", "seeds": [0, 1], **content}, sort_keys=False))
     recipes = read_recipes(path)
-    return recipes, groups_of(recipes, folder / "out", REPOSITORY)
+    return recipes, plan_runs(recipes, folder / "out", REPOSITORY)
 
 
 def evaluation(
@@ -49,10 +49,20 @@ def evaluation(
     }  # fmt: skip
 
 
-def write_evaluation(group: Group, recipe: str, seed: int, content: dict[str, Any]) -> Path:
-    """Puts an eval.json where a run leaves it, with the provenance that the group's plan expects."""
-    path = group.evaluation(recipe, seed)
+def write_evaluation(run: SnakemakeRun, recipe: str, seed: int, content: dict[str, Any]) -> Path:
+    """Writes an eval.json to its place, with the provenance that the run's plan expects."""
+    path = run.evaluation(recipe, seed)
     path.parent.mkdir(parents=True, exist_ok=True)
-    stages = group.plan.evaluation_stages(group.scene, [with_seed(recipe, seed)])
+    stages = run.plan.evaluation_stages(run.scene, [with_seed(recipe, seed)])
     path.write_text(json.dumps({**content, "provenance": {"stages": stages}}))
+    return path
+
+
+def write_failure(path: Path, job: str, reason: str, level: str = "ERROR") -> Path:
+    """Writes the log of a job, named by stage and scene, that failed for a reason."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(
+        f"2026-11-21 20:30:20,123 INFO drivesplat.workflow.job: {job} begins\n"
+        f"2026-11-21 20:31:20,123 {level} drivesplat.workflow.job: {job}: {reason}\n"
+    )
     return path

@@ -1,4 +1,4 @@
-"""Work in a process of its own: it begins with an empty device, and leaves one."""
+"""Functions in a new process, which starts and ends with an empty device."""
 
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -12,8 +12,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def in_own_process(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """What a function of a module returns or raises, called in a new process. Raises TrainingError where that process
+def run_in_process(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Calls a module's function in a new process; returns or raises what it does. Raises TrainingError if the process
     is killed."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:

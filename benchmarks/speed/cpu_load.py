@@ -1,4 +1,4 @@
-"""How busy the processors were with other work while something was timed."""
+"""The load of other programs on the processors while something is timed."""
 
 import os
 import resource
@@ -10,22 +10,22 @@ STATISTICS = Path("/proc/stat")
 
 
 @dataclass(frozen=True)
-class Moment:
-    """Seconds that the processors of this machine have been busy (None where it does not tell), and of those what this
-    process and its children that ended have had, at a time."""
+class CpuSample:
+    """CPU times in seconds: `busy` of all processors (None if the system does not tell), `own` of this process and its
+    ended children; `at` is the time of the sample."""
 
     at: float
     busy: float | None
     own: float
 
     @classmethod
-    def now(cls) -> "Moment":
+    def now(cls) -> "CpuSample":
         usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         return cls(time.monotonic(), _busy(), sum(usage.ru_utime + usage.ru_stime for usage in usages))
 
 
-def busy_elsewhere(before: Moment, after: Moment) -> float | None:
-    """How many processors on average had other work between two moments; None where it is not known."""
+def busy_elsewhere(before: CpuSample, after: CpuSample) -> float | None:
+    """The mean number of processors that other programs kept busy between two samples; None if unknown."""
     if before.busy is None or after.busy is None or after.at <= before.at:
         return None
     elsewhere = (after.busy - before.busy) - (after.own - before.own)
@@ -33,7 +33,7 @@ def busy_elsewhere(before: Moment, after: Moment) -> float | None:
 
 
 def _busy() -> float | None:
-    """The time of all processors together that was neither idle nor spent waiting for disks."""
+    """The time of all processors together, without idle time and waiting for disks."""
     try:
         _, user, nice, system, _, _, irq, softirq, *_ = STATISTICS.read_text().splitlines()[0].split()
     except (OSError, ValueError, IndexError):

@@ -1,4 +1,4 @@
-"""Files of recipes: what is refused, in one line; which recipes share a run, and what each is trained on."""
+"""Recipe files: refusals in one line, which recipes share a run, and the settings of each."""
 
 import json
 from typing import Any
@@ -7,7 +7,8 @@ import pytest
 import yaml
 from helpers import REPOSITORY
 
-from benchmarks.quality.groups import Group, groups_of, read_recipes
+from benchmarks.quality.recipes import plan_runs, read_recipes
+from benchmarks.snakemake_run import SnakemakeRun
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import load, merged
 from drivesplat.workflow.stages import stage_settings
@@ -17,60 +18,60 @@ PLAIN = {"scene": "0061", "seeds": [0, 1], "recipes": {"vanilla": {"of": "vanill
 
 
 @pytest.fixture
-def groups(tmp_path):
-    """Writes a recipe file and reads it into groups."""
+def runs(tmp_path):
+    """Writes a recipe file and plans its runs."""
 
-    def read(content: Any = None, **more: Any) -> list[Group]:
+    def read(content: Any = None, **more: Any) -> list[SnakemakeRun]:
         path = tmp_path / "mine.yaml"
         path.write_text(content if isinstance(content, str) else yaml.safe_dump({**PLAIN, **more}, sort_keys=False))
-        return groups_of(read_recipes(path), tmp_path / "out", REPOSITORY)
+        return plan_runs(read_recipes(path), tmp_path / "out", REPOSITORY)
 
     return read
 
 
-def told(group: Group, stage: str, method: str | None = None) -> dict[str, Any]:
-    return json.loads(stage_settings(group.plan.config, stage, group.scene, method))
+def settings_of(run: SnakemakeRun, stage: str, method: str | None = None) -> dict[str, Any]:
+    return json.loads(stage_settings(run.plan.config, stage, run.scene, method))
 
 
-def test_recipes_are_methods_with_every_seed_and_the_only_ones(groups, tmp_path):
-    (group,) = groups()
+def test_recipes_are_methods_with_every_seed_and_the_only_ones(runs, tmp_path):
+    (run,) = runs()
     names = ["vanilla-seed0", "vanilla-seed1", "street-seed0", "street-seed1"]
-    assert list(group.plan.config.all_methods) == names
+    assert list(run.plan.config.all_methods) == names
     folder = tmp_path / "out/plain/0061"
-    assert group.targets == [folder / name / "eval.json" for name in names]
-    assert group.log("street", 1, "train") == tmp_path / "out/plain/logs/0061/street-seed1/train.log"
+    assert run.targets == [folder / name / "eval.json" for name in names]
+    assert run.log("street", 1, "train") == tmp_path / "out/plain/logs/0061/street-seed1/train.log"
 
 
-def test_a_method_of_the_config_is_trained_as_it_is_there_but_for_the_seed(groups):
-    (group,) = groups()
+def test_a_method_of_the_config_is_trained_as_it_is_there_but_for_the_seed(runs):
+    (run,) = runs()
     config = load(DEFAULTS)
     for name in ("vanilla", "street"):
         expected = json.loads(stage_settings(config, "train", "0061", name))
-        assert told(group, "train", f"{name}-seed1") == expected | {"random_seed": 1}
+        assert settings_of(run, "train", f"{name}-seed1") == expected | {"random_seed": 1}
 
 
-def test_what_is_laid_over_config_yaml_comes_to_the_config_of_the_plan(groups):
-    """Snakemake merges the file of a group over config.yaml, as `merged` does."""
-    made = groups(recipes={"street": {"of": "street"}, "more": {"of": "street", "config": {"sweeps": True}}})
-    for group in made:
-        written = yaml.safe_load(yaml.safe_dump(group.overlay))
-        assert load(merged(DEFAULTS, written)) == group.plan.config
+def test_what_is_laid_over_config_yaml_comes_to_the_config_of_the_plan(runs):
+    """Snakemake merges the file of a run over config.yaml, as `merged` does."""
+    made = runs(recipes={"street": {"of": "street"}, "more": {"of": "street", "config": {"sweeps": True}}})
+    for run in made:
+        written = yaml.safe_load(yaml.safe_dump(run.overlay))
+        assert load(merged(DEFAULTS, written)) == run.plan.config
 
 
-def test_parts_and_overrides_go_over_those_of_the_method_it_is_of(groups):
+def test_parts_and_overrides_go_over_those_of_the_method_it_is_of(runs):
     recipes = {
         "bare": {"of": "street", "parts": ["background"], "overrides": {"sky": "none", "train": {"depth_weight": 0.0}}},
         "own": {"parts": ["background", "actors"]},
     }
-    (group,) = groups(recipes=recipes)
-    bare, own = told(group, "train", "bare-seed0"), told(group, "train", "own-seed0")
+    (run,) = runs(recipes=recipes)
+    bare, own = settings_of(run, "train", "bare-seed0"), settings_of(run, "train", "own-seed0")
     assert (bare["parts"], bare["sky"], bare["train"]["depth_weight"]) == (["background"], "none", 0.0)
     assert bare["train"]["sky_bce_weight"] == 0.05, "street's own, which the recipe leaves alone"
     assert own["parts"] == ["background", "actors"]
     assert (own["sky"], own["train"]["sky_bce_weight"]) == ("cubemap", 0.0), "of nothing: the settings of the config"
 
 
-def test_recipes_share_a_folder_where_their_scene_is_the_same(groups, tmp_path):
+def test_recipes_share_a_folder_where_their_scene_is_the_same(runs, tmp_path):
     recipes = {
         "street": {"of": "street"},
         "swept": {"of": "street", "config": {"sweeps": True}},
@@ -78,37 +79,37 @@ def test_recipes_share_a_folder_where_their_scene_is_the_same(groups, tmp_path):
         "vanilla_swept": {"of": "vanilla", "config": {"sweeps": True}},
         "small": {"of": "street", "config": {"images": {"width": 320}, "lidar_seed": {"far_points": 0}}},
     }
-    made = groups(recipes=recipes)
-    assert [group.recipes for group in made] == [("street", "vanilla"), ("swept", "vanilla_swept"), ("small",)]
-    assert [told(group, "extract")["sweeps"] for group in made] == [False, True, False]
-    assert [told(group, "lidar_seed")["lidar_seed"]["far_points"] for group in made] == [80_000, 80_000, 0]
-    plain, swept, small = (group.folder.relative_to(tmp_path / "out").as_posix() for group in made)
+    made = runs(recipes=recipes)
+    assert [run.methods for run in made] == [("street", "vanilla"), ("swept", "vanilla_swept"), ("small",)]
+    assert [settings_of(run, "extract")["sweeps"] for run in made] == [False, True, False]
+    assert [settings_of(run, "lidar_seed")["lidar_seed"]["far_points"] for run in made] == [80_000, 80_000, 0]
+    plain, swept, small = (run.folder.relative_to(tmp_path / "out").as_posix() for run in made)
     assert plain == "plain" and swept.startswith("sweeps-") and small.startswith("images-lidar_seed-")
-    alone = groups(recipes={"renamed": recipes["small"], "other": recipes["swept"]})
-    assert {group.folder.name for group in alone} == {small, swept}, "folders depend on no other recipe"
+    alone = runs(recipes={"renamed": recipes["small"], "other": recipes["swept"]})
+    assert {run.folder.name for run in alone} == {small, swept}, "folders depend on no other recipe"
 
 
-def test_base_files_lie_under_the_recipes_in_order(groups, tmp_path):
+def test_base_files_lie_under_the_recipes_in_order(runs, tmp_path):
     first = {"holdout": {"every_nth": 4, "offset": 2}, "methods": {"third": {"overrides": {"sky": "mask"}}}}
     second = {"holdout": {"offset": 1}, "train": {"iterations": 77}}
     for name, content in (("a.yaml", first), ("b.yaml", second), ("empty.yaml", None)):
         (tmp_path / name).write_text(yaml.safe_dump(content) if content else "")
     base = [str(tmp_path / name) for name in ("a.yaml", "b.yaml", "empty.yaml")]
     recipes = {"third": {"of": "third"}, "long": {"of": "third", "overrides": {"train": {"iterations": 99}}}}
-    (group,) = groups(base=base, recipes=recipes)
-    config = group.plan.config
+    (run,) = runs(base=base, recipes=recipes)
+    config = run.plan.config
     assert (config.holdout.every_nth, config.holdout.offset, config.holdout.last_block) == (4, 1, 4)
-    iterations = [told(group, "train", f"{name}-seed0")["train"]["iterations"] for name in recipes]
-    assert iterations == [77, 99] and told(group, "train", "third-seed0")["sky"] == "mask"
+    iterations = [settings_of(run, "train", f"{name}-seed0")["train"]["iterations"] for name in recipes]
+    assert iterations == [77, 99] and settings_of(run, "train", "third-seed0")["sky"] == "mask"
 
 
-def test_what_recipes_set_holds_over_what_a_dataset_sets_for_itself(groups):
+def test_what_recipes_set_holds_over_what_a_dataset_sets_for_itself(runs):
     """The demo trains for 1,000 iterations on 25,000 points of LiDAR, whatever stands further up in the config."""
     recipes = {"vanilla": {}, "few": {"config": {"lidar_seed": {"max_points": 200}}}}
-    plain, few = groups(scene="demo", config={"train": {"iterations": 7}}, recipes=recipes)
-    assert told(plain, "train", "vanilla-seed0")["train"]["iterations"] == 7
-    assert told(plain, "train", "vanilla-seed0")["train"]["cap_max"] == 40_000
-    seeds = [told(group, "lidar_seed")["lidar_seed"] for group in (plain, few)]
+    plain, few = runs(scene="demo", config={"train": {"iterations": 7}}, recipes=recipes)
+    assert settings_of(plain, "train", "vanilla-seed0")["train"]["iterations"] == 7
+    assert settings_of(plain, "train", "vanilla-seed0")["train"]["cap_max"] == 40_000
+    seeds = [settings_of(run, "lidar_seed")["lidar_seed"] for run in (plain, few)]
     assert [(seed["max_points"], seed["far_points"]) for seed in seeds] == [(25_000, 8_000), (200, 8_000)]
 
 
@@ -134,16 +135,16 @@ def test_what_recipes_set_holds_over_what_a_dataset_sets_for_itself(groups):
         ({"recipes": {"a": {"config": {"results_dir": "x"}}}}, ["recipes.a.config.results_dir"]),
         ({"recipes": {"a": {"config": {"lidar_seed": {"points": 3}}}}}, ["recipe a: ", "lidar_seed.points"]),
         ({"config": {"ablation": {}}}, ["mine.yaml", "'config.ablation'"]),
-        ({"config": {"holdout": {"every_nth": -1}}}, ["base and config of all recipes: ", "holdout.every_nth", "-1"]),
+        ({"config": {"holdout": {"every_nth": -1}}}, ["base and config: ", "holdout.every_nth", "-1"]),
         ({"base": ["nowhere.yaml"]}, ["nowhere.yaml", "config file cannot be read"]),
         ({"seeds": [1, 1]}, ["mine.yaml", "seeds", "twice"]),
         ({"seeds": []}, ["mine.yaml", "seeds", "at least 1"]),
     ],
     ids=str,
 )
-def test_what_is_wrong_is_told_in_one_line(groups, content, words):
+def test_what_is_wrong_is_told_in_one_line(runs, content, words):
     with pytest.raises(ConfigError) as failure:
-        groups(content) if isinstance(content, str) else groups(**content)
+        runs(content) if isinstance(content, str) else runs(**content)
     message = str(failure.value)
     assert "\n" not in message and all(word in message for word in words), message
 
@@ -158,27 +159,27 @@ def test_what_is_wrong_is_told_in_one_line(groups, content, words):
     ],
     ids=str,
 )
-def test_recipes_that_come_to_the_same_are_refused(groups, again):
+def test_recipes_that_train_the_same_are_refused(runs, again):
     """Vanilla has no actors; no sweeps are the default."""
-    with pytest.raises(ConfigError, match="'vanilla' and 'again' come to the same on scene 0061"):
-        groups(recipes={"vanilla": {}, "again": again})
+    with pytest.raises(ConfigError, match="'vanilla' and 'again' train the same on scene 0061"):
+        runs(recipes={"vanilla": {}, "again": again})
 
 
-def test_recipes_on_other_copies_of_a_dataset_are_not_the_same(groups):
+def test_recipes_on_other_copies_of_a_dataset_are_not_the_same(runs):
     other = {"config": {"datasets": {"nuscenes": {"dataroot": "elsewhere"}}}}
-    assert len(groups(recipes={"vanilla": {}, "other": other})) == 2
+    assert len(runs(recipes={"vanilla": {}, "other": other})) == 2
 
 
-def test_two_worlds_in_one_folder_are_refused(groups):
+def test_two_worlds_in_one_folder_are_refused(runs):
     """Each run would make its own world there, and the other's results stale."""
     night = {"datasets": {"demo": {"world": {"night": True}}}}
     with pytest.raises(ConfigError, match=r"'day' and 'night' make different worlds in resources/demo"):
-        groups(scene="demo", recipes={"day": {}, "night": {"config": night}})
+        runs(scene="demo", recipes={"day": {}, "night": {"config": night}})
     apart = merged(night, {"datasets": {"demo": {"dataroot": "resources/night"}}})
-    assert len(groups(scene="demo", recipes={"day": {}, "night": {"config": apart}})) == 2
+    assert len(runs(scene="demo", recipes={"day": {}, "night": {"config": apart}})) == 2
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks/recipes").glob("*.yaml")), ids=lambda path: path.name)
 def test_the_recipes_that_come_along_are_valid(path, tmp_path, monkeypatch):
     monkeypatch.chdir(REPOSITORY)
-    assert groups_of(read_recipes(path), tmp_path, REPOSITORY)
+    assert plan_runs(read_recipes(path), tmp_path, REPOSITORY)
