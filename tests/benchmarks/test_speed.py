@@ -189,14 +189,14 @@ def test_the_page_says_how_it_was_measured():
         "NVIDIA H200, 16 processors", "SSIM of `plain`: fused_ssim", "random seeds 0, 1.",
     ):  # fmt: skip
         assert words in line, words
-    assert "other work" not in text and "Milliseconds" not in text
+    assert "Other programs" not in text and "Milliseconds" not in text
 
 
 def test_other_work_on_the_processors_is_told():
     text = markdown(speed(TWO, [*RUNS[:3], ended("plain", 1, 50.0, 22.0, busy_elsewhere=4.04)], []))
-    assert "up to 4.0 of the 16 processors had other work" in text
+    assert "up to 4.0 of the 16 processors busy" in text
     unknown = [{**run, "busy_elsewhere": None} for run in RUNS]
-    assert "other work" not in markdown(speed(TWO, unknown, []))
+    assert "Other programs" not in markdown(speed(TWO, unknown, []))
 
 
 def shares(**of: tuple[float, float]) -> dict[str, dict[str, float]]:
@@ -209,7 +209,7 @@ def test_stages_stand_side_by_side_with_their_share_of_the_iteration():
     profiles = [{"recipe": "plain", "iterations": 300, "stages": plain}]
     profiles += [{"recipe": "ours", "iterations": 300, "stages": ours}]
     text = markdown(speed(TWO, RUNS, profiles))
-    assert "over 10 iterations that go on from the trained models of seed 0" in text
+    assert "over 10 iterations that continue from the trained models of seed 0" in text
     assert rows(text)[2][0] == ["stage", "`plain`", "`vanilla`"]
     assert rows(text)[2][2:] == [
         ["render", "2.00 (50%)", "1.00 (50%)"], ["checks", "-", "0.50 (25%)"], ["data", "1.00 (25%)", "-"],
