@@ -41,7 +41,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rasterization import gsplat_backend as gpu
 from drivesplat.rasterization import rasterize
-from drivesplat.rendering import captured_frames as frames_on_gpu
+from drivesplat.rendering import captured_frames
 from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
@@ -368,8 +368,8 @@ def street_film() -> Film:
 @pytest.fixture
 def captures(monkeypatch) -> list[graphs.Graph]:
     """What is captured from now on, with lists that have exactly the room that those before them needed."""
-    made, capture = [], frames_on_gpu.captured
-    monkeypatch.setattr(frames_on_gpu, "captured", lambda *t, **named: made.append(capture(*t, **named)) or made[-1])
+    made, capture = [], captured_frames.captured
+    monkeypatch.setattr(captured_frames, "captured", lambda *t, **named: made.append(capture(*t, **named)) or made[-1])
     monkeypatch.setattr(rooms, "LEAST", 0)
     monkeypatch.setattr(rooms, "MARGIN", 1.0)
     return made
@@ -397,11 +397,11 @@ def test_frames_in_a_row_are_those_by_themselves(street_film, captures, monkeypa
     mixed = [*film_frames(model, [(view, None) for pair in zip(views, smaller, strict=True) for view in pair])]
     assert_frames(mixed[::2], expected)
     assert_frames(mixed[1::2], [film_frame(model, view) for view in smaller])
-    assert None not in captures and timeline._cache == known, "all of it was expected"
+    assert None not in captures and timeline._cache == known, "all states were precomputed"
 
 
-def test_a_film_that_outgrows_its_room_is_captured_anew(street_film, captures):
-    """Beside a thread that uses its frames; the second time all of it has room, in what was captured last."""
+def test_a_film_whose_lists_overflow_is_captured_anew(street_film, captures):
+    """Beside a thread that uses its frames; on the second pass the last graph has the capacity for all of it."""
     model, views, expected = street_film
     found = [*in_advance(film_frames(model, [(view, None) for view in [*views, *views]]))]
     assert len(captures) > 1 and None not in captures
@@ -409,7 +409,7 @@ def test_a_film_that_outgrows_its_room_is_captured_anew(street_film, captures):
     assert_frames(found, [*expected, *expected])
 
 
-def test_a_film_that_is_given_up_leaves_the_next_as_it_is(street_film, captures):
+def test_an_abandoned_film_does_not_affect_the_next(street_film, captures):
     model, views, expected = street_film
     given_up = film_frames(model, [(view, None) for view in [*views, *views]])
     for _ in range(7):
@@ -418,7 +418,7 @@ def test_a_film_that_is_given_up_leaves_the_next_as_it_is(street_film, captures)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
 
 
-def test_a_film_of_what_stands_still_is_captured_too(street_film, captures, monkeypatch):
+def test_a_static_film_is_captured_too(street_film, captures, monkeypatch):
     model, views, _ = street_film
     monkeypatch.setattr(rooms, "MARGIN", 4.0)
     alone = SplatModel([model.parts[0]], model.sky)
@@ -433,7 +433,7 @@ def test_frames_of_a_camera_of_the_rig_are_not_captured(street_film, captures):
     assert not captures
 
 
-def test_frames_that_cannot_be_captured_come_all_the_same(street_film, monkeypatch, caplog):
+def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film, monkeypatch, caplog):
     model, views, expected = street_film
     together = SplatModel.gaussians_at_time_states
 

@@ -1,7 +1,6 @@
-"""The frames of films: what a model shows, as bytes in main memory, one after the other.
+"""The frames of films: renderings of a model as 8-bit images in main memory, in order.
 
-On a GPU a frame is asked for before the one before it has come, and only the end of a frame waits for the device: while
-the GPU renders one, Python asks for the next.
+On a GPU, Python submits the next frame while the GPU renders the one before it.
 """
 
 from collections import deque
@@ -17,26 +16,28 @@ from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.captured_frames import Asked, FramesOnGpu, Shown
+from drivesplat.rendering.captured_frames import FrameInput, GpuFrameRenderer, PendingFrame
 from drivesplat.rendering.color_bytes import nearest_bytes
 
-A = TypeVar("A")
-NOT_FINITE = "a frame of a film was rendered as no numbers; delete its checkpoint.pt and rerun"
+T = TypeVar("T")
+NOT_FINITE = "a frame of a film contains NaN or Inf; delete its checkpoint.pt and rerun"
 
 
-def film_frames(model: SplatModel, shown: Iterable[Shown]) -> Iterator[np.ndarray]:
-    """What each view shows, (h, w, 3) uint8 RGB. Raises ResultError where one is not finite."""
-    on_device = model.parts[0].params["means"].is_cuda
-    yield from (_in_a_row(FramesOnGpu(model).asked, shown) if on_device else (_rendered(model, *one) for one in shown))
+def film_frames(model: SplatModel, inputs: Iterable[FrameInput]) -> Iterator[np.ndarray]:
+    """Renders each view, (h, w, 3) uint8 RGB. Raises ResultError where a rendering contains NaN or Inf."""
+    if model.parts[0].params["means"].is_cuda:
+        yield from _pipelined(GpuFrameRenderer(model).submit, inputs)
+    else:
+        yield from (_rendered(model, *one) for one in inputs)
 
 
 def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
-    """What one view shows, as `film_frames` says."""
+    """Renders one view as `film_frames` does."""
     return next(film_frames(model, [(view, gaussians)]))
 
 
 def as_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Colours in [0, 1] to the nearest byte, in main memory. Raises ResultError where they are not finite."""
+    """Colours in [0, 1] as the nearest uint8, in main memory. Raises ResultError where one is NaN or Inf."""
     if not torch.isfinite(image).all():
         raise ResultError(NOT_FINITE)
     return nearest_bytes(image).cpu().numpy()
@@ -47,21 +48,21 @@ def _rendered(model: SplatModel, view: View, gaussians: Gaussians | None) -> np.
     return as_bytes(model.render(view, gaussians=gaussians).image)
 
 
-def _in_a_row(ask: Callable[[A], Asked], shown: Iterable[A]) -> Iterator[np.ndarray]:
-    """The frames in order, each asked for before the one before it is waited for."""
-    waiting: deque[Asked] = deque()
-    for one in shown:
-        waiting.append(ask(one))
-        if len(waiting) > 1:
-            yield _come(waiting.popleft())
-    while waiting:
-        yield _come(waiting.popleft())
+def _pipelined(submit: Callable[[T], PendingFrame], inputs: Iterable[T]) -> Iterator[np.ndarray]:
+    """The frames in order; each is submitted before the one before it is waited for."""
+    pending: deque[PendingFrame] = deque()
+    for one in inputs:
+        pending.append(submit(one))
+        if len(pending) > 1:
+            yield _finished(pending.popleft())
+    while pending:
+        yield _finished(pending.popleft())
 
 
-def _come(asked: Asked) -> np.ndarray:
-    asked.wait()
-    if asked.cut_short:
-        return _come(asked.again())
-    if not asked.frame.finite:
+def _finished(pending: PendingFrame) -> np.ndarray:
+    pending.wait()
+    if pending.overflowed:
+        return _finished(pending.retry())
+    if not pending.frame.finite:
         raise ResultError(NOT_FINITE)
-    return asked.frame.pixels.numpy()
+    return pending.frame.pixels.numpy()
