@@ -13,7 +13,7 @@ from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.training.run import read_summary
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images", "sweeps")) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)
     recording, upstream = read_recording(files.scene, files.parser, files.masks)
     record, summary = read_masks_record(recording.masks), read_summary(files.summary)

@@ -12,5 +12,8 @@ from drivesplat.settings.extract import SceneSource
 with job(snakemake) as current:
     tables = current.input.tables
     scene = extract_scene(current.settings(SceneSource), Path(tables[0]).parents[1])
+    current.record_dataset(
+        images=(frame.image_path for frame in scene.frames), sweeps=(sweep.path for sweep in scene.sweeps)
+    )
     provenance = current.provenance(inputs={"tables": digests_of(tables)})
     write_scene(current.output.scene, dataclasses.replace(scene, provenance=provenance))

@@ -7,7 +7,7 @@ from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.free_space import FreeSpaceJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("sweeps",)) as current:
     scene = read_scene(current.input.scene)
     triangulated = read_triangulated(current.input.triangulated[0]) if current.input.triangulated else None
     record = free_space_record(scene, current.settings(FreeSpaceJob), triangulated)

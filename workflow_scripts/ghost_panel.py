@@ -10,7 +10,7 @@ from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.inspection import PanelJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images",)) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)
     recording, upstream = read_recording(files.scene, files.parser, files.masks)
     provenance = current.provenance(*upstream, checkpoint["provenance"])

@@ -7,7 +7,7 @@ from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.lidar_depth import LidarDepthJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("sweeps",)) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
     images = lidar_depths(scene, current.settings(LidarDepthJob), own_car)
     provenance = current.provenance(scene.provenance, upstream)

@@ -11,7 +11,7 @@ from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.lidar_seed import SeedJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images", "sweeps")) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
     triangulated = read_triangulated(current.input.triangulated[0]) if current.input.triangulated else None
     points = seed_points(scene, current.settings(SeedJob), own_car, triangulated)

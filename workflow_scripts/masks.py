@@ -9,7 +9,7 @@ from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.masks import MaskJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images", "sweeps")) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
     record = make_masks(scene, current.settings(MaskJob), Path(current.output.masks).parent, own_car)
     write_json(current.output.masks, {**record, "provenance": current.provenance(scene.provenance, upstream)})

@@ -9,7 +9,7 @@ from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene, write_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images", "sweeps")) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
     refinement = refined_or_kept(scene, current.settings(RefinePosesJob), own_car, current.threads)
     provenance = current.provenance(scene.provenance, upstream)

@@ -11,7 +11,7 @@ from drivesplat.scene.images import write_image
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.inspection import RemovalJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images",)) as current:
     files, made, checkpoint = current.input, current.output, read_checkpoint(current.input.checkpoint)
     recording, upstream = read_recording(files.scene, files.parser, files.masks)
     provenance = current.provenance(*upstream, checkpoint["provenance"])

@@ -6,7 +6,7 @@ from drivesplat.inspection.track_table import draw_tracks, sightings_of, track_r
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.inspection import TracksJob
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images",)) as current:
     files, camera = current.input, current.settings(TracksJob).eval_camera
     recording, _ = read_recording(files.scene, files.parser, files.masks)
     sightings = sightings_of(recording, camera)

@@ -6,7 +6,7 @@ from drivesplat.workflow.job import job
 from drivesplat.settings.train import TrainJob
 from drivesplat.training.run import TrainingFiles, read_inputs, run_training
 
-with job(snakemake) as current:
+with job(snakemake, dataset=("images",)) as current:
     files = current.input
     wanted = ([*paths] for paths in (files.actors, files.lidar_depth, files.free_space))
     inputs, upstream = read_inputs(files.parser, files.masks, *wanted)

@@ -7,6 +7,7 @@ from typing import Any
 from drivesplat.errors import DriveSplatError
 from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io.storage import read_json
+from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.scene.scene_warnings import DARK
 
 LOOKS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
@@ -77,6 +78,8 @@ def _movers(group: dict[str, Any], gap: float | None) -> str:
 
 if __name__ == "__main__":
     try:
-        print("\n".join(in_words(read_json(sys.argv[1], rule="scene_metrics"), sys.argv[1])))
+        metrics = read_json(sys.argv[1], rule="scene_metrics")
+        checked_digest(sys.argv[1], warn=False)
+        print("\n".join(in_words(metrics, sys.argv[1])))
     except DriveSplatError as error:
         sys.exit(f"drivesplat: {error}")

@@ -36,9 +36,10 @@ _PLAIN_GLOBALS = {
 }
 
 
-def unreadable(path: str | Path, rule: str, why: str) -> ResultError:
-    """The one sentence for a file that cannot be used."""
-    return ResultError(f"{path}: {why}; delete it and rerun: the rule '{rule}' rebuilds it")
+def unreadable(path: str | Path, rule: str, why: str, delete: str | Path | None = None) -> ResultError:
+    """The one sentence for a file that cannot be used. `delete`: the rule's declared output, where `path` is not one:
+    Snakemake rebuilds what it knows."""
+    return ResultError(f"{path}: {why}; delete {delete or 'it'} and rerun: the rule '{rule}' rebuilds it")
 
 
 def unwritable(path: str | Path, error: OSError) -> ResultError:

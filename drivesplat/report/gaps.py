@@ -11,6 +11,7 @@ from drivesplat.errors import ResultError
 from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io import storage
 from drivesplat.io.storage import read_json, unreadable
+from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.provenance.record import differences
 from drivesplat.report.failures import why_missing
 from drivesplat.report.statistics import gap_closed, mean_over_scenes
@@ -35,6 +36,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
     for path in paths:
         try:
             record = read_json(path, rule="scene_metrics")
+            checked_digest(path, warn=False)
             scene = record["scene"]
             reasons = _mismatches(record, job.expected, measured)
             scene_rows = [_row(record, method) for method in record["methods"]]

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from drivesplat.errors import ResultError
+from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.settings.report import PICTURES
 
 WIDEST = 1280
@@ -44,6 +45,7 @@ def looks_of(files: Iterable[str | Path], results: Path) -> dict[tuple[str, str]
 def picture_of(path: Path) -> Image.Image:
     """A picture in RGB. Raises ResultError naming the path where it cannot be read."""
     try:
+        checked_digest(path, warn=False)
         with Image.open(path) as image:
             return image.convert("RGB")
     except OSError as error:

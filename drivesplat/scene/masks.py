@@ -52,4 +52,4 @@ def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple
     try:
         return read_mask(path, size)
     except DatasetError as error:
-        raise unreadable(path, "masks", str(error)) from error
+        raise unreadable(path, "masks", str(error), delete=folder / "masks.json") from error

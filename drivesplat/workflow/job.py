@@ -6,13 +6,20 @@ import json
 import logging
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.storage import unwritable
+from drivesplat.provenance.file_digests import (
+    check_dataset,
+    checked_digest,
+    file_digests,
+    member_states,
+    record_output,
+)
 from drivesplat.provenance.record import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
@@ -40,6 +47,9 @@ class Job:
         self._params = snakemake.params
         self._resources = snakemake.resources
         self._card: BinaryIO | None = None
+        self._read: dict[str, str] = {}
+        self._members = {str(path): member_states(path) for path in self.output}
+        self._dataset: dict[str, dict[str, str]] = {}
 
     @property
     def stage(self) -> str:
@@ -68,10 +78,34 @@ class Job:
         """The provenance of this rule's result, made from results with the provenances `upstream`."""
         return provenance(self.stage, json.loads(self._params.settings), self._params.code, upstream, inputs or {})
 
+    def check_inputs(self, dataset: Iterable[str] = ()) -> None:
+        """Compares the inputs with what their rules wrote, and the dataset's files of the kinds `dataset` ('images',
+        'sweeps') with what `extract` read. Raises ResultError naming an altered file and the rule that rebuilds it."""
+        scene = getattr(self.wildcards, "scene", None)
+        for path in map(str, self.input):
+            self._read[path] = checked_digest(path, warn=scene in Path(path).parts)
+        if dataset:
+            record = self.input.scene if hasattr(self.input, "scene") else self.input.parser
+            check_dataset(Path(record).parent, dataset)
+
+    def record_dataset(self, **files: Iterable[str | Path]) -> None:
+        """Keeps the digests of the dataset's `files` by kind, for the jobs that read them."""
+        self._dataset = {
+            kind: file_digests(path for path in paths if Path(path).is_file()) for kind, paths in files.items()
+        }
+
+    def record_outputs(self) -> None:
+        """Keeps the digests of all that the job has read and written, for the jobs that read it."""
+        for path, before in self._members.items():
+            record_output(path, self._rule, before, self._read, self._dataset)
+
 
 @contextmanager
-def job(snakemake: Any) -> Iterator[Job]:
+def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) -> Iterator[Job]:
     """A rule's script as a context: logs into the rule's log, and ends a failure in one line on the console.
+
+    Inputs are compared with what their rules wrote, unless the script does that itself (`check_inputs`); `dataset` are
+    the kinds of the dataset's files that the script reads ('images', 'sweeps').
 
     A DriveSplatError is told as its sentence, a disk that takes no more as what it says; anything else is a bug, told
     with the place of its traceback in the log.
@@ -85,7 +119,10 @@ def job(snakemake: Any) -> Iterator[Job]:
     log = logging.getLogger(__name__)
     log.info("%s begins", current.name)
     try:
+        if check_inputs:
+            current.check_inputs(dataset)
         yield current
+        current.record_outputs()
         log.info("%s ends", current.name)
     except DriveSplatError as error:
         log.error("%s: %s", current.name, error)

@@ -1,0 +1,177 @@
+"""Files altered after their rule wrote them, over a finished run: every reader refuses them, and its advice works."""
+
+import json
+import re
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers import REPOSITORY
+from helpers.workflow_copy import WorkflowCopy
+
+FLIPS = 100
+READS_DATASET = re.compile(r"dataset=\((.*?)\)")
+
+
+class NamedFiles(list):
+    """The inputs or outputs of a rule, as Snakemake gives them to its script."""
+
+    def __init__(self, **files: str):
+        super().__init__(files.values())
+        self.__dict__.update(files)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> WorkflowCopy:
+    """A run that has measured one method with actors, supervised with LiDAR depth and free space."""
+    street = {"train": {"depth_weight": 0.1, "floaters": {"free_space": True}}}
+    copy = WorkflowCopy.make(
+        tmp_path_factory.mktemp("altered"),
+        methods={"street": {"parts": ["background", "actors"], "overrides": street}},
+        actors={"random_points": 200},
+    )
+    done = copy.run("results/0001/metrics.json", "results/0001/street/parts/parts.json")
+    assert done.returncode == 0, done.stdout
+    return copy
+
+
+def records(copy: WorkflowCopy) -> dict[str, dict]:
+    """The records of digests, by the output they are about."""
+    found = sorted((copy.folder / "results").rglob(".digests/*.json"))
+    return {str((path.parents[1] / path.stem).relative_to(copy.folder)): json.loads(path.read_text()) for path in found}
+
+
+def script(rule: str) -> Path:
+    return REPOSITORY / f"workflow_scripts/{rule}.py"
+
+
+def readers(copy: WorkflowCopy) -> dict[str, list[str]]:
+    """By file that the scene's rules read of results or dataset: the rules that read it."""
+    found: dict[str, set[str]] = {}
+    known = records(copy)
+    for record in known.values():
+        rule = record["rule"]
+        for path in record["read"]:
+            members = known[path]["members"] if path in known else {}
+            for name in (path, *(str(Path(path).parent / member) for member in members)):
+                found.setdefault(name, set()).add(rule)
+        told = READS_DATASET.search(script(rule).read_text())
+        for kind in re.findall(r'"(\w+)"', told[1]) if told else ():
+            for path in known["results/0001/scene.json"]["dataset"][kind]:
+                found.setdefault(path, set()).add(rule)
+    return {path: sorted(rules) for path, rules in sorted(found.items()) if "v1.0-mini" not in path}
+
+
+def refusal(copy: WorkflowCopy, rule: str, log: Path) -> str | None:
+    """What the script of a rule logs when it refuses altered inputs; None where it accepts them.
+
+    It gets no settings: a script that accepts its inputs fails soon after.
+    """
+    read = next(record["read"] for record in records(copy).values() if record["rule"] == rule)
+    name = {"scene": "scene", "scene_refined": "scene", "parser": "parser"}
+    inputs = NamedFiles(**{name.get(Path(path).stem, Path(path).stem): path for path in read})
+    wildcards = SimpleNamespace(scene="0001", method="street")
+    told = SimpleNamespace(
+        input=inputs, output=[], wildcards=wildcards, log=[str(log)], threads=1, rule=rule, params=None, resources=None
+    )
+    with pytest.raises(SystemExit):
+        runpy.run_path(str(script(rule)), {"snakemake": told})
+    line = log.read_text().splitlines()[-1]
+    return line if re.search("not what the rule wrote|changed since the rule", line) else None
+
+
+def test_each_of_100_flipped_bits_is_refused_with_file_and_rule(finished, tmp_path, monkeypatch):
+    """Bits at fixed random places of intermediates, masks, images and sweeps, each read by one of its rules."""
+    monkeypatch.chdir(finished.folder)
+    random, places = np.random.default_rng(0), readers(finished)
+    kinds = {Path(path).name if path.startswith("results") else Path(path).suffix for path in places}
+    assert {
+        "scene.json",
+        "own_car.json",
+        "masks.json",
+        "seed.ply",
+        "parser.pkl",
+        "checkpoint.pt",
+        "train.json",
+    } <= kinds
+    assert {".jpg", ".bin"} <= kinds and any("masks/regions" in path for path in places)
+    names, silent = list(places), []
+    always = [name for name in names if name.startswith("results") and "/masks/" not in name]
+    for number in range(FLIPS):
+        path = Path(always[number] if number < len(always) else str(random.choice(names)))
+        rule = str(random.choice(places[str(path)]))
+        whole = path.read_bytes()
+        content = bytearray(whole)
+        content[random.integers(len(content))] ^= 1 << int(random.integers(8))
+        path.write_bytes(content)
+        told = refusal(finished, rule, tmp_path / "it.log")
+        path.write_bytes(whole)
+        if told is None or str(path) not in told or not re.search(r"rerun: the rule '\w+' re(builds|ads) it", told):
+            silent.append((str(path), rule, told))
+    assert not silent
+
+
+def test_unaltered_files_are_accepted(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(finished.folder)
+    for rule in {rule for rules in readers(finished).values() for rule in rules}:
+        assert refusal(finished, rule, tmp_path / "it.log") is None
+
+
+def test_the_report_leaves_a_scene_with_altered_metrics_out(finished, tmp_path):
+    from drivesplat.report.gaps import gap_report
+    from drivesplat.settings.report import ReportJob
+
+    copy = finished.again(tmp_path / "copy")
+    metrics = copy.folder / "results/0001/metrics.json"
+    metrics.write_text(re.sub(r'("psnr": \d)', r"\g<1>1", metrics.read_text(), count=1))
+    report = gap_report([str(metrics)], ReportJob(expected={"0001": {}}, reference=None, random_seed=0), tmp_path)
+    assert [(one["scene"], str(metrics) in one["why"]) for one in report["left_out"]] == [("0001", True)]
+
+
+DELETE = re.compile(r"(results/\S+): .*; delete (\S+) and rerun: the rule '(\w+)' rebuilds it")
+
+
+@pytest.mark.parametrize(
+    ("path", "rule", "lost"),
+    [
+        ("results/0001/masks/regions/CAM_FRONT/*.png", "masks", True),
+        ("results/0001/masks/sky/CAM_FRONT/*.png", "masks", False),
+        ("results/0001/seed.ply", "lidar_seed", False),
+    ],
+)
+def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, lost):
+    """Members that Snakemake does not know, lost and altered, and a declared output."""
+    copy = finished.again(tmp_path / "copy")
+    (copy.folder / "results/0001/parser.pkl").unlink()
+    (copy.folder / "results/0001/street/checkpoint.pt").unlink()
+    damaged = sorted(copy.folder.glob(path))[-1]
+    whole = damaged.read_bytes()
+    if lost:
+        damaged.unlink()
+    else:
+        damaged.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    target = "results/0001/street/checkpoint.pt"
+    refused = copy.run(target)
+    name, delete, told = DELETE.search(refused.stdout).groups()
+    assert refused.returncode and told == rule and (copy.folder / name) == damaged
+    (copy.folder / (name if delete == "it" else delete)).unlink()
+    done = copy.run(target)
+    assert done.returncode == 0, done.stdout
+    assert damaged.read_bytes() == whole
+
+
+def test_an_image_replaced_after_extract_is_refused_and_following_the_advice_measures_it(finished, tmp_path):
+    copy = finished.again(tmp_path / "copy")
+    images = sorted((copy.folder / "data/samples/CAM_FRONT").glob("*.jpg"))
+    images[4].write_bytes(images[5].read_bytes())
+    (copy.folder / "results/0001/masks/masks.json").unlink()
+    target = "results/0001/masks/masks.json"
+    refused = copy.run(target)
+    assert refused.returncode and re.search(
+        rf"{images[4].name}: changed since the rule 'extract' read it", refused.stdout
+    )
+    (copy.folder / re.search(r"delete (\S+) and rerun", refused.stdout)[1]).unlink()
+    done = copy.run(target)
+    assert done.returncode == 0, done.stdout
