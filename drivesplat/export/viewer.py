@@ -28,7 +28,7 @@ from drivesplat.io.storage import atomic_write, canonical_json
 from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
-from drivesplat.rendering.color_bytes import nearest_bytes
+from drivesplat.rendering.color_bytes import to_uint8
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.export import ViewerJob
@@ -111,7 +111,7 @@ def sky_faces(sky: Sky | None, size: int) -> np.ndarray:
     """The sky (6, size, size, 3) uint8 as OpenGL's cube map in world directions: faces +x -x +y -y +z -z."""
     if sky is None:
         return np.zeros((6, size, size, 3), np.uint8)
-    return torch.stack([nearest_bytes(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
+    return torch.stack([to_uint8(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
 
 
 def cube_rays(size: int) -> Float[Tensor, "6 size size 3"]:

@@ -19,7 +19,7 @@ from drivesplat.kernels.cuda_graphs import Graph, captured, fresh_pool, own_stre
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.color_bytes import nearest_bytes
+from drivesplat.rendering.color_bytes import to_uint8
 
 FrameInput = tuple[View, Gaussians | None]
 """A view, and the Gaussians to render in place of the model's own at its time (None: the model's own)."""
@@ -167,7 +167,7 @@ class _FrameGraph:
 def _render(model: SplatModel, view: View, gaussians: Gaussians | None) -> RenderedFrame:
     """A frame of a view, on the device."""
     image = model.render(view, gaussians=gaussians).image
-    return RenderedFrame(nearest_bytes(image), torch.isfinite(image).all())
+    return RenderedFrame(to_uint8(image), torch.isfinite(image).all())
 
 
 def _overflowed(needs: Sequence[int], capacities: Sequence[int]) -> bool:

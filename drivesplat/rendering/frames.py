@@ -17,7 +17,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.captured_frames import FrameInput, GpuFrameRenderer, PendingFrame
-from drivesplat.rendering.color_bytes import nearest_bytes
+from drivesplat.rendering.color_bytes import to_uint8
 
 T = TypeVar("T")
 NOT_FINITE = "a frame of a film contains NaN or Inf; delete its checkpoint.pt and rerun"
@@ -36,16 +36,16 @@ def film_frame(model: SplatModel, view: View, gaussians: Gaussians | None = None
     return next(film_frames(model, [(view, gaussians)]))
 
 
-def as_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
+def uint8_image(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     """Colours in [0, 1] as the nearest uint8, in main memory. Raises ResultError where one is NaN or Inf."""
     if not torch.isfinite(image).all():
         raise ResultError(NOT_FINITE)
-    return nearest_bytes(image).cpu().numpy()
+    return to_uint8(image).cpu().numpy()
 
 
 @torch.no_grad()
 def _rendered(model: SplatModel, view: View, gaussians: Gaussians | None) -> np.ndarray:
-    return as_bytes(model.render(view, gaussians=gaussians).image)
+    return uint8_image(model.render(view, gaussians=gaussians).image)
 
 
 def _pipelined(submit: Callable[[T], PendingFrame], inputs: Iterable[T]) -> Iterator[np.ndarray]:

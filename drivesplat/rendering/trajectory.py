@@ -1,4 +1,4 @@
-"""Paths of a film's camera: the recorded one made smooth, and others beside it; and what such a camera sees.
+"""Paths of a film's camera: the smoothed recorded path, or an offset from it; and the intrinsics of a film.
 
 Frames as in `drivesplat.scene.scene`: world metres, OpenCV cameras, ego x forward, y left, z up. Timestamps:
 microseconds.
@@ -28,12 +28,12 @@ class CameraPath:
         return len(self.timestamps)
 
     def __getitem__(self, chosen: slice) -> "CameraPath":
-        """A stretch of it."""
+        """A section of the path."""
         return CameraPath(self.timestamps[chosen], self.camera_to_world[chosen])
 
 
 def film_path(scene: Scene, camera: str, fps: int, offset: TrajectorySettings) -> CameraPath:
-    """Where a film of the drive, `fps` frames a second at the drive's own speed, is looked at from.
+    """The camera path of a film at `fps` frames a second and the speed of the drive, displaced by `offset`.
 
     It runs from the camera's first image to its last. Raises DatasetError where the scene does not hold that camera.
     """
@@ -42,11 +42,11 @@ def film_path(scene: Scene, camera: str, fps: int, offset: TrajectorySettings) -
     timestamps = film_timestamps(frames[0].timestamp, frames[-1].timestamp, fps)
     camera_to_world = smooth_poses(recorded, np.stack([frame.camera_to_world for frame in frames]), timestamps)
     ego_to_world = smooth_poses(recorded, np.stack([frame.ego_to_world for frame in frames]), timestamps)
-    return CameraPath(timestamps, beside(camera_to_world, ego_to_world, offset))
+    return CameraPath(timestamps, displaced(camera_to_world, ego_to_world, offset))
 
 
 def recorded_frames(scene: Scene, camera: str) -> list[Frame]:
-    """A camera's images, key frames and those between, at increasing times; the first where several share one.
+    """A camera's images, key frames and others, at increasing times; of several with one time the first.
 
     Raises DatasetError where there are none.
     """
@@ -64,7 +64,7 @@ def recorded_frames(scene: Scene, camera: str) -> list[Frame]:
 
 
 def film_timestamps(first: int, last: int, fps: int) -> np.ndarray:
-    """The times (n,) int64 of a film's frames: first + k / fps while within [first, last], each rounded by itself."""
+    """The times (n,) int64 of a film's frames: first + k / fps within [first, last], each rounded separately."""
     count = (last - first) * fps // 1_000_000 + 1
     elapsed = (2_000_000 * np.arange(count, dtype=np.int64) + fps) // (2 * fps)
     return first + elapsed
@@ -73,9 +73,9 @@ def film_timestamps(first: int, last: int, fps: int) -> np.ndarray:
 def smooth_poses(timestamps: np.ndarray, poses: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Poses (n, 4, 4) at the times `wanted` (n,) of a motion through `poses` (m, 4, 4) at increasing `timestamps` (m,).
 
-    Position and rotation are twice continuously differentiable, so that neither speed nor turn rate jumps.
+    Position and rotation are twice continuously differentiable, so that speed and turn rate are continuous.
     """
-    # seconds since the first pose: a polynomial in microseconds since 1970 has no digits left
+    # seconds since the first pose: polynomials in microseconds since 1970 lose all precision
     known, at = (timestamps - timestamps[0]) * 1e-6, (wanted - timestamps[0]) * 1e-6
     smooth = np.tile(np.eye(4), (len(wanted), 1, 1))
     rotations = Rotation.from_matrix(poses[:, :3, :3])
@@ -87,8 +87,8 @@ def smooth_poses(timestamps: np.ndarray, poses: np.ndarray, wanted: np.ndarray) 
     return smooth
 
 
-def beside(camera_to_world: np.ndarray, ego_to_world: np.ndarray, offset: TrajectorySettings) -> np.ndarray:
-    """Cameras (n, 4, 4) moved by `offset` along and about the axes of the car (n, 4, 4) that carries them."""
+def displaced(camera_to_world: np.ndarray, ego_to_world: np.ndarray, offset: TrajectorySettings) -> np.ndarray:
+    """Cameras (n, 4, 4) moved by `offset` along and about the axes of the ego vehicle (n, 4, 4)."""
     left, up = ego_to_world[:, :3, 1], ego_to_world[:, :3, 2]
     yaw = Rotation.from_rotvec(math.radians(offset.yaw) * up).as_matrix()
     moved = camera_to_world.copy()
@@ -100,8 +100,8 @@ def beside(camera_to_world: np.ndarray, ego_to_world: np.ndarray, offset: Trajec
 def film_intrinsics(frame: Frame, width: int, height: int, horizontal_fov: float | None) -> np.ndarray:
     """K (3, 3), continuous pixels, of a film of `width` x `height` pixels by the camera of `frame`.
 
-    The recorded image, enlarged alike in both directions about its middle until it is as wide as the film, or until the
-    horizontal field of view is `horizontal_fov` degrees. A film of another aspect gains or loses above and below.
+    Scales the recorded image about its centre to the width of the film, or to a horizontal field of view of
+    `horizontal_fov` degrees. With another aspect ratio the film is padded or cropped at top and bottom.
     """
     k = continuous_intrinsics(frame, (frame.width, frame.height))
     scale = width / frame.width

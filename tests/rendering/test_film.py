@@ -135,7 +135,7 @@ def test_a_film_has_every_frame_and_lasts_as_long(folder, count, fps):
     assert list(folder.iterdir()) == [path]
 
 
-def test_colours_and_orientation_come_back(folder):
+def test_colours_and_orientation_survive_encoding(folder):
     write_video(folder / "street.mp4", iter([quarters()] * 3), SIZE, FPS, 10)
     notes, frames = decoded(folder / "street.mp4")
     assert notes["pix_fmt"].replace(" ", "").startswith("yuv420p(tv,bt709,")  # matrix, primaries and curve alike
@@ -160,7 +160,7 @@ def test_a_film_can_be_played_before_it_is_loaded(folder):
     assert 0 < content.index(b"moov") < content.index(b"mdat")
 
 
-def test_a_lower_crf_is_nearer_and_larger(folder):
+def test_a_lower_crf_gives_a_smaller_error_and_a_larger_file(folder):
     size, error = [], []
     for crf in (5, 40):
         path = folder / f"{crf}.mp4"
@@ -224,7 +224,7 @@ def test_a_frame_of_another_size_is_refused(folder, started):
     assert_nothing_left(folder, started)
 
 
-def test_a_missing_ffmpeg_is_told(folder, monkeypatch):
+def test_a_missing_ffmpeg_is_reported(folder, monkeypatch):
     def missing() -> str:
         raise RuntimeError("No ffmpeg exe could be found.")
 
@@ -235,7 +235,7 @@ def test_a_missing_ffmpeg_is_told(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("content", [None, "no program", ""])
-def test_an_ffmpeg_that_is_none_is_told(folder, tmp_path, monkeypatch, content):
+def test_a_file_that_is_not_ffmpeg_is_reported(folder, tmp_path, monkeypatch, content):
     named = tmp_path / "named"
     if content is not None:
         named.write_text(content)
@@ -256,7 +256,7 @@ def test_an_ffmpeg_that_is_none_is_told(folder, tmp_path, monkeypatch, content):
     ],
     ids=["at once", "at the end", "midway with success", "killed", "closes its input", "wordy"],
 )  # fmt: skip
-def test_an_ffmpeg_that_dies_is_told_with_its_last_words(folder, started, fake_ffmpeg, monkeypatch, script, told):
+def test_a_crash_of_ffmpeg_is_reported_with_its_last_output(folder, started, fake_ffmpeg, monkeypatch, script, told):
     monkeypatch.setattr(video, "PATIENCE", 1.0)
     fake_ffmpeg(script)
     message = failure(folder, noise(40))
@@ -267,7 +267,7 @@ def test_an_ffmpeg_that_dies_is_told_with_its_last_words(folder, started, fake_f
 @pytest.mark.parametrize(
     ("script", "told"), [("exec sleep 60", "took no more"), ("cat >/dev/null; exec sleep 60 </dev/null", "an end")]
 )
-def test_an_ffmpeg_that_hangs_is_not_waited_for_for_ever(folder, started, fake_ffmpeg, monkeypatch, script, told):
+def test_a_hanging_ffmpeg_times_out(folder, started, fake_ffmpeg, monkeypatch, script, told):
     monkeypatch.setattr(video, "PATIENCE", 0.5)
     fake_ffmpeg(script)
     assert told in failure(folder, noise(40))
@@ -286,7 +286,7 @@ def test_an_ffmpeg_that_hangs_is_not_waited_for_for_ever(folder, started, fake_f
     ],
     ids=["no file", "no film", "truncated", "frames lost", "other rate", "other size"],
 )  # fmt: skip
-def test_a_film_that_is_not_what_was_given_is_found_out(folder, started, fake_ffmpeg, script, found):
+def test_a_film_that_differs_from_its_input_is_detected(folder, started, fake_ffmpeg, script, found):
     fake_ffmpeg(script)
     given, wrote = failure(folder, noise(20)).split(" and wrote ")
     assert given.endswith("20 frames of 160x120 at 30 fps")
@@ -294,7 +294,7 @@ def test_a_film_that_is_not_what_was_given_is_found_out(folder, started, fake_ff
     assert_nothing_left(folder, started)
 
 
-def test_a_full_disk_is_told(folder, started):
+def test_a_full_disk_is_reported(folder, started):
     """A limit on the size of files stands for the full disk."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
@@ -306,7 +306,7 @@ def test_a_full_disk_is_told(folder, started):
     assert_nothing_left(folder, started)
 
 
-def test_a_folder_that_is_a_file_is_told(tmp_path):
+def test_a_file_in_place_of_the_folder_is_reported(tmp_path):
     (tmp_path / "films").write_text("")
     assert "cannot be written" in failure(tmp_path / "films", noise(3))
 
@@ -352,7 +352,7 @@ def middle_of_light(frame: np.ndarray) -> np.ndarray:
     ],
     ids=["recorded", "aside", "turned"],
 )
-def test_the_cameras_told_beside_a_film_are_those_that_it_was_filmed_with(folder, tiny_scene, changes):
+def test_the_record_of_a_film_has_the_cameras_it_was_rendered_with(folder, tiny_scene, changes):
     """The ball is where pinhole, K and pose of the record put it, in every frame."""
     record = json.loads(json.dumps(filmed(tiny_scene, folder / "street.mp4", a_job(**changes))))
     _, frames = decoded(folder / "street.mp4")
@@ -363,7 +363,7 @@ def test_the_cameras_told_beside_a_film_are_those_that_it_was_filmed_with(folder
         np.testing.assert_allclose(middle_of_light(frame), expected[:2], atol=0.3)
 
 
-def test_a_film_lasts_as_long_as_the_drive_and_its_record_says_what_it_is(folder, tiny_scene):
+def test_a_film_lasts_as_long_as_the_drive_and_has_a_record(folder, tiny_scene):
     offset = TrajectorySettings(lateral=2.0)
     record = filmed(tiny_scene, folder / "street.mp4", a_job(trajectory=offset))
     times = [frame.timestamp for frame in tiny_scene.frames]
@@ -381,7 +381,7 @@ def test_a_film_lasts_as_long_as_the_drive_and_its_record_says_what_it_is(folder
     assert record["render_seconds"] > 0
 
 
-def test_a_model_is_asked_for_the_time_since_the_first_image_of_any_camera(tiny_scene):
+def test_film_times_count_from_the_first_image_of_any_camera(tiny_scene):
     earlier = dataclasses.replace(tiny_scene.frames[0], camera="CAM_BACK", timestamp=tiny_scene.frames[0].timestamp - 7)
     scene = dataclasses.replace(tiny_scene, frames=(*tiny_scene.frames, earlier))
     shot = Shot(scene, film_path(scene, "CAM_FRONT", 2, TrajectorySettings()), a_job(fps=2), SIZE)
@@ -389,7 +389,7 @@ def test_a_model_is_asked_for_the_time_since_the_first_image_of_any_camera(tiny_
     np.testing.assert_allclose(times, 7e-6 + 0.5 * np.arange(10), atol=1e-9)
 
 
-def test_colours_are_rounded_to_the_nearest_byte_and_those_beyond_white_are_white():
+def test_colours_are_rounded_to_the_nearest_uint8_and_clipped():
     """A ball brighter than white before a sky of 0.2, 1 / 3 and 0.78."""
     settings = GaussianSettings(sh_degree=0, init_opacity=0.999)
     part = Background.from_points(np.array([[0.0, 0.0, 5.0]]), np.full((1, 3), 9.0), settings, 1.0)
@@ -402,14 +402,14 @@ def test_colours_are_rounded_to_the_nearest_byte_and_those_beyond_white_are_whit
     assert frame[60, 80].tolist() == [255, 255, 255]
 
 
-def test_a_film_of_no_numbers_is_refused(folder, started, tiny_scene):
+def test_a_film_with_nan_is_refused(folder, started, tiny_scene):
     checkpoint = a_checkpoint(**{"parts.0.params.sh0": torch.full((1, 1, 3), torch.nan)})
     with pytest.raises(ResultError, match=r"NaN or Inf.*checkpoint\.pt"):
         render_film(tiny_scene, checkpoint, a_job(), DeviceSettings(kind="cpu"), folder / "street.mp4")
     assert_nothing_left(folder, started)
 
 
-def test_a_camera_that_the_scene_lacks_is_told_before_anything_is_made(folder, tiny_scene):
+def test_a_camera_that_the_scene_lacks_is_refused_before_any_output(folder, tiny_scene):
     with pytest.raises(DatasetError, match="CAM_BACK"):
         filmed(tiny_scene, folder / "street.mp4", a_job(camera="CAM_BACK"))
     assert not list(folder.iterdir())

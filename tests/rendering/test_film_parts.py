@@ -37,7 +37,7 @@ def parts_film(scene: Scene, folder: Path, checkpoint: dict[str, Any], **changes
     return render_parts(scene, checkpoint, a_format(**changes), CPU, folder / "parts.mp4")
 
 
-def test_everything_what_stands_still_and_what_moves_stand_side_by_side(scene, tmp_path, reels):
+def test_scene_static_and_dynamic_parts_are_side_by_side(scene, tmp_path, reels):
     """Each third is what a model of these parts alone shows; what moves stands before grey instead of the sky."""
     whole = street_model()
     still, actors = street_model(whole.parts[0]), SplatModel([street_actors()], None).requires_grad_(False)
@@ -55,7 +55,7 @@ def test_everything_what_stands_still_and_what_moves_stand_side_by_side(scene, t
     assert 0.3 < before_grey.mean() < 0.9
 
 
-def test_everything_is_what_the_ordinary_film_shows(scene, tmp_path, reels):
+def test_the_first_image_equals_the_ordinary_film(scene, tmp_path, reels):
     checkpoint, size = checkpoint_of(street_model()), {"width": 20, "height": 10}
     record = parts_film(scene, tmp_path, checkpoint)
     job = FilmJob(**a_format(**size).model_dump(), trajectory=TrajectorySettings())
@@ -69,7 +69,7 @@ def test_everything_is_what_the_ordinary_film_shows(scene, tmp_path, reels):
 @pytest.mark.parametrize(
     ("asked", "tile"), [((64, 36), (20, 10)), ((1920, 1080), (640, 360)), ((100, 50), (32, 16)), ((16, 16), (4, 4))]
 )
-def test_each_is_a_third_as_wide_in_even_pixels(asked, tile):
+def test_each_image_has_a_third_of_the_width_in_even_pixels(asked, tile):
     """H.264 wants even sizes; the aspect is kept as far as that goes."""
     assert a_format(width=asked[0], height=asked[1]).tile(3) == tile
 
@@ -83,7 +83,7 @@ def test_a_film_of_parts_has_a_frame_for_each_camera(scene, tmp_path):
     assert json.loads(json.dumps(record)) == record
 
 
-def test_where_nothing_moves_the_third_picture_is_plain_grey(scene, tmp_path, reels):
+def test_the_third_image_is_plain_grey_without_dynamic_parts(scene, tmp_path, reels):
     still = street_model(street_model().parts[0])
     record = parts_film(scene, tmp_path, checkpoint_of(still))
     for frame in reels["parts"]:
@@ -92,7 +92,7 @@ def test_where_nothing_moves_the_third_picture_is_plain_grey(scene, tmp_path, re
     assert record["frames"] == len(reels["parts"])
 
 
-def test_frames_are_rendered_not_long_before_the_encoder_takes_them(scene, tmp_path, monkeypatch):
+def test_rendering_does_not_run_far_ahead_of_the_encoder(scene, tmp_path, monkeypatch):
     rendered = []
     monkeypatch.setattr(
         "drivesplat.rendering.film.film_frame", lambda *_: rendered.append(1) or np.zeros((10, 20, 3), np.uint8)

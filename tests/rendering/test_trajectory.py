@@ -89,7 +89,7 @@ def test_a_film_passes_through_the_recorded_poses(motion):
     np.testing.assert_allclose(path.camera_to_world[::5], recorded, atol=1e-9)
 
 
-def test_images_at_uneven_times_are_passed_through():
+def test_a_film_passes_through_images_at_uneven_times():
     times = START_US + np.cumsum(np.random.default_rng(0).integers(20_000, 130_000, 60))
     poses = np.stack([on_a_hilly_bend((t - START_US) * 1e-6) for t in times])
     np.testing.assert_allclose(smooth_poses(times, poses, times), poses, atol=1e-9)
@@ -110,7 +110,7 @@ def test_a_film_runs_at_the_speed_of_the_drive():
     np.testing.assert_allclose(np.linalg.norm(np.diff(centers, axis=0), axis=1), SPEED / 25, rtol=1e-4)
 
 
-def test_a_steady_turn_driven_at_two_images_a_second_is_filmed_as_one():
+def test_a_steady_turn_at_two_images_a_second_stays_steady():
     path = film(drive(on_a_circle))
     truth = true_poses(path, on_a_circle) @ CAMERA_TO_EGO
     assert np.linalg.norm(path.camera_to_world[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 5e-3
@@ -143,7 +143,7 @@ def test_rotations_are_rotations(motion):
 
 
 @pytest.mark.parametrize(("lateral", "vertical"), [(2.0, 0.0), (-3.5, 0.0), (0.0, 1.25), (2.0, -0.5)])
-def test_every_frame_is_to_the_side_by_what_was_asked(lateral, vertical):
+def test_every_frame_is_displaced_by_the_offset(lateral, vertical):
     """Perpendicular to the heading of the turning car, not along one direction of the world."""
     scene = drive(on_a_circle)
     recorded, path = film(scene), film(scene, offset=TrajectorySettings(lateral=lateral, vertical=vertical))
@@ -159,7 +159,7 @@ def test_the_left_of_a_left_turn_is_its_inside():
     np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), np.hypot(RADIUS - left - 2.0, ahead), atol=5e-3)
 
 
-def test_on_a_leaning_road_sideways_is_the_cars_own_left():
+def test_on_a_banked_road_lateral_is_the_left_of_the_ego_vehicle():
     scene = drive(on_a_hilly_bend, rate=10.0)
     recorded, path = film(scene, fps=10), film(scene, fps=10, offset=TrajectorySettings(lateral=2.0))
     left = np.stack([frame.ego_to_world[:3, 1] for frame in scene.frames])
@@ -169,7 +169,7 @@ def test_on_a_leaning_road_sideways_is_the_cars_own_left():
 
 
 @pytest.mark.parametrize("yaw", [90.0, -30.0, 180.0])
-def test_yaw_turns_the_camera_to_the_left_about_its_own_centre(yaw):
+def test_yaw_turns_the_camera_to_the_left_about_its_centre(yaw):
     scene = drive(on_a_circle)
     recorded, path = film(scene), film(scene, offset=TrajectorySettings(yaw=yaw))
     np.testing.assert_array_equal(path.camera_to_world[:, :3, 3], recorded.camera_to_world[:, :3, 3])
@@ -194,13 +194,13 @@ def test_between_two_images_the_camera_moves_straight():
     )
 
 
-def test_a_standing_car_films_one_pose():
+def test_a_standing_vehicle_gives_one_pose():
     path = film(drive(standing))
     expected = np.broadcast_to(standing(0) @ CAMERA_TO_EGO, path.camera_to_world.shape)
     np.testing.assert_allclose(path.camera_to_world, expected, atol=1e-9)
 
 
-def test_the_order_of_images_other_cameras_and_doubled_times_change_nothing():
+def test_image_order_other_cameras_and_duplicate_times_have_no_effect():
     frames = list(drive(on_a_hilly_bend).frames)
     twins = [dataclasses.replace(frame, camera_to_world=np.eye(4), ego_to_world=np.eye(4)) for frame in frames]
     others = [frame_at(i * 130_000 - 5, standing, "CAM_BACK") for i in range(99)]
@@ -208,14 +208,14 @@ def test_the_order_of_images_other_cameras_and_doubled_times_change_nothing():
     np.testing.assert_array_equal(path.camera_to_world, film(scene_of(frames)).camera_to_world)
 
 
-def test_a_camera_that_the_scene_lacks_is_told_with_those_it_has():
+def test_the_error_for_an_unknown_camera_names_the_known_ones():
     scene = scene_of([frame_at(0, standing, "CAM_BACK"), frame_at(9, standing, "CAM_LEFT")])
     with pytest.raises(DatasetError, match=r"bend .*CAM_FRONT.*CAM_BACK, CAM_LEFT"):
         film(scene)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1600, 900), (1920, 1080), (800, 800), (320, 90)])
-def test_without_a_field_of_view_a_film_is_the_enlarged_image_cropped_or_padded_above_and_below(width, height):
+def test_without_a_field_of_view_a_film_is_the_scaled_image_cropped_or_padded_vertically(width, height):
     frame = frame_at(0, standing)
     k = film_intrinsics(frame, width, height, None)
     scale = width / 1600
@@ -229,7 +229,7 @@ def test_without_a_field_of_view_a_film_is_the_enlarged_image_cropped_or_padded_
 
 
 @pytest.mark.parametrize("fov", [40.0, 90.0, 120.0])
-def test_a_field_of_view_is_seen_from_edge_to_edge(fov):
+def test_a_field_of_view_spans_the_width_of_the_film(fov):
     centred = np.array([[1266.4, 0.0, 799.5], [0.0, 1266.4, 449.5], [0.0, 0.0, 1.0]])
     k = film_intrinsics(dataclasses.replace(frame_at(0, standing), intrinsics=centred), 1280, 720, fov)
     edges = [np.degrees(np.arctan((x - k[0, 2]) / k[0, 0])) for x in (0.0, 1280.0)]
@@ -237,7 +237,7 @@ def test_a_field_of_view_is_seen_from_edge_to_edge(fov):
     np.testing.assert_allclose([k[1, 1], k[1, 2]], [k[0, 0], 360.0])
 
 
-def test_the_middle_of_a_zoomed_film_shows_what_the_middle_of_the_image_shows():
+def test_zooming_keeps_the_image_centre():
     frame = frame_at(0, standing)
     middles = [
         np.linalg.inv(film_intrinsics(frame, 1920, 1080, fov)) @ [960.0, 540.0, 1.0] for fov in (None, 30.0, 100.0)
