@@ -1,7 +1,7 @@
 """scene.json, and triangulated.pkl where poses are refined, into free_space.pkl."""
 
 from drivesplat.workflow.job import job
-from drivesplat.io.storage import write_plain_pickle
+from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.scene.scene import read_scene

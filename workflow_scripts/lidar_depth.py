@@ -1,7 +1,7 @@
 """scene.json and own_car.json into lidar_depth.pkl."""
 
 from drivesplat.workflow.job import job
-from drivesplat.io.storage import write_plain_pickle
+from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene

@@ -3,7 +3,8 @@
 import dataclasses
 
 from drivesplat.workflow.job import job
-from drivesplat.io.storage import write_json, write_plain_pickle
+from drivesplat.io.plain_pickle import write_plain_pickle
+from drivesplat.io.storage import write_json
 from drivesplat.poses.refinement import refined_or_kept
 from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene, write_scene

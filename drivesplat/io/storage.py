@@ -1,4 +1,4 @@
-"""Files that are either whole or absent: atomic writes, and readers that accept plain data only.
+"""Files that are either whole or absent: atomic writes, and readers of JSON.
 
 Every writer writes beside its target, flushes to disk and renames. Every reader turns a truncated, foreign or unsafe
 file into a ResultError that names the file and the rule that rebuilds it.
@@ -10,14 +10,11 @@ import hashlib
 import io
 import json
 import os
-import pickle
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
-
-import numpy as np
 
 from drivesplat.errors import ResultError
 
@@ -25,15 +22,6 @@ ABANDONED_SECONDS = 3600.0
 
 Provenance = dict[str, Any]
 """What a result was made of: a JSON document of settings, code and inputs (`drivesplat.provenance.record`)."""
-
-_PLAIN_GLOBALS = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("numpy.core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy.core.numeric", "_frombuffer"),
-    ("numpy._core.numeric", "_frombuffer"),
-}
 
 
 def unreadable(path: str | Path, rule: str, why: str, delete: str | Path | None = None) -> ResultError:
@@ -142,55 +130,3 @@ def read_record(path: str | Path, rule: str, *keys: str) -> dict[str, Any]:
     if absent:
         raise unreadable(path, rule, f"not what the rule writes (it lacks {', '.join(absent)})")
     return record
-
-
-def write_plain_pickle(path: str | Path, value: Any) -> None:
-    """Pickles plain containers and numpy arrays; refuses anything else with a TypeError."""
-    _require_plain(value)
-    with atomic_write(path) as file:
-        pickle.dump(value, file, protocol=4)
-
-
-def read_plain_pickle(path: str | Path, rule: str) -> Any:
-    """Reads what `write_plain_pickle` wrote.
-
-    Nothing in the file is executed: any global beyond numpy's own array constructors is refused before it is imported.
-    Raises ResultError naming `path` and `rule`.
-    """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise unreadable(path, rule, f"cannot be read ({error.strerror})") from error
-    try:
-        value = _PlainUnpickler(io.BytesIO(content)).load()
-        _require_plain(value)
-        return value
-    except Exception as error:  # a pickle can fail in any way: every one means "not our file"
-        raise unreadable(path, rule, f"not a pickle of plain data and arrays ({error})") from error
-
-
-class _PlainUnpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Callable:
-        if (module, name) not in _PLAIN_GLOBALS:
-            raise pickle.UnpicklingError(f"it refers to {module}.{name}")
-        core = (
-            "numpy.core" if np.__version__.startswith("1.") else "numpy._core"
-        )  # numpy 1 and 2 name the same module differently
-        return super().find_class(module.replace("numpy._core", "numpy.core").replace("numpy.core", core), name)
-
-
-def _require_plain(value: Any) -> None:
-    """Raises TypeError for anything but plain containers, scalars and arrays; a subclass of one is not plain."""
-    kind = type(value)
-    if kind is dict:
-        for key, item in value.items():
-            _require_plain(key)
-            _require_plain(item)
-    elif kind in (list, tuple):
-        for item in value:
-            _require_plain(item)
-    elif kind is np.ndarray:
-        if value.dtype.hasobject:
-            raise TypeError("an array of Python objects is not plain data")
-    elif value is not None and kind not in (bool, int, float, str, bytes):
-        raise TypeError(f"{kind.__name__} is not plain data")

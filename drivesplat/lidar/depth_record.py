@@ -11,7 +11,8 @@ The stage `lidar_depth` makes it (`drivesplat.preprocess.lidar_depth`).
 from pathlib import Path
 from typing import Any
 
-from drivesplat.io.storage import read_plain_pickle, unreadable
+from drivesplat.io.plain_pickle import read_plain_pickle
+from drivesplat.io.storage import unreadable
 
 
 def read_lidar_depth(path: str | Path) -> dict[str, Any]:

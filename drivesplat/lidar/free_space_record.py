@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.io.storage import read_plain_pickle, unreadable
+from drivesplat.io.plain_pickle import read_plain_pickle
+from drivesplat.io.storage import unreadable
 
 
 def read_free_space(path: str | Path) -> dict[str, Any]:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.io.storage import read_plain_pickle, unreadable
+from drivesplat.io.plain_pickle import read_plain_pickle
+from drivesplat.io.storage import unreadable
 from drivesplat.poses.observations import Observations
 
 SHARP_PIXELS = 2.0

@@ -18,7 +18,8 @@ The stage `actors` makes it (`drivesplat.preprocess.actor_seed`).
 from pathlib import Path
 from typing import Any
 
-from drivesplat.io.storage import read_plain_pickle, unreadable
+from drivesplat.io.plain_pickle import read_plain_pickle
+from drivesplat.io.storage import unreadable
 from drivesplat.scene.motion import Motion
 
 _KEYS = {

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from drivesplat.io.storage import Provenance, read_plain_pickle, unreadable, write_plain_pickle
+from drivesplat.io.plain_pickle import read_plain_pickle, write_plain_pickle
+from drivesplat.io.storage import Provenance, unreadable
 from drivesplat.io.typed_record import typed_record
 
 RULE = "parser"

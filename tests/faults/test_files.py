@@ -165,7 +165,7 @@ EXECUTES = {
 
 
 def test_nothing_loads_a_file_in_a_way_that_could_execute_it():
-    """torch's loader takes tensors alone, YAML's is a safe one, and pickles have one reader, of plain data."""
+    """torch's loader takes tensors alone, YAML's is a safe one, and no pickle is executed."""
     found = set()
     for path in SOURCES:
         for name, call in calls(path):
@@ -174,7 +174,7 @@ def test_nothing_loads_a_file_in_a_way_that_could_execute_it():
                 found.add((path.name, name))
             if name == "yaml.load" and arguments.get("Loader") != "_EveryKeyOnce":
                 found.add((path.name, name))
-        if "pickle.Unpickler" in path.read_text() and path.name != "storage.py":
+        if "pickle.Unpickler(" in path.read_text():
             found.add((path.name, "pickle.Unpickler"))
     assert not found
 

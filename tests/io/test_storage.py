@@ -1,16 +1,12 @@
 """Files are whole or absent, hold plain data only, and a bad one is named together with the rule that rebuilds it."""
 
 import builtins
-import collections
-import enum
 import errno
 import json
 import os
-import pickle
 import time
 from contextlib import nullcontext
 
-import numpy as np
 import pytest
 
 from drivesplat.errors import ResultError
@@ -19,11 +15,9 @@ from drivesplat.io.storage import (
     atomic_write,
     canonical_json,
     read_json,
-    read_plain_pickle,
     sha256_file,
     sha256_text,
     write_json,
-    write_plain_pickle,
 )
 
 
@@ -202,155 +196,3 @@ def test_foreign_json_is_refused_naming_file_and_rule(tmp_path, content):
 def test_a_missing_result_is_named_with_its_rule(tmp_path):
     with pytest.raises(ResultError, match=r"absent\.json.*'extract'"):
         read_json(tmp_path / "absent.json", rule="extract")
-    with pytest.raises(ResultError, match=r"absent\.pkl.*'parser'"):
-        read_plain_pickle(tmp_path / "absent.pkl", rule="parser")
-
-
-def assert_same(a, b) -> None:
-    assert type(a) is type(b)
-    if isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype and a.shape == b.shape
-        assert a.tobytes() == b.tobytes()
-    elif isinstance(a, dict):
-        assert list(a) == list(b)
-        for key in a:
-            assert_same(a[key], b[key])
-    elif isinstance(a, (list, tuple)):
-        assert len(a) == len(b)
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
-    else:
-        assert a == b
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        {"Ks": np.eye(3), "timestamps": np.array([2**60 + 1]), "points": np.zeros((0, 3), np.float32)},
-        {"splits": {"train": np.arange(3), "held_out": []}, "size": (640, 360), "none": None, "flag": True, 4: b"\0"},
-        [np.array([True, False]), np.array(["a", "bc"]), np.array(1.5), np.arange(6).reshape(2, 3).T],
-        np.array([(1, 2.0)], dtype=[("x", "i4"), ("y", "f8")]),
-    ],
-)
-def test_a_plain_pickle_returns_as_it_was_written(tmp_path, value):
-    write_plain_pickle(tmp_path / "value.pkl", value)
-    assert_same(read_plain_pickle(tmp_path / "value.pkl", rule="parser"), value)
-
-
-class Anything:
-    """A class of our own."""
-
-
-class Colour(enum.IntEnum):
-    RED = 1
-
-
-class Text(str):
-    """More than a string."""
-
-    __slots__ = ()
-
-
-Pair = collections.namedtuple("Pair", "a b")
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        np.array([None, 1], dtype=object),
-        np.array([("a", 1)], dtype=[("x", object), ("y", "i4")]),
-        Anything(),
-        Anything,
-        len,
-        {1, 2},
-        np.float64(1.0),
-        np.int64(1),
-        np.dtype("f8"),
-        {Anything(): 1},
-        [[(Anything(),)]],
-        1j,
-        collections.OrderedDict(a=1),
-        collections.defaultdict(list),
-        Pair(1, 2),
-        Colour.RED,
-        Text("text"),
-        np.ma.masked_array([1.0, 2.0]),
-    ],
-    ids=lambda value: type(value).__name__,
-)
-def test_what_is_no_plain_data_is_refused_when_it_is_written(tmp_path, value):
-    """Whatever the reader refuses the writer must refuse: a result that is written can be read again."""
-    with pytest.raises(TypeError):
-        write_plain_pickle(tmp_path / "value.pkl", {"value": value})
-    assert files_below(tmp_path) == set()
-
-
-class RunsACommand:
-    def __init__(self, marker):
-        self.command = f"touch '{marker}'"
-
-    def __reduce__(self):
-        return os.system, (self.command,)
-
-
-class Opens:
-    def __init__(self, marker):
-        self.marker = str(marker)
-
-    def __reduce__(self):
-        return builtins.open, (self.marker, "w")
-
-
-class Evaluates:
-    def __init__(self, marker):
-        self.code = f"open({str(marker)!r}, 'w').close()"
-
-    def __reduce__(self):
-        return builtins.eval, (self.code,)
-
-
-@pytest.mark.parametrize("attack", [RunsACommand, Opens, Evaluates])
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_a_pickle_that_would_run_something_is_refused_and_runs_nothing(tmp_path, attack, protocol):
-    marker = tmp_path / "executed"
-    content = pickle.dumps({"Ks": np.eye(3), "attack": attack(marker)}, protocol=protocol)
-    pickle.loads(pickle.dumps(attack(marker)))
-    assert marker.exists(), "the attack itself must work for this test to mean anything"
-    marker.unlink()
-    (tmp_path / "parser.pkl").write_bytes(content)
-    with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
-        read_plain_pickle(tmp_path / "parser.pkl", rule="parser")
-    assert not marker.exists()
-
-
-def test_an_attack_hidden_inside_an_array_of_objects_is_refused_and_runs_nothing(tmp_path):
-    marker = tmp_path / "executed"
-    array = np.empty(1, dtype=object)
-    array[0] = RunsACommand(marker)
-    (tmp_path / "parser.pkl").write_bytes(pickle.dumps(array))
-    with pytest.raises(ResultError, match="'parser'"):
-        read_plain_pickle(tmp_path / "parser.pkl", rule="parser")
-    assert not marker.exists()
-
-
-@pytest.mark.parametrize("value", [np.array([None, 1]), collections.OrderedDict(a=1), Pair(1, 2), {1, 2}, 1j])
-def test_a_pickle_of_anything_but_plain_data_is_refused_when_it_is_read(tmp_path, value):
-    (tmp_path / "parser.pkl").write_bytes(pickle.dumps({"value": value}))
-    with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
-        read_plain_pickle(tmp_path / "parser.pkl", rule="parser")
-
-
-def test_a_pickle_truncated_anywhere_is_refused_naming_file_and_rule(tmp_path):
-    write_plain_pickle(tmp_path / "whole.pkl", {"Ks": np.eye(3), "names": ["a", "b"]})
-    whole = (tmp_path / "whole.pkl").read_bytes()
-    for length in range(len(whole)):
-        (tmp_path / "cut.pkl").write_bytes(whole[:length])
-        with pytest.raises(ResultError, match=r"cut\.pkl.*'parser'"):
-            read_plain_pickle(tmp_path / "cut.pkl", rule="parser")
-
-
-@pytest.mark.parametrize("content", [b"", b"ply\nformat", b"\x89PNG\r\n\x1a\n", b"PK\x03\x04", b"\x80\xff."])
-def test_a_foreign_pickle_is_refused_naming_file_and_rule(tmp_path, content):
-    (tmp_path / "foreign.pkl").write_bytes(content)
-    with pytest.raises(ResultError, match=r"foreign\.pkl.*'parser'"):
-        read_plain_pickle(tmp_path / "foreign.pkl", rule="parser")

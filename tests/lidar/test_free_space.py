@@ -13,7 +13,7 @@ from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, drive, scene_at, se
 from helpers.tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.io.storage import write_plain_pickle
+from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.lidar.traversal import OCCUPIED, count_passing
 from drivesplat.preprocess.free_space import Rays, camera_rays, free_space_record, lidar_rays, proven_empty, proving

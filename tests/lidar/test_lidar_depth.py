@@ -12,7 +12,7 @@ from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import write_plain_pickle
+from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.lidar.depth import Depths, taken_apart
 from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.movers import Mover, movers

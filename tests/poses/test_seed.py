@@ -10,7 +10,7 @@ from helpers.tiny_world import CAMERA_AT, World, cast
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import write_plain_pickle
+from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.triangulated import (
     LEAST_VIEWS,

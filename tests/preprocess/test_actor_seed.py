@@ -23,7 +23,7 @@ from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import write_plain_pickle
+from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.actor_record import motion_of, read_actors

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from drivesplat.errors import DatasetError, ResultError
+from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.io.point_cloud import PointCloud
-from drivesplat.io.storage import write_plain_pickle
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.splits import frame_groups
 from drivesplat.scene.training_record import read_training_record, write_training_record
