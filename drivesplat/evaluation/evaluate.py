@@ -20,7 +20,7 @@ from drivesplat.evaluation.sample_pair import Shown, held_out_pair
 from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.io.prefetch import ahead
 from drivesplat.lidar.depth import Depths, clouds_of, depths_in
-from drivesplat.machine.device import telling_out_of_memory
+from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
@@ -64,7 +64,7 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     model, device = open_model(inputs.checkpoint, device_settings)
     unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
     record, summary = inputs.recording.record, inputs.summary
-    with telling_out_of_memory(lambda: len(model)):
+    with explain_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
         groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
         against = against_truth(model, inputs, job, lpips_map, device)

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from drivesplat.errors import ResultError
-from drivesplat.machine.device import telling_out_of_memory
+from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import open_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel
@@ -68,7 +68,7 @@ class Sight:
         Raises ResultError where it is not finite, DeviceError where the card is full.
         """
         shown = self.gaussians if rows is None else self.gaussians[rows]
-        with telling_out_of_memory(lambda: len(shown)):
+        with explain_out_of_memory(lambda: len(shown)):
             picture = self.drive.model.render(self.view, gaussians=shown)
         if not bool(torch.isfinite(picture.image).all()):
             raise ResultError("the model shows no numbers; delete its checkpoint.pt and rerun")

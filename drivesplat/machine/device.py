@@ -1,4 +1,4 @@
-"""The compute device, probed through torch alone, so that AMD's builds of torch are treated alike."""
+"""The compute device, probed through torch only, so that AMD's builds of torch are treated alike."""
 
 import logging
 import platform
@@ -10,7 +10,8 @@ from importlib import import_module
 import torch
 
 from drivesplat.errors import DeviceError
-from drivesplat.machine.gsplat_build.installed import build_record, compiled_extension, covers, package_folder
+from drivesplat.machine.compute_capability import covers, dotted
+from drivesplat.machine.gsplat_build.installed import build_record, compiled_extension, package_folder
 from drivesplat.settings.device import DeviceSettings
 
 log = logging.getLogger(__name__)
@@ -20,10 +21,10 @@ REBUILD = "`rm -r .venv; make setup`"
 
 
 def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) -> torch.device:
-    """The torch device to train or render on; `min_free_gb` stands in for the setting of that name where given.
+    """The torch device to train or render on; `min_free_gb`, if given, replaces the setting of that name.
 
-    Raises DeviceError, saying what to do, where there is no usable GPU (unless `cpu` or `any` was written), gsplat is
-    not importable or cannot run on it, or too little memory is free.
+    Raises DeviceError, with what to do, if there is no usable GPU (unless `cpu` or `any` is set), gsplat cannot be
+    imported or run on it, or too little memory is free.
     """
     if settings.kind == "cpu" or (settings.kind == "any" and not torch.cuda.is_available()):
         return torch.device("cpu")
@@ -32,7 +33,7 @@ def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) ->
     except DeviceError as error:
         if settings.kind != "any":
             raise
-        log.warning("going on with the CPU: %s", error)
+        log.warning("using the CPU: %s", error)
         return torch.device("cpu")
     if settings.max_gb is not None:
         total_gb = torch.cuda.get_device_properties().total_memory / 1e9
@@ -42,13 +43,10 @@ def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) ->
 
 def _require_gpu(needed_gb: float) -> None:
     if not torch.cuda.is_available():
-        build = (
-            "is built without GPU support"
-            if not (torch.version.cuda or torch.version.hip)
-            else "sees no GPU (driver missing or too old?)"
-        )
+        has_gpu_support = torch.version.cuda or torch.version.hip
+        why = "finds no GPU (driver missing or too old?)" if has_gpu_support else "is built without GPU support"
         raise DeviceError(
-            f"no usable GPU: torch {torch.__version__} {build}; "
+            f"no usable GPU: torch {torch.__version__} {why}; "
             "`make doctor` says what to do, or write device: cpu (very slow on real scenes)"
         )
     free_gb = torch.cuda.mem_get_info()[0] / 1e9
@@ -62,12 +60,12 @@ def _require_gpu(needed_gb: float) -> None:
 
 
 def _require_gsplat() -> None:
-    """Loads gsplat's kernels. Never compiles: left alone, gsplat would, silently and for minutes."""
+    """Loads gsplat's kernels. Never compiles them, which gsplat would by default, silently and for minutes."""
     if torch.version.cuda and not {"gsplat.csrc", "gsplat.cuda._backend"} & sys.modules.keys():
         _refuse_uncompiled()
     try:
         if torch.version.cuda and "gsplat.cuda._backend" not in sys.modules:
-            import_module("gsplat.csrc")  # what does not load would be compiled anew
+            import_module("gsplat.csrc")  # gsplat would compile kernels that it cannot load
         from gsplat.cuda._backend import _C
     except Exception as error:  # compiled code can fail to load in any way
         raise DeviceError(
@@ -83,31 +81,29 @@ def _require_gsplat() -> None:
 
 def _refuse_uncompiled() -> None:
     if package_folder() is None:
-        return  # the import says so
+        return  # the import reports it
     if compiled_extension() is None:
         raise DeviceError(
-            "gsplat is installed, but its CUDA kernels are not compiled for this torch, and a run does not start that: "
-            f"{COMPILE} (minutes, once; it brings nvcc along), `make doctor` says what it needs; or write device: cpu"
+            "gsplat is installed, but its CUDA kernels are not compiled for this torch, and runs do not compile them: "
+            f"{COMPILE} (minutes, once; it installs nvcc), `make doctor` says what it needs; or write device: cpu"
         )
-    archs = build_record().get("archs")
-    if archs and not covers(archs, torch.cuda.get_device_capability()):
-        major, minor = torch.cuda.get_device_capability()
+    archs, capability = build_record().get("archs"), torch.cuda.get_device_capability()
+    if archs and not covers(archs, capability):
         raise DeviceError(
-            f"gsplat has been compiled for compute capability {', '.join(archs)}, and "
-            f"{torch.cuda.get_device_name()} has {major}.{minor}: "
-            f'run `GSPLAT_ARCHS="{";".join([*archs, f"{major}.{minor}"])}" make setup`, '
+            f"gsplat has been compiled for compute capability {', '.join(archs)}, and {torch.cuda.get_device_name()} "
+            f'has {dotted(capability)}: run `GSPLAT_ARCHS="{";".join([*archs, dotted(capability)])}" make setup`, '
             "or write device: cpu"
         )
 
 
 def device_name(device: torch.device) -> str:
-    """What `train.json` calls the device."""
+    """The name of the device in `train.json`."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({platform.machine()})"
 
 
 @contextmanager
-def telling_out_of_memory(gaussians: Callable[[], int]) -> Iterator[None]:
-    """Turns an exhausted GPU into a DeviceError with what lowers the need; `gaussians` counts them when it happens."""
+def explain_out_of_memory(gaussians: Callable[[], int]) -> Iterator[None]:
+    """Raises an out-of-memory error of the GPU as a DeviceError with what to do; `gaussians` returns their number."""
     try:
         yield
     except torch.cuda.OutOfMemoryError:

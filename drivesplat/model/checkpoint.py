@@ -7,7 +7,7 @@ import torch
 
 from drivesplat.io import checkpoint_file
 from drivesplat.io.storage import unreadable
-from drivesplat.machine.device import choose_device, telling_out_of_memory
+from drivesplat.machine.device import choose_device, explain_out_of_memory
 from drivesplat.model.build import rebuild_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.device import DeviceSettings
@@ -35,5 +35,5 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
     """
     device = choose_device(device_settings, min_free_gb=0.0)
     model, _ = trained_model(checkpoint)
-    with telling_out_of_memory(lambda: len(model)):
+    with explain_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from drivesplat.io.prefetch import in_advance
 from drivesplat.io.video import write_video
-from drivesplat.machine.device import telling_out_of_memory
+from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -130,7 +130,7 @@ def write_film(
         mininterval=1.0,
     )
     size = (columns * shot.size[0], shot.size[1])
-    with telling_out_of_memory(lambda: len(model)):
+    with explain_out_of_memory(lambda: len(model)):
         write_video(path, iter(frames), size, shot.format.fps, shot.format.crf, threads=torch.get_num_threads())
     seconds = time.perf_counter() - began
     log.info("%s: %d frames, %.1f s, %.3f s a frame", path.name, count, seconds, seconds / count)

@@ -16,7 +16,7 @@ from drivesplat.io.prefetch import ahead
 from drivesplat.io.storage import canonical_json, read_record, sha256_text, write_json
 from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.free_space_record import read_free_space
-from drivesplat.machine.device import choose_device, telling_out_of_memory
+from drivesplat.machine.device import choose_device, explain_out_of_memory
 from drivesplat.model.build import ModelInit, build_model, definitions, gaussian_cap
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.actor_record import read_actors
@@ -140,7 +140,7 @@ class Prepared:
 
 def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
     """The training images on the device, an untrained model, and the settings with the cap that holds for them."""
-    with telling_out_of_memory(lambda: 0):
+    with explain_out_of_memory(lambda: 0):
         views = load_views(inputs.record, inputs.guides(job), device)
     settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.record, job.train)})
     exposed = inputs.exposed(job)

@@ -1,4 +1,4 @@
-"""Where the work runs: what is refused before training, and in which words."""
+"""The compute device: what is refused before training, and with which message."""
 
 import importlib.machinery
 import importlib.util
@@ -14,7 +14,7 @@ import torch
 from helpers import REPOSITORY
 
 from drivesplat.errors import DeviceError
-from drivesplat.machine.device import choose_device, device_name, telling_out_of_memory
+from drivesplat.machine.device import choose_device, device_name, explain_out_of_memory
 from drivesplat.machine.gsplat_build.installed import RECORD, versions
 from drivesplat.settings.device import DeviceSettings
 
@@ -26,7 +26,7 @@ def no_gpu(monkeypatch):
 
 @pytest.fixture
 def a_gpu(monkeypatch):
-    """A card of 24 GB of which 10 are free, and a gsplat compiled for it."""
+    """A GPU with 10 of 24 GB free, and a gsplat compiled for it."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (10_000_000_000, 24_000_000_000))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "NVIDIA RTX 4090")
@@ -34,7 +34,7 @@ def a_gpu(monkeypatch):
 
 
 def install_gsplat(monkeypatch, compiled: object) -> None:
-    """Stands in for the module that loads gsplat's kernels; an exception as `compiled` is raised by its import."""
+    """Replaces the module that loads gsplat's kernels; an exception as `compiled` is raised by its import."""
     backend = ModuleType("gsplat.cuda._backend")
 
     def missing(name: str) -> object:
@@ -48,7 +48,7 @@ def install_gsplat(monkeypatch, compiled: object) -> None:
 
 
 def refusal(kind: str = "auto", **settings: float) -> str:
-    """The sentence with which a device is refused."""
+    """The message with which a device is refused."""
     with pytest.raises(DeviceError) as error:
         choose_device(DeviceSettings(kind=kind, **settings))
     assert "\n" not in str(error.value)
@@ -63,26 +63,26 @@ def test_without_a_gpu_nothing_falls_back_to_the_cpu_silently(no_gpu, kind):
 
 @pytest.mark.parametrize(
     ("cuda", "hip", "said"),
-    [(None, None, "built without GPU support"), ("13.0", None, "sees no GPU"), (None, "6.4", "sees no GPU")],
+    [(None, None, "built without GPU support"), ("13.0", None, "finds no GPU"), (None, "6.4", "finds no GPU")],
 )
-def test_without_a_gpu_it_says_whether_torch_or_the_driver_is_at_fault(no_gpu, monkeypatch, cuda, hip, said):
+def test_without_a_gpu_the_message_names_torch_or_the_driver_as_the_cause(no_gpu, monkeypatch, cuda, hip, said):
     monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setattr(torch.version, "hip", hip)
     message = refusal()
     assert said in message and torch.__version__ in message
 
 
-def test_who_writes_cpu_gets_it(no_gpu):
+def test_device_cpu_selects_the_cpu(no_gpu):
     assert choose_device(DeviceSettings(kind="cpu")) == torch.device("cpu")
     assert choose_device(DeviceSettings.model_validate("cpu")) == torch.device("cpu")
 
 
-def test_who_writes_cpu_gets_it_even_with_a_gpu(a_gpu):
+def test_device_cpu_selects_the_cpu_even_with_a_gpu(a_gpu):
     assert choose_device(DeviceSettings(kind="cpu", min_free_gb=1000)) == torch.device("cpu")
 
 
 @pytest.mark.parametrize("kind", ["auto", "cuda"])
-def test_a_usable_gpu_is_taken(a_gpu, kind):
+def test_a_usable_gpu_is_selected(a_gpu, kind):
     assert choose_device(DeviceSettings(kind=kind)) == torch.device("cuda")
 
 
@@ -93,15 +93,15 @@ def test_too_little_free_memory_is_refused_with_both_numbers(a_gpu):
     assert "device.min_free_gb" in message and "train.cap_max" in message
 
 
-def test_what_makes_do_with_the_cpu_says_why_it_does(a_gpu, caplog):
+def test_device_any_falls_back_to_the_cpu_with_a_warning(a_gpu, caplog):
     assert choose_device(DeviceSettings(kind="any", min_free_gb=1.0)) == torch.device("cuda")
     assert not caplog.records
     assert choose_device(DeviceSettings(kind="any", min_free_gb=12.5)) == torch.device("cpu")
-    assert "going on with the CPU" in caplog.text and "12.5" in caplog.text
+    assert "using the CPU" in caplog.text and "12.5" in caplog.text
 
 
 @pytest.mark.parametrize(("max_gb", "fraction"), [(None, None), (6.0, 0.25), (48.0, 1.0)])
-def test_a_job_takes_no_more_memory_than_it_may(a_gpu, monkeypatch, max_gb, fraction):
+def test_the_memory_of_a_job_is_limited(a_gpu, monkeypatch, max_gb, fraction):
     limits = []
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda *_: SimpleNamespace(total_memory=24_000_000_000))
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", limits.append)
@@ -110,31 +110,31 @@ def test_a_job_takes_no_more_memory_than_it_may(a_gpu, monkeypatch, max_gb, frac
 
 
 @pytest.mark.parametrize(("asked", "enough"), [(10.0, True), (10.1, False), (0.0, True)])
-def test_free_memory_is_compared_with_what_is_asked(a_gpu, asked, enough):
+def test_free_memory_is_compared_with_the_setting(a_gpu, asked, enough):
     if enough:
         assert choose_device(DeviceSettings(min_free_gb=asked)) == torch.device("cuda")
     else:
         refusal(min_free_gb=asked)
 
 
-def test_a_stage_that_needs_less_memory_than_a_training_may_say_so(a_gpu):
+def test_a_stage_can_lower_the_required_memory(a_gpu):
     assert choose_device(DeviceSettings(min_free_gb=500), min_free_gb=0.0) == torch.device("cuda")
 
 
-def test_gsplat_that_cannot_be_imported_is_named_with_what_to_do(a_gpu, monkeypatch):
+def test_a_failing_import_of_gsplat_is_reported_with_what_to_do(a_gpu, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
     message = refusal()
     assert "gsplat cannot be loaded" in message and "reinstall" in message and "device: cpu" in message
 
 
 @pytest.mark.parametrize("error", [IndexError("list index out of range"), RuntimeError("Error building\nextension")])
-def test_gsplat_that_fails_to_build_is_named_with_its_error(a_gpu, monkeypatch, error):
+def test_a_failing_build_of_gsplat_is_reported_with_its_error(a_gpu, monkeypatch, error):
     install_gsplat(monkeypatch, error)
     message = refusal()
     assert type(error).__name__ in message and str(error).split()[-1] in message
 
 
-def test_cuda_without_nvcc_is_named_with_what_to_do(a_gpu, monkeypatch):
+def test_cuda_without_nvcc_is_reported_with_what_to_do(a_gpu, monkeypatch):
     install_gsplat(monkeypatch, None)
     message = refusal()
     assert "nvcc" in message and "toolkit" in message and "device: cpu" in message
@@ -142,7 +142,7 @@ def test_cuda_without_nvcc_is_named_with_what_to_do(a_gpu, monkeypatch):
 
 @pytest.fixture
 def gsplat_package(a_gpu, monkeypatch, tmp_path):
-    """The card of `a_gpu`, of compute capability 8.9, and a gsplat that is sources alone and would compile if asked."""
+    """The GPU of `a_gpu`, of compute capability 8.9, and a gsplat of sources that compiles when imported."""
     for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(torch.version, "cuda", "13.0")
@@ -169,7 +169,7 @@ def compiled_into(package: Path, archs: list[str] | None, code: str = "") -> Non
 
 @pytest.fixture
 def loadable(monkeypatch):
-    """Python modules in the place of compiled ones."""
+    """Python modules replace compiled ones."""
     real = importlib.machinery.FileFinder.find_spec
 
     def sources_first(self, name, target=None):
@@ -186,23 +186,23 @@ def test_a_run_does_not_start_compiling_gsplat(gsplat_package):
     assert f"{sys.executable} -m drivesplat.machine.gsplat_build" in message and "device: cpu" in message
 
 
-def test_a_prebuilt_gsplat_is_taken_as_it_is(gsplat_package, loadable):
+def test_a_prebuilt_gsplat_is_used(gsplat_package, loadable):
     compiled_into(gsplat_package, None)
     assert choose_device(DeviceSettings()) == torch.device("cuda")
 
 
-def test_gsplat_compiled_for_this_card_is_taken(gsplat_package, loadable):
+def test_gsplat_compiled_for_this_gpu_is_used(gsplat_package, loadable):
     compiled_into(gsplat_package, ["7.5", "8.6"])
     assert choose_device(DeviceSettings()) == torch.device("cuda")
 
 
-def test_gsplat_compiled_for_another_card_names_both_and_the_command(gsplat_package, loadable):
+def test_gsplat_compiled_for_another_gpu_names_both_and_the_command(gsplat_package, loadable):
     compiled_into(gsplat_package, ["7.5"])
     message = refusal()
     assert "RTX 4090" in message and "8.9" in message and 'GSPLAT_ARCHS="7.5;8.9" make setup' in message
 
 
-def test_compiled_gsplat_that_does_not_load_is_not_compiled_anew(gsplat_package, loadable):
+def test_compiled_gsplat_that_does_not_load_is_not_recompiled(gsplat_package, loadable):
     compiled_into(gsplat_package, None, "raise ImportError('undefined symbol: _ZN3c10')")
     message = refusal()
     assert "gsplat cannot be loaded" in message and "undefined symbol" in message and "make doctor" in message
@@ -214,7 +214,7 @@ def test_on_amd_gsplat_loads_its_own_way(gsplat_package, monkeypatch):
     assert choose_device(DeviceSettings()) == torch.device("cuda")
 
 
-def test_without_gsplat_the_training_stage_still_comes_to_its_one_sentence():
+def test_without_gsplat_the_training_stage_fails_with_one_sentence():
     """What the script of the rule `train` does on a machine where gsplat is not installed."""
     script = (
         "import sys; sys.modules['gsplat'] = None\n"
@@ -232,13 +232,13 @@ def test_without_gsplat_the_training_stage_still_comes_to_its_one_sentence():
     assert "gsplat cannot be loaded" in done.stdout
 
 
-def test_the_cpu_is_named_with_its_kind():
+def test_the_cpu_is_named_with_its_architecture():
     assert device_name(torch.device("cpu")).startswith("cpu (")
 
 
-def test_out_of_memory_is_told_with_what_lowers_the_need():
+def test_out_of_memory_is_reported_with_what_to_do():
     count = 1
-    with pytest.raises(DeviceError) as error, telling_out_of_memory(lambda: count):
+    with pytest.raises(DeviceError) as error, explain_out_of_memory(lambda: count):
         count = 1_234_567
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
     message = str(error.value)
@@ -247,5 +247,5 @@ def test_out_of_memory_is_told_with_what_lowers_the_need():
 
 
 def test_other_errors_are_not_taken_for_out_of_memory():
-    with pytest.raises(ZeroDivisionError), telling_out_of_memory(lambda: 1):
+    with pytest.raises(ZeroDivisionError), explain_out_of_memory(lambda: 1):
         raise ZeroDivisionError

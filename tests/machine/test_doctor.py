@@ -1,38 +1,41 @@
-"""What the doctor makes of a machine: facts go in, findings come out."""
+"""The findings of the doctor for given facts."""
 
 import os
 import subprocess
 import sys
 from dataclasses import replace
 from hashlib import sha256
+from pathlib import Path
 
 import pytest
 from helpers import REPOSITORY
 
+from drivesplat.io.free_disk import free_bytes
 from drivesplat.machine.doctor import facts as facts_module
 from drivesplat.machine.doctor.__main__ import main
 from drivesplat.machine.doctor.checks import examine
-from drivesplat.machine.doctor.facts import Backbone, Dataset, Facts, Gsplat, Torch, gather
-from drivesplat.machine.doctor.torch_builds import Card, advice, at_least, fitting_build, generation, read_cards
+from drivesplat.machine.doctor.facts import Dataset, Facts, Gsplat, Torch, gather
+from drivesplat.machine.doctor.torch_builds import Gpu, advice, at_least, best_build, generation, read_gpus
+from drivesplat.machine.gsplat_build.toolkit import Toolkit
 from drivesplat.settings.config import load
 
-GOOD_CARD = Card("NVIDIA GeForce RTX 4090", "580.65.06", (8, 9), 25.3, 24.0)
+GOOD_GPU = Gpu("NVIDIA GeForce RTX 4090", "580.65.06", (8, 9), 25.3, 24.0)
 TORCH = Torch("2.11.0+cu130", cuda="13.0")
 COMPILED = Gsplat("1.5.3", "/venv/gsplat/csrc.so", ("8.9",))
-BACKBONE = Backbone(sha256="7be5be79" + "0" * 56)
+BACKBONE = "7be5be79" + "0" * 56
 
 LAPTOP = Facts(
     torch=TORCH, gsplat=Gsplat("1.5.3"), config=load({}), datasets=(Dataset("nuscenes", root="/data"),),
-    disk_gb={"results": 100.0}, backbone=BACKBONE, ffmpeg="/bin/ffmpeg",
+    disk_gb={"results": 100.0}, backbone_sha256=BACKBONE, ffmpeg="/bin/ffmpeg",
 )  # fmt: skip
-"""A machine without a GPU where all else is well."""
+"""A machine without a GPU and without problems."""
 WORKSTATION = replace(
     LAPTOP,
-    cards=(GOOD_CARD,),
-    torch=replace(TORCH, card=GOOD_CARD.name, capability=(8, 9), free_gb=24.0, total_gb=25.3),
+    gpus=(GOOD_GPU,),
+    torch=replace(TORCH, gpu=GOOD_GPU.name, capability=(8, 9), free_gb=24.0, total_gb=25.3),
     gsplat=COMPILED,
 )
-"""A machine where everything is well."""
+"""A machine with a GPU and without problems."""
 
 
 def of(facts: Facts, topic: str) -> list[tuple[str, str]]:
@@ -50,19 +53,19 @@ def levels(facts: Facts) -> set[str]:
     return {finding.level for finding in examine(facts)}
 
 
-def test_where_all_is_well_nothing_but_ok_is_said():
+def test_a_machine_without_problems_has_only_ok_findings():
     assert levels(WORKSTATION) == {"ok"}
 
 
-def test_modules_that_every_job_compiles_are_told_where_they_are_many():
-    level, text = only(replace(WORKSTATION, read_as_source=1240), "bytecode")
+def test_many_uncached_modules_are_reported():
+    level, text = only(replace(WORKSTATION, uncached_modules=1240), "bytecode")
     assert level == "note" and "1,240 modules" in text and "PYTHONPYCACHEPREFIX" in text
-    assert not of(replace(WORKSTATION, read_as_source=30), "bytecode")
+    assert not of(replace(WORKSTATION, uncached_modules=30), "bytecode")
 
 
-def test_modules_are_counted_whose_bytecode_is_nowhere(tmp_path):
+def test_modules_without_cached_bytecode_are_counted(tmp_path):
     script = (
-        "import sys, json, http.server; from drivesplat.machine.doctor.facts import _read_as_source as f; print(f())"
+        "import sys, json, http.server; from drivesplat.machine.doctor.facts import _uncached_modules as f; print(f())"
     )
     counts = []
     for keeps in ({"PYTHONDONTWRITEBYTECODE": "1"}, {}, {"PYTHONDONTWRITEBYTECODE": "1"}):
@@ -70,7 +73,7 @@ def test_modules_are_counted_whose_bytecode_is_nowhere(tmp_path):
         environment = {**clean, "PYTHONPYCACHEPREFIX": str(tmp_path), **keeps}
         run = [sys.executable, "-c", script]
         counts.append(int(subprocess.run(run, env=environment, cwd=REPOSITORY, capture_output=True, check=True).stdout))
-    assert counts[0] > 100 and counts[1:] == [0, 0], "none are kept; all are kept; all were kept before"
+    assert counts[0] > 100 and counts[1:] == [0, 0], "none cached; all written; all cached before"
 
 
 def test_no_gpu_is_a_note_with_its_consequence():
@@ -79,49 +82,56 @@ def test_no_gpu_is_a_note_with_its_consequence():
     assert "fix" not in levels(LAPTOP)
 
 
-def test_a_driver_that_does_not_answer_is_told():
-    level, text = only(replace(LAPTOP, cards_problem="nvidia-smi fails: couldn't communicate"), "GPU")
+def test_a_driver_that_does_not_answer_is_reported():
+    level, text = only(replace(LAPTOP, gpu_problem="nvidia-smi fails: couldn't communicate"), "GPU")
     assert level == "note" and "couldn't communicate" in text and "driver" in text
 
 
-def test_an_old_driver_names_the_driver_and_the_other_build():
-    card = replace(GOOD_CARD, driver="550.120")
-    facts = replace(LAPTOP, cards=(card,))
+def test_an_old_driver_is_reported_with_its_version_and_the_fitting_build():
+    gpu = replace(GOOD_GPU, driver="550.120")
+    facts = replace(LAPTOP, gpus=(gpu,))
     level, text = only(facts, "torch")
     assert level == "fix" and "550.120" in text and "580" in text and "TORCH_CUDA=cu126 make setup" in text
     level, text = of(facts, "GPU")[-1]
     assert level == "note" and text.startswith("torch cannot use it (see torch above)")
 
 
-def test_a_pascal_card_is_too_old_whatever_the_build():
-    facts = replace(LAPTOP, cards=(Card("NVIDIA GeForce GTX 1080", "580.65.06", (6, 1)),))
+def test_a_pascal_gpu_is_too_old_for_every_build():
+    facts = replace(LAPTOP, gpus=(Gpu("NVIDIA GeForce GTX 1080", "580.65.06", (6, 1)),))
     level, text = only(facts, "torch")
     assert level == "note" and "Pascal" in text and "too old for gsplat" in text and "TORCH_CUDA=cpu" in text
 
 
-def test_a_volta_card_is_sent_to_the_older_build():
-    level, text = only(replace(LAPTOP, cards=(Card("Tesla V100", "580.65.06", (7, 0)),)), "torch")
+def test_a_volta_gpu_is_advised_the_older_build():
+    level, text = only(replace(LAPTOP, gpus=(Gpu("Tesla V100", "580.65.06", (7, 0)),)), "torch")
     assert level == "fix" and "TORCH_CUDA=cu126 make setup" in text
 
 
-def test_a_cpu_build_beside_a_usable_card_says_so():
-    facts = replace(LAPTOP, cards=(GOOD_CARD,), torch=Torch("2.11.0+cpu"))
+def test_a_cpu_build_with_a_usable_gpu_is_reported():
+    facts = replace(LAPTOP, gpus=(GOOD_GPU,), torch=Torch("2.11.0+cpu"))
     level, text = only(facts, "torch")
     assert level == "note" and "RTX 4090" in text and "TORCH_CUDA=cu130 make setup" in text
     assert only(replace(LAPTOP, torch=Torch("2.11.0+cpu")), "torch")[0] == "ok"
 
 
-def test_a_card_that_torch_does_not_see_is_to_be_fixed():
-    levels_and_texts = of(replace(LAPTOP, cards=(GOOD_CARD,)), "GPU")
-    assert levels_and_texts[-1][0] == "fix" and "CUDA_VISIBLE_DEVICES" in levels_and_texts[-1][1]
+def test_a_gpu_that_torch_does_not_find_is_to_be_fixed():
+    findings = of(replace(LAPTOP, gpus=(GOOD_GPU,)), "GPU")
+    assert findings[-1][0] == "fix" and "CUDA_VISIBLE_DEVICES" in findings[-1][1]
 
 
-@pytest.mark.parametrize("toolkit", [None, ("/usr/local/cuda", "13.0"), ("/usr/local/cuda", "12.4")])
-def test_cuda_without_compiled_gsplat_says_that_a_run_will_be_refused(toolkit):
+@pytest.mark.parametrize(
+    "toolkit",
+    [
+        None,
+        Toolkit(Path("/usr/local/cuda"), "13.0", "installed"),
+        Toolkit(Path("/usr/local/cuda"), "12.4", "installed"),
+    ],
+)
+def test_with_uncompiled_gsplat_the_doctor_says_that_training_will_be_refused(toolkit):
     facts = replace(WORKSTATION, gsplat=Gsplat("1.5.3"), toolkit=toolkit)
     level, text = only(facts, "gsplat")
     assert level == "fix" and "refused" in text and "make setup" in text
-    assert ("nvcc" in text) is (toolkit is None or toolkit[1] == "12.4")
+    assert ("nvcc" in text) is (toolkit is None or toolkit.release == "12.4")
 
 
 def test_without_nvcc_for_cuda_12_a_toolkit_has_to_be_installed():
@@ -131,16 +141,14 @@ def test_without_nvcc_for_cuda_12_a_toolkit_has_to_be_installed():
     assert "docs/installation.md" in only(facts, "CUDA toolkit")[1]
 
 
-def test_without_a_cpp_compiler_what_to_install_is_named():
-    facts = replace(
-        WORKSTATION, gsplat=Gsplat("1.5.3"), compile_problem="there is no C++ compiler: sudo apt-get install g++"
-    )
+def test_without_a_cpp_compiler_the_package_to_install_is_named():
+    facts = replace(WORKSTATION, gsplat=Gsplat("1.5.3"), compile_problem="no C++ compiler: sudo apt-get install g++")
     level, text = only(facts, "C++ compiler")
     assert level == "fix" and "apt-get install g++" in text
-    assert of(replace(facts, gsplat=COMPILED), "C++ compiler") == [], "of no interest once compiled"
+    assert of(replace(facts, gsplat=COMPILED), "C++ compiler") == [], "irrelevant once compiled"
 
 
-def test_gsplat_compiled_for_another_card_names_both_and_the_command():
+def test_gsplat_compiled_for_another_gpu_names_both_and_the_command():
     facts = replace(WORKSTATION, gsplat=replace(COMPILED, archs=("7.5",)))
     level, text = only(facts, "gsplat")
     assert level == "fix" and "7.5" in text and 'GSPLAT_ARCHS="7.5;8.9" make setup' in text
@@ -153,16 +161,18 @@ def test_gsplat_of_a_prebuilt_wheel_is_fine():
 @pytest.mark.parametrize(
     "facts",
     [
-        replace(WORKSTATION, gsplat=None, gsplat_problem="no module named gsplat"),
+        replace(WORKSTATION, gsplat=None),
         replace(WORKSTATION, gsplat=replace(COMPILED, problem="ImportError: undefined symbol")),
     ],
 )
 def test_gsplat_that_cannot_be_imported_is_to_be_fixed(facts):
     level, text = only(facts, "gsplat")
-    assert level == "fix" and "make setup" in text and (facts.gsplat_problem or facts.gsplat.problem) in text
+    assert (
+        level == "fix" and "make setup" in text and (facts.gsplat.problem if facts.gsplat else "not installed") in text
+    )
 
 
-def test_a_gpu_that_triton_does_not_compile_for_is_a_note_with_what_it_needs():
+def test_a_triton_problem_is_a_note_with_the_packages_to_install():
     assert only(WORKSTATION, "Triton")[0] == "ok" and not of(LAPTOP, "Triton")
     level, text = only(replace(WORKSTATION, triton_problem="Failed to find C compiler."), "Triton")
     assert level == "note" and "Failed to find C compiler." in text and "gcc" in text and "python3-dev" in text
@@ -181,11 +191,11 @@ def test_too_little_free_memory_is_compared_with_the_config():
     assert levels(enough) == {"ok"}
 
 
-def test_amd_is_recognised_by_torch_alone():
+def test_amd_is_recognised_from_torch_only():
     torch = Torch(
-        "2.8.0+rocm6.4", hip="6.4", card="AMD Instinct MI300X", capability=(9, 4), free_gb=190.0, total_gb=192.0
+        "2.8.0+rocm6.4", hip="6.4", gpu="AMD Instinct MI300X", capability=(9, 4), free_gb=190.0, total_gb=192.0
     )
-    facts = replace(WORKSTATION, cards=(), torch=torch, gsplat=Gsplat("1.5.3b2"))
+    facts = replace(WORKSTATION, gpus=(), torch=torch, gsplat=Gsplat("1.5.3b2"))
     assert levels(facts) == {"ok"}
     assert "ROCm 6.4" in only(facts, "torch")[1] and "MI300X" in only(facts, "GPU")[1]
     assert "AMD" in only(facts, "gsplat")[1] and of(facts, "CUDA toolkit") == []
@@ -193,54 +203,54 @@ def test_amd_is_recognised_by_torch_alone():
     assert only(without, "GPU")[0] == "note" and "docs/amd.md" in only(without, "GPU")[1]
 
 
-def test_a_missing_dataset_is_a_note_with_where_and_how():
+def test_a_missing_dataset_is_a_note_with_its_place_and_source():
     problem = "nuScenes v1.0-mini not found: there is no folder /data; download it from https://www.nuscenes.org"
     level, text = only(replace(LAPTOP, datasets=(Dataset("nuscenes", problem=problem),)), "dataset nuscenes")
     assert level == "note" and problem in text and "make demo" in text
 
 
-def test_a_generated_dataset_need_not_be_there():
+def test_a_generated_dataset_may_be_missing():
     level, text = only(replace(LAPTOP, datasets=(Dataset("demo", problem="none", generated=True),)), "dataset demo")
     assert level == "ok" and "generates" in text
 
 
 def test_a_missing_backbone_says_that_lpips_will_be_null():
-    level, text = only(replace(LAPTOP, backbone=Backbone()), "LPIPS")
+    level, text = only(replace(LAPTOP, backbone_sha256=None), "LPIPS")
     assert level == "note" and "null" in text and "resources/lpips/alexnet.pth" in text and "https://" in text
 
 
-def test_a_backbone_that_could_not_be_fetched_gives_the_same_reason_as_a_run():
+def test_a_failed_backbone_download_is_reported_with_the_reason_of_the_run():
     reason = "the AlexNet backbone could not be fetched from https://x (no route); put the file at y yourself"
-    level, text = only(replace(LAPTOP, backbone=Backbone(last_failure=reason)), "LPIPS")
+    level, text = only(replace(LAPTOP, backbone_sha256=None, backbone_failure=reason), "LPIPS")
     assert level == "note" and reason in text and "null" in text
 
 
 def test_a_corrupt_backbone_is_to_be_fixed():
-    level, text = only(replace(LAPTOP, backbone=Backbone(sha256="ab" * 32)), "LPIPS")
+    level, text = only(replace(LAPTOP, backbone_sha256="ab" * 32), "LPIPS")
     assert level == "fix" and "abab" in text and "7be5be79" in text and "null" in text
 
 
 def test_lpips_switched_off_needs_no_backbone():
-    facts = replace(LAPTOP, config=load({"lpips": {"enabled": False}}), backbone=Backbone())
+    facts = replace(LAPTOP, config=load({"lpips": {"enabled": False}}), backbone_sha256=None)
     assert only(facts, "LPIPS")[0] == "ok"
 
 
 @pytest.mark.parametrize(("free", "level"), [(0.4, "fix"), (5.0, "note"), (50.0, "ok")])
-def test_low_disk_is_told_by_how_much_it_hurts(free, level):
+def test_low_disk_space_is_reported_by_its_severity(free, level):
     assert only(replace(LAPTOP, disk_gb={"results": free}), "disk")[0] == level
 
 
-def test_other_breakage_is_to_be_fixed():
-    broken = replace(LAPTOP, config=None, config_problem="'trian' is not a setting", ffmpeg=None, outdated=True)
+def test_other_problems_are_to_be_fixed():
+    broken = replace(LAPTOP, config=None, config_problem="'trian' is not a setting", ffmpeg=None, venv_outdated=True)
     for topic in ("config", "ffmpeg", "Python"):
         assert only(broken, topic)[0] == "fix"
     assert only(replace(LAPTOP, python=(3, 13)), "Python")[0] == "note"
 
 
-# What is gathered.
+# Gathering facts.
 
 
-def test_the_config_is_read_with_presets_laid_over(tmp_path):
+def test_the_config_is_read_with_presets_merged(tmp_path):
     preset = tmp_path / "preset.yaml"
     preset.write_text("device: {min_free_gb: 3}\nresults_dir: elsewhere\n")
     found = gather(REPOSITORY, [REPOSITORY / "config.yaml", preset])
@@ -255,7 +265,7 @@ def test_a_wrong_config_is_a_finding_not_a_crash(tmp_path):
     assert "absent.yaml" in facts_module._config([tmp_path / "absent.yaml"])[1]
 
 
-def test_datasets_are_looked_for_where_the_config_says(tiny_root, tmp_path):
+def test_datasets_are_searched_in_the_folders_of_the_config(tiny_root, tmp_path):
     config = load({"datasets": {
         "tiny": {"dataroot": str(tiny_root), "scenes": ["0001"]}, "gone": {"dataroot": str(tmp_path / "no")}
     }})  # fmt: skip
@@ -265,14 +275,15 @@ def test_datasets_are_looked_for_where_the_config_says(tiny_root, tmp_path):
 
 
 def test_the_backbone_is_hashed_and_the_last_failure_read(tmp_path):
-    assert facts_module._backbone(tmp_path) == Backbone()
+    assert facts_module._backbone_failure(tmp_path) is None
     folder = tmp_path / "resources/lpips"
     folder.mkdir(parents=True)
     (folder / "alexnet.pth").write_bytes(b"weights")
     (folder / "backbone.json").write_text('{"unavailable": "no route"}')
-    assert facts_module._backbone(tmp_path) == Backbone(sha256(b"weights").hexdigest(), "no route")
+    found = gather(tmp_path, [])
+    assert (found.backbone_sha256, found.backbone_failure) == (sha256(b"weights").hexdigest(), "no route")
     (folder / "backbone.json").write_text("[1")
-    assert facts_module._backbone(tmp_path).last_failure is None
+    assert facts_module._backbone_failure(tmp_path) is None
 
 
 def test_a_venv_of_other_requirements_is_noticed(tmp_path, monkeypatch):
@@ -282,19 +293,17 @@ def test_a_venv_of_other_requirements_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "prefix", str(tmp_path / ".venv"))
     stamp = tmp_path / facts_module.STAMP
     stamp.write_text(sha256(b"requirements.txt\nconstraints.txt\n").hexdigest() + " cu126\n")
-    assert not facts_module._outdated(tmp_path)
+    assert not facts_module._venv_outdated(tmp_path)
     stamp.write_text("0" * 64 + "\n")
-    assert facts_module._outdated(tmp_path)
+    assert facts_module._venv_outdated(tmp_path)
 
 
-def test_free_disk_is_that_of_the_nearest_folder_there_is(tmp_path):
-    assert facts_module.free_disk_gb(tmp_path / "not" / "yet") == pytest.approx(
-        facts_module.free_disk_gb(tmp_path), rel=0.1
-    )
+def test_free_disk_of_a_missing_folder_is_that_of_its_nearest_parent(tmp_path):
+    assert free_bytes(tmp_path / "not" / "yet") == pytest.approx(free_bytes(tmp_path), rel=0.1)
 
 
 @pytest.mark.parametrize(("facts", "status"), [(LAPTOP, 0), (replace(LAPTOP, ffmpeg=None), 1)])
-def test_the_exit_status_tells_whether_something_is_broken(monkeypatch, capsys, facts, status):
+def test_the_exit_status_is_1_if_something_is_broken(monkeypatch, capsys, facts, status):
     monkeypatch.setattr(facts_module, "gather", lambda *_: facts)
     monkeypatch.chdir(REPOSITORY)
     assert main([]) == status
@@ -309,7 +318,7 @@ def test_a_python_without_the_packages_says_what_to_do():
     assert done.returncode == 1 and done.stdout.startswith("fix") and "make setup" in done.stdout
 
 
-# Cards and builds.
+# GPUs and builds of torch.
 
 
 def smi(answers: dict[str, tuple[int, str]]):
@@ -322,27 +331,27 @@ def smi(answers: dict[str, tuple[int, str]]):
     return run
 
 
-def test_cards_are_read_with_what_nvidia_smi_tells():
-    cards, problem = read_cards(smi({"new": (0, "NVIDIA RTX A2000, 580.65.06, 6138, [N/A], 8.6\n")}))
+def test_gpus_are_read_from_nvidia_smi():
+    gpus, problem = read_gpus(smi({"new": (0, "NVIDIA RTX A2000, 580.65.06, 6138, [N/A], 8.6\n")}))
     assert problem is None
-    assert cards == [Card("NVIDIA RTX A2000", "580.65.06", (8, 6), 6138 * 1024**2 / 1e9, None)]
+    assert gpus == [Gpu("NVIDIA RTX A2000", "580.65.06", (8, 6), 6138 * 1024**2 / 1e9, None)]
 
 
-def test_an_nvidia_smi_that_does_not_know_compute_capability_still_tells_the_driver():
+def test_without_compute_capability_in_nvidia_smi_the_driver_is_still_read():
     old = {"new": (2, 'Field "compute_cap" is not a valid field to query.'), "old": (0, "GTX 980, 470.1, 4096, 4000\n")}
-    (card,), problem = read_cards(smi(old))
-    assert problem is None and card.driver == "470.1" and card.capability is None
+    (gpu,), problem = read_gpus(smi(old))
+    assert problem is None and gpu.driver == "470.1" and gpu.capability is None
 
 
-def test_a_failing_or_empty_nvidia_smi_is_a_problem_and_an_absent_one_none():
+def test_a_failing_or_empty_nvidia_smi_is_a_problem_and_a_missing_one_is_none():
     failing = (9, "NVIDIA-SMI has failed because it couldn't communicate with the NVIDIA driver.")
-    assert "couldn't communicate" in read_cards(smi({"new": failing, "old": failing}))[1]
-    assert read_cards(smi({"new": (0, "")})) == ([], "nvidia-smi knows of no GPU")
+    assert "couldn't communicate" in read_gpus(smi({"new": failing, "old": failing}))[1]
+    assert read_gpus(smi({"new": (0, "")})) == ([], "nvidia-smi reports no GPU")
 
     def absent(*_, **__):
         raise FileNotFoundError
 
-    assert read_cards(absent) == ([], None)
+    assert read_gpus(absent) == ([], None)
 
 
 def test_drivers_are_compared_as_numbers():
@@ -368,25 +377,25 @@ def test_drivers_are_compared_as_numbers():
         (None, "550.1", "cu126"),
     ],
 )
-def test_each_card_and_driver_has_its_build(capability, driver, build):
-    card = Card("card", driver, capability)
-    assert fitting_build(card) == build
+def test_the_best_build_for_gpu_and_driver(capability, driver, build):
+    gpu = Gpu("gpu", driver, capability)
+    assert best_build(gpu) == build
     if build is not None:
-        assert advice([card], build) is None
+        assert advice([gpu], build) is None
         if build != "cu130":
-            assert f"TORCH_CUDA={build} make setup" in advice([card], "cu130")
+            assert f"TORCH_CUDA={build} make setup" in advice([gpu], "cu130")
     else:
-        assert "TORCH_CUDA=cpu make setup" in advice([card], "cu130")
+        assert "TORCH_CUDA=cpu make setup" in advice([gpu], "cu130")
 
 
-def test_one_usable_card_among_others_is_enough():
-    old = Card("GTX 1080", "580.65", (6, 1))
-    assert advice([old, GOOD_CARD], "cu130") is None
+def test_one_usable_gpu_among_others_suffices():
+    old = Gpu("GTX 1080", "580.65", (6, 1))
+    assert advice([old, GOOD_GPU], "cu130") is None
     assert advice([old], "cpu") is None and advice([], "cu130") is None
 
 
-def test_a_build_too_old_for_a_new_card_is_told():
-    assert "TORCH_CUDA=cu130" in advice([Card("RTX 5090", "580.65", (12, 0))], "cu126")
+def test_a_build_too_old_for_a_new_gpu_is_reported():
+    assert "TORCH_CUDA=cu130" in advice([Gpu("RTX 5090", "580.65", (12, 0))], "cu126")
 
 
 def test_generations_are_named():

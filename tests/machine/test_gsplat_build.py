@@ -1,4 +1,4 @@
-"""Compiling gsplat at set-up: everything around the compiler, with made-up compilers."""
+"""Compiling gsplat at set-up, with fake compilers."""
 
 import os
 import subprocess
@@ -11,10 +11,10 @@ import pytest
 from helpers import REPOSITORY
 
 from drivesplat.errors import DeviceError
+from drivesplat.machine.compute_capability import covers
 from drivesplat.machine.gsplat_build import __main__ as command
 from drivesplat.machine.gsplat_build import compile as building
 from drivesplat.machine.gsplat_build import diagnose, installed, toolkit
-from drivesplat.machine.gsplat_build.compile_job import sources
 from drivesplat.machine.gsplat_build.toolkit import Toolkit
 
 TOOLKIT = Toolkit(Path("/opt/cuda"), "13.0", "CUDA_HOME")
@@ -22,7 +22,7 @@ TOOLKIT = Toolkit(Path("/opt/cuda"), "13.0", "CUDA_HOME")
 
 @pytest.fixture
 def package(tmp_path, monkeypatch) -> Path:
-    """A gsplat package of sources alone, and an environment of its own to build in."""
+    """A gsplat package with only sources, and a separate build folder."""
     folder = tmp_path / "site/gsplat"
     folder.mkdir(parents=True)
     (folder / "__init__.py").touch()
@@ -34,10 +34,10 @@ def package(tmp_path, monkeypatch) -> Path:
     return folder
 
 
-# What is installed.
+# Installed kernels.
 
 
-def test_sources_alone_are_not_compiled(package):
+def test_a_package_with_only_sources_is_not_compiled(package):
     assert installed.compiled_extension() is None and installed.build_record() == {}
 
 
@@ -45,22 +45,22 @@ def test_sources_alone_are_not_compiled(package):
 def test_the_kernels_of_a_prebuilt_wheel_are_found(package, name):
     (package / name).touch()
     assert installed.compiled_extension() == package / name
-    assert command.already_done(["7.5", "12.0"]), "a wheel's kernels are trusted"
+    assert command.is_compiled(["7.5", "12.0"]), "kernels of a wheel are trusted"
 
 
-def test_what_was_compiled_is_remembered_with_its_versions(package, tmp_path, monkeypatch):
+def test_compiled_kernels_are_recorded_with_their_versions(package, tmp_path, monkeypatch):
     (tmp_path / "csrc.so").write_bytes(b"code")
     target = building.install(tmp_path / "csrc.so", package, ["7.5", "8.6"])
     assert target.read_bytes() == b"code" and installed.compiled_extension() == target
     assert installed.build_record()["archs"] == ["7.5", "8.6"]
     assert [file.name for file in package.glob(".*")] == []
-    assert command.already_done(["8.6"]) and command.already_done(["8.9"]) and not command.already_done(["9.0"])
+    assert command.is_compiled(["8.6"]) and command.is_compiled(["8.9"]) and not command.is_compiled(["9.0"])
     monkeypatch.setattr(installed, "versions", lambda: {"torch": "9.9", "gsplat": "1.5.3"})
-    assert installed.compiled_extension() is None and not command.already_done(["8.6"])
+    assert installed.compiled_extension() is None and not command.is_compiled(["8.6"])
 
 
 @pytest.mark.parametrize("content", ["{", "[1]", ""])
-def test_an_unreadable_note_is_none(package, content):
+def test_an_unreadable_record_counts_as_missing(package, content):
     (package / installed.RECORD).write_text(content)
     assert installed.build_record() == {}
 
@@ -80,7 +80,7 @@ def test_an_unreadable_note_is_none(package, content):
     ],
 )
 def test_machine_code_runs_within_a_major_version_and_ptx_later(archs, capability, runs):
-    assert installed.covers(archs, capability) is runs
+    assert covers(archs, capability) is runs
 
 
 def test_the_platform_of_torch_is_read_without_importing_it():
@@ -91,11 +91,11 @@ def test_the_platform_of_torch_is_read_without_importing_it():
     subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, check=True)
 
 
-# What to compile for.
+# Architectures to compile for.
 
 
 @pytest.mark.parametrize(
-    ("variable", "cards", "archs"),
+    ("variable", "gpus", "archs"),
     [
         (None, [], []),
         (None, [(8, 6), (7, 5), (8, 6)], ["7.5", "8.6"]),
@@ -105,8 +105,8 @@ def test_the_platform_of_torch_is_read_without_importing_it():
         ("none", [(8, 6)], []),
     ],
 )
-def test_the_variable_goes_before_the_cards(variable, cards, archs):
-    assert command.wanted_archs({} if variable is None else {"GSPLAT_ARCHS": variable}, cards) == archs
+def test_the_variable_takes_precedence_over_the_gpus(variable, gpus, archs):
+    assert command.wanted_archs({} if variable is None else {"GSPLAT_ARCHS": variable}, gpus) == archs
 
 
 @pytest.mark.parametrize(
@@ -121,17 +121,17 @@ def test_the_variable_goes_before_the_cards(variable, cards, archs):
         ([], "13.0", "GSPLAT_ARCHS"),
     ],
 )
-def test_wrong_archs_are_refused_before_anything_is_compiled(archs, cuda, said):
+def test_invalid_archs_are_refused_before_compiling(archs, cuda, said):
     problem = diagnose.arch_problem(archs, cuda)
     assert problem is None if said is None else said in problem
 
 
-def run_command(monkeypatch, platform, cards=(), archs=None, done=False, arguments=()):
+def run_command(monkeypatch, platform, gpus=(), archs=None, done=False, arguments=()):
     monkeypatch.setattr(command, "torch_platform", lambda: platform)
-    monkeypatch.setattr(command, "read_cards", lambda: (list(cards), None))
-    monkeypatch.setattr(command, "already_done", lambda _: done)
+    monkeypatch.setattr(command, "read_gpus", lambda: (list(gpus), None))
+    monkeypatch.setattr(command, "is_compiled", lambda _: done)
     monkeypatch.setattr(command, "provide_toolkit", lambda _: TOOLKIT)
-    monkeypatch.setattr(diagnose, "what_is_missing", lambda: None)
+    monkeypatch.setattr(diagnose, "missing_prerequisite", lambda: None)
     built = []
     monkeypatch.setattr(building, "compile_and_install", lambda *a: built.append(a) or Path("/gsplat/csrc.so"))
     monkeypatch.delenv("GSPLAT_ARCHS", raising=False)
@@ -140,7 +140,7 @@ def run_command(monkeypatch, platform, cards=(), archs=None, done=False, argumen
     return command.main(arguments), built
 
 
-def test_without_a_card_nothing_is_compiled_and_a_line_says_so(monkeypatch, capsys):
+def test_without_a_gpu_nothing_is_compiled_and_a_line_says_so(monkeypatch, capsys):
     assert run_command(monkeypatch, ("13.0", None)) == (0, [])
     assert "no NVIDIA GPU here" in capsys.readouterr().err
     assert run_command(monkeypatch, ("13.0", None), arguments=["--if-needed"]) == (0, [])
@@ -148,12 +148,12 @@ def test_without_a_card_nothing_is_compiled_and_a_line_says_so(monkeypatch, caps
 
 
 @pytest.mark.parametrize(("platform", "said"), [((None, None), "CPU alone"), ((None, "6.4"), "docs/amd.md")])
-def test_other_builds_of_torch_need_no_compiling(monkeypatch, capsys, platform, said):
+def test_builds_of_torch_without_cuda_need_no_compiling(monkeypatch, capsys, platform, said):
     assert run_command(monkeypatch, platform, archs="8.6") == (0, [])
     assert said in capsys.readouterr().err
 
 
-def test_for_named_archs_it_compiles_without_a_card_and_says_how_long(monkeypatch, capsys):
+def test_named_archs_are_compiled_without_a_gpu_with_an_estimate(monkeypatch, capsys):
     monkeypatch.setenv("MAX_JOBS", "2")
     status, built = run_command(monkeypatch, ("13.0", None), archs="7.5;8.9")
     said = capsys.readouterr().err
@@ -161,28 +161,28 @@ def test_for_named_archs_it_compiles_without_a_card_and_says_how_long(monkeypatc
     assert f"about {building.expected_minutes(2, 2)} min" in said and "build.log" in said
 
 
-def test_what_is_done_is_not_done_again(monkeypatch, capsys):
+def test_compiled_archs_are_not_compiled_again(monkeypatch, capsys):
     assert run_command(monkeypatch, ("13.0", None), archs="7.5", done=True) == (0, [])
     assert capsys.readouterr().err == ""
 
 
 def test_a_missing_compiler_is_an_error_with_what_to_install(monkeypatch, capsys):
     assert run_command(monkeypatch, ("13.0", None), archs="7.5")[0] == 0
-    monkeypatch.setattr(command, "provide_toolkit", lambda _: pytest.fail("fetched in vain"))
-    monkeypatch.setattr(diagnose, "what_is_missing", lambda: "no C++ compiler: `sudo apt-get install g++`")
+    monkeypatch.setattr(command, "provide_toolkit", lambda _: pytest.fail("installed in vain"))
+    monkeypatch.setattr(diagnose, "missing_prerequisite", lambda: "no C++ compiler: `sudo apt-get install g++`")
     assert command.main([]) == 1 and "apt-get install g++" in capsys.readouterr().err
 
 
 def test_a_cpp_compiler_and_python_headers_are_looked_for(monkeypatch, tmp_path):
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert "apt-get install g++" in diagnose.what_is_missing()
+    assert "apt-get install g++" in diagnose.missing_prerequisite()
     (tmp_path / "c++").touch(mode=0o755)
     monkeypatch.setattr(diagnose.sysconfig, "get_paths", lambda: {"include": str(tmp_path)})
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    assert f"apt-get install python{version}-dev" in diagnose.what_is_missing()
+    assert f"apt-get install python{version}-dev" in diagnose.missing_prerequisite()
     (tmp_path / "Python.h").touch()
-    assert diagnose.what_is_missing() is None
+    assert diagnose.missing_prerequisite() is None
 
 
 # The toolkit.
@@ -204,7 +204,7 @@ def no_toolkit(monkeypatch, tmp_path):
     monkeypatch.setattr(toolkit, "system_homes", lambda: iter(()))
 
 
-def test_cuda_home_is_taken_where_it_is_of_torchs_major_version(no_toolkit, monkeypatch, tmp_path):
+def test_cuda_home_is_used_if_it_has_torchs_major_version(no_toolkit, monkeypatch, tmp_path):
     monkeypatch.setenv("CUDA_HOME", str(make_toolkit(tmp_path / "cuda", "13.2")))
     assert toolkit.provide_toolkit("13.0") == Toolkit(tmp_path / "cuda", "13.2", "CUDA_HOME")
     with pytest.raises(DeviceError, match=r"nvcc 13\.2, but torch is built for CUDA 12\.6"):
@@ -221,7 +221,7 @@ def test_cuda_13_comes_from_pypi(no_toolkit, monkeypatch):
         toolkit.provide_toolkit("12.6")
 
 
-def test_where_pypi_is_out_of_reach_an_installed_toolkit_does(no_toolkit, monkeypatch, tmp_path):
+def test_without_pypi_an_installed_toolkit_is_used(no_toolkit, monkeypatch, tmp_path):
     def unreachable():
         raise DeviceError("`pip install` failed (no route)")
 
@@ -234,7 +234,7 @@ def test_where_pypi_is_out_of_reach_an_installed_toolkit_does(no_toolkit, monkey
     assert toolkit.provide_toolkit("12.6").home == tmp_path / "a"
 
 
-def test_an_nvcc_in_path_counts_with_its_headers_only(monkeypatch, tmp_path):
+def test_an_nvcc_in_path_counts_only_with_its_headers(monkeypatch, tmp_path):
     home = make_toolkit(tmp_path / "cuda", "13.0")
     monkeypatch.setenv("PATH", str(home / "bin"))
     assert home in toolkit.system_homes()
@@ -242,7 +242,7 @@ def test_an_nvcc_in_path_counts_with_its_headers_only(monkeypatch, tmp_path):
     assert home not in toolkit.system_homes()
 
 
-def test_pypis_packages_become_a_folder_that_linkers_understand(tmp_path):
+def test_packages_from_pypi_are_arranged_for_linkers(tmp_path):
     packages = make_toolkit(tmp_path / "nvidia/cu13", "13.0")
     for name in ("lib/libcudart.so.13", "lib/libcublas.so.13", "nvvm/bin/cicc"):
         (packages / name).parent.mkdir(parents=True, exist_ok=True)
@@ -269,7 +269,7 @@ def test_free_memory_is_read(tmp_path):
     assert building.free_memory_gb(tmp_path / "none") == 4.0
 
 
-def test_the_compiler_gets_its_toolkit_whatever_the_machine_has(monkeypatch):
+def test_the_compiler_uses_the_given_toolkit(monkeypatch):
     monkeypatch.setenv("CUDA_HOME", "/usr/local/cuda")
     monkeypatch.setenv("PATH", "/usr/bin")
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "5.0")
@@ -285,21 +285,21 @@ def test_all_kernels_are_compiled(tmp_path):
     names = ["csrc/Null.cpp", "csrc/NullCUDA.cu", "ext.cpp"]
     for name in [*names, "csrc/Null.h"]:
         (cuda / name).touch()
-    assert sorted(sources(tmp_path)) == sorted(str(cuda / name) for name in names)
+    assert sorted(building.sources(tmp_path)) == sorted(str(cuda / name) for name in names)
 
 
 def shell(script: str) -> list[str]:
     return ["bash", "-c", textwrap.dedent(script)]
 
 
-def test_progress_is_told_with_the_time_left(package, tmp_path):
+def test_progress_is_reported_with_the_remaining_time(package, tmp_path):
     said = []
     steps = shell("echo '[1/2] nvcc one'; sleep 0.3; echo '[2/2] nvcc two'; sleep 0.3")
     building.run_with_progress(steps, os.environ, tmp_path / "log", said.append)
     assert [line.split()[0] for line in said] == ["1/2", "2/2"] and "min to go" in said[0]
 
 
-def test_an_interruption_takes_the_compilers_along(package, tmp_path, monkeypatch):
+def test_an_interruption_ends_the_compilers(package, tmp_path, monkeypatch):
     log = tmp_path / "log"
 
     def interrupt(_):
@@ -311,7 +311,7 @@ def test_an_interruption_takes_the_compilers_along(package, tmp_path, monkeypatc
         building.run_with_progress(shell("sleep 60 & echo $!; wait"), os.environ, log, print)
     compiler, patience = Path("/proc", log.read_text().strip(), "stat"), monotonic() + 10
     while compiler.exists() and compiler.read_text().split()[2] != "Z":
-        assert monotonic() < patience, "the compiler goes on"
+        assert monotonic() < patience, "the compiler is still running"
 
 
 @pytest.mark.parametrize(
@@ -340,7 +340,7 @@ def test_a_failed_build_names_its_cause_and_the_log(package, tmp_path, log, said
     assert log in "\n".join(lines) and max(map(len, "\n".join(lines).splitlines())) < 400
 
 
-def test_errors_far_from_the_end_are_shown_too():
+def test_errors_far_from_the_end_are_shown():
     log = "nvcc fatal : first\n" + "\n".join(f"note {i}" for i in range(100))
     assert diagnose.last_lines(log).splitlines()[0] == "nvcc fatal : first"
     assert diagnose.last_lines(log).endswith("note 99")
@@ -355,33 +355,33 @@ def fake_job(monkeypatch, body: str) -> None:
     monkeypatch.setattr(building, "check_loads", lambda env: None)
 
 
-def test_a_build_ends_inside_the_package_and_leaves_nothing_else(package, monkeypatch, tmp_path):
+def test_a_build_is_installed_in_the_package_and_leaves_nothing_else(package, monkeypatch, tmp_path):
     fake_job(monkeypatch, 'echo "[1/1] nvcc"; echo code > "$1/csrc.so"')
     target = building.compile_and_install(TOOLKIT, ["8.6"], 1, print)
     assert target == package / "csrc.so" and target.read_text() == "code\n"
     assert not (tmp_path / "build").exists()
 
 
-def test_a_build_that_fails_keeps_what_it_has_compiled(package, monkeypatch, tmp_path):
+def test_a_failed_build_keeps_its_object_files(package, monkeypatch, tmp_path):
     fake_job(monkeypatch, 'touch "$1/One.cuda.o" "$1/lock"; exit 1')
     with pytest.raises(DeviceError):
         building.compile_and_install(TOOLKIT, ["8.6"], 1, lambda _: None)
     assert (tmp_path / "build/One.cuda.o").exists() and not (package / "csrc.so").exists()
 
 
-def test_torchs_stale_lock_is_gone_when_the_compiler_starts(package, monkeypatch, tmp_path):
+def test_a_stale_lock_of_torch_is_removed_before_compiling(package, monkeypatch, tmp_path):
     fake_job(monkeypatch, 'test ! -e "$1/lock" && touch "$1/csrc.so"')
     (tmp_path / "build").mkdir()
     (tmp_path / "build/lock").touch()
     assert building.compile_and_install(TOOLKIT, ["8.6"], 1, print).exists()
 
 
-def test_two_builds_at_once_are_told_apart(package, tmp_path):
-    with building._alone(tmp_path / "build"), pytest.raises(DeviceError, match="another process"):
+def test_a_second_concurrent_build_is_refused(package, tmp_path):
+    with building._exclusive(tmp_path / "build"), pytest.raises(DeviceError, match="another process"):
         building.compile_and_install(TOOLKIT, ["8.6"], 1, print)
 
 
-def test_the_result_is_tried_as_a_run_will_import_it(tmp_path):
+def test_the_result_is_imported_as_in_a_run(tmp_path):
     backend = tmp_path / "gsplat/cuda/_backend.py"
     backend.parent.mkdir(parents=True)
     for folder in (backend.parent, backend.parent.parent):

@@ -1,5 +1,5 @@
-"""What of this machine the workflow can use, and what to do about the rest: `make doctor`.
+"""Diagnosis of this machine: what the workflow can use, and how to fix the rest (`make doctor`).
 
-`torch_builds` (cards, drivers and the builds of torch for them; standard library alone, since the set-up asks it before
-anything is installed), `facts` (everything found out, in one record), `checks` (facts to findings, pure).
+`torch_builds`: GPUs, drivers and builds of torch; standard library only, since set-up runs it before any package is
+installed. `facts`: everything found out, in one record. `checks`: findings from facts, pure functions.
 """

@@ -1,9 +1,10 @@
-"""`python -m drivesplat.machine.doctor [CONFIG ...]`: what works on this machine and what does not, a line each.
+"""What works on this machine and what does not, a line each.
 
-Config files (presets) are laid over config.yaml in the order given. Exit status 0: the CPU demo can run
-and nothing is broken (notes are fine); 1: at least one `fix`.
+Exit status 0: the CPU demo can run and nothing
+is broken (there may be notes); 1: at least one `fix`.
 """
 
+import argparse
 import os
 import sys
 from collections.abc import Sequence
@@ -14,6 +15,9 @@ ROOT = Path(__file__).parents[3]
 
 def main(arguments: Sequence[str]) -> int:
     """Prints the findings. Returns the exit status."""
+    parser = argparse.ArgumentParser("python -m drivesplat.machine.doctor", description=__doc__)
+    parser.add_argument("config", nargs="*", type=Path, help="merged over config.yaml in this order (presets)")
+    files = parser.parse_args(arguments).config
     try:
         from drivesplat.machine.doctor.checks import examine
         from drivesplat.machine.doctor.facts import gather
@@ -21,7 +25,7 @@ def main(arguments: Sequence[str]) -> int:
         print(f"fix   packages      {error} in {sys.executable}: run make setup, then make doctor")
         return 1
     os.chdir(ROOT)
-    findings = examine(gather(ROOT, [Path("config.yaml"), *(Path(name) for name in arguments)]))
+    findings = examine(gather(ROOT, [Path("config.yaml"), *files]))
     width = max(len(finding.topic) for finding in findings)
     for finding in findings:
         print(f"{finding.level:4}  {finding.topic:{width}}  {finding.text}")

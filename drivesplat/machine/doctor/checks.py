@@ -1,270 +1,244 @@
-"""From facts to findings: what each means and what to do about it, one line each. Pure functions."""
+"""Findings from facts, one line each: what a fact means and what to do about it. Pure functions."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
-from drivesplat.machine.doctor.facts import Dataset, Facts, Torch, lpips_of
-from drivesplat.machine.doctor.torch_builds import BUILDS, OLDEST_FOR_GSPLAT, advice, dotted
-from drivesplat.machine.gsplat_build.installed import covers
+from drivesplat.machine.compute_capability import MIN_CAPABILITY, covers, dotted
+from drivesplat.machine.doctor.facts import Dataset, Facts
+from drivesplat.machine.doctor.torch_builds import BUILDS, advice
 from drivesplat.machine.gsplat_build.toolkit import FROM_PYPI_SINCE, same_major
-from drivesplat.settings.evaluate import BACKBONE
+from drivesplat.settings.evaluate import BACKBONE, LpipsSettings
 
-LOWEST_DISK_GB, ROOMY_DISK_GB = 1.0, 10.0
-FEW_MODULES = 200
-"""So many take a few tenths of a second to compile; torch has more than a thousand."""
+MIN_DISK_GB, AMPLE_DISK_GB = 1.0, 10.0
+MAX_UNCACHED_MODULES = 200
+"""They take a few tenths of a second to compile; torch has more than a thousand modules."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor: `ok`, `note` (works without, with a consequence) or `fix` (broken, with what to do)."""
+    """A line of the doctor: `ok`, `note` (works with a restriction) or `fix` (broken, with what to do)."""
 
     level: Literal["ok", "note", "fix"]
     topic: str
     text: str
 
 
+ok, note, fix = (partial(Finding, level) for level in ("ok", "note", "fix"))
+
+
 def examine(facts: Facts) -> list[Finding]:
-    """All findings, in the order in which things depend on each other."""
+    """All findings, in the order of their dependencies."""
     checks = (python, bytecode, torch_build, gpu, gsplat, compiler, triton, config, datasets, disk, backbone, ffmpeg)
     return [finding for check in checks for finding in check(facts)]
 
 
 def python(facts: Facts) -> Iterator[Finding]:
-    """The interpreter, and whether its packages are those required now."""
+    """The interpreter, and whether its packages are the required ones."""
     version = ".".join(map(str, facts.python))
+    found = f"{version} ({facts.executable})"
     if not (3, 11) <= facts.python <= (3, 12):
-        yield Finding(
-            "note", "Python", f"{version} ({facts.executable}): tested with 3.11 and 3.12; PYTHON=python3.11 make setup"
-        )
-    elif facts.outdated:
-        yield Finding("fix", "Python", ".venv was made from other requirements than the present ones: run make setup")
+        yield note("Python", f"{found}: tested with 3.11 and 3.12; PYTHON=python3.11 make setup")
+    elif facts.venv_outdated:
+        yield fix("Python", ".venv was made from other requirements than the present ones: run make setup")
     else:
-        yield Finding("ok", "Python", f"{version} ({facts.executable})")
+        yield ok("Python", found)
 
 
 def bytecode(facts: Facts) -> Iterator[Finding]:
-    """Whether every job compiles its packages' Python anew; nothing to say where it does not."""
-    if facts.read_as_source > FEW_MODULES:
-        yield Finding(
-            "note", "bytecode", f"Python compiles {facts.read_as_source:,} modules anew in every job, for seconds: "
-            "unset PYTHONDONTWRITEBYTECODE, or, where packages cannot be written to, set PYTHONPYCACHEPREFIX to a "
-            "folder that can",
-        )  # fmt: skip
+    """Whether every job compiles its modules again."""
+    if facts.uncached_modules > MAX_UNCACHED_MODULES:
+        text = f"every job compiles {facts.uncached_modules:,} modules, which takes seconds: "
+        text += "unset PYTHONDONTWRITEBYTECODE, or, if the packages are read-only, set PYTHONPYCACHEPREFIX to a "
+        yield note("bytecode", text + "writable folder")
 
 
 def torch_build(facts: Facts) -> Iterator[Finding]:
-    """The build of torch, against the cards that nvidia-smi knows."""
+    """The build of torch, and whether it fits the GPUs reported by nvidia-smi."""
     torch = facts.torch
     if torch is None:
-        yield Finding("fix", "torch", f"cannot be imported ({facts.torch_problem}): run make setup")
-        return
-    if not torch.cuda and not torch.hip:
-        if any(card.capability is None or card.capability >= OLDEST_FOR_GSPLAT for card in facts.cards):
-            text = f"{torch.version} is built for the CPU alone and ignores {facts.cards[0].name}: "
-            yield Finding("note", "torch", text + "TORCH_CUDA=cu130 make setup takes the GPU build")
+        yield fix("torch", f"cannot be imported ({facts.torch_problem}): run make setup")
+    elif not torch.cuda and not torch.hip:
+        if any(gpu.runs_gsplat for gpu in facts.gpus):
+            text = f"{torch.version} is built for the CPU and ignores {facts.gpus[0].name}: "
+            yield note("torch", text + "TORCH_CUDA=cu130 make setup installs the GPU build")
         else:
-            yield Finding("ok", "torch", f"{torch.version}, for the CPU alone")
-        return
-    platform = f"CUDA {torch.cuda}" if torch.cuda else f"ROCm {torch.hip}"
-    if facts.torch_problem:
-        yield Finding("fix", "torch", f"{torch.version} for {platform}: {facts.torch_problem}")
-        return
-    if wrong := _misfit(facts):
-        hopeless = all(card.capability and card.capability < OLDEST_FOR_GSPLAT for card in facts.cards)
-        yield Finding("note" if hopeless else "fix", "torch", wrong)
-        return
-    yield Finding("ok", "torch", f"{torch.version} for {platform}")
+            yield ok("torch", f"{torch.version}, for the CPU only")
+    else:
+        found = f"{torch.version} for " + (f"CUDA {torch.cuda}" if torch.cuda else f"ROCm {torch.hip}")
+        if facts.torch_problem:
+            yield fix("torch", f"{found}: {facts.torch_problem}")
+        elif problem := _unfit_build(facts):
+            yield (fix if any(gpu.runs_gsplat for gpu in facts.gpus) else note)("torch", problem)
+        else:
+            yield ok("torch", found)
 
 
-def _misfit(facts: Facts) -> str | None:
+def _unfit_build(facts: Facts) -> str | None:
     name = next((build.name for build in BUILDS.values() if build.cuda == facts.torch.cuda), None)
-    return advice(facts.cards, name) if name else None
+    return advice(facts.gpus, name) if name else None
 
 
 def gpu(facts: Facts) -> Iterator[Finding]:
-    """The card torch uses, and its free memory against what a training asks for."""
-    for card in facts.cards:
-        memory = f", {card.total_gb:.1f} GB, {card.free_gb:.1f} GB free" if card.total_gb and card.free_gb else ""
-        yield Finding("ok", "GPU", f"{card}, driver {card.driver}{memory}" if card.capability else f"{card}{memory}")
+    """The GPU that torch uses, and whether its free memory suffices for training."""
+    for gpu in facts.gpus:
+        memory = f", {gpu.total_gb:.1f} GB, {gpu.free_gb:.1f} GB free" if gpu.total_gb and gpu.free_gb else ""
+        yield ok("GPU", f"{gpu}, driver {gpu.driver}{memory}" if gpu.capability else f"{gpu}{memory}")
     torch = facts.torch
-    if torch is None or torch.card is None:
-        yield from _no_gpu(facts)
+    if torch is None or torch.gpu is None:
+        yield _no_gpu(facts)
         return
-    if not facts.cards:
+    if not facts.gpus:
         known = f", compute capability {dotted(torch.capability)}" if torch.cuda and torch.capability else ""
-        yield Finding("ok", "GPU", f"{torch.card}{known}, {torch.free_gb:.1f} of {torch.total_gb:.1f} GB free")
+        yield ok("GPU", f"{torch.gpu}{known}, {torch.free_gb:.1f} of {torch.total_gb:.1f} GB free")
     needed = facts.config.device.min_free_gb if facts.config else 0.0
     if torch.free_gb < needed:
-        yield Finding(
-            "fix", "GPU", f"{torch.card} has {torch.free_gb:.1f} GB of free memory, device.min_free_gb asks for "
-            f"{needed:g}: a training will not start; end other programs on it (nvidia-smi lists them), take a smaller "
-            "preset (presets/8gb.yaml), or lower train.cap_max, images.width and device.min_free_gb",
-        )  # fmt: skip
+        text = f"{torch.gpu} has {torch.free_gb:.1f} GB of free memory, device.min_free_gb asks for {needed:g}: a "
+        text += "training will not start; end other programs on it (nvidia-smi lists them), use a smaller preset "
+        yield fix("GPU", text + "(presets/8gb.yaml), or lower train.cap_max, images.width and device.min_free_gb")
 
 
-def _no_gpu(facts: Facts) -> Iterator[Finding]:
+def _no_gpu(facts: Facts) -> Finding:
     consequence = "the CPU demo runs; real scenes are refused unless you write device: cpu (very slow)"
-    if facts.cards_problem:
+    torch = facts.torch
+    if facts.gpu_problem:
         cure = "(re)install NVIDIA's driver (Ubuntu: sudo ubuntu-drivers install), then reboot"
-        yield Finding("note", "GPU", f"{facts.cards_problem}: {cure}; until then {consequence}")
-    elif facts.cards:
-        built_for_gpu = facts.torch is not None and (facts.torch.cuda or facts.torch.hip)
-        if built_for_gpu and _misfit(facts) is None:
-            hidden = "torch sees none of them: is CUDA_VISIBLE_DEVICES set, or the driver freshly updated (reboot)?"
-            yield Finding("fix", "GPU", hidden)
-        else:
-            yield Finding("note", "GPU", f"torch cannot use it (see torch above): {consequence}")
-    else:
-        amd = facts.torch is not None and facts.torch.hip
-        missing = "this torch for ROCm sees no AMD GPU (see docs/amd.md)" if amd else "none found"
-        yield Finding("note", "GPU", f"{missing}: {consequence}")
+        return note("GPU", f"{facts.gpu_problem}: {cure}; until then {consequence}")
+    if facts.gpus and torch is not None and (torch.cuda or torch.hip) and _unfit_build(facts) is None:
+        return fix("GPU", "torch finds no GPU: is CUDA_VISIBLE_DEVICES set, or was the driver updated (reboot)?")
+    if facts.gpus:
+        return note("GPU", f"torch cannot use it (see torch above): {consequence}")
+    if torch is not None and torch.hip:
+        return note("GPU", f"this torch for ROCm finds no AMD GPU (see docs/amd.md): {consequence}")
+    return note("GPU", f"none found: {consequence}")
 
 
 def gsplat(facts: Facts) -> Iterator[Finding]:
-    """gsplat, and whether its kernels are compiled for the card."""
+    """gsplat, and whether its kernels are compiled for the GPU."""
     found, torch = facts.gsplat, facts.torch
     if found is None:
-        yield Finding("fix", "gsplat", f"not importable ({facts.gsplat_problem}): run make setup")
+        yield fix("gsplat", "not installed: run make setup")
     elif found.problem:
-        yield Finding(
-            "fix", "gsplat", f"{found.version} cannot be loaded ({found.problem}): rm -r .venv, then make setup"
-        )
+        yield fix("gsplat", f"{found.version} cannot be loaded ({found.problem}): rm -r .venv, then make setup")
     elif torch is None or not torch.cuda:
         where = "its kernels come with AMD's package" if torch and torch.hip else "its kernels are not needed on a CPU"
-        yield Finding("ok", "gsplat", f"{found.version}; {where}")
+        yield ok("gsplat", f"{found.version}; {where}")
     elif found.extension is None:
-        yield from _uncompiled(facts)
+        yield _uncompiled(facts)
     else:
-        yield from _compiled(facts, torch)
+        yield _compiled(facts)
 
 
-def _uncompiled(facts: Facts) -> Iterator[Finding]:
-    usable = facts.torch.capability is not None and facts.torch.capability >= OLDEST_FOR_GSPLAT
-    text = f"{facts.gsplat.version} is not compiled: "
-    if usable:
-        brings = int(facts.torch.cuda.split(".")[0]) >= FROM_PYPI_SINCE
-        nvcc = " (brings nvcc along)" if brings else f" with a CUDA {facts.torch.cuda} toolkit in CUDA_HOME"
-        if facts.toolkit and same_major(facts.toolkit[1], facts.torch.cuda):
-            nvcc = ""
-        yield Finding(
-            "fix", "gsplat", f"{text}a training on the GPU will be refused; run make setup{nvcc}, minutes, once"
-        )
-    else:
-        yield Finding(
-            "note", "gsplat", f'{text}no GPU to compile for; for one elsewhere: GSPLAT_ARCHS="8.6" make setup'
-        )
+def _uncompiled(facts: Facts) -> Finding:
+    torch, text = facts.torch, f"{facts.gsplat.version} is not compiled: "
+    if torch.capability is None or torch.capability < MIN_CAPABILITY:
+        return note("gsplat", f'{text}no GPU to compile for; for one elsewhere: GSPLAT_ARCHS="8.6" make setup')
+    nvcc = f" with a CUDA {torch.cuda} toolkit in CUDA_HOME"
+    if facts.toolkit and same_major(facts.toolkit.release, torch.cuda):
+        nvcc = ""
+    elif int(torch.cuda.split(".")[0]) >= FROM_PYPI_SINCE:
+        nvcc = " (installs nvcc, too)"
+    return fix("gsplat", f"{text}training on the GPU will be refused; run make setup{nvcc}, which takes minutes, once")
 
 
-def _compiled(facts: Facts, torch: Torch) -> Iterator[Finding]:
-    archs = facts.gsplat.archs
+def _compiled(facts: Facts) -> Finding:
+    archs, torch = facts.gsplat.archs, facts.torch
     text = f"{facts.gsplat.version}, compiled ({facts.gsplat.extension})"
-    if archs and torch.capability and not covers(archs, torch.capability):
-        mine = dotted(torch.capability)
-        yield Finding(
-            "fix", "gsplat", f"{text} for compute capability {', '.join(archs)}, but {torch.card} has {mine}: "
-            f'GSPLAT_ARCHS="{";".join([*archs, mine])}" make setup',
-        )  # fmt: skip
-    else:
-        yield Finding("ok", "gsplat", text + (f" for compute capability {', '.join(archs)}" if archs else ""))
+    if not archs:
+        return ok("gsplat", text)
+    text += f" for compute capability {', '.join(archs)}"
+    if torch.capability is None or covers(archs, torch.capability):
+        return ok("gsplat", text)
+    has = dotted(torch.capability)
+    return fix("gsplat", f'{text}, but {torch.gpu} has {has}: GSPLAT_ARCHS="{";".join([*archs, has])}" make setup')
 
 
 def triton(facts: Facts) -> Iterator[Finding]:
-    """Whether the kernels that train faster can be compiled; of interest where there is a GPU alone."""
-    if facts.torch is None or facts.torch.card is None:
+    """Whether Triton kernels, which make training faster, can be compiled for the GPU."""
+    if facts.torch is None or facts.torch.gpu is None:
         return
     if facts.triton_problem is None:
-        yield Finding("ok", "Triton", "compiles for this GPU")
+        yield ok("Triton", "compiles for this GPU")
     else:
-        yield Finding(
-            "note", "Triton", f"cannot be used ({facts.triton_problem}): trainings take longer; it needs a C compiler "
-            "and Python's headers (Ubuntu: sudo apt install gcc python3-dev)",
-        )  # fmt: skip
+        text = f"cannot be used ({facts.triton_problem}): training takes longer; it needs a C compiler and Python's "
+        yield note("Triton", text + "headers (Ubuntu: sudo apt install gcc python3-dev)")
 
 
 def compiler(facts: Facts) -> Iterator[Finding]:
-    """What compiling gsplat takes; of interest only until it is compiled."""
-    done = facts.gsplat is not None and facts.gsplat.extension is not None
+    """What compiling gsplat needs, until it is compiled."""
+    compiled = facts.gsplat is not None and facts.gsplat.extension is not None
     if facts.torch is None or not facts.torch.cuda:
         return
     if facts.toolkit:
-        yield Finding("ok", "CUDA toolkit", f"nvcc {facts.toolkit[1]} in {facts.toolkit[0]}")
-    elif not done:
-        major = int(facts.torch.cuda.split(".")[0])
-        how = "make setup fetches it from PyPI where gsplat has to be compiled"
-        if major < FROM_PYPI_SINCE:
-            how = f"compiling gsplat needs CUDA {facts.torch.cuda}'s: see docs/installation.md"
-        yield Finding("note", "CUDA toolkit", f"none; {how}")
-    if facts.compile_problem and not done:
-        needed = facts.torch.capability is not None
-        yield Finding("fix" if needed else "note", "C++ compiler", facts.compile_problem)
-    elif not done:
-        yield Finding("ok", "C++ compiler", "found")
+        yield ok("CUDA toolkit", f"nvcc {facts.toolkit.release} in {facts.toolkit.home}")
+    elif not compiled and int(facts.torch.cuda.split(".")[0]) < FROM_PYPI_SINCE:
+        text = f"none; compiling gsplat needs that of CUDA {facts.torch.cuda}: see docs/installation.md"
+        yield note("CUDA toolkit", text)
+    elif not compiled:
+        yield note("CUDA toolkit", "none; make setup installs it from PyPI if gsplat has to be compiled")
+    if facts.compile_problem and not compiled:
+        yield (note if facts.torch.capability is None else fix)("C++ compiler", facts.compile_problem)
+    elif not compiled:
+        yield ok("C++ compiler", "found")
 
 
 def config(facts: Facts) -> Iterator[Finding]:
     """The configuration."""
     if facts.config_problem:
-        yield Finding("fix", "config", facts.config_problem)
+        yield fix("config", facts.config_problem)
     elif facts.config:
         scenes = len(facts.config.scenes)
-        yield Finding("ok", "config", f"{scenes} scenes, methods {', '.join(facts.config.methods)}")
+        yield ok("config", f"{scenes} scenes, methods {', '.join(facts.config.methods)}")
 
 
 def datasets(facts: Facts) -> Iterator[Finding]:
     """The datasets that the config names."""
-    for dataset in facts.datasets:
-        yield _dataset(dataset)
+    yield from map(_dataset, facts.datasets)
 
 
 def _dataset(dataset: Dataset) -> Finding:
     topic = f"dataset {dataset.name}"
     if dataset.root is not None:
-        return Finding("ok", topic, f"found in {dataset.root}")
+        return ok(topic, f"found in {dataset.root}")
     if dataset.generated:
-        return Finding("ok", topic, "not made yet: the workflow generates it where it is needed")
-    return Finding("note", topic, f"{dataset.problem}; make demo needs none")
+        return ok(topic, "not there yet: the workflow generates it when needed")
+    return note(topic, f"{dataset.problem}; make demo does not need it")
 
 
 def disk(facts: Facts) -> Iterator[Finding]:
-    """Free space where results and downloads go."""
+    """Free space for results and downloads."""
     for folder, free in facts.disk_gb.items():
         text = f"{free:.1f} GB free for {folder}/"
-        if free < LOWEST_DISK_GB:
-            text += ": jobs will fail; make room, or let results_dir name a folder on another disk"
-            yield Finding("fix", "disk", text)
-        elif free < ROOMY_DISK_GB:
-            text += f": enough for the demo; a real scene takes up to about a gigabyte, ten want {ROOMY_DISK_GB:g} GB"
-            yield Finding("note", "disk", text)
+        if free < MIN_DISK_GB:
+            yield fix("disk", f"{text}: jobs will fail; free space, or set results_dir to a folder on another disk")
+        elif free < AMPLE_DISK_GB:
+            text += ": enough for the demo; a real scene takes up to about 1 GB, ten scenes need about "
+            yield note("disk", f"{text}{AMPLE_DISK_GB:g} GB")
         else:
-            yield Finding("ok", "disk", text)
+            yield ok("disk", text)
 
 
 def backbone(facts: Facts) -> Iterator[Finding]:
     """LPIPS's AlexNet."""
-    lpips, found = lpips_of(facts.config), facts.backbone
+    lpips, found = facts.config.lpips if facts.config else LpipsSettings(), facts.backbone_sha256
     if not lpips.enabled:
-        yield Finding("ok", "LPIPS", "switched off (lpips.enabled), so its backbone is not needed")
-    elif found.sha256 is None:
-        text = f"LPIPS was null: {found.last_failure}"
-        if not found.last_failure:
-            text = "no AlexNet backbone yet: the first evaluation fetches it; without network LPIPS is null with that "
-            text += f"reason, unless you put {lpips.url} at {BACKBONE}"
-        yield Finding("note", "LPIPS", text)
-    elif not found.sha256.startswith(lpips.sha256):
-        yield Finding(
-            "fix", "LPIPS", f"{BACKBONE} has SHA-256 {found.sha256[:16]}…, lpips.sha256 says {lpips.sha256}: LPIPS "
-            f"will be null; remove the file, or replace it with {lpips.url}",
-        )  # fmt: skip
+        yield ok("LPIPS", "disabled (lpips.enabled), so its backbone is not needed")
+    elif found is None and facts.backbone_failure:
+        yield note("LPIPS", f"LPIPS was null: {facts.backbone_failure}")
+    elif found is None:
+        text = "no AlexNet backbone yet: the first evaluation downloads it; without network LPIPS is null with that "
+        yield note("LPIPS", f"{text}reason, unless you put {lpips.url} at {BACKBONE}")
+    elif not found.startswith(lpips.sha256):
+        text = f"{BACKBONE} has SHA-256 {found[:16]}…, lpips.sha256 says {lpips.sha256}: LPIPS will be null; "
+        yield fix("LPIPS", f"{text}remove the file, or replace it with {lpips.url}")
     else:
-        yield Finding("ok", "LPIPS", f"AlexNet backbone in {BACKBONE}, checksum right")
+        yield ok("LPIPS", f"AlexNet backbone in {BACKBONE}, checksum correct")
 
 
 def ffmpeg(facts: Facts) -> Iterator[Finding]:
     """The program that writes videos."""
     if facts.ffmpeg:
-        yield Finding("ok", "ffmpeg", facts.ffmpeg)
+        yield ok("ffmpeg", facts.ffmpeg)
     else:
-        yield Finding(
-            "fix", "ffmpeg", "none: run make setup (imageio-ffmpeg brings one), or sudo apt-get install ffmpeg"
-        )
+        yield fix("ffmpeg", "none: run make setup (installs imageio-ffmpeg), or sudo apt-get install ffmpeg")

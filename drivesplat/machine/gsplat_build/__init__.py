@@ -1,7 +1,7 @@
-"""gsplat's CUDA kernels, compiled once at set-up and kept inside the installed gsplat package.
+"""gsplat's CUDA kernels, compiled once at set-up and stored inside the installed gsplat package.
 
-gsplat's wheel on PyPI holds sources. Left alone it compiles them at its first import, for minutes, and only where nvcc
-is at hand at that moment. Compiled here they become the module `gsplat.csrc`, which gsplat's loader tries before
-anything else: later imports need neither nvcc nor any variable. `python -m drivesplat.machine.gsplat_build` does it,
-and `make setup`.
+gsplat's wheel on PyPI contains sources. By default gsplat compiles them at its first import, which takes minutes and
+needs nvcc at that moment. Compiled here they become the module `gsplat.csrc`, which gsplat's loader tries first, so
+that later imports need neither nvcc nor environment variables. `make setup` calls
+`python -m drivesplat.machine.gsplat_build`.
 """

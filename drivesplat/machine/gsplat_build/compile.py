@@ -1,7 +1,7 @@
-"""Compiling gsplat's kernels with progress, and putting them where gsplat's loader looks first."""
+"""Compiling gsplat's kernels with progress reports, and installing them where gsplat's loader looks first."""
 
+import argparse
 import fcntl
-import json
 import os
 import re
 import shutil
@@ -14,22 +14,23 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drivesplat.errors import DeviceError
+from drivesplat.io.storage import atomic_path, write_json
 from drivesplat.machine.gsplat_build import diagnose
 from drivesplat.machine.gsplat_build.installed import RECORD, package_folder, versions
 from drivesplat.machine.gsplat_build.toolkit import Toolkit
 
 JOB_MEMORY_GB = 2.5
-"""What one nvcc takes at its peak, with room."""
+"""Peak memory of one nvcc process, with a margin."""
 FIXED_CORE_SECONDS = 150
 CORE_SECONDS_PER_ARCH = 400
 """Measured with CUDA 13.0 on shared server cores: 560 s for one compute capability, 1,380 s for three."""
 STEP = re.compile(r"^\[(\d+)/(\d+)\] ", re.MULTILINE)
 POLL_S = 1.0
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 def build_folder() -> Path:
-    """Where objects are kept until all are compiled, so that an interrupted build goes on where it stopped."""
+    """The folder of object files until all are compiled, so that an interrupted build can continue."""
     return Path(sys.prefix) / "gsplat-build"
 
 
@@ -39,7 +40,7 @@ def log_file() -> Path:
 
 
 def free_memory_gb(meminfo: Path = Path("/proc/meminfo")) -> float:
-    """Main memory that programs may still take, in GB; a cautious 4 where the system does not tell."""
+    """Available main memory in GB; 4 if the system does not report it."""
     try:
         match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text())
     except OSError:
@@ -48,17 +49,17 @@ def free_memory_gb(meminfo: Path = Path("/proc/meminfo")) -> float:
 
 
 def parallel_jobs(cores: int, memory_gb: float) -> int:
-    """How many compilers may run at once without exhausting memory."""
+    """How many compilers can run at once without exhausting memory."""
     return max(1, min(cores, int(memory_gb / JOB_MEMORY_GB)))
 
 
 def expected_minutes(archs: int, jobs: int) -> int:
-    """A guess at how long compiling for so many compute capabilities takes, in whole minutes."""
+    """The estimated duration of compiling for this number of compute capabilities."""
     return max(1, round((FIXED_CORE_SECONDS + CORE_SECONDS_PER_ARCH * archs) / jobs / 60))
 
 
 def compile_environment(toolkit: Toolkit, archs: Sequence[str], jobs: int) -> dict[str, str]:
-    """The variables under which torch compiles; nothing of them is needed afterwards."""
+    """The environment in which torch compiles; not needed afterwards."""
     repository = str(Path(__file__).parents[3])
     tools = [str(Path(sys.executable).parent), str(toolkit.home / "bin"), os.environ.get("PATH", os.defpath)]
     return {
@@ -71,19 +72,19 @@ def compile_environment(toolkit: Toolkit, archs: Sequence[str], jobs: int) -> di
     }
 
 
-def compile_and_install(toolkit: Toolkit, archs: Sequence[str], jobs: int, say: Say) -> Path:
-    """Compiles for `archs`, installs the result into the gsplat package and tries it in a fresh process.
+def compile_and_install(toolkit: Toolkit, archs: Sequence[str], jobs: int, report: Report) -> Path:
+    """Compiles for `archs`, installs the result into the gsplat package and imports it in a new process.
 
-    Returns the installed file. Raises DeviceError with the end of the log, its place and the cause where it is known.
+    Returns the installed file. Raises DeviceError with the path of the log and the cause, if it is known.
     """
     package = package_folder()
     if package is None:
         raise DeviceError("gsplat is not installed in this Python; run `make setup`")
     folder = build_folder()
-    with _alone(folder):
-        (folder / "lock").unlink(missing_ok=True)  # torch waits for ever on one that an interrupted build left
-        command = [sys.executable, "-m", "drivesplat.machine.gsplat_build.compile_job", str(folder)]
-        run_with_progress(command, compile_environment(toolkit, archs, jobs), log_file(), say)
+    with _exclusive(folder):
+        (folder / "lock").unlink(missing_ok=True)  # torch would wait forever for the lock of an interrupted build
+        command = [sys.executable, "-m", "drivesplat.machine.gsplat_build.compile", str(folder)]
+        run_with_progress(command, compile_environment(toolkit, archs, jobs), log_file(), report)
         installed = install(folder / "csrc.so", package, archs)
     check_loads(os.environ)
     shutil.rmtree(folder, ignore_errors=True)
@@ -91,21 +92,19 @@ def compile_and_install(toolkit: Toolkit, archs: Sequence[str], jobs: int, say: 
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _exclusive(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder.with_suffix(".lock"), "w", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise DeviceError(
-                f"gsplat is being compiled by another process already (in {folder}); wait for it"
-            ) from None
-        os.set_inheritable(lock.fileno(), True)  # compilers that outlive this process keep it
+            raise DeviceError(f"another process is compiling gsplat (in {folder}); wait for it") from None
+        os.set_inheritable(lock.fileno(), True)  # compilers that outlive this process keep the lock
         yield
 
 
-def run_with_progress(command: Sequence[str], env: Mapping[str, str], log: Path, say: Say) -> None:
-    """Runs a build that ninja reports on, saying how far it is. Raises DeviceError where it fails."""
+def run_with_progress(command: Sequence[str], env: Mapping[str, str], log: Path, report: Report) -> None:
+    """Runs a build with ninja and reports its progress. Raises DeviceError if it fails."""
     start, reported = time.monotonic(), 0
     with open(log, "wb") as output:
         process = subprocess.Popen(
@@ -114,45 +113,43 @@ def run_with_progress(command: Sequence[str], env: Mapping[str, str], log: Path,
         try:
             while process.poll() is None:
                 time.sleep(POLL_S)
-                reported = _report(log, start, reported, say)
+                reported = _report_progress(log, start, reported, report)
         finally:
-            if process.poll() is None:  # interrupted: ninja and its compilers go, too
+            if process.poll() is None:  # interrupted: end ninja and its compilers, too
                 os.killpg(process.pid, signal.SIGTERM)
                 process.wait()
     if process.returncode:
         text = log.read_text(errors="replace")
-        say(diagnose.last_lines(text))
+        report(diagnose.last_lines(text))
         why = diagnose.cause(text) or "see the lines above; docs/installation.md lists known causes"
         raise DeviceError(f"compiling gsplat failed: {why} (whole log: {log})")
 
 
-def _report(log: Path, start: float, reported: int, say: Say) -> int:
+def _report_progress(log: Path, start: float, reported: int, report: Report) -> int:
     steps = STEP.findall(log.read_text(errors="replace"))
-    if not steps or int(steps[-1][0]) <= reported:
+    done, total = map(int, steps[-1]) if steps else (0, 0)
+    if done <= reported:
         return reported
-    done, total = int(steps[-1][0]), int(steps[-1][1])
-    elapsed = time.monotonic() - start
-    left = elapsed / done * (total - done)
-    say(f"{done}/{total} files compiled, {elapsed / 60:.0f} min so far, about {max(1, round(left / 60))} min to go")
+    elapsed = (time.monotonic() - start) / 60
+    remaining = max(1, round(elapsed / done * (total - done)))
+    report(f"{done}/{total} files compiled, {elapsed:.0f} min so far, about {remaining} min to go")
     return done
 
 
 def install(built: Path, package: Path, archs: Iterable[str]) -> Path:
-    """Puts compiled kernels into the gsplat package, whole or not at all, with a note of what they are for."""
+    """Copies compiled kernels into the gsplat package atomically, with a record of what they were compiled for."""
     if not built.is_file():
-        raise DeviceError(f"compiling gsplat left no {built}; the log is {log_file()}")
+        raise DeviceError(f"compiling gsplat did not create {built}; the log is {log_file()}")
     target = package / "csrc.so"
     (package / RECORD).unlink(missing_ok=True)
-    aside = package / ".csrc.so.partial"
-    shutil.copyfile(built, aside)
-    aside.replace(target)
-    note = {"archs": list(archs), "versions": versions()}
-    (package / RECORD).write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
+    with atomic_path(target) as temporary:
+        shutil.copyfile(built, temporary)
+    write_json(package / RECORD, {"archs": list(archs), "versions": versions()})
     return target
 
 
 def check_loads(env: Mapping[str, str]) -> None:
-    """Imports gsplat's kernels as a run will: a fresh process, no nvcc in PATH. Raises DeviceError where that fails."""
+    """Imports gsplat's kernels as a run does: in a new process without nvcc in PATH. Raises DeviceError on failure."""
     script = "import gsplat.csrc; from gsplat.cuda._backend import _C; assert _C is gsplat.csrc, _C"
     plain = {name: value for name, value in env.items() if name not in ("CUDA_HOME", "CUDA_PATH")}
     plain["PATH"] = "/usr/bin:/bin"
@@ -160,3 +157,35 @@ def check_loads(env: Mapping[str, str]) -> None:
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise DeviceError(f"gsplat was compiled but cannot be loaded ({last}); remove .venv and run `make setup` again")
+
+
+def sources(package: Path) -> list[str]:
+    """gsplat's kernels and their Python bindings."""
+    cuda = package / "cuda"
+    return [str(path) for path in (*sorted(cuda.glob("csrc/*.cu")), *sorted(cuda.glob("csrc/*.cpp")), cuda / "ext.cpp")]
+
+
+def compile_in(folder: str) -> None:
+    """Compiles gsplat's kernels as the module `csrc` into a folder and imports it, with the flags of gsplat's build.
+
+    Runs in a process of its own: torch reads CUDA_HOME, TORCH_CUDA_ARCH_LIST and MAX_JOBS once, and ninja writes to its
+    output.
+    """
+    from torch.utils.cpp_extension import load
+
+    package = package_folder()
+    load(
+        name="csrc",
+        sources=sources(package),
+        extra_cflags=["-O3", "-Wno-attributes"],
+        extra_cuda_cflags=["-O3", "-use_fast_math"],
+        extra_include_paths=[str(package / "cuda/include"), str(package / "cuda/csrc/third_party/glm")],
+        build_directory=folder,
+        verbose=True,
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser("python -m drivesplat.machine.gsplat_build.compile", description=__doc__)
+    parser.add_argument("folder", help="where to compile gsplat's kernels")
+    compile_in(parser.parse_args().folder)
