@@ -16,7 +16,7 @@ from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
-from drivesplat.readers.nuscenes.download.destination import download_job, refuse
+from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
 from drivesplat.workflow.gpus import any_card
 from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
@@ -140,7 +140,7 @@ class Plan(Outputs):
     def refuse_download(self, targets: list[str]) -> None:
         """Raises ConfigError where nuScenes mini is asked for and may not be fetched."""
         if DOWNLOAD in targets:
-            refuse(download_job(self.config))
+            require_permission(download_job(self.config))
 
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""

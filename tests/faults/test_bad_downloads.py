@@ -20,7 +20,6 @@ from helpers.workflow_copy import WorkflowCopy, complaints
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.nuscenes.download import fetch as fetching
-from drivesplat.readers.nuscenes.download import unpack as unpacking
 from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
 from drivesplat.settings.download import DownloadJob
 
@@ -237,15 +236,15 @@ def repacked(archive: bytes, add: Member, outside: Path) -> bytes:
 @pytest.mark.parametrize(
     ("add", "why"),
     [
-        pytest.param(member("../evil"), "leads out of the folder", id="parent"),
-        pytest.param(member("samples/../../evil"), "leads out of the folder", id="parent further in"),
-        pytest.param(absolute, "is an absolute path", id="absolute"),
-        pytest.param(member("\\\\host\\evil"), "is an absolute path", id="network drive"),
-        pytest.param(member("samples\\evil"), "is no name", id="backslash"),
-        pytest.param(member("samples/\x1b[2Jevil\n"), "is no name", id="control characters"),
-        pytest.param(through_a_link, "is a link to", id="through a link"),
-        pytest.param(member("samples/in", tarfile.SYMTYPE, "maps"), "is a link to", id="link inside"),
-        pytest.param(member("evil", tarfile.LNKTYPE, "/etc/passwd"), "is a link to '/etc/passwd'", id="hard link"),
+        pytest.param(member("../evil"), "is no safe path", id="parent"),
+        pytest.param(member("samples/../../evil"), "is no safe path", id="parent further in"),
+        pytest.param(absolute, "is no safe path", id="absolute"),
+        pytest.param(member("\\\\host\\evil"), "is no safe path", id="network drive"),
+        pytest.param(member("samples\\evil"), "is no safe path", id="backslash"),
+        pytest.param(member("samples/\x1b[2Jevil\n"), "is no safe path", id="control characters"),
+        pytest.param(through_a_link, "neither a file nor a folder", id="through a link"),
+        pytest.param(member("samples/in", tarfile.SYMTYPE, "maps"), "neither a file nor a folder", id="link inside"),
+        pytest.param(member("evil", tarfile.LNKTYPE, "/etc/passwd"), "neither a file nor a folder", id="hard link"),
         pytest.param(member("evil", tarfile.CHRTYPE), "neither a file nor a folder", id="device"),
         pytest.param(member("evil", tarfile.FIFOTYPE), "neither a file nor a folder", id="fifo"),
         pytest.param(sparse, "neither a file nor a folder", id="sparse"),
@@ -260,11 +259,8 @@ def repacked(archive: bytes, add: Member, outside: Path) -> bytes:
         pytest.param(endless, "is damaged (there is no end to it)", id="endless padding"),
     ],
 )
-def test_an_archive_that_is_not_to_be_trusted_is_refused_before_anything_is_written(
-    archive, tmp_path, monkeypatch, add, why
-):
+def test_an_archive_that_is_not_to_be_trusted_is_refused_before_anything_is_written(archive, tmp_path, add, why):
     """Even where its checksum is right."""
-    monkeypatch.setattr(unpacking, "MAX_PADDING", 2 << 20)
     with served(Site(repacked(archive, add, tmp_path))) as site:
         job = site.job(tmp_path / "data/mini", max_files=200)
         message = refused(job)

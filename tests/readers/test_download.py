@@ -16,12 +16,12 @@ from helpers.tiny_world import World, write_world
 
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.preprocess.extract import extract_scene
+from drivesplat.readers.nuscenes.download import console, nuscenes_mini
 from drivesplat.readers.nuscenes.download import fetch as fetching
-from drivesplat.readers.nuscenes.download import nuscenes_mini, progress
-from drivesplat.readers.nuscenes.download.destination import download_job, is_there
+from drivesplat.readers.nuscenes.download.console import ByteProgress
+from drivesplat.readers.nuscenes.download.destination import download_job, is_present
 from drivesplat.readers.nuscenes.download.fetch import fetch
 from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
-from drivesplat.readers.nuscenes.download.progress import Progress
 from drivesplat.settings.config import load
 from drivesplat.settings.extract import SceneSource
 from drivesplat.workflow.plan import Plan
@@ -55,7 +55,7 @@ def plain():
 @pytest.fixture(autouse=True)
 def no_pause(monkeypatch):
     monkeypatch.setattr(fetching, "PAUSE_S", 0.0)
-    monkeypatch.setattr(fetching, "NEWS", 100_000)
+    monkeypatch.setattr(fetching, "MIN_NEW_BYTES", 100_000)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -100,7 +100,7 @@ def test_what_is_there_already_is_left_alone_and_nothing_is_fetched(site, tmp_pa
 
 def test_where_another_run_was_faster_nothing_is_fetched(site, tmp_path, monkeypatch):
     looks = [False, True]
-    monkeypatch.setattr(nuscenes_mini, "is_there", lambda _: looks.pop(0))
+    monkeypatch.setattr(nuscenes_mini, "is_present", lambda _: looks.pop(0))
     download(site.job(tmp_path / "mini"))
     assert site.asked == [] and list(tmp_path.iterdir()) == []
 
@@ -219,7 +219,7 @@ def test_a_part_that_is_too_long_starts_over(plain, tmp_path):
 def test_a_checksum_of_null_is_a_warning_and_the_size_counts(site, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         download(site.job(tmp_path / "mini", sha256=None))
-    assert "size alone is checked" in caplog.text and is_there(site.job(tmp_path / "mini"))
+    assert "only the size of" in caplog.text and is_present(site.job(tmp_path / "mini"))
 
 
 def in_a_process(call, *arguments) -> multiprocessing.Process:
@@ -287,10 +287,10 @@ def test_a_run_killed_while_unpacking_unpacks_again_without_fetching(site, world
 
 
 def test_progress_is_told_now_and_then(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "EVERY_S", 0.0)
-    Progress("download", 4_000_000_000, 1_000_000_000).add(1_000_000_000)
+    monkeypatch.setattr(console, "INTERVAL_S", 0.0)
+    ByteProgress("download", 4_000_000_000, 1_000_000_000).add(1_000_000_000)
     assert "download: 50 % of 4.00 GB, " in capsys.readouterr().err
-    told = Progress("download", 4_000_000_000, 1_000_000_000)
+    told = ByteProgress("download", 4_000_000_000, 1_000_000_000)
     told.add(1_000_000_000)
     assert told.line(100.0) == "download: 50 % of 4.00 GB, 10.0 MB/s, 3 min left"
 

@@ -1,1 +1,1 @@
-"""nuScenes mini from its server into the folder where the config looks for it."""
+"""The download of nuScenes mini."""

@@ -1,4 +1,4 @@
-"""Whether nuScenes mini may be fetched, for which dataset of the config, and whether its place is free.
+"""Whether nuScenes mini may be downloaded, for which dataset of the config, and whether its folder is free.
 
 Cheap to import: the Snakefile asks before any job runs.
 """
@@ -6,20 +6,20 @@ Cheap to import: the Snakefile asks before any job runs.
 from pathlib import Path
 
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.readers.datasets import layout
+from drivesplat.readers.nuscenes import layout
 from drivesplat.settings.config import Config
 from drivesplat.settings.download import DownloadJob
 
 RULE = "download_nuscenes_mini"
-"""The rule that fetches it."""
-READER, VERSION = "nuscenes", "v1.0-mini"
+"""The rule that downloads it."""
+VERSION = "v1.0-mini"
 TERMS = "https://www.nuscenes.org/terms-of-use"
 
 
 def download_job(config: Config) -> DownloadJob:
-    """What to fetch, for the first recorded dataset of version v1.0-mini. Raises ConfigError where there is none."""
+    """The download for the first recorded dataset of version v1.0-mini. Raises ConfigError if there is none."""
     for name, dataset in config.datasets.items():
-        if (dataset.reader, dataset.version, dataset.world) == (READER, VERSION, None):
+        if (dataset.reader, dataset.version, dataset.world) == ("nuscenes", VERSION, None):
             return DownloadJob(
                 accept_nuscenes_terms=config.accept_nuscenes_terms,
                 dataset=name,
@@ -30,15 +30,19 @@ def download_job(config: Config) -> DownloadJob:
     raise ConfigError(f"no recorded dataset of version {VERSION} is in the config: there is nowhere to put it")
 
 
-def refuse(job: DownloadJob) -> None:
-    """Raises ConfigError where the terms are not accepted, or the dataset's folder holds something else."""
+def require_permission(job: DownloadJob) -> None:
+    """Raises ConfigError if the terms are not accepted, or the dataset's folder holds other data."""
     if not job.accept_nuscenes_terms:
         raise ConfigError(
             f"nuScenes comes under terms (non-commercial use, unless licensed): read {TERMS}, and where you accept "
             "them set accept_nuscenes_terms: true in config.yaml, or --config accept_nuscenes_terms=True"
         )
-    if not is_there(job):
-        _refuse_other_data(job)
+    root = dataroot(job)
+    if not is_present(job) and root.exists() and not (root.is_dir() and not any(root.iterdir())):
+        raise ConfigError(
+            f"{root} is to hold nuScenes {job.version}, but holds something else, or only a part of it: "
+            f"set another datasets.{job.dataset}.dataroot, or empty that folder"
+        )
 
 
 def dataroot(job: DownloadJob) -> Path:
@@ -46,20 +50,10 @@ def dataroot(job: DownloadJob) -> Path:
     return Path(job.dataroot).expanduser().resolve()
 
 
-def is_there(job: DownloadJob) -> bool:
-    """Whether the dataset is complete already, as far as its tables tell."""
-    files = layout(READER)
+def is_present(job: DownloadJob) -> bool:
+    """Whether all tables of the dataset are present."""
     try:
-        files.table_files(files.find_root(job.dataroot, job.version), job.version)
+        layout.table_files(layout.find_root(job.dataroot, job.version), job.version)
     except DatasetError:
         return False
     return True
-
-
-def _refuse_other_data(job: DownloadJob) -> None:
-    root = dataroot(job)
-    if root.exists() and not (root.is_dir() and not any(root.iterdir())):
-        raise ConfigError(
-            f"{root} is to hold nuScenes {job.version}, but holds something else, or only a part of it: "
-            f"set another datasets.{job.dataset}.dataroot, or empty that folder"
-        )

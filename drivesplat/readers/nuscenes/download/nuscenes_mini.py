@@ -1,5 +1,5 @@
-"""The rule `download_nuscenes_mini`: the archive fetched and checked, unpacked beside the dataset's folder, and moved
-there as a whole. A run that is killed anywhere is gone on with by the next one."""
+"""The rule `download_nuscenes_mini`: downloads the archive, verifies it, unpacks it beside the dataset's folder, and
+moves the result there as a whole. The next run resumes one that was killed."""
 
 import fcntl
 import logging
@@ -10,12 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.datasets import layout
-from drivesplat.readers.nuscenes.download.destination import dataroot, is_there, refuse
-from drivesplat.readers.nuscenes.download.disk import require_space
+from drivesplat.readers.nuscenes import layout
+from drivesplat.readers.nuscenes.download.console import announce
+from drivesplat.readers.nuscenes.download.destination import dataroot, is_present, require_permission
 from drivesplat.readers.nuscenes.download.fetch import fetch, part_of, size_of
-from drivesplat.readers.nuscenes.download.progress import tell
-from drivesplat.readers.nuscenes.download.unpack import BadArchiveError, Limits, unpack
+from drivesplat.readers.nuscenes.download.unpack import BadArchiveError, require_space, unpack
 from drivesplat.settings.download import DownloadJob
 
 log = logging.getLogger(__name__)
@@ -24,66 +23,56 @@ ARCHIVE, UNPACKED = "v1.0-mini.tgz", "unpacked"
 
 
 def download(job: DownloadJob) -> None:
-    """Makes sure that nuScenes mini is at the dataroot; does nothing where it is there.
+    """Ensures that nuScenes mini is at the dataroot; does nothing if it is there.
 
-    Raises ConfigError where it may not be fetched, DatasetError where it cannot be; a line each.
+    Raises ConfigError if it may not be downloaded, DatasetError if that fails; one line each.
     """
-    refuse(job)
-    root = dataroot(job)
-    if is_there(job):
-        tell(f"nuScenes {job.version} is in {job.dataroot} already: nothing to do")
+    require_permission(job)
+    if is_present(job):
+        announce(f"nuScenes {job.version} is in {job.dataroot} already: nothing to do")
         return
     folder = work_folder(job)
     try:
-        with _held(folder):
-            if not is_there(job):  # another run may have been faster
-                shutil.rmtree(folder / UNPACKED, ignore_errors=True)  # of a run that was killed
-                _require_space(job, folder)
-                _bring(job, folder, root)
+        with _locked(folder):
+            if not is_present(job):  # another run may have been faster
+                _fill(job, folder)
             _clear(folder, job.nuscenes_mini.keep_archive)
     except OSError as error:
         where = error.filename or folder
         raise DatasetError(
             f"{where}: {error.strerror or error}; free space, fix its permissions, or set another dataroot"
         ) from error
-    tell(f"nuScenes {job.version} is in {root}")
+    announce(f"nuScenes {job.version} is in {dataroot(job)}")
 
 
 def work_folder(job: DownloadJob) -> Path:
-    """Beside the dataset's folder: the archive, whole or in part, and what is unpacked of it."""
+    """The folder beside the dataset's, for the archive and its unpacked files."""
     root = dataroot(job)
     return root.with_name(f"{root.name}.download")
 
 
-def _require_space(job: DownloadJob, folder: Path) -> None:
-    source, archive = job.nuscenes_mini, folder / ARCHIVE
-    have = size_of(archive) or size_of(part_of(archive))
-    fetched = max(source.size_bytes - have, 0)
-    require_space(folder, fetched + round(source.max_unpacked_gb * 1e9), "nuScenes mini")
-
-
-def _bring(job: DownloadJob, folder: Path, root: Path) -> None:
-    source, archive = job.nuscenes_mini, folder / ARCHIVE
+def _fill(job: DownloadJob, folder: Path) -> None:
+    """Fetches and unpacks the archive in `folder`, and moves the result to the dataroot."""
+    source, archive, unpacked = job.nuscenes_mini, folder / ARCHIVE, folder / UNPACKED
+    shutil.rmtree(unpacked, ignore_errors=True)  # of a killed run
+    missing = max(source.size_bytes - (size_of(archive) or size_of(part_of(archive))), 0)
+    require_space(folder, missing + round(source.max_unpacked_gb * 1e9), "nuScenes mini")
     if source.sha256 is None:
-        log.warning(
-            "nuscenes_mini.sha256 is null: of the archive from %s the size alone is checked, not the content",
-            source.url,
-        )
+        log.warning("nuscenes_mini.sha256 is null: only the size of %s is checked, not its content", source.url)
     fetch(source, archive)
-    limits = Limits(round(source.max_unpacked_gb * 1e9), source.max_files)
-    tables = [f"{job.version}/{table}.json" for table in layout("nuscenes").TABLES]
+    tables = [f"{job.version}/{table}.json" for table in layout.TABLES]
     try:
-        unpack(archive, folder / UNPACKED, limits, tables)
+        unpack(archive, unpacked, source, tables)
     except BadArchiveError as error:
         archive.unlink()
         raise DatasetError(f"{source.url}: {error}; it has been removed") from error
     os.sync()
-    (folder / UNPACKED).rename(root)  # takes the place of an empty folder, of nothing else
+    unpacked.rename(dataroot(job))  # replaces an empty folder, and nothing else
 
 
 @contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """Keeps a second run out of the folder until this one ends, however it ends. Raises DatasetError."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Excludes other runs from the folder until this one ends. Raises DatasetError if another has it."""
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "lock", "w", encoding="utf-8") as lock:
         try:
@@ -95,7 +84,7 @@ def _held(folder: Path) -> Iterator[None]:
 
 def _clear(folder: Path, keep_archive: bool) -> None:
     if keep_archive and (folder / ARCHIVE).is_file():
-        tell(f"the archive is kept: {folder / ARCHIVE}")
+        announce(f"the archive is kept: {folder / ARCHIVE}")
         (folder / "lock").unlink()
     else:
-        shutil.rmtree(folder, ignore_errors=True)  # a run that was faster may have removed it
+        shutil.rmtree(folder, ignore_errors=True)  # another run may have removed it already

@@ -1,4 +1,4 @@
-"""How far a long download has come, told now and then."""
+"""Console and log lines of a download."""
 
 import logging
 import sys
@@ -6,35 +6,35 @@ import time
 
 log = logging.getLogger(__name__)
 
-EVERY_S = 10.0
+INTERVAL_S = 10.0
+"""Time between two progress lines."""
 
 
-def tell(message: str) -> None:
-    """Puts a line into the log and on the console."""
+def announce(message: str) -> None:
+    """Writes a line to the log and to the console."""
     log.info(message)
     print(f"drivesplat: {message}", file=sys.stderr, flush=True)
 
 
-class Progress:
-    """Bytes that have come of `total`, of which `done` were there before."""
+class ByteProgress:
+    """Counts bytes up to `total`, of which `done` were there before, and announces progress and remaining time."""
 
     def __init__(self, what: str, total: int, done: int = 0):
         self._what, self._total, self._done = what, total, done
-        self._begun = self._told = time.monotonic()
-        self._since = 0
+        self._start = self._announced = time.monotonic()
+        self._new = 0
 
     def add(self, count: int) -> None:
-        """Counts bytes; tells about every ten seconds."""
         self._done += count
-        self._since += count
+        self._new += count
         now = time.monotonic()
-        if now - self._told >= EVERY_S:
-            self._told = now
-            tell(self.line(now - self._begun))
+        if now - self._announced >= INTERVAL_S:
+            self._announced = now
+            announce(self.line(now - self._start))
 
     def line(self, seconds: float) -> str:
-        """How far it is, `seconds` after it began."""
-        rate = self._since / max(seconds, 1e-9)
+        """The progress line, `seconds` after the start."""
+        rate = self._new / max(seconds, 1e-9)
         left = (self._total - self._done) / rate if rate > 0 else 0.0
         unit = f"{left / 60:.0f} min" if left >= 120 else f"{left:.0f} s"
         percent = 100 * self._done / self._total
