@@ -1,8 +1,8 @@
-"""The moving actors: for every track a set of Gaussians in its own box's frame, all of them moved in one batch.
+"""The moving actors: a set of Gaussians per track, in the frame of its box, all transformed in one batch.
 
-After Street Gaussians (Yan et al. 2024, arXiv 2401.01339): the boxes carry the Gaussians, small corrections of the
-boxes are learned, and colours vary with time as a Fourier series over the actor's life. Colours are functions of the
-direction in the object's frame: their spherical harmonics turn with it.
+After Street Gaussians (Yan et al. 2024, arXiv 2401.01339): Gaussians are transformed by the track, small corrections of
+the boxes are learned, and colours vary with time as a Fourier series over the track's duration. Colours are functions
+of the direction in the object's frame: their spherical harmonics rotate with it.
 """
 
 from collections.abc import Sequence
@@ -54,11 +54,11 @@ class ActorPoses:
 
 
 class Actors(Part):
-    """The Gaussians of a tracks, n in all; `params["owner"]` (n,) says whose each is.
+    """The Gaussians of a tracks, n in all; `params["owner"]` (n,) is the index of each one's track.
 
-    `sh0` (n, f, 1, 3) and `shN` (n, f, k - 1, 3) hold f Fourier coefficients of every coefficient of the colours.
-    `shared` holds the corrections at all m annotations, one track after the other: `translation` (m, 3) metres along
-    the world's axes, `yaw` (m,) radians about the object's vertical axis.
+    `sh0` (n, f, 1, 3) and `shN` (n, f, k - 1, 3) hold f Fourier coefficients of every colour coefficient. `shared`
+    holds the corrections at all m annotations, track after track: `translation` (m, 3) metres along the world's axes,
+    `yaw` (m,) radians about the object's vertical axis.
     """
 
     name = "actors"
@@ -111,9 +111,6 @@ class Actors(Part):
     def precompute(self, times: Sequence[float]) -> None:
         self.timeline.precompute(times, self.params["means"].device)
 
-    def at(self, time: float) -> Gaussians:
-        return self.at_time_state(self.time_state(time))
-
     def time_state(self, time: float) -> TimeState:
         return self.timeline.at(time, self.params["means"].device)
 
@@ -122,7 +119,7 @@ class Actors(Part):
         return self.placed(state, self.poses(state))
 
     def poses(self, state: TimeState) -> ActorPoses:
-        """Where the actors are, by their annotations and the learned corrections."""
+        """The annotated poses of the actors with their learned corrections."""
         weights = state.weights * self._annotated
         turns = about_vertical(weights @ self.shared["yaw"])
         return ActorPoses(
@@ -177,20 +174,20 @@ class Actors(Part):
         return Gaussians.of(*placed(shapes, objects, owner, self._owns), sh)
 
     def _of_owners(self, values: Float[Tensor, "a *v"]) -> Float[Tensor, "n *v"]:
-        """For every Gaussian its actor's value: a product with the matrix of who owns what, exact, and with a gradient
-        that is a product as well, where that of indexing adds up row by row."""
+        """For every Gaussian the value of its actor, by a product with the ownership matrix: exact, with a gradient
+        that is a matrix product too, whereas the gradient of indexing sums row by row."""
         return (self._owns.to(values.dtype) @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
-        """1 where a Gaussian is an actor's, else 0; made anew where densification has changed whose they are, and
-        wherever an iteration of a training is captured, to be replayed when it has."""
+        """The ownership matrix: 1 where a Gaussian is an actor's, else 0. Cached until densification changes `owner`;
+        computed within every captured training iteration, since its replays may follow a densification."""
         owner, (known, version, matrix) = self.params["owner"], self._known_owners
         captured = owner.is_cuda and torch.cuda.is_current_stream_capturing()
         changed = known is not owner or version != owner._version or (captured and torch.is_grad_enabled())
         if matrix is None or changed or matrix.device != owner.device:
             matrix = one_hot(owner, len(self.timeline.tracks)).float()
-            if not captured:  # which is computed when it is replayed, and not yet
+            if not captured:  # a captured matrix has no values before a replay
                 self._known_owners = owner, owner._version, matrix
         return matrix
 
@@ -237,7 +234,7 @@ class Actors(Part):
 
     @torch.no_grad()
     def motions(self) -> list[Motion]:
-        """Every track's motion with its learned corrections."""
+        """The motion of every track with its learned corrections."""
         shifts, turns = (self.shared[key].double().cpu().numpy() for key in ("translation", "yaw"))
         motions = []
         for track, own in zip(self.timeline.tracks, self.timeline.owned, strict=True):
@@ -250,8 +247,8 @@ class Actors(Part):
 def track_penalties(
     translation: Float[Tensor, "m 3"], yaw: Float[Tensor, " m"], neighbours: Int[Tensor, "q 3"], settings: TrackSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """What corrections cost: their mean square, and that of their second differences along the tracks, both in units of
-    what annotations are expected to be off. `neighbours` are every three annotations that follow one another."""
+    """The penalties of corrections: their mean square, and that of their second differences along the tracks, both in
+    units of the expected annotation error. `neighbours` are all triples of consecutive annotations."""
     off = torch.cat([translation / settings.sigma_translation, yaw[:, None] / settings.sigma_yaw], dim=1)
     penalties = {"track_size": settings.size_weight * off.square().sum(dim=1).mean()}
     if len(neighbours):

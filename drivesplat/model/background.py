@@ -14,7 +14,7 @@ from drivesplat.settings.gaussians import GaussianSettings
 
 
 class Background(Part):
-    """Static Gaussians that spread over `extent` metres."""
+    """Static Gaussians with an extent of `extent` metres."""
 
     name = "background"
 
@@ -30,9 +30,6 @@ class Background(Part):
     ) -> "Background":
         """Initialised from seed points: `positions` (n, 3) metres and `colors` (n, 3) in [0, 1]."""
         return cls(init_params(positions, colors, settings, classes), settings, extent)
-
-    def at(self, time: float) -> Gaussians:
-        return self.at_time_state(self.time_state(time))
 
     def time_state(self, time: float) -> Sequence[Tensor]:
         return ()

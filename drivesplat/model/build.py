@@ -1,4 +1,4 @@
-"""A method's settings into a model: the only place that knows parts and skies by name."""
+"""Building a model from the settings of a method: the only module that knows parts and skies by name."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,12 +19,12 @@ from drivesplat.scene.actor_record import motion_of
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
-EXPOSED = "exposure.first."
-"""What the names of exposures' first gains begin with in a model's state; the camera follows."""
-POSED = "camera_poses." + TIMES
-"""And those of the times of corrected camera poses."""
-FEW = 4
-"""An actor keeps so many points of its seed whatever the cap: a Gaussian's first size is by its three neighbours."""
+EXPOSURE_PREFIX = "exposure.first."
+"""Prefix of the initial gains of exposures in a model's state; the camera name follows."""
+POSES_PREFIX = "camera_poses." + TIMES
+"""Prefix of the times of corrected camera poses in a model's state; the camera name follows."""
+MIN_SEED_POINTS = 4
+"""Seed points that an actor keeps whatever the cap: the initial scale of a Gaussian comes from three neighbours."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ModelInit:
 
 
 def gaussian_cap(record: TrainingRecord, settings: TrainSettings) -> int:
-    """The most Gaussians a scene's training images can hold: `cap_max`, or fewer where they have few pixels."""
+    """The maximum number of Gaussians for a scene's training images: `cap_max`, or fewer for images with few pixels."""
     if not settings.pixels_per_gaussian:
         return settings.cap_max
     pixels = int(record.image_sizes[record.splits["train"]].prod(axis=1).sum())
@@ -51,8 +51,8 @@ def gaussian_cap(record: TrainingRecord, settings: TrainSettings) -> int:
 
 
 def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings) -> SplatModel:
-    """An untrained model. A part that has nothing to consist of (actors where nothing moves) is left out."""
-    makers = {"background": _background, "actors": _actors}
+    """An untrained model without the parts that would be empty, such as actors in a static scene."""
+    makers = {"background": _init_background, "actors": _init_actors}
     made = (makers[name](init, settings) for name in parts)
     return SplatModel(
         [part for part in made if part is not None],
@@ -64,7 +64,7 @@ def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, sett
 
 
 def definitions(model: SplatModel) -> list[dict[str, Any]]:
-    """What `rebuild_model` needs of a model's parts, beside parameters: plain data and tensors."""
+    """What `rebuild_model` needs of a model's parts beside parameters: plain data and tensors."""
     return [{"part": part.name, **part.definition()} for part in model.parts]
 
 
@@ -72,14 +72,16 @@ def rebuild_model(
     state: Mapping[str, torch.Tensor], parts: list[dict[str, Any]], sky: SkyKind, settings: TrainSettings
 ) -> SplatModel:
     """The model whose `state_dict` is `state` and whose `definitions` are `parts`."""
-    makers = {"background": _background_again, "actors": _actors_again}
+    makers = {"background": _restore_background, "actors": _restore_actors}
     made = []
     for i, definition in enumerate(parts):
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         made.append(makers[definition["part"]](params, definition, settings))
-    exposed = {key.removeprefix(EXPOSED): gains for key, gains in state.items() if key.startswith(EXPOSED)}
-    posed = {key.removeprefix(POSED): at.tolist() for key, at in state.items() if key.startswith(POSED)}
+    exposed = {
+        key.removeprefix(EXPOSURE_PREFIX): gains for key, gains in state.items() if key.startswith(EXPOSURE_PREFIX)
+    }
+    posed = {key.removeprefix(POSES_PREFIX): at.tolist() for key, at in state.items() if key.startswith(POSES_PREFIX)}
     model = SplatModel(
         made,
         _sky(sky, settings, np.full(3, 0.5)),
@@ -91,26 +93,26 @@ def rebuild_model(
     return model
 
 
-def _background(init: ModelInit, settings: TrainSettings) -> Part:
+def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
     record = init.record
-    kept = some_of(len(record.points), settings.cap_max)
+    kept = random_subset(len(record.points), settings.cap_max)
     positions, colors = record.points[kept], record.points_rgb[kept] / 255.0
     return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes)
 
 
-def _background_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
+def _restore_background(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
     return Background(params, settings.gaussians, definition["extent"])
 
 
-def _actors(init: ModelInit, settings: TrainSettings) -> Part | None:
+def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
     actors = [actor for actor in init.actors if len(actor["points"])]
     if not actors:
         return None
     tracks = [ActorTrack(actor["id"], actor["size"], motion_of(actor)) for actor in actors]
     limits = [actor_cap(actor, settings) for actor in actors]
     counts = [len(actor["points"]) for actor in actors]
-    shares = shared_out(list(map(min, counts, limits)), settings.actors.cap_max)
-    kept = [some_of(count, share) for count, share in zip(counts, shares, strict=True)]
+    shares = split_cap(list(map(min, counts, limits)), settings.actors.cap_max)
+    kept = [random_subset(count, share) for count, share in zip(counts, shares, strict=True)]
     points, colors = (
         [actor[key][chosen] for actor, chosen in zip(actors, kept, strict=True)] for key in ("points", "points_rgb")
     )
@@ -119,32 +121,32 @@ def _actors(init: ModelInit, settings: TrainSettings) -> Part | None:
 
 
 def actor_cap(actor: dict[str, Any], settings: TrainSettings) -> int:
-    """The most Gaussians that the training pixels in an actor's box can hold."""
+    """The maximum number of Gaussians for the training pixels in an actor's box."""
     if not settings.pixels_per_gaussian:
         return settings.actors.cap_max
     return max(settings.actors.least, int(actor["pixels"] / settings.pixels_per_gaussian))
 
 
-def shared_out(wanted: Sequence[int], cap: int) -> list[int]:
-    """How many of the Gaussians that each wants it may have, `cap` in all: FEW, or all if it wants fewer, and of those
-    beyond the same fraction as the others. Where the cap has no room for FEW each, they have them nonetheless."""
+def split_cap(wanted: Sequence[int], cap: int) -> list[int]:
+    """Splits `cap` Gaussians among actors that want so many: each gets up to MIN_SEED_POINTS, even beyond the cap, and
+    the same fraction of the rest of its wish."""
     if sum(wanted) <= cap:
         return list(wanted)
-    least = np.minimum(wanted, FEW)
-    more = wanted - least
-    room = max(0, cap - int(least.sum()))
-    ends = np.cumsum([0, *more]) * room // max(1, int(more.sum()))
-    return (least + np.diff(ends)).tolist()
+    base = np.minimum(wanted, MIN_SEED_POINTS)
+    rest = wanted - base
+    left = max(0, cap - int(base.sum()))
+    ends = np.cumsum([0, *rest]) * left // max(1, int(rest.sum()))
+    return (base + np.diff(ends)).tolist()
 
 
-def some_of(count: int, limit: int) -> np.ndarray:
+def random_subset(count: int, limit: int) -> np.ndarray:
     """Indices of at most `limit` of `count`, in order."""
     if count <= limit:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
 
 
-def _actors_again(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
+def _restore_actors(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
     tracks = [ActorTrack.from_plain(plain) for plain in definition["tracks"]]
     return Actors(params, tracks, settings.actors, settings.gaussians)
 

@@ -1,4 +1,4 @@
-"""Where cameras were, corrected: a small rigid transform per training image, in that camera's own frame."""
+"""Learned corrections of camera poses: a small rigid transform per training image, in the camera's own frame."""
 
 import dataclasses
 import math
@@ -13,16 +13,16 @@ from drivesplat.model.view import View
 from drivesplat.settings.camera_poses import CameraPoseSettings
 
 TIMES = "times_"
-"""What the names of the times' buffers begin with; the camera follows."""
+"""Prefix of the names of the buffers of times; the camera name follows."""
 
 
 class CameraPoses(nn.Module):
-    """For each camera of `times`, the seconds (n,) of its training images, increasing: corrections, of which `params`
-    hold (n, 6) numbers a camera, those of shifts first. A number p is a correction of tanh(p) times its bound. They
-    begin at 0.
+    """Corrections for each camera of `times`, the increasing times (n,) of its training images in seconds. `params`
+    hold (n, 6) numbers a camera, first those of shifts, initially 0; a number p is a correction of tanh(p) times its
+    bound.
 
-    corrected camera_to_world = camera_to_world @ correction. Between two training images numbers are linear in time;
-    before the first and after the last they stay. Cameras that are not listed are where they are.
+    corrected camera_to_world = camera_to_world @ correction. Numbers are linear in time between two training images and
+    constant before the first and after the last. Cameras that are not listed are not corrected.
     """
 
     def __init__(self, times: Mapping[str, Sequence[float]], settings: CameraPoseSettings):
@@ -36,14 +36,14 @@ class CameraPoses(nn.Module):
         self.register_buffer("bounds", torch.tensor(bounds), persistent=False)
 
     def corrected(self, view: View) -> View:
-        """A view from where its camera really was."""
+        """A view from its camera's corrected pose."""
         if view.camera not in self.params:
             return view
         moved = view.camera_to_world @ transform(self.bounds * torch.tanh(self._numbers(view.camera, view.time)))
         return dataclasses.replace(view, camera_to_world=moved)
 
     def penalty(self, camera: str | None) -> Float[Tensor, ""] | None:
-        """What a camera's corrections cost, all of them; None where there are none."""
+        """The penalty of all corrections of a camera; None where there are none."""
         if camera not in self.params:
             return None
         parts = torch.tanh(self.params[camera])
@@ -67,7 +67,7 @@ class CameraPoses(nn.Module):
         return found
 
     def _numbers(self, camera: str, time: float) -> Float[Tensor, "6"]:
-        """A camera's numbers at a time, which is known without asking the device."""
+        """A camera's numbers at a time. The time is known to Python: no host synchronisation."""
         times, numbers = self._times[camera], self.params[camera]
         after = bisect_right(times, time)
         if after == 0 or after == len(times):
@@ -77,8 +77,8 @@ class CameraPoses(nn.Module):
 
 
 def transform(correction: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
-    """The rigid transform of a shift and a small rotation vector (radians), differentiable at none: the quaternion (1,
-    v / 2), normalised, which is off by |v|³ / 12."""
+    """The rigid transform of a shift and a small rotation vector v (radians), differentiable at 0: the normalised
+    quaternion (1, v / 2), with an error of |v|³ / 12."""
     shift, vector = correction[:3], correction[3:]
     w, x, y, z = torch.nn.functional.normalize(torch.cat([vector.new_ones(1), 0.5 * vector]), dim=0)
     rows = [

@@ -1,4 +1,4 @@
-"""How the cameras of a rig show colours: each exposes and white-balances by itself."""
+"""Exposure and white balance of each camera of a rig."""
 
 from collections.abc import Mapping
 
@@ -12,12 +12,12 @@ CHANNELS = ("red", "green", "blue")
 
 
 class Exposures(nn.Module):
-    """For each of some cameras an affine map of every colour channel: c is shown as f exp(g) c + o. `first` holds the
-    gains f (3,) that a camera was found to have before the training, `params` what is learned: log gains g (row 0) and
-    offsets o (row 1), (2, 3) a camera, in units of how much they are expected to be. They begin at 0.
+    """For each listed camera an affine map of every colour channel: c becomes f exp(g) c + o. `first` holds the initial
+    gains f (3,) estimated before the training; `params` what is learned: log gains g (row 0) and offsets o (row 1),
+    (2, 3) a camera, in units of their expected size, initially 0.
 
-    Any other camera shows colours as they are: the reference, without which gains and the brightness of the scene could
-    trade places, and cameras that recorded no training image.
+    Other cameras keep the model's colours: the reference camera, which fixes the brightness of the scene, and cameras
+    without training images.
     """
 
     def __init__(self, first: Mapping[str, Tensor], settings: ExposureSettings):
@@ -28,15 +28,15 @@ class Exposures(nn.Module):
         self.params = nn.ParameterDict({camera: nn.Parameter(torch.zeros(2, 3)) for camera in first})
         self._settings = settings
 
-    def shown(self, image: Float[Tensor, "h w 3"], camera: str | None) -> Float[Tensor, "h w 3"]:
-        """An image in the model's colours as `camera` shows it."""
+    def applied(self, image: Float[Tensor, "h w 3"], camera: str | None) -> Float[Tensor, "h w 3"]:
+        """Maps an image from the model's colours to those of `camera`."""
         if camera not in self.params:
             return image
         gains, offsets = self._map(camera)
         return image * gains + offsets
 
     def penalty(self, camera: str | None) -> Float[Tensor, ""] | None:
-        """The weighted mean square of a camera's parameters; None where there are none to be paid for."""
+        """The weighted mean square of a camera's parameters; None without parameters or weight."""
         if camera not in self.params or not self._settings.weight:
             return None
         return self._settings.weight * self.params[camera].square().mean()
@@ -52,7 +52,7 @@ class Exposures(nn.Module):
         return dict.fromkeys(self.params, self._settings.learning_rate)
 
     def figures(self) -> dict[str, float]:
-        """Every gain and offset by its name: 'CAM_BACK/gain_red'. Waits for the device."""
+        """Every gain and offset by name: 'CAM_BACK/gain_red'. Waits for the device."""
         if not len(self.params):
             return {}
         values = torch.stack([torch.stack(self._map(camera)) for camera in self.params]).detach().reshape(-1).tolist()

@@ -1,4 +1,4 @@
-"""Gaussians in world coordinates, ready for the rasterizer."""
+"""Gaussians in world coordinates as the rasterizer takes them."""
 
 import math
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Gaussians:
-    """n Gaussians: `means` and `scales` metres, `quats` w, x, y, z, `opacities` in [0, 1], coefficients of RGB colours:
-    the constant ones and the others, which are learned apart."""
+    """n Gaussians: `means` and `scales` in metres, `quats` w, x, y, z, `opacities` in [0, 1], and spherical harmonics
+    of RGB colours: `sh0` of degree 0, `shN` of the degrees above."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -26,30 +26,29 @@ class Gaussians:
     def of(
         cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Float[Tensor, "n k 3"]
     ) -> "Gaussians":
-        """With all coefficients together."""
+        """From the coefficients of all degrees in one tensor."""
         return cls(means, quats, scales, opacities, sh[:, :1], sh[:, 1:])
 
     @property
     def sh(self) -> Float[Tensor, "n k 3"]:
-        """All coefficients together."""
+        """The coefficients of all degrees."""
         return torch.cat([self.sh0, self.shN], dim=1)
 
     def __len__(self) -> int:
         return len(self.means)
 
     def __getitem__(self, chosen: Bool[Tensor, " n"] | Int[Tensor, " m"] | slice) -> "Gaussians":
-        """Those that a mask, indices or a slice choose."""
+        """A subset, by mask, indices or slice."""
         return Gaussians(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
     @property
     def sh_degree(self) -> int:
-        """The degree that the number of coefficients stands for: k = (degree + 1)²."""
+        """The degree of the spherical harmonics: k = (degree + 1)² coefficients."""
         return math.isqrt(1 + self.shN.shape[1]) - 1
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
-    """Several sets as one, in order, all with as many SH coefficients as the richest; a single set is returned as it
-    is."""
+    """Several sets as one, in order, with the highest SH degree of them; a single set is returned unchanged."""
     if len(sets) == 1:
         return sets[0]
     coefficients = max(s.shN.shape[1] for s in sets)

@@ -1,8 +1,8 @@
-"""Spherical harmonics that turn with an object.
+"""Rotation of spherical harmonics with an object.
 
-A colour function given in an object's frame is again one of the same degree in the world's frame: a linear map of its
-coefficients, block by block of a degree. Rotated coefficients go through the rasterizer like any others, and give the
-colours that evaluation along directions in the object's frame gives.
+A colour function in an object's frame has the same degree in the world's frame: its coefficients are mapped linearly,
+degree by degree. Rasterizing the rotated coefficients gives the colours that evaluation along directions in the
+object's frame gives.
 """
 
 from functools import cache
@@ -15,8 +15,9 @@ from torch import Tensor
 def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) -> Float[Tensor, "a k k"]:
     """The maps of k `coefficients` under `rotations` (object to world): sh_world = map @ sh_object.
 
-    Exact for every degree, from as many directions as determine it: with Y(d) the basis along directions d (rows),
-    Y(d) sh_world = Y(R^T d) sh_object for all d. Between degrees it is exactly 0: Adam makes whole steps of rounding.
+    Exact for every degree, by least squares over sufficiently many directions: with Y(d) the basis along directions d
+    (rows), Y(d) sh_world = Y(R^T d) sh_object for all d. Entries between degrees are exactly 0, since Adam would
+    amplify rounding errors.
     """
     if coefficients <= 4:
         return _of_vectors(rotations, coefficients)
@@ -42,7 +43,7 @@ def _axes(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 3"]:
 
 
 def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """Coefficients of an object's frame as those of the world's."""
+    """Coefficients in an object's frame as coefficients in the world's frame."""
     if sh.shape[1] == 1:
         return sh
     return rotation_of_harmonics(object_to_world[None].to(sh), sh.shape[1])[0] @ sh
@@ -50,7 +51,9 @@ def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -
 
 def _basis(coefficients: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
     """The first k functions along unit directions, in the order and with the signs of 3D Gaussian Splatting."""
-    from gsplat.cuda._torch_impl import _eval_sh_bases_fast  # the stages say in a sentence where gsplat is missing
+    from gsplat.cuda._torch_impl import (
+        _eval_sh_bases_fast,  # imported late: stages report a missing gsplat in a sentence
+    )
 
     return _eval_sh_bases_fast(coefficients, directions)
 
@@ -58,7 +61,7 @@ def _basis(coefficients: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor
 @cache
 def _directions(coefficients: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Directions (m, 3) spread over the sphere (a Fibonacci lattice), the pseudo-inverse (k, m) of their basis, and
-    which coefficients (k, k) are of one degree."""
+    which coefficients (k, k) have the same degree."""
     count = 4 * coefficients
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1.0 - 2.0 * index / count

@@ -1,4 +1,4 @@
-"""What a method is made of: parts that place Gaussians, and a sky behind them.
+"""The components of a model: parts, which consist of Gaussians, and the sky behind them.
 
 Each part owns its parameters, their learning rates and its densification. A method is a list of parts.
 """
@@ -18,7 +18,7 @@ from drivesplat.model.view import View
 from drivesplat.scene.motion import Motion
 
 FADED = 1e-4
-"""Opacity of a faded Gaussian: under every strategy's threshold, so that the strategy removes or relocates it."""
+"""Opacity of a faded Gaussian, below the threshold at which every strategy removes or relocates it."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,19 @@ class RigidGroup:
 
 
 class Part(nn.Module, ABC):
-    """A set of Gaussians: the world's static background, the moving actors, ...
+    """A set of Gaussians: the static background, the moving actors, ...
 
-    `params` holds what every Gaussian has of its own, a row each, under gsplat's names (`drivesplat.model.parameters`),
-    so that gsplat's strategies densify it; `shared` what many have in common.
+    `params` holds the parameters of each Gaussian, a row each, under gsplat's names (`drivesplat.model.parameters`), as
+    gsplat's strategies expect them; `shared` those that several Gaussians share.
     """
 
     name: str
     moves = False
-    """Whether its Gaussians are objects that are elsewhere at another time."""
+    """Whether its Gaussians are dynamic: at other places at other times."""
     extent: float
-    """Over how many metres its Gaussians spread: densification and learning rates of positions go by it."""
+    """Extent of its Gaussians in metres, which scales densification and the learning rate of positions."""
     cap_max: int | None = None
-    """The most Gaussians that densification may make of it; None: as many as the training's settings say."""
+    """Maximum number of Gaussians in densification; None: that of the training's settings."""
     params: nn.ParameterDict
     count_on_device: Float[Tensor, ""]
     """The number of its Gaussians in device memory; valid only with `preallocated` rows."""
@@ -67,12 +67,13 @@ class Part(nn.Module, ABC):
     def precompute(self, times: Sequence[float]) -> None:
         """Precomputes state for the given times, which may be faster for many times together than one by one."""
 
-    @abstractmethod
     def at(self, time: float) -> Gaussians:
         """Its Gaussians in world coordinates at a time in seconds since the first image.
 
-        Always `self.row_count` rows in one order; one that is absent then has opacity 0.
+        Always `self.row_count` rows in one order; a Gaussian that is absent then has opacity 0. A part without time
+        states overrides this.
         """
+        return self.at_time_state(self.time_state(time))
 
     def time_state(self, time: float) -> Sequence[Tensor] | None:
         """The state of its Gaussians at a time as tensors on its device, of the same shapes at every time:
@@ -96,7 +97,7 @@ class Part(nn.Module, ABC):
 
     @abstractmethod
     def definition(self) -> dict[str, Any]:
-        """What, beside its parameters and settings, makes it what it is: plain data, for the checkpoint."""
+        """What the checkpoint needs beside parameters and settings: plain data and tensors."""
 
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         """Its Gaussians with the colours of a time as rigid groups: one static group, or one for every track. Names are
@@ -104,20 +105,20 @@ class Part(nn.Module, ABC):
         return {self.name: RigidGroup(self.at(time), None)}
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
-        """Weighted terms for the training loss about itself, by name."""
+        """Its own weighted terms of the training loss, by name."""
         return {}
 
     def confine(self) -> None:
-        """Fades Gaussians that have gone where this part must not have any."""
+        """Fades Gaussians at places where this part must not have any."""
 
     @torch.no_grad()
     def fade(self, rows: Bool[Tensor, " n"]) -> None:
-        """Makes Gaussians invisible."""
+        """Makes Gaussians nearly transparent."""
         opacities, faded = self.params["opacities"], torch.logit(torch.tensor(FADED)).item()
         opacities.masked_fill_(rows & (opacities > faded), faded)
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
-        """Which of its rows are a track's own; None where this part does not know the track as an object."""
+        """The mask of a track's rows; None where this part does not know the track as an object."""
         return None
 
     def __len__(self) -> int:
@@ -126,7 +127,7 @@ class Part(nn.Module, ABC):
 
     @property
     def row_count(self) -> int:
-        """How many rows each of `params` has."""
+        """The number of rows of each of `params`."""
         return len(self.params["means"])
 
     @property
@@ -152,11 +153,11 @@ def active_fraction(parts: Iterable[Part]) -> float | Float[Tensor, ""]:
 
 
 class Sky(nn.Module, ABC):
-    """What is seen where no Gaussian is: a colour by direction."""
+    """The background colour by direction, seen where no Gaussian is."""
 
     params: nn.ParameterDict
     keeps_gaussians_out: bool
-    """Whether Gaussians are to stay out of sky pixels, since this sky alone is to be seen there."""
+    """Whether the loss keeps Gaussians out of sky pixels, so that only the sky is seen there."""
 
     @abstractmethod
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -169,8 +170,7 @@ class Sky(nn.Module, ABC):
         view: View,
         rays: Float[Tensor, "h w 3"] | None = None,
     ) -> Float[Tensor, "h w 3"]:
-        """What a view shows: `splats`, premultiplied by `alpha`, before this sky. `rays` are `view.rays()` where they
-        are known."""
+        """Composites `splats`, premultiplied by `alpha`, over this sky. `rays` are `view.rays()` if already known."""
         return splats + (1.0 - alpha) * self.colors(view.rays() if rays is None else rays)
 
     @abstractmethod

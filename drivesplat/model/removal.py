@@ -1,4 +1,4 @@
-"""Taking a vehicle out of a trained model: by its own Gaussians where the model knows them, else by its box."""
+"""Removing a vehicle from a trained model: by its own Gaussians where the model knows them, else by its box."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,17 +14,17 @@ from drivesplat.scene.tracks import Box
 
 @dataclass(frozen=True)
 class Removal:
-    """`removed` (n,) bool rows of the model's Gaussians; `by`: what told them from the rest."""
+    """`removed` (n,) bool rows of the model's Gaussians; `by`: the criterion that selected them."""
 
     removed: Bool[Tensor, " n"]
     by: Literal["actor", "box"]
 
 
 def removal_of(model: SplatModel, gaussians: Gaussians, box: Box, margin: float) -> Removal:
-    """What is to be removed of `gaussians` (the model's at the time of `box`) so that the box's object goes.
+    """The rows of `gaussians`, the model's at the time of `box`, that show the object in the box.
 
-    A model that knows the object gives its Gaussians; of any other, those go whose centres lie in the box, grown
-    by `margin` metres at its sides and roof.
+    The object's own Gaussians where the model knows it, else those with centres in the box, enlarged by `margin` metres
+    at its sides and roof.
     """
     own = model.of_track(box.track_id)
     if own is not None:

@@ -1,4 +1,4 @@
-"""A scene as a list of parts with a sky behind them, and how a camera sees it."""
+"""A model of a scene: a list of parts, a sky, and the properties of cameras; and its rendering."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,11 +21,10 @@ from drivesplat.rasterization import Rendering, rasterize
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view shows of `gaussians`: `image` with the sky behind, as the view's camera exposes it; `splats` without
-    sky in the model's own colours (premultiplied by their `alpha`), `depth` in metres or None."""
+    """A rendering of `gaussians`: `image` with sky and the exposure of the view's camera; `splats` without sky in the
+    model's own colours (premultiplied by their `alpha`), `depth` in metres or None."""
 
     gaussians: Gaussians
-
     image: Float[Tensor, "h w 3"]
     splats: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
@@ -34,7 +33,7 @@ class Picture:
 
 
 class SplatModel(nn.Module):
-    """Parts, a sky (None: black), how cameras expose (None: all alike), and where they were (None: as recorded)."""
+    """Parts, a sky (None: black), exposures of cameras (None: all alike), pose corrections (None: recorded poses)."""
 
     def __init__(
         self,
@@ -56,7 +55,7 @@ class SplatModel(nn.Module):
 
     @property
     def beside_parts(self) -> dict[str, Sky | Exposures | CameraPoses]:
-        """What else is learned, by name: modules with `params` and their `learning_rates()`."""
+        """Other learned modules by name, with `params` and `learning_rates()`."""
         named = {"sky": self.sky, "exposure": self.exposure, "camera_poses": self.camera_poses}
         return {name: module for name, module in named.items() if module is not None}
 
@@ -97,7 +96,7 @@ class SplatModel(nn.Module):
         return found
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
-        """Which of `gaussians_at`'s rows are a track's own; None where no part knows the track as an object."""
+        """The mask of a track's rows of `gaussians_at`; None where no part knows the track as an object."""
         found = [part.of_track(track_id) for part in self.parts]
         if all(rows is None for rows in found):
             return None
@@ -107,12 +106,12 @@ class SplatModel(nn.Module):
 
     @property
     def rows(self) -> list[slice]:
-        """Which of `gaussians_at`'s rows are each part's."""
+        """The slice of rows of `gaussians_at` of each part."""
         ends = [*accumulate(part.row_count for part in self.parts)]
         return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
     def moving(self) -> Bool[Tensor, " n"]:
-        """Which of `gaussians_at`'s rows belong to parts that move."""
+        """The mask of rows of `gaussians_at` that belong to dynamic parts."""
         device = self.parts[0].params["means"].device
         return torch.cat([torch.full((part.row_count,), part.moves, device=device) for part in self.parts])
 
@@ -126,9 +125,9 @@ class SplatModel(nn.Module):
         with_depth: bool = False,
         rays: Tensor | None = None,
     ) -> Picture:
-        """The view, with spherical harmonics up to `sh_degree` (None: all there are).
+        """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
-        `gaussians` stand in for `gaussians_at(view.time)`; `rays` (h, w, 3) saves computing `view.rays()` again.
+        `gaussians` replace `gaussians_at(view.time)`; `rays` (h, w, 3) are `view.rays()` if already known.
         """
         shown = self.gaussians_at(view.time) if gaussians is None else gaussians
         seen_from = self.seen_from(view)
@@ -143,16 +142,16 @@ class SplatModel(nn.Module):
         if self.sky is not None:
             image = self.sky.behind(splats, alpha, seen_from, rays if seen_from is view else None)
         if self.exposure is not None:
-            image = self.exposure.shown(image, view.camera)
+            image = self.exposure.applied(image, view.camera)
         depth = rendering.depth[0, ..., 0] if rendering.depth is not None else None
         return Picture(shown, image, splats, alpha[..., 0], depth, rendering.info)
 
     def seen_from(self, view: View) -> View:
-        """A view from where its camera really was, as far as this model knows."""
+        """The view from its camera's corrected pose, where this model corrects poses."""
         return view if self.camera_poses is None else self.camera_poses.corrected(view)
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
-        """How opaque the parts that move are by themselves in a picture of this model; None without such parts."""
+        """The alpha of the dynamic parts rendered alone, for a picture of this model; None without such parts."""
         moving = [picture.gaussians[rows] for part, rows in zip(self.parts, self.rows, strict=True) if part.moves]
         if not moving:
             return None
@@ -160,7 +159,7 @@ class SplatModel(nn.Module):
         return self._composited(alone, alone.means.new_ones(len(alone), 1), view).alpha[0, ..., 0]
 
     def class_logits(self, picture: Picture, view: View) -> Float[Tensor, "h w c"] | None:
-        """The logits of classes in a picture of this model; None for a model that tells no classes apart."""
+        """The rendered class logits of a picture of this model; None for a model without semantic classes."""
         if not all("classes" in part.params for part in self.parts):
             return None
         logits = torch.cat([part.params["classes"] for part in self.parts])

@@ -69,13 +69,13 @@ class Timeline:
 
     @property
     def owned(self) -> list[slice]:
-        """Which of the m annotations are each track's."""
+        """The slice of the m annotations of each track."""
         ends = np.cumsum([len(track.motion.times) for track in self.tracks]).tolist()
         return [slice(start, end) for start, end in zip([0, *ends], ends, strict=False)]
 
     @property
     def of_actors(self) -> Bool[Tensor, "a m"]:
-        """Which annotations are each actor's."""
+        """The mask of annotations of each actor."""
         rows = torch.zeros(len(self.tracks), sum(len(track.motion.times) for track in self.tracks), dtype=torch.bool)
         for row, own in zip(rows, self.owned, strict=True):
             row[own] = True
@@ -83,7 +83,7 @@ class Timeline:
 
     @property
     def neighbours(self) -> Int[Tensor, "q 3"]:
-        """Every three annotations that follow one another without a gap."""
+        """All triples of consecutive annotations without a gap."""
         triples = [
             [own.start + i - 1, own.start + i, own.start + i + 1]
             for track, own in zip(self.tracks, self.owned, strict=True)

@@ -12,8 +12,8 @@ from drivesplat.scene.training_record import TrainingRecord
 
 @dataclass(frozen=True)
 class View:
-    """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image. `camera` names the one of
-    the rig whose colours it shows; None: the reference's, which are the model's own."""
+    """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image. `camera` names the camera
+    of the rig whose exposure applies; None: that of the reference camera, the model's own colours."""
 
     K: Float[Tensor, "3 3"]
     camera_to_world: Float[Tensor, "4 4"]

@@ -109,7 +109,7 @@ def distances(actors: Actors, thing: Thing, pose: np.ndarray, time: float) -> np
     return np.linalg.norm(actors.at(time).means.detach().double().numpy() - truth, axis=1)
 
 
-def test_an_object_is_found_in_its_own_frame_from_images_of_it_passing_by():
+def test_an_object_is_learned_in_its_own_frame_from_images_of_it_passing_by():
     """Places from 0.08 m off to within half a centimetre of each other and colours from grey to within 1 % on the
     whole, none of them far off. The object as a whole and its track, which is right, may lean against each other by a
     centimetre or two: images cannot tell, and the track's penalty draws them back slowly. In the world it is there."""
@@ -162,7 +162,7 @@ def test_a_wrong_annotation_among_right_ones_is_corrected(mistake: Callable[[np.
     assert left[True] < 0.3 and left[False] > 0.9
 
 
-def test_colours_learned_at_one_heading_are_those_of_another():
+def test_colours_learned_at_one_heading_hold_at_another():
     """From all around, while it hardly turns; then, turned by 1.8 rad, seen as nobody saw it: each side still has its
     colours. Painted for the world's directions it would show those of other sides."""
     thing = a_thing(slope=0.25)

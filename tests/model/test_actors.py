@@ -86,7 +86,7 @@ def linear(values: np.ndarray, slope: float, start: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("time", [0.8, 1.0, 1.37, 2.0, 2.9, 3.0, 3.2])
-def test_a_turning_actor_is_where_its_corrected_box_takes_it(time):
+def test_a_turning_actor_is_transformed_by_its_corrected_box(time):
     """Corrections along the world's axes and about the object's vertical, linear in time as its motion is, so that the
     closed form holds between annotations, too."""
     actors = actors_of(van())
@@ -104,7 +104,7 @@ def test_a_turning_actor_is_where_its_corrected_box_takes_it(time):
 
 
 @pytest.mark.parametrize("index", [0, 2, 4])
-def test_at_an_annotation_its_own_correction_holds(index):
+def test_the_correction_of_an_annotation_holds_at_its_time(index):
     """Whatever those of its neighbours are; a box that is tilted, too, is turned about its own vertical."""
     actors = actors_of(tilted(van()))
     p, gaussians = doubled(actors), actors.at(TIMES[index])
@@ -347,7 +347,7 @@ def test_no_corrections_cost_nothing():
     assert penalties_of(np.zeros((5, 3)), np.zeros(5), van()) == {"track_size": 0.0, "track_bend": 0.0}
 
 
-def test_penalties_are_mean_squares_in_units_of_what_annotations_are_off():
+def test_penalties_are_mean_squares_in_units_of_the_annotation_error():
     rng = np.random.default_rng(7)
     translation, yaw = rng.normal(size=(5, 3)), rng.normal(size=5)
     found = penalties_of(
@@ -359,14 +359,14 @@ def test_penalties_are_mean_squares_in_units_of_what_annotations_are_off():
     assert found == pytest.approx({"track_size": 0.3 * size, "track_bend": 0.7 * bend}, rel=1e-5)
 
 
-def test_corrections_that_change_steadily_along_each_run_do_not_bend():
+def test_linear_corrections_have_no_bend_penalty():
     """The van's, and those of the car's two runs: across its gap, and from track to track, they may leap."""
     steady = np.concatenate([np.arange(5.0), 20.0 + 3.0 * np.arange(3), -7.0 - np.arange(3)])
     found = penalties_of(steady[:, None] * [0.1, -0.2, 0.3], 0.01 * steady, van(), car())
     assert found["track_bend"] == pytest.approx(0.0, abs=1e-9) and found["track_size"] > 1.0
 
 
-def test_where_no_three_annotations_follow_one_another_nothing_bends():
+def test_without_three_consecutive_annotations_there_is_no_bend_penalty():
     pair = track_of(motion_through([0.0, 0.5], [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
     assert penalties_of(np.ones((2, 3)), np.ones(2), pair).keys() == {"track_size"}
 
@@ -383,7 +383,7 @@ def test_penalties_pull_corrections_back():
 # ---- what else they are asked
 
 
-def test_gaussians_outside_their_own_grown_box_fade_and_no_others():
+def test_only_gaussians_outside_their_own_enlarged_box_fade():
     """The van's box is 5 x 2 x 2.2 m, the car's 4 x 2 x 1.6 m, both grown by 0.1 m on every side."""
     cases = [
         (0, (2.58, 0.0, 0.0), False), (0, (2.62, 0.0, 0.0), True), (1, (2.05, 0.9, 0.0), False),
@@ -415,7 +415,7 @@ def test_a_track_knows_its_rows():
 
 @pytest.mark.parametrize(("corrected", "tolerance"), [("steadily", 1e-4), ("anyhow", 0.05)])
 @pytest.mark.parametrize("time", [1.0, 1.6, 2.9])
-def test_in_its_pieces_an_actor_is_where_it_is_in_the_model(time, corrected, tolerance):
+def test_rigid_groups_place_actors_as_the_model_does(time, corrected, tolerance):
     """A piece's motion goes through the corrected annotations: as the model's does where corrections change steadily,
     and within centimetres where they leap by 0.1 rad from annotation to annotation."""
     actors = actors_of(tilted(van()), car(), settings=ActorSettings(sh_degree=0))
@@ -441,5 +441,5 @@ def test_in_its_pieces_an_actor_is_where_it_is_in_the_model(time, corrected, tol
 
 
 @pytest.mark.parametrize("cap_max", [10, 100])
-def test_densification_is_held_to_the_cap_however_many_there_are(cap_max):
+def test_densification_respects_the_cap_of_all_actors(cap_max):
     assert actors_of(van(), count=30, settings=ActorSettings(cap_max=cap_max)).cap_max == cap_max

@@ -71,7 +71,7 @@ def test_a_small_correction_is_the_rigid_transform_of_its_rotation_vector():
     assert torch.isfinite(numbers.grad).all(), "there is a gradient at no correction"
 
 
-def test_nothing_is_corrected_at_first_nor_for_other_cameras():
+def test_initial_poses_and_other_cameras_are_not_corrected():
     fresh, learned = poses(), filled(poses())
     view = a_view(0.7)
     torch.testing.assert_close(fresh.corrected(view).camera_to_world, view.camera_to_world)
@@ -91,7 +91,7 @@ def test_corrections_are_bounded(spread):
     assert np.abs(moved[:3, 3]).max() > 0.005
 
 
-def test_between_training_images_corrections_are_between_theirs_and_beyond_them_the_last():
+def test_corrections_are_interpolated_between_training_images_and_constant_beyond():
     learned = filled(poses(), spread=0.2)
     numbers = learned.params["FRONT"].detach()
     for time, expected in [(0.125, 0.75 * numbers[0] + 0.25 * numbers[1]), (1.5, 0.5 * (numbers[2] + numbers[3]))]:
@@ -101,7 +101,7 @@ def test_between_training_images_corrections_are_between_theirs_and_beyond_them_
     np.testing.assert_allclose(correction(learned, 9.0), correction(learned, 2.5), atol=1e-6)
 
 
-def test_penalties_are_those_of_size_and_of_second_differences():
+def test_penalties_are_of_size_and_second_differences():
     learned = filled(poses({"size_weight": 0.3, "bend_weight": 0.7}))
     parts = np.tanh(learned.params["FRONT"].detach().double().numpy())
     bends = parts[:-2] - 2 * parts[1:-1] + parts[2:]
@@ -152,7 +152,7 @@ def fitted(camera_poses: CameraPoses | None, iterations: int = 300) -> SplatMode
     return model
 
 
-def test_a_training_that_was_ended_takes_up_what_it_had_learned():
+def test_a_resumed_training_keeps_its_corrections():
     had, again = fitted(poses(LOOSE), iterations=5), model_of(poses(LOOSE))
     assert any(value.any() for value in had.camera_poses.params.values())
     restore_model(again, {name: value.clone() for name, value in had.state_dict().items()})
@@ -173,13 +173,13 @@ def learned() -> SplatModel:
 
 
 @pytest.mark.parametrize("time", [*TIMES, 1.5])
-def test_wrong_poses_are_found_at_training_images_and_carried_to_held_out_ones(learned, time):
+def test_wrong_poses_are_corrected_at_training_and_held_out_images(learned, time):
     shift, turn = off(learned, time)
     given_shift, given_turn = off(fitted(None), time)
     assert shift < 0.6 * given_shift and turn < 0.35 * given_turn
 
 
-def test_a_held_out_image_is_rendered_from_where_its_neighbours_say(learned):
+def test_a_held_out_image_uses_the_corrections_of_its_neighbours(learned):
     with torch.no_grad():
         truth = model_of(None).render(a_view(1.5)).image
         view = a_view(1.5, moved=wrong_by(1.5))
@@ -187,7 +187,7 @@ def test_a_held_out_image_is_rendered_from_where_its_neighbours_say(learned):
     assert errors[0] < 0.1 * errors[1]
 
 
-def test_objects_and_classes_are_seen_from_the_same_place(learned):
+def test_objects_and_classes_are_rendered_from_the_corrected_pose(learned):
     """What is composited apart lies over the image: its alpha is the image's where all is composited."""
     view = a_view(1.0, moved=wrong_by(1.0))
     with torch.no_grad():
@@ -196,7 +196,7 @@ def test_objects_and_classes_are_seen_from_the_same_place(learned):
     torch.testing.assert_close(alone.alpha[0, ..., 0], picture.alpha)
 
 
-def test_the_penalty_is_a_term_of_the_loss_only_where_something_is_learned(learned):
+def test_the_penalty_is_a_loss_term_only_for_corrected_cameras(learned):
     view = TrainingView(a_view(1.0), torch.zeros(SIZE[1], SIZE[0], 3, dtype=torch.uint8))
     for model, pays in ((learned, True), (model_of(None), False)):
         terms = loss_terms(model.render(view.view), view, model, TrainSettings())
@@ -211,7 +211,7 @@ def test_a_checkpoint_holds_corrections_and_their_times(learned):
         torch.testing.assert_close(rebuilt.seen_from(view).camera_to_world, model.seen_from(view).camera_to_world)
 
 
-def test_corrections_are_learned_ever_more_slowly_and_logged(learned):
+def test_the_learning_rate_of_corrections_decays_and_they_are_logged(learned):
     optimizers = make_optimizers(learned)
     set_learning_rates(learned, optimizers, 50, TrainSettings(iterations=100))
     group = optimizers.beside_parts["camera_poses"]["FRONT"].param_groups[0]
@@ -224,7 +224,7 @@ def test_corrections_are_learned_ever_more_slowly_and_logged(learned):
 
 
 @pytest.mark.parametrize("corrected", [True, False])
-def test_a_training_corrects_its_own_cameras_at_their_times_where_it_is_told_to(tmp_path, corrected):
+def test_a_training_corrects_its_cameras_where_the_settings_say_so(tmp_path, corrected):
     """Of six images half a second apart the third is held out; train.json says how far poses were corrected."""
     poses = CameraPoseSettings(corrected=corrected, learning_rate=0.05)
     train = settings_of(iterations=20, checkpoint_every=50, pixels_per_gaussian=0, camera_poses=poses)

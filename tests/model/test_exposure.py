@@ -82,24 +82,24 @@ def of(camera: str, views: list[TrainingView]) -> list[TrainingView]:
     return [view for view in views if view.view.camera == camera]
 
 
-def test_a_camera_shows_gains_and_offsets_and_the_reference_does_not():
+def test_exposure_applies_to_listed_cameras_and_not_to_the_reference():
     exposures = exposures_of("BACK", settings=AFFINE)
     image = torch.rand(4, 5, 3)
-    torch.testing.assert_close(exposures.shown(image, "BACK"), image)
+    torch.testing.assert_close(exposures.applied(image, "BACK"), image)
     with torch.no_grad():
         exposures.params["BACK"][0], exposures.params["BACK"][1] = GAINS.log() / 0.2, OFFSET / 0.05
-    torch.testing.assert_close(exposures.shown(image, "BACK"), image * GAINS + OFFSET)
+    torch.testing.assert_close(exposures.applied(image, "BACK"), image * GAINS + OFFSET)
     for camera in ("FRONT", None):
-        assert exposures.shown(image, camera) is image
+        assert exposures.applied(image, camera) is image
     figures = exposures.figures()
     assert figures["BACK/gain_blue"] == pytest.approx(0.8) and figures["BACK/offset_red"] == pytest.approx(OFFSET)
     assert len(figures) == 6
     found = Exposures({"BACK": GAINS}, AFFINE)
-    torch.testing.assert_close(found.shown(image, "BACK"), image * GAINS)
+    torch.testing.assert_close(found.applied(image, "BACK"), image * GAINS)
     assert not found.penalty("BACK").any(), "what was found is free"
 
 
-def test_the_penalty_is_the_weighted_mean_square_of_the_camera_that_is_seen():
+def test_the_penalty_is_the_weighted_mean_square_of_the_rendered_camera():
     exposures = exposures_of("BACK", "LEFT", settings=ExposureSettings(weight=0.4))
     with torch.no_grad():
         exposures.params["BACK"][0] = 0.3
@@ -109,7 +109,7 @@ def test_the_penalty_is_the_weighted_mean_square_of_the_camera_that_is_seen():
     assert exposures_of("BACK", settings=ExposureSettings(weight=0.0)).penalty("BACK") is None
 
 
-def test_the_picture_is_exposed_after_the_sky_and_the_splats_are_not():
+def test_exposure_applies_to_the_image_with_sky_and_not_to_the_splats():
     settings = settings_of(exposure=AFFINE)
     model = exposed(settings)
     model.sky = untrained(settings, sky=True).sky
@@ -121,7 +121,7 @@ def test_the_picture_is_exposed_after_the_sky_and_the_splats_are_not():
     assert not torch.equal(front.image, front.splats)
 
 
-def test_only_the_camera_that_is_seen_pays_and_learns():
+def test_only_the_rendered_camera_has_a_penalty_and_learns():
     views, settings = rig_views(), settings_of(exposure=AFFINE)
     for camera, pays in (("FRONT", False), ("BACK", True)):
         model = exposed(settings)
@@ -152,13 +152,13 @@ def test_gains_of_a_camera_are_recovered(learned):
     assert abs(figures["BACK/offset_green"] - OFFSET) < 0.03
 
 
-def test_both_cameras_profit(learned):
+def test_exposure_improves_both_cameras(learned):
     for camera, gain in (("BACK", 1.5), ("FRONT", 1.5)):
         views = of(camera, rig_views())
         assert mean_psnr(learned["affine"], views) > mean_psnr(learned["none"], views) + gain
 
 
-def test_a_new_way_is_shown_as_the_reference_shows_it(learned):
+def test_a_new_trajectory_is_rendered_in_the_reference_colours(learned):
     view = rig_views()[1].view
     plain, front, back = (
         learned["affine"].render(dataclasses.replace(view, camera=camera)).image for camera in (None, "FRONT", "BACK")
@@ -194,7 +194,7 @@ def test_a_resumed_training_of_exposures_is_the_same_training(tmp_path):
     )
 
 
-def test_exposures_learn_once_there_is_a_scene_and_ever_more_slowly():
+def test_exposures_start_late_and_their_learning_rate_decays():
     settings = settings_of(iterations=100, exposure=AFFINE)
     model = exposed(settings)
     optimizers = make_optimizers(model)
@@ -208,7 +208,7 @@ def test_exposures_learn_once_there_is_a_scene_and_ever_more_slowly():
 # ---- what is known before
 
 
-def test_gains_of_a_rig_are_found_from_colours_of_shared_surfaces():
+def test_gains_of_a_rig_are_estimated_from_shared_surfaces():
     """The second camera shares surfaces with the first, the third with the second alone, the fourth with none."""
     rng = np.random.default_rng(0)
     true = np.log([[1.0, 1.0, 1.0], [1.3, 1.1, 0.8], [0.7, 1.2, 1.5], [2.0, 2.0, 2.0]])
@@ -232,7 +232,7 @@ def rig(tmp_path_factory) -> TrainingInputs:
     return TrainingInputs(training_record(scene, seed, ParserJob(holdout=holdout, images=images)), folder, [], [])
 
 
-def test_gains_of_the_demos_rig_are_found_before_the_training(rig):
+def test_the_gains_of_the_demo_rig_are_estimated_before_the_training(rig):
     """Images are gamma encoded: a gain of light becomes its 2.2th root."""
     views = load_views(rig.record, Guides({}, {}, {}), CPU)
     found = first_gains(rig.record, views, ["CAM_BACK"], "CAM_FRONT")
@@ -241,7 +241,7 @@ def test_gains_of_the_demos_rig_are_found_before_the_training(rig):
     np.testing.assert_array_equal(first_gains(rig.record, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
 
 
-def test_a_training_begins_with_what_was_found_and_its_checkpoint_holds_it(rig, tmp_path):
+def test_a_training_starts_from_the_estimated_gains_and_saves_them(rig, tmp_path):
     train = settings_of(iterations=4, checkpoint_every=10, pixels_per_gaussian=0, exposure=AFFINE)
     job = TrainJob(parts=("background",), sky="none", train=train, random_seed=0, reference_camera="CAM_FRONT")
     files = TrainingFiles(tmp_path / "it/checkpoint.pt", tmp_path / "it/train.json")
@@ -274,7 +274,7 @@ def inputs_of(folder: Path, cameras: list[int]) -> TrainingInputs:
         ([0, 1, 2, 2, 1], None, ()),
     ],
 )
-def test_all_cameras_with_training_images_are_exposed_but_the_reference(tmp_path, cameras, reference, expected):
+def test_all_training_cameras_but_the_reference_have_an_exposure(tmp_path, cameras, reference, expected):
     job = TrainJob(parts=("background",), sky="none", train=TrainSettings(), random_seed=0, reference_camera=reference)
     assert inputs_of(tmp_path, cameras).exposed(job) == expected
 
@@ -292,7 +292,7 @@ def test_a_view_knows_its_camera(tmp_path):
         (["CAM_BACK"], "affine", None),
     ],
 )
-def test_the_camera_that_is_measured_is_the_reference(cameras, kind, expected):
+def test_the_evaluated_camera_is_the_reference(cameras, kind, expected):
     values = {"cameras": cameras, "eval_camera": "CAM_BACK", "train": {"exposure": {"kind": kind}}}
     job = TrainJob.model_validate_json(stage_settings(load(values), "train", "0061", "vanilla"))
     assert job.reference_camera == expected
@@ -301,7 +301,7 @@ def test_the_camera_that_is_measured_is_the_reference(cameras, kind, expected):
 # ---- the demo world's cameras
 
 
-def test_cameras_of_a_synthetic_rig_take_in_as_much_light_as_they_are_told_to():
+def test_cameras_of_a_synthetic_rig_have_the_configured_exposure():
     """Where neither is clipped, encoded with a gamma of 2.2 the light is what the gains say."""
     gains = (1.4, 1.0, 0.6)
     plain, other = (recorder_of(exposures=e) for e in ({}, {"CAM_BACK": gains}))

@@ -37,7 +37,7 @@ def maps(rotations: np.ndarray, coefficients: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("coefficients", COUNTS)
-def test_turned_coefficients_give_along_d_what_the_objects_give_along_d_in_its_frame(coefficients):
+def test_rotated_coefficients_give_the_colours_of_the_object_frame(coefficients):
     directions, sh = random_directions(), np.random.default_rng(2).normal(size=(coefficients, 3))
     for rotation, turned in zip(ROTATIONS, maps(ROTATIONS, coefficients) @ sh, strict=True):
         in_object = basis(directions @ rotation, coefficients) @ sh  # rows are R^T d
@@ -45,7 +45,7 @@ def test_turned_coefficients_give_along_d_what_the_objects_give_along_d_in_its_f
 
 
 @pytest.mark.parametrize("coefficients", COUNTS)
-def test_a_turn_after_a_turn_is_the_product_of_their_maps(coefficients):
+def test_maps_compose_as_rotations_do(coefficients):
     first, second = ROTATIONS[:2]
     composed = maps((second @ first)[None], coefficients)[0]
     of_first, of_second = maps(ROTATIONS[:2], coefficients)
@@ -63,16 +63,16 @@ def test_degrees_do_not_mix_and_lose_nothing():
 
 
 @pytest.mark.parametrize("coefficients", [4, 9])
-def test_few_degrees_turn_as_they_do_among_many(coefficients):
+def test_the_map_of_few_degrees_equals_that_among_many(coefficients):
     among_all = maps(ROTATIONS, 16)[:, :coefficients, :coefficients]
     np.testing.assert_allclose(maps(ROTATIONS, coefficients), among_all, atol=1e-6)
 
 
-def test_without_a_turn_nothing_changes():
+def test_the_identity_rotation_changes_nothing():
     np.testing.assert_allclose(maps(np.eye(3)[None], 16)[0], np.eye(16), atol=1e-6)
 
 
-def test_a_quarter_turn_takes_what_is_red_in_front_to_the_left():
+def test_a_quarter_turn_moves_red_from_front_to_left():
     """An object that is bright along its x axis, turned to face the world's y axis, in single precision."""
     bright_along_x = torch.tensor([0.0, 0.0, 0.0, -1.0])[None, :, None].repeat(1, 1, 3)
     turned = rotated(bright_along_x, torch.from_numpy(about_z(np.pi / 2)))
@@ -81,6 +81,6 @@ def test_a_quarter_turn_takes_what_is_red_in_front_to_the_left():
     np.testing.assert_allclose(seen, [0.4886025, -0.4886025, 0.0], atol=1e-5)
 
 
-def test_one_colour_for_all_directions_is_left_as_it_is():
+def test_degree_zero_is_invariant():
     sh = torch.rand(3, 1, 3)
     assert rotated(sh, torch.from_numpy(ROTATIONS[0])) is sh

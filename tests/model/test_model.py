@@ -97,7 +97,7 @@ def test_viewmat_undoes_camera_to_world():
     torch.testing.assert_close(view.viewmat @ view.camera_to_world, torch.eye(4), atol=1e-6, rtol=0)
 
 
-def test_seed_gaussians_have_the_points_places_and_colours():
+def test_seed_gaussians_have_the_positions_and_colours_of_the_points():
     positions, colors = seed_points(50)
     gaussians = Background.from_points(positions, colors, GaussianSettings(sh_degree=2), 1.0).at(0.0)
     np.testing.assert_allclose(gaussians.means.detach(), positions, atol=1e-6)
@@ -113,7 +113,7 @@ def test_seed_gaussians_have_the_opacity_set(opacity):
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.3])
-def test_seed_gaussians_are_round_and_as_large_as_their_neighbours_are_far(factor):
+def test_seed_gaussians_are_isotropic_with_the_distance_of_neighbours_as_scale(factor):
     positions, colors = seed_points(60)
     gaussians = Background.from_points(positions, colors, GaussianSettings(init_scale=factor), 1.0).at(0.0)
     distances = np.sort(np.linalg.norm(positions[:, None] - positions[None], axis=-1), axis=1)[:, 1:4]
@@ -123,14 +123,14 @@ def test_seed_gaussians_are_round_and_as_large_as_their_neighbours_are_far(facto
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_few_points_are_gaussians_too(count):
+def test_few_points_give_gaussians(count):
     positions = np.arange(3.0 * count).reshape(count, 3)
     gaussians = Background.from_points(positions, np.full((count, 3), 0.5), GaussianSettings(), 1.0).at(0.0)
     assert len(gaussians) == count
     assert torch.isfinite(gaussians.scales).all() and (gaussians.scales > 0).all()
 
 
-def test_points_at_one_place_have_a_size():
+def test_coincident_points_have_a_positive_scale():
     gaussians = Background.from_points(np.ones((5, 3)), np.full((5, 3), 0.5), GaussianSettings(), 1.0).at(0.0)
     assert torch.isfinite(torch.log(gaussians.scales)).all()
 
@@ -142,7 +142,7 @@ def test_positions_learn_in_proportion_to_the_scene():
 
 
 @pytest.mark.parametrize("sky", [ConstantSky, CubemapSky])
-def test_the_sky_shows_through_what_the_gaussians_leave(sky):
+def test_the_sky_is_composited_behind_the_gaussians(sky):
     part = Background.from_points(*seed_points(40), GaussianSettings(init_scale=0.3, init_opacity=0.5), 1.0)
     color = torch.tensor([0.3, 0.6, 0.9])
     behind = sky(color, 1e-2) if sky is ConstantSky else shaken(sky(4, color, 1e-2))
@@ -157,7 +157,7 @@ def test_the_sky_shows_through_what_the_gaussians_leave(sky):
     assert picture.depth.shape == picture.alpha.shape and without.depth is None
 
 
-def test_given_rays_stand_in_for_the_views_own():
+def test_given_rays_replace_those_of_the_view():
     model = SplatModel([Background.from_points(*seed_points(10), GaussianSettings(), 1.0)], shaken_cubemap())
     view = a_view()
     torch.testing.assert_close(model.render(view, 0, rays=view.rays()).image, model.render(view, 0).image)
@@ -191,7 +191,7 @@ class Riding(Part):
         return {}
 
 
-def test_a_model_shows_all_its_parts_at_the_views_time():
+def test_a_model_renders_all_parts_at_the_time_of_the_view():
     first = Background.from_points(*seed_points(20, seed=1), GaussianSettings(), 1.0)
     second = Background.from_points(*seed_points(15, seed=2), GaussianSettings(), 1.0)
     moved = {name: value.detach().clone() for name, value in second.params.items()}
@@ -213,7 +213,7 @@ def test_concatenate_keeps_order_and_every_field():
 
 
 @pytest.mark.parametrize("degrees", [(0, 2), (2, 0), (1, 3), (1, 1)])
-def test_sets_with_fewer_coefficients_keep_their_colours_among_richer_ones(degrees):
+def test_concatenation_keeps_the_colours_of_lower_degrees(degrees):
     parts = [
         shaken(Background.from_points(*seed_points(n, seed=n), GaussianSettings(sh_degree=degree), 1.0))
         for n, degree in zip((3, 4), degrees, strict=True)
@@ -264,7 +264,7 @@ def street(antialiased: bool = False) -> SplatModel:
     return SplatModel([first, actors_of(a_track(), a_track("later", 1.0), count=4), second], None, antialiased)
 
 
-def test_rows_say_which_gaussians_are_each_parts():
+def test_rows_are_the_slices_of_each_part():
     model = street()
     together = model.gaussians_at(0.7)
     assert model.rows == [slice(0, 12), slice(12, 20), slice(20, 25)]
@@ -303,7 +303,7 @@ def test_two_rigid_groups_of_one_name_are_refused():
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_what_moves_is_as_opaque_by_itself_as_it_is_rendered_alone(antialiased):
+def test_the_alpha_of_dynamic_parts_equals_their_own_rendering(antialiased):
     """Whatever stands before or behind it in the picture."""
     model = street(antialiased)
     model.parts[1].params["scales"].data -= 2.0  # small enough for antialiasing to matter
@@ -314,7 +314,7 @@ def test_what_moves_is_as_opaque_by_itself_as_it_is_rendered_alone(antialiased):
     assert float(found.detach().max()) > 0.05 and float((picture.alpha - found).detach().abs().max()) > 0.1
 
 
-def test_nothing_is_said_of_what_moves_where_nothing_does():
+def test_a_static_model_has_no_alpha_of_dynamic_parts():
     still = SplatModel([round_gaussians([[0.0, 0.0, 4.0]])], None)
     assert still.objects_alpha(still.render(a_view()), a_view()) is None
 
@@ -343,7 +343,7 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
     assert [value.requires_grad for value in rebuilt.parameters()] == [v.requires_grad for v in model.parameters()]
 
 
-def test_actors_start_from_their_records():
+def test_actors_are_initialised_from_their_records():
     records = [actor_record(a_track(), 10, seed=1), actor_record(a_track("later", 1.0), 7, seed=2)]
     model = build_model(model_init(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
     actors = model.parts[1]
@@ -371,7 +371,7 @@ def test_an_actors_gaussians_are_capped_by_its_training_pixels(pixels, changes, 
     assert actor_cap(actor_record(a_track(), pixels=pixels), settings) == expected
 
 
-def test_each_actor_starts_with_no_more_points_than_its_cap():
+def test_each_actor_is_initialised_with_at_most_its_cap():
     """A twentieth of 400 and of 2000 pixels; together they may never have more than both."""
     records = [actor_record(a_track(), 60, pixels=400), actor_record(a_track("later", 1.0), 60, pixels=2000)]
     settings = TrainSettings(pixels_per_gaussian=20.0, actors=ActorSettings(least=8))
@@ -414,7 +414,7 @@ def test_a_cap_that_divides_unevenly_is_used_up_fairly():
     assert counts.sum() == 50 and set(counts.tolist()) == {12, 13}
 
 
-def test_seeds_are_thinned_to_points_of_their_own_the_same_every_time():
+def test_seeds_are_thinned_to_a_reproducible_subset():
     actors, again = (with_cap(60, [100, 200]) for _ in range(2))
     assert torch.equal(actors.params["means"], again.params["means"])
     for i, count in enumerate((100, 200)):
@@ -424,20 +424,20 @@ def test_seeds_are_thinned_to_points_of_their_own_the_same_every_time():
 
 
 @pytest.mark.parametrize("records", [[], [actor_record(track_of(motion_through([0.0], [[0.0, 0.0, 0.0]])), 0)]])
-def test_where_nothing_moves_a_street_is_its_background(records):
+def test_a_street_without_actors_is_its_background(records):
     model = build_model(model_init(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
     assert [part.name for part in model.parts] == ["background"] and not model.moving().any()
 
 
 @pytest.mark.parametrize(("sky", "kind"), [("none", type(None)), ("mask", ConstantSky), ("cubemap", CubemapSky)])
-def test_the_sky_setting_names_the_sky(sky, kind):
+def test_the_sky_setting_selects_the_sky(sky, kind):
     model = build_model(model_init(parser_record(5)), ("background",), sky, TrainSettings(sky_resolution=4))
     assert isinstance(model.sky, kind)
     if model.sky is not None:
         np.testing.assert_allclose(model.sky.colors(a_view().rays())[3, 4].detach(), SKY_COLOR, atol=1e-5)
 
 
-def test_a_model_starts_with_no_more_points_than_its_cap():
+def test_a_model_is_initialised_with_at_most_its_cap():
     record = parser_record(300)
     model = build_model(model_init(record), ("background",), "none", TrainSettings(cap_max=120))
     means = model.parts[0].params["means"].detach().numpy()

@@ -38,7 +38,7 @@ def test_actors_come_and_go(time, present):
 
 
 @pytest.mark.parametrize("time", [1.0, 1.1, 2.5, 3.1])
-def test_those_present_are_where_their_motions_say(time):
+def test_poses_of_present_actors_follow_their_motions(time):
     state = timeline().at(time, CPU)
     for i, track in enumerate((a_van(), a_car())):
         (pose,) = track.motion.poses(np.array([time]))
@@ -50,7 +50,7 @@ def test_those_present_are_where_their_motions_say(time):
 
 
 @pytest.mark.parametrize("time", [0.9, 2.6])
-def test_every_actors_weights_stand_with_its_own_annotations(time):
+def test_weights_are_placed_at_the_annotations_of_their_actor(time):
     state = timeline().at(time, CPU)
     assert timeline().owned == [slice(0, 5), slice(5, 12)]
     assert timeline().of_actors.tolist() == [[True] * 5 + [False] * 7, [False] * 5 + [True] * 7]
@@ -58,7 +58,7 @@ def test_every_actors_weights_stand_with_its_own_annotations(time):
     np.testing.assert_allclose(state.weights[5:], a_car().motion.weights(np.array([time]))[0], atol=1e-6)
 
 
-def test_annotations_of_an_absent_actor_weigh_nothing():
+def test_annotations_of_an_absent_actor_have_weight_zero():
     weights = timeline().at(2.0, CPU).weights
     assert weights[:5].any() and not weights[5:].any()
 
@@ -67,13 +67,13 @@ def test_annotations_of_an_absent_actor_weigh_nothing():
     ("time", "progress"),
     [(1.0, [0.0, 0.25]), (1.5, [0.25, 0.375]), (3.1, [1.0, 0.775]), (0.8, [0.0, 0.2]), (9.0, [1.0, 1.0])],
 )
-def test_the_series_runs_from_the_first_to_the_last_annotation_and_stops_there(time, progress):
+def test_the_series_runs_from_the_first_to_the_last_annotation(time, progress):
     """Of absent actors, too: their colours of a time are asked for when they are placed elsewhere, or written out."""
     expected = [[np.cos(np.pi * i * t) for i in range(5)] for t in progress]
     np.testing.assert_allclose(timeline().at(time, CPU).series, expected, atol=1e-6)
 
 
-def test_of_a_single_annotation_the_series_stands_at_its_start():
+def test_the_series_of_a_single_annotation_is_constant():
     one = Timeline([track_of(motion_through([2.0], [[0.0, 0.0, 0.0]]))], 3)
     for time in (1.8, 2.0, 2.2):
         np.testing.assert_allclose(one.at(time, CPU).series[0], np.ones(3), atol=1e-6)
