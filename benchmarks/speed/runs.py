@@ -21,7 +21,7 @@ from drivesplat.evaluation.evaluate import evaluate_groups, protocol
 from drivesplat.io.checkpoint_file import load
 from drivesplat.io.storage import read_json
 from drivesplat.machine.device import choose_device, device_name
-from drivesplat.model.build import gaussian_cap, some_of
+from drivesplat.model.build import gaussian_cap, random_subset
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.provenance.record import provenance
@@ -79,7 +79,7 @@ def plain(task: Task, device: torch.device, paths: list[str]) -> tuple[Times, Sp
     began = time.monotonic()
     record = read_training_record(task.files.parser)
     cap = gaussian_cap(record, task.train.train)
-    kept = some_of(len(record.points), cap)
+    kept = random_subset(len(record.points), cap)
     splats = init_splats(record.points[kept], record.points_rgb[kept], task.seed).to(device)
     recipe = PlainRecipe(Schedule.of(task.iterations), cap, task.seed, task.workers)
     summary = fit(splats, ImageFiles(record, paths), scene_scale(record), recipe, task.folder)
