@@ -3,16 +3,19 @@
 import math
 import re
 import signal
+from collections.abc import Callable
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import gsplat
 import numpy as np
 import pytest
 import torch
 from gsplat import MCMCStrategy
 from gsplat.relocation import compute_relocation
+from helpers.reference_rasterizer import rasterize_reference
 from helpers.trainings import (
     ALL_TERMS,
     EndedError,
@@ -30,24 +33,22 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
 from drivesplat.io.prefetch import in_advance
-from drivesplat.kernels import capacity as rooms
-from drivesplat.kernels import cuda_graphs as graphs
-from drivesplat.kernels.cuda_graphs import own_stream
+from drivesplat.kernels import capacity
+from drivesplat.kernels.cuda_graphs import CudaGraph, capture_stream
+from drivesplat.kernels.relocation import relocation_in_torch
 from drivesplat.machine.device import choose_device
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rasterization import gsplat_backend as gpu
-from drivesplat.rasterization import rasterize
+from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.rendering import captured_frames
 from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
 from drivesplat.training import trainer as trainer_module
-from drivesplat.training.strategies import relocation
 from drivesplat.training.trainer import Trainer
 
 pytestmark = [
@@ -79,14 +80,14 @@ def random_scene(count: int = 3000, cameras: int = 2) -> dict[str, torch.Tensor]
     return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
-def seen_and_gradients(backend: str, dtype: torch.dtype, antialiased: bool) -> dict[str, torch.Tensor]:
+def seen_and_gradients(
+    rasterizer: Callable[..., Rendering], dtype: torch.dtype, antialiased: bool
+) -> dict[str, torch.Tensor]:
     """Image, alpha and depth of the random scene, and the gradients of a random weighting of all three."""
     scene = {name: value.to(GPU, dtype) for name, value in random_scene().items()}
     for name in INPUTS:
         scene[name].requires_grad_()
-    rendering = rasterize(
-        **scene, width=WIDTH, height=HEIGHT, sh_degree=3, antialiased=antialiased, with_depth=True, backend=backend
-    )
+    rendering = rasterizer(**scene, width=WIDTH, height=HEIGHT, sh_degree=3, antialiased=antialiased, with_depth=True)
     seen = {"image": rendering.image, "alpha": rendering.alpha, "depth": rendering.depth}
     generator = torch.Generator().manual_seed(1)
     weights = {name: torch.rand(value.shape, generator=generator, dtype=torch.float64) for name, value in seen.items()}
@@ -97,8 +98,8 @@ def seen_and_gradients(backend: str, dtype: torch.dtype, antialiased: bool) -> d
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gsplat_agrees_with_the_reference(antialiased):
-    expected = seen_and_gradients("reference", torch.float64, antialiased)
-    found = seen_and_gradients("gsplat", torch.float32, antialiased)
+    expected = seen_and_gradients(rasterize_reference, torch.float64, antialiased)
+    found = seen_and_gradients(rasterize, torch.float32, antialiased)
     assert 0.05 < float(expected["alpha"].mean()) < 0.95
     wrong = {}
     for name, truth in expected.items():
@@ -111,8 +112,8 @@ def test_gsplat_agrees_with_the_reference(antialiased):
 
 def test_gpu_tensors_are_rendered_by_gsplat(monkeypatch):
     scene = {name: value.to(GPU, torch.float32) for name, value in random_scene(100).items()}
-    asked, projection = [], gpu.fully_fused_projection
-    monkeypatch.setattr(gpu, "fully_fused_projection", lambda *a, **k: asked.append(1) or projection(*a, **k))
+    asked, projection = [], gsplat.fully_fused_projection
+    monkeypatch.setattr(gsplat, "fully_fused_projection", lambda *a, **k: asked.append(1) or projection(*a, **k))
     info = rasterize(**scene, width=WIDTH, height=HEIGHT, sh_degree=3).info
     assert asked == [1]
     assert {"means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"} <= info.keys()
@@ -195,7 +196,7 @@ def test_relocation_is_gsplats():
     scales = torch.rand(len(ratios), 3, generator=generator) + 0.05
     binoms = MCMCStrategy().initialize_state()["binoms"]
     expected = compute_relocation(opacities.to(GPU), scales.to(GPU), ratios.to(GPU), binoms.to(GPU))
-    found = relocation(opacities, scales, ratios, binoms)
+    found = relocation_in_torch(opacities, scales, ratios, binoms)
     for ours, gsplats in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, gsplats.cpu(), rtol=1e-3, atol=1e-6)
 
@@ -366,12 +367,12 @@ def street_film() -> Film:
 
 
 @pytest.fixture
-def captures(monkeypatch) -> list[graphs.Graph]:
+def captures(monkeypatch) -> list[CudaGraph]:
     """What is captured from now on, with lists that have exactly the room that those before them needed."""
-    made, capture = [], captured_frames.captured
-    monkeypatch.setattr(captured_frames, "captured", lambda *t, **named: made.append(capture(*t, **named)) or made[-1])
-    monkeypatch.setattr(rooms, "LEAST", 0)
-    monkeypatch.setattr(rooms, "MARGIN", 1.0)
+    made, capture = [], captured_frames.capture
+    monkeypatch.setattr(captured_frames, "capture", lambda *t, **named: made.append(capture(*t, **named)) or made[-1])
+    monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
+    monkeypatch.setattr(capacity, "MARGIN", 1.0)
     return made
 
 
@@ -386,7 +387,7 @@ def test_frames_in_a_row_are_those_by_themselves(street_film, captures, monkeypa
     model, views, expected = street_film
     timeline = model.parts[1].timeline
     known = dict(timeline._cache)
-    monkeypatch.setattr(rooms, "MARGIN", 4.0)
+    monkeypatch.setattr(capacity, "MARGIN", 4.0)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     assert len(captures) == 1 and captures[0] is not None
     edited = [(view, model.gaussians_at(view.time) if i % 2 else None) for i, view in enumerate(views)]
@@ -420,7 +421,7 @@ def test_an_abandoned_film_does_not_affect_the_next(street_film, captures):
 
 def test_a_static_film_is_captured_too(street_film, captures, monkeypatch):
     model, views, _ = street_film
-    monkeypatch.setattr(rooms, "MARGIN", 4.0)
+    monkeypatch.setattr(capacity, "MARGIN", 4.0)
     alone = SplatModel([model.parts[0]], model.sky)
     assert_frames([*film_frames(alone, [(view, None) for view in views])], [film_frame(alone, view) for view in views])
     assert len(captures) == 1
@@ -444,7 +445,8 @@ def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film
 
     monkeypatch.setattr(SplatModel, "gaussians_at_time_states", asks)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
-    assert [record.message.split(",")[0] for record in caplog.records] == ["frames of films cannot be recorded"]
+    (record,) = caplog.records
+    assert record.message.startswith("frames of films cannot be captured as a CUDA graph")
 
 
 def trained_with(
@@ -458,7 +460,7 @@ def trained_with(
             part.params["scales"].shape, generator=torch.Generator().manual_seed(0)
         )
     chosen = chosen.model_copy(update={"cuda_graphs": capture, "iterations": iterations})
-    with own_stream(GPU):
+    with capture_stream(GPU):
         trainer = Trainer.begin(model.to(GPU), guided_views(GPU), chosen, 0, GPU)
         losses = [
             float(torch.stack(list(continued(trainer).values())).sum()) for _ in range(iterations_done or iterations)
@@ -500,7 +502,7 @@ def test_graphs_stay_valid_through_relocation_and_growth_into_preallocated_rows(
     part = trainer.model.parts[0]
     count, known, preallocated = len(part), dict(trainer.graphs._graphs), part.preallocated
     assert known and preallocated and losses[-1] < losses[0]
-    with own_stream(GPU):
+    with capture_stream(GPU):
         continued(trainer, 10)  # step 48 is among them
         assert len(part) > count and part.preallocated < preallocated and trainer.graphs._graphs == known
         terms = continued(trainer, 10)
@@ -519,17 +521,17 @@ def test_a_growing_training_learns_the_same_by_cuda_graphs():
 
 
 def test_overflowed_lists_are_detected(monkeypatch):
-    monkeypatch.setattr(rooms, "LEAST", 0)
-    monkeypatch.setattr(rooms, "MARGIN", 1.0)
+    monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
+    monkeypatch.setattr(capacity, "MARGIN", 1.0)
     trainer, _ = trained_with(True, iterations=8)
     trainer.model.parts[0].params["scales"].data += 1.0
-    with own_stream(GPU):
+    with capture_stream(GPU):
         continued(trainer, 4)
     assert any(int(graph.missing) > 0 for graph in trainer.graphs._graphs.values())
     trainer.graphs.check()
     assert not any(int(graph.missing) > 0 for graph in trainer.graphs._graphs.values())
-    monkeypatch.setattr(rooms, "MARGIN", 1.5)
-    with own_stream(GPU):
+    monkeypatch.setattr(capacity, "MARGIN", 1.5)
+    with capture_stream(GPU):
         continued(trainer, 2 * len(trainer.images.views))
     assert trainer.graphs.enabled and len(trainer.graphs._graphs) == len(trainer.images.views)
 
@@ -545,5 +547,6 @@ def test_a_training_that_cannot_be_captured_goes_on_without_graphs(monkeypatch, 
     monkeypatch.setattr(trainer_module, "loss_terms", asks)
     trainer, losses = trained_with(True, iterations=12)
     assert torch.rand(3, device=GPU).any(), "random numbers can still be drawn"
-    assert [record.message.startswith("iterations cannot be recorded") for record in caplog.records] == [True]
+    (record,) = caplog.records
+    assert record.message.startswith("iterations cannot be captured as a CUDA graph")
     assert not trainer.graphs.enabled and losses[-1] < losses[0] and all(map(math.isfinite, losses))

@@ -31,9 +31,9 @@ from benchmarks.speed.plain import (
 from benchmarks.speed.plain_images import endless, loader_of
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim
 from drivesplat.io.checkpoint_file import save
+from drivesplat.kernels.gsplat_private import cpu_strategies
 from drivesplat.rasterization import rasterize
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
-from drivesplat.training.strategies import torch_twins
 
 CHECKPOINT = "ckpt.pt"
 
@@ -175,4 +175,4 @@ class PlainTraining:
 
     def _kernels(self) -> AbstractContextManager[None]:
         """On a CPU, replaces the two CUDA kernels that gsplat's strategies call by torch functions."""
-        return nullcontext() if self.device.type == "cuda" else torch_twins()
+        return nullcontext() if self.device.type == "cuda" else cpu_strategies()

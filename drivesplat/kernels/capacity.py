@@ -1,5 +1,8 @@
-"""How much room tiles' lists of Gaussians get: as much as they need, which the device has to be asked for, or, where
-nothing may wait for it, as much as they needed before and a margin."""
+"""Capacity of the buffers that hold tiles' lists of Gaussians.
+
+An exact capacity needs host synchronisation. Where nothing may wait for the device, as in a CUDA graph, buffers get the
+capacity that the same lists needed before, and a margin.
+"""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -9,54 +12,55 @@ from dataclasses import dataclass, field
 from jaxtyping import Int
 from torch import Tensor
 
-MARGIN, LEAST = 1.5, 4096
-"""Room beyond what was needed: a factor, and a number of entries."""
+MARGIN, MIN_CAPACITY = 1.5, 4096
+"""A planned capacity is MIN_CAPACITY plus MARGIN times the entries needed before."""
 
 
 @dataclass
-class _Rooms:
-    """Lists made in a context: how many entries each has needed, or may have."""
+class _Capacities:
+    """Of the lists made in a context: the capacities that are planned (None: exact ones), the entries that lists
+    needed, and the lists made with a planned capacity."""
 
     planned: list[int] | None = None
-    needs: list[int] = field(default_factory=list)
+    needed: list[int] = field(default_factory=list)
     lists: list[tuple[Tensor, int]] = field(default_factory=list)
 
 
-_rooms: ContextVar[_Rooms | None] = ContextVar("rooms", default=None)
+_current: ContextVar[_Capacities | None] = ContextVar("capacities", default=None)
 
 
 @contextmanager
-def counted() -> Iterator[list[int]]:
-    """Lists made meanwhile have the room they need; how much that was, one after the other."""
-    with _entered(_Rooms()) as rooms:
-        yield rooms.needs
+def exact() -> Iterator[list[int]]:
+    """Lists made in this context have exact capacities, in the order of the yielded numbers of entries."""
+    with _entered(_Capacities()) as capacities:
+        yield capacities.needed
 
 
 @contextmanager
-def given(needs: Sequence[int]) -> Iterator[list[tuple[Int[Tensor, ""], int]]]:
-    """Lists made meanwhile have room for what as many lists needed before, and for more; how many entries each needs,
-    which the device knows, and its room."""
-    with _entered(_Rooms([LEAST + int(MARGIN * need) for need in needs])) as rooms:
-        yield rooms.lists
+def planned(needed: Sequence[int]) -> Iterator[list[tuple[Int[Tensor, ""], int]]]:
+    """Lists made in this context have planned capacities, by the entries that as many lists needed before. Yields, for
+    every list, the entries that it needs, a number on the device, and its capacity."""
+    with _entered(_Capacities([MIN_CAPACITY + int(MARGIN * entries) for entries in needed])) as capacities:
+        yield capacities.lists
 
 
-def room_for(needed: Int[Tensor, ""]) -> int:
-    """The room of the next list, which needs so many entries."""
-    rooms = _rooms.get()
-    if rooms is not None and rooms.planned is not None:
-        room = rooms.planned[len(rooms.lists)]
-        rooms.lists.append((needed, room))
-        return room
-    need = int(needed)
-    if rooms is not None:
-        rooms.needs.append(need)
-    return need
+def capacity_for(needed: Int[Tensor, ""]) -> int:
+    """The capacity of the next list, which needs so many entries."""
+    capacities = _current.get()
+    if capacities is not None and capacities.planned is not None:
+        capacity = capacities.planned[len(capacities.lists)]
+        capacities.lists.append((needed, capacity))
+        return capacity
+    entries = int(needed)
+    if capacities is not None:
+        capacities.needed.append(entries)
+    return entries
 
 
 @contextmanager
-def _entered(rooms: _Rooms) -> Iterator[_Rooms]:
-    before = _rooms.set(rooms)
+def _entered(capacities: _Capacities) -> Iterator[_Capacities]:
+    before = _current.set(capacities)
     try:
-        yield rooms
+        yield capacities
     finally:
-        _rooms.reset(before)
+        _current.reset(before)

@@ -1,13 +1,13 @@
-"""Work for the GPU captured as a CUDA graph and replayed: Python says once what the GPU does, not a thousand times.
+"""Work for the GPU captured as a CUDA graph and replayed: Python launches one graph in place of hundreds of kernels.
 
-A graph holds on to the addresses of what it reads and writes: it sees what lies there when it is replayed, and leaves
-its result where it did before. What is captured must ask the device nothing, nor how many Gaussians tiles list
-(`rooms`).
+A graph keeps the addresses of what it reads and writes: a replay reads what is there then, and overwrites the earlier
+result. Captured work must not synchronise with the host; buffers of lists get a planned capacity
+(`drivesplat.kernels.capacity`).
 """
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -15,85 +15,90 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels import capacity, torch_private, triton_support
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-Pool = tuple[int, int]
-"""Memory that graphs work in, as torch knows it."""
+MemoryPool = tuple[int, int]
+"""torch's handle of the memory that graphs share."""
 
 
 @dataclass(frozen=True)
-class Graph(Generic[T]):
-    """How to have the GPU do something again, and what that leaves, always in the same place: `result`; how many
-    entries each of its lists of Gaussians `needed` the last time, of `rooms`; and how many one was ever `missing`."""
+class CudaGraph(Generic[T]):
+    """A captured graph. `replay` runs it and overwrites `result`, `needed`, the entries that each of its lists needed,
+    and `missing`, the most entries that any list has ever lacked; `capacities` are those of the lists."""
 
     replay: Callable[[], None]
     result: T
     needed: Int[Tensor, " lists"]
-    rooms: Sequence[int]
+    capacities: Sequence[int]
     missing: Int[Tensor, ""]
 
 
+def graphs_supported(device: torch.device) -> bool:
+    """Whether rasterization on this device can be captured: only Triton's lists do without host synchronisation."""
+    return device.type == "cuda" and triton_support.compiles()
+
+
 @contextmanager
-def own_stream(device: torch.device) -> Iterator[None]:
-    """Work for the device goes into a queue of its own: what the usual one is asked for cannot be captured, nor what
-    autograd once did there."""
+def capture_stream(device: torch.device) -> Iterator[None]:
+    """Work for the device runs in a stream of its own; the default stream, and what autograd ran there, cannot be
+    captured."""
     if device.type != "cuda":
         yield
         return
-    usual, own = torch.cuda.current_stream(device), torch.cuda.Stream(device)
-    own.wait_stream(usual)
+    default, own = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+    own.wait_stream(default)
     with torch.cuda.stream(own):
         yield
-    usual.wait_stream(own)
+    default.wait_stream(own)
 
 
-def fresh_pool() -> Pool:
-    """Memory for graphs; what torch holds in reserve, which is of no use to them, is given back."""
+def new_pool() -> MemoryPool:
+    """A memory pool for graphs. Frees torch's cached memory first, which graphs cannot use."""
     torch.cuda.empty_cache()
     return torch.cuda.graph_pool_handle()
 
 
-def captured(
-    once: Callable[[], T], needs: Sequence[int], pool: Pool, device: torch.device, what: str, errors: str = "global"
-) -> Graph[T] | None:
-    """What is done `once`, which is not done thereby. Within `own_stream`; `needs` are how many entries each list of
-    Gaussians that it makes has needed, `errors` is torch's `capture_error_mode`. None, and a warning that names `what`,
-    where the GPU or its driver refuses."""
-    graph, drawn = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(device)
+def capture(
+    work: Callable[[], T], needed: Sequence[int], pool: MemoryPool, device: torch.device, what: str,
+    errors: str = "global",
+) -> CudaGraph[T] | None:  # fmt: skip
+    """Captures `work` without running it; to be called within `capture_stream`.
+
+    `needed` are the entries that each list of Gaussians in it needed before, `errors` is torch's `capture_error_mode`.
+    Returns None, and logs a warning that names `what`, where the GPU or its driver refuses.
+    """
+    graph, random_state = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(device)
     missing = torch.zeros((), dtype=torch.int32, device=device)
-    needed_then = torch.zeros(len(needs), dtype=torch.int32, device=device)
+    needed_now = torch.zeros(len(needed), dtype=torch.int32, device=device)
     try:
-        with rooms.given(needs) as lists:
+        with capacity.planned(needed) as lists:
             graph.capture_begin(pool=pool, capture_error_mode=errors)
             try:
-                result = once()
-                for place, (needed, room) in zip(needed_then, lists, strict=True):
-                    place.copy_(needed)
-                    torch.maximum(missing, needed - room, out=missing)
+                result = work()
+                for place, (entries, available) in zip(needed_now, lists, strict=True):
+                    place.copy_(entries)
+                    torch.maximum(missing, entries - available, out=missing)
             finally:
                 graph.capture_end()
-        return Graph(graph.replay, result, needed_then, [room for _, room in lists], missing)
-    except Exception as error:  # of the driver's, of torch's, of Triton's: all that is lost is time
-        log.warning("%s cannot be recorded, which takes longer: %s", what, _first_line(error))
-    _tidy_up(device, pool, drawn)  # when nothing holds on to what was to be captured any more
+        return CudaGraph(graph.replay, result, needed_now, [available for _, available in lists], missing)
+    except Exception as error:  # of the driver, torch or Triton; the work itself is not affected
+        log.warning("%s cannot be captured as a CUDA graph, which takes longer: %s", what, _first_line(error))
+    _end_broken_capture(device, pool, random_state)  # when nothing refers to the captured tensors any more
     return None
 
 
 def _first_line(error: Exception) -> str:
-    """Of what went wrong first: what breaks a capture off lets its end fail, too."""
+    """The first error's first line: an error during a capture makes the end of the capture fail as well."""
     return str(error.__context__ or error).splitlines()[0]
 
 
-def _tidy_up(device: torch.device, pool: Pool, drawn: Tensor) -> None:
-    """Ends for torch what it still takes for a capture, which broke off: its generator goes on from what had been
-    `drawn`, and memory is given back again."""
+def _end_broken_capture(device: torch.device, pool: MemoryPool, random_state: Tensor) -> None:
+    """Restores torch's state after a capture that broke off: its random generator and its memory pool."""
     index = torch.cuda.current_device() if device.index is None else device.index
-    fresh = torch.Generator(device=device)
-    fresh.set_state(drawn)
-    torch.cuda.default_generators[index].graphsafe_set_state(fresh.graphsafe_get_state())
-    for name in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
-        with suppress(AttributeError, RuntimeError):
-            getattr(torch._C, name)(index, pool)
+    generator = torch.Generator(device=device)
+    generator.set_state(random_state)
+    torch.cuda.default_generators[index].graphsafe_set_state(generator.graphsafe_get_state())
+    torch_private.release_graph_pool(index, pool)

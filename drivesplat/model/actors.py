@@ -14,14 +14,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from torch.nn.functional import normalize, one_hot
+from torch.nn.functional import one_hot
 
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels import torch_private
+from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
+from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
+from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup
-from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.actors import ActorSettings, TrackSettings
@@ -144,39 +146,14 @@ class Actors(Part):
 
     def placed(self, state: TimeState, poses: ActorPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
-        p, rotations = self.params, rotation_matrix(poses.quats)
-        if on_gpu.for_tensor(p["means"]):
-            return self._placed_on_gpu(state, poses, rotations)
-        scales = self._of_owners(poses.scales)[:, None]
-        sh = self.harmonics(state)
-        if sh.shape[1] > 1:  # colours turn by degrees at most: no gradient of theirs is worth its noise to the track
-            sh = self._of_owners(rotation_of_harmonics(rotations.detach(), sh.shape[1])) @ sh
-        turned = (self._of_owners(rotations) @ (scales * p["means"])[..., None])[..., 0]
-        return Gaussians.of(
-            turned + self._of_owners(poses.translations),
-            (self._of_owners(left_factor(poses.quats)) @ normalize(p["quats"], dim=-1)[..., None])[..., 0],
-            scales * torch.exp(p["scales"]),
-            torch.sigmoid(p["opacities"]) * self._of_owners(poses.present.to(scales.dtype)),
-            sh,
-        )
-
-    def _placed_on_gpu(self, state: TimeState, poses: ActorPoses, rotations: Float[Tensor, "a 3 3"]) -> Gaussians:
-        """The same by two kernels."""
-        from drivesplat.kernels.triton.colours_in_time import turned_colours
-        from drivesplat.kernels.triton.placing import Objects, Shapes, placed
-
-        p, owner, coefficients = self.params, self.params["owner"], self.params["shN"].shape[2] + 1
-        shapes = Shapes(p["means"], p["quats"], p["scales"], p["opacities"])
-        presence = poses.present.to(rotations.dtype)
-        objects = Objects(poses.quats, poses.translations, poses.scales, presence)
-        turns = rotation_of_harmonics(rotations.detach(), coefficients)
-        sh = turned_colours(p["sh0"], p["shN"], state.series, turns, owner)
-        return Gaussians.of(*placed(shapes, objects, owner, self._owns), sh)
-
-    def _of_owners(self, values: Float[Tensor, "a *v"]) -> Float[Tensor, "n *v"]:
-        """For every Gaussian the value of its actor, by a product with the ownership matrix: exact, with a gradient
-        that is a matrix product too, whereas the gradient of indexing sums row by row."""
-        return (self._owns.to(values.dtype) @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
+        p, owner, owns = self.params, self.params["owner"], self._owns
+        local = LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
+        presence = poses.present.to(poses.scales.dtype)
+        objects = ObjectPoses(poses.quats, poses.translations, poses.scales, presence)
+        # colors rotate by a few degrees: their gradient would add only noise to the track
+        rotations = rotation_of_harmonics(rotation_matrix(poses.quats.detach()), p["shN"].shape[2] + 1)
+        sh = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
+        return Gaussians.of(*place(local, objects, owner, owns), sh)
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:
@@ -184,21 +161,19 @@ class Actors(Part):
         computed within every captured training iteration, since its replays may follow a densification."""
         owner, (known, version, matrix) = self.params["owner"], self._known_owners
         captured = owner.is_cuda and torch.cuda.is_current_stream_capturing()
-        changed = known is not owner or version != owner._version or (captured and torch.is_grad_enabled())
+        changed = (
+            known is not owner or version != torch_private.write_count(owner) or (captured and torch.is_grad_enabled())
+        )
         if matrix is None or changed or matrix.device != owner.device:
             matrix = one_hot(owner, len(self.timeline.tracks)).float()
             if not captured:  # a captured matrix has no values before a replay
-                self._known_owners = owner, owner._version, matrix
+                self._known_owners = owner, torch_private.write_count(owner), matrix
         return matrix
 
     def harmonics(self, state: TimeState) -> Float[Tensor, "n k 3"]:
         """The colour coefficients at a time state, in the object's frame: the sum over i of f_i cos(i pi t / T), t
         running from 0 to T over the actor's annotations (equation 5 of the paper)."""
-        coefficients = torch.cat([self.params["sh0"], self.params["shN"]], dim=2)
-        if coefficients.shape[1] == 1:
-            return coefficients[:, 0]
-        series = self._of_owners(state.series)
-        return (series[:, :, None, None] * coefficients).sum(dim=1)
+        return colors_in_object(self.params["sh0"], self.params["shN"], state.series, self._owns)
 
     def learning_rates(self) -> dict[str, float]:
         tracks = self._settings.tracks
@@ -216,7 +191,7 @@ class Actors(Part):
 
     @torch.no_grad()
     def confine(self) -> None:
-        self.fade((self.params["means"].abs() > self._of_owners(self._reach)).any(dim=1))
+        self.fade((self.params["means"].abs() > of_owners(self._reach, self._owns)).any(dim=1))
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
         known = [track.id for track in self.timeline.tracks]

@@ -51,11 +51,9 @@ def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -
 
 def _basis(coefficients: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
     """The first k functions along unit directions, in the order and with the signs of 3D Gaussian Splatting."""
-    from gsplat.cuda._torch_impl import (
-        _eval_sh_bases_fast,  # imported late: stages report a missing gsplat in a sentence
-    )
+    from drivesplat.kernels.gsplat_private import sh_basis  # late: stages report a missing gsplat
 
-    return _eval_sh_bases_fast(coefficients, directions)
+    return sh_basis(coefficients, directions)
 
 
 @cache

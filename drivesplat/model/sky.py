@@ -5,11 +5,10 @@ meet there, so that the colour is continuous over seams by construction.
 """
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels.cube_map import CubeMap, cube_map_colors, over_cube_map
 from drivesplat.model.part import Sky
 from drivesplat.model.view import View
 
@@ -44,14 +43,7 @@ class CubemapSky(Sky):
         self._learning_rate = learning_rate
 
     def colors(self, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        faces = self.params["texels"][self.index]
-        sampled = F.grid_sample(
-            faces.permute(3, 0, 1, 2)[None],
-            face_coordinates(rays)[None, None],
-            align_corners=True,
-            padding_mode="border",
-        )
-        return torch.sigmoid(sampled[0, :, 0].permute(1, 2, 0))
+        return cube_map_colors(self._cube_map, rays)
 
     def behind(
         self,
@@ -60,31 +52,15 @@ class CubemapSky(Sky):
         view: View,
         rays: Float[Tensor, "h w 3"] | None = None,
     ) -> Float[Tensor, "h w 3"]:
-        if view.camera_to_world.requires_grad or not on_gpu.for_tensor(splats):
-            return super().behind(splats, alpha, view, rays)
-        from drivesplat.kernels.triton.cube import Cube, before_cube
+        directions = view.rays if rays is None else lambda: rays
+        return over_cube_map(splats, alpha, self._cube_map, view.K, view.camera_to_world, directions)
 
-        return before_cube(splats, alpha, Cube(self.params["texels"], self.index), view.K, view.camera_to_world)
+    @property
+    def _cube_map(self) -> CubeMap:
+        return CubeMap(self.params["texels"], self.index)
 
     def learning_rates(self) -> dict[str, float]:
         return {"texels": self._learning_rate}
-
-
-def face_coordinates(rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Where directions meet the cube, as grid_sample's x, y (on the face) and z (which face), all in [-1, 1].
-
-    Faces 0 to 5 are +x, -x, +y, -y, +z, -z. On a face with axis i, x and y are the coordinates of axes i + 1 and i + 2.
-    """
-    if rays.device.type == "cpu" and not rays.requires_grad:
-        from drivesplat.kernels.numba.cube import face_coordinates_of
-
-        return torch.from_numpy(face_coordinates_of(rays.contiguous().numpy()))
-    axis = rays.abs().argmax(dim=-1, keepdim=True)
-    along = rays.gather(-1, axis)
-    u = rays.gather(-1, (axis + 1) % 3) / along.abs()
-    v = rays.gather(-1, (axis + 2) % 3) / along.abs()
-    face = 2 * axis + (along < 0)
-    return torch.cat([u, v, face * (2.0 / 5.0) - 1.0], dim=-1)
 
 
 def shared_vertices(resolution: int) -> tuple[Int[Tensor, "6 r r"], int]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from drivesplat.errors import ResultError
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
@@ -176,10 +176,5 @@ def _colors(gaussians: Gaussians, view: View, sh_degree: int | None) -> tuple[Te
     """What the rasterizer is given: coefficients and their degree, at most `sh_degree`; or, where there is a kernel for
     it, the colours (n, 3) that the view's camera sees, and None."""
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
-    if on_gpu.for_tensor(gaussians.means) and not view.camera_to_world.requires_grad:
-        from drivesplat.kernels.triton import harmonics
-
-        if degree in harmonics.DEGREES:
-            own = gaussians.means, gaussians.sh0, gaussians.shN
-            return harmonics.seen_colours(*own, view.camera_to_world, degree), None
-    return gaussians.sh, degree
+    colors = fused_view_colors(gaussians.means, gaussians.sh0, gaussians.shN, view.camera_to_world, degree)
+    return (gaussians.sh, degree) if colors is None else (colors, None)

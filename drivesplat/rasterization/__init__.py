@@ -1,4 +1,4 @@
-"""One door to the rasterizers: 3D Gaussians in, image, alpha and depth out."""
+"""Rasterization: 3D Gaussians in; image, alpha and depth out."""
 
 from drivesplat.rasterization.rasterization import rasterize
 from drivesplat.rasterization.rendering import Rendering

@@ -1,13 +1,13 @@
-"""The rasterization call, with gsplat's meaning, whatever stands behind it."""
+"""The rasterization call, with the meaning of gsplat's, on GPU and CPU."""
 
-from collections.abc import Callable
-
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.rasterization.rendering import Rendering
-
-BACKENDS = ("gsplat", "cpu", "reference")
+from drivesplat.kernels.compositing import composite
+from drivesplat.kernels.projection import project
+from drivesplat.kernels.view_colors import view_colors
+from drivesplat.rasterization.rendering import Rendering, assembled
 
 
 def rasterize(
@@ -25,35 +25,65 @@ def rasterize(
     antialiased: bool = False,
     absgrad: bool = False,
     with_depth: bool = False,
-    backend: str | None = None,
 ) -> Rendering:
-    """Renders n Gaussians in C pinhole cameras.
+    """Renders n 3D Gaussians in c pinhole cameras.
 
-    `means` in world metres; `quats` w, x, y, z (normalised inside); `scales` metres; `opacities` in [0, 1]; `colors`
-    are SH coefficients up to `sh_degree`, or final values where that is None. `viewmats` take world to camera (OpenCV);
-    `Ks` use the continuous pixel convention. The projection is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian
-    Splatting (Kerbl et al. 2023); `antialiased` scales opacities by the 2D filter's loss (Yu et al. 2024).
+    The projection is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023). Tensors on a
+    GPU are rendered by gsplat and Triton in float32, others by numba in float32 or float64, in as many threads as torch
+    uses and with results that do not depend on their number. Gradients reach all tensors but `Ks`.
 
-    `backend`: one of BACKENDS; None takes gsplat on a GPU and cpu elsewhere.
+    Args:
+        means: Centres in world coordinates, metres.
+        quats: Rotations, Gaussian to world, as w, x, y, z of any length.
+        scales: Standard deviations along the Gaussian's axes, metres.
+        opacities: In [0, 1].
+        colors: Values of each channel, or spherical harmonics with k >= (sh_degree + 1)² coefficients.
+        viewmats: World to camera, metres, in OpenCV axes: x right, y down, z forward.
+        Ks: Intrinsics in pixels; the centre of the first pixel is at (0.5, 0.5).
+        width: Image width in pixels.
+        height: Image height in pixels.
+        sh_degree: Degree up to which harmonics are evaluated, at most 3 on a CPU; None: `colors` are final values.
+        antialiased: Scale opacities by the area that the 2D filter adds (Yu et al. 2024).
+        absgrad: Let the backward pass write `info["means2d"].absgrad` (c, n, 2), as gsplat's strategies need it.
+        with_depth: Also render the expected depth.
+
+    Returns:
+        A `Rendering`: image (c, h, w, channels), premultiplied by alpha; alpha (c, h, w, 1); depth (c, h, w, 1) in
+        metres or None; info for gsplat's strategies.
+
+    Raises:
+        ValueError: On a CPU, for an `sh_degree` above 3 or too few coefficients.
+
+    Example:
+        One red Gaussian two metres in front of a camera at the origin.
+
+        >>> import torch
+        >>> from drivesplat.rasterization import rasterize
+        >>> means = torch.tensor([[0.0, 0.0, 2.0]])
+        >>> quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+        >>> scales = torch.full((1, 3), 0.1)
+        >>> opacities, colors = torch.tensor([0.8]), torch.tensor([[1.0, 0.0, 0.0]])
+        >>> viewmats = torch.eye(4)[None]
+        >>> Ks = torch.tensor([[[50.0, 0.0, 16.5], [0.0, 50.0, 12.5], [0.0, 0.0, 1.0]]])
+        >>> rendering = rasterize(means, quats, scales, opacities, colors, viewmats, Ks, 32, 24, with_depth=True)
+        >>> tuple(rendering.image.shape), tuple(rendering.alpha.shape)
+        ((1, 24, 32, 3), (1, 24, 32, 1))
+        >>> rendering.image[0, 12, 16].tolist() == [rendering.alpha[0, 12, 16].item(), 0.0, 0.0]
+        True
+        >>> round(rendering.alpha[0, 12, 16].item(), 3), round(rendering.depth[0, 12, 16].item(), 3)
+        (0.8, 2.0)
     """
-    chosen = backend or ("gsplat" if means.is_cuda else "cpu")
-    return _backend(chosen)(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-        sh_degree=sh_degree, antialiased=antialiased, absgrad=absgrad, with_depth=with_depth,
-    )  # fmt: skip
-
-
-def _backend(name: str) -> Callable[..., Rendering]:
-    if name == "gsplat":
-        from drivesplat.rasterization.gsplat_backend import rasterize_gsplat
-
-        return rasterize_gsplat
-    if name == "cpu":
-        from drivesplat.rasterization.cpu import rasterize_cpu
-
-        return rasterize_cpu
-    if name == "reference":
-        from drivesplat.rasterization.reference import rasterize_reference
-
-        return rasterize_reference
-    raise ValueError(f"no rasterizer is called {name!r}: there are {', '.join(BACKENDS)}")
+    cameras = len(viewmats)
+    if means.is_cuda and len(means) == 0:  # gsplat's kernels need at least one Gaussian
+        size = (cameras, height, width)
+        channels = colors.shape[-1] + with_depth
+        return assembled(means.new_zeros(*size, channels), means.new_zeros(*size, 1), with_depth)
+    gaussians = project(means, quats, scales, opacities, viewmats, Ks, width, height, antialiased)
+    if sh_degree is not None:
+        values = view_colors(means, colors, viewmats, gaussians.radii, sh_degree)
+    else:
+        values = colors[None] if cameras == 1 else colors.expand(cameras, -1, -1)
+    if with_depth:
+        values = torch.cat([values, gaussians.depths[..., None]], dim=-1)
+    image, alpha = composite(gaussians, values, width, height, absgrad)
+    return assembled(image, alpha, with_depth, **gaussians._asdict())

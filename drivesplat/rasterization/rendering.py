@@ -1,4 +1,4 @@
-"""What every rasterizer returns."""
+"""The result of rasterization."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +9,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Rendering:
-    """What C cameras see: `image` (C, h, w, channels), `alpha` (C, h, w, 1), `depth` (C, h, w, 1) in metres or None.
+    """The images of c cameras.
 
-    `image` is premultiplied: nothing is composited behind it. `depth` is the expected depth along the camera axis.
-    `info` holds what gsplat's densification strategies read (`means2d`, `radii`, `width`, `height`, `n_cameras`,
-    `gaussian_ids`).
+    `image` is premultiplied by `alpha`: nothing is composited behind it. `depth` is the expected depth in metres along
+    the camera axis, or None. `info` holds what gsplat's strategies read: `means2d`, `radii`, `depths`, `conics`,
+    `opacities`, `width`, `height`, `n_cameras` and `gaussian_ids`.
     """
 
     image: Float[Tensor, "c h w channels"]
@@ -25,10 +25,8 @@ class Rendering:
 def assembled(
     composited: Float[Tensor, "c h w channels"], alpha: Float[Tensor, "c h w 1"], with_depth: bool, **projected: Any
 ) -> Rendering:
-    """What has been composited as a Rendering; `with_depth`: the last channel is the depth, weighted by alpha.
-
-    `projected` are the Gaussians in the images, as strategies read them: means2d, radii, depths, conics, opacities.
-    """
+    """A Rendering of composited values, whose last channel is depth times alpha where `with_depth`. `projected` are the
+    Gaussians in the images: means2d, radii, depths, conics, opacities."""
     cameras, height, width = alpha.shape[:3]
     info = {**projected, "width": width, "height": height, "n_cameras": cameras, "gaussian_ids": None}
     if not with_depth:

@@ -13,9 +13,8 @@ import torch
 from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
-from drivesplat.kernels import capacity as rooms
-from drivesplat.kernels import triton as on_gpu
-from drivesplat.kernels.cuda_graphs import Graph, captured, fresh_pool, own_stream
+from drivesplat.kernels import capacity, triton_support
+from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -62,7 +61,7 @@ class GpuFrameRenderer:
         self._model = model
         self._needs: list[int] | None = None  # the most entries that each list of a frame needed; None before the first
         self._graph: _FrameGraph | None = None
-        self._captures = on_gpu.compiles()
+        self._captures = triton_support.compiles()
 
     def submit(self, wanted: FrameInput) -> PendingFrame:
         """Starts rendering a frame."""
@@ -86,8 +85,8 @@ class GpuFrameRenderer:
         states = self._time_states(view) if gaussians is None else None
         if states is not None and (frame_graph := self._graph_for(view, states)) is not None:
             graph = frame_graph.replay(view, states)
-            return self._pending(graph.result, graph.needed, graph.rooms, wanted)
-        with rooms.given(self._needs) as lists:
+            return self._pending(graph.result, graph.needed, graph.capacities, wanted)
+        with capacity.planned(self._needs) as lists:
             frame = _render(self._model, view, gaussians)
         needs = [needed.int() for needed, _ in lists]
         needed = torch.stack(needs) if needs else torch.empty(0, dtype=torch.int32)
@@ -95,10 +94,10 @@ class GpuFrameRenderer:
 
     def _measured(self, wanted: FrameInput) -> PendingFrame:
         """A frame with exact capacities, which later frames get too. Waits for the device."""
-        with rooms.counted() as needs:
+        with capacity.exact() as needs:
             frame = _render(self._model, *wanted)
         self._needs = [max(pair) for pair in zip(needs, self._needs or needs, strict=True)]
-        if self._graph is not None and _overflowed(needs, self._graph.graph.rooms):
+        if self._graph is not None and _overflowed(needs, self._graph.graph.capacities):
             self._graph = None
         return self._pending(frame, torch.empty(0, dtype=torch.int32), [], wanted)
 
@@ -132,7 +131,7 @@ class _FrameGraph:
 
     view: View
     states: TimeStates
-    graph: Graph[RenderedFrame]
+    graph: CudaGraph[RenderedFrame]
 
     @classmethod
     def capture(cls, model: SplatModel, view: View, states: TimeStates, needs: Sequence[int]) -> "_FrameGraph | None":
@@ -144,16 +143,16 @@ class _FrameGraph:
         def render() -> RenderedFrame:
             return _render(model, own_view, model.gaussians_at_time_states(own_states))
 
-        pool = fresh_pool()
-        with own_stream(device):  # a second thread encodes the film meanwhile
-            graph = captured(render, needs, pool, device, "frames of films", errors="thread_local")
+        pool = new_pool()
+        with capture_stream(device):  # a second thread encodes the film meanwhile
+            graph = capture(render, needs, pool, device, "frames of films", errors="thread_local")
         return None if graph is None else cls(own_view, own_states, graph)
 
     def fits(self, view: View) -> bool:
         """Whether a view has the same size."""
         return (view.width, view.height) == (self.view.width, self.view.height)
 
-    def replay(self, view: View, states: TimeStates) -> Graph[RenderedFrame]:
+    def replay(self, view: View, states: TimeStates) -> CudaGraph[RenderedFrame]:
         """The graph, replayed with a view and time states."""
         self.view.K.copy_(view.K)
         self.view.camera_to_world.copy_(view.camera_to_world)

@@ -18,14 +18,15 @@ class Densifier:
     called before the part's tensors are reallocated; where it returns True, the part gets preallocated rows."""
 
     def __init__(self, part: Part, settings: TrainSettings, preallocates: Callable[[], bool] = lambda: False):
-        from drivesplat.training import strategies  # gsplat; the stage says in a sentence where it is missing
+        from drivesplat.kernels.gsplat_private import cpu_strategies  # gsplat; the stage explains where it is missing
+        from drivesplat.training import strategies
 
         self._part = part
         self._by_gradient = settings.strategy == "default"
         self._cap = part.cap_max or settings.cap_max
         self._few, self._few_until = few_at_first(self._cap, settings)
         self._strategy = strategies.make_strategy(settings, part, self._cap, preallocates)
-        self._on_cpu = strategies.torch_twins
+        self._on_cpu = cpu_strategies
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
         self._every = settings.default.refine_every if self._by_gradient else settings.mcmc.refine_every
         scale = {"scene_scale": part.extent} if self._by_gradient else {}

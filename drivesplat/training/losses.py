@@ -5,13 +5,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from drivesplat.kernels import triton as on_gpu
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.kernels.color_difference import color_difference
+from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.colours import colour_difference
 from drivesplat.training.views import LidarDepth, TrainingView
 
 WORST = 0.05
@@ -25,17 +24,18 @@ def loss_terms(
     nothing in it could hold against that. Of what the own car's body hides nothing is asked."""
     shown = picture.gaussians
     alpha = picture.alpha if view.own_car is None else picture.alpha.masked_fill(view.own_car, 1.0)
-    colours = colour_difference(picture.image, view, of_moving=settings.dynamic_weight > 0)
+    moving = view.moving if settings.dynamic_weight > 0 else None
+    difference = color_difference(picture.image, view.pixels, view.own_car, moving)
     terms = {
-        "l1": (1.0 - settings.ssim_weight) * colours.l1,
-        "ssim": settings.ssim_weight * (1.0 - colours.similarity),
+        "l1": (1.0 - settings.ssim_weight) * difference.l1,
+        "ssim": settings.ssim_weight * (1.0 - difference.ssim),
     }
-    if colours.moving_l1 is not None:
-        terms["dynamic"] = settings.dynamic_weight * colours.moving_l1
-    regularisers = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
-    if any(regularisers.values()):
-        means, share = mean_opacity_and_scale(shown), active_fraction(model.parts)
-        terms |= {name: w * mean / share for (name, w), mean in zip(regularisers.items(), means, strict=True) if w}
+    if difference.moving_l1 is not None:
+        terms["dynamic"] = settings.dynamic_weight * difference.moving_l1
+    regularizers = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
+    if any(regularizers.values()):
+        means, share = mean_opacity_and_scale(shown.opacities, shown.scales), active_fraction(model.parts)
+        terms |= {name: w * mean / share for (name, w), mean in zip(regularizers.items(), means, strict=True) if w}
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
@@ -62,17 +62,6 @@ def _moving_terms(
         seen = alpha if view.own_car is None else alpha.masked_fill(view.own_car, 1.0)
         terms["entropy"] = settings.entropy_weight * entropy(seen)
     return terms
-
-
-def mean_opacity_and_scale(shown: Gaussians) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """The mean opacity, and the mean of all scales in metres, 0 for those of what is not there, of opacity 0; over all
-    rows, preallocated ones included."""
-    if on_gpu.for_tensor(shown.scales) and len(shown):
-        from drivesplat.kernels.triton import regularisers
-
-        return regularisers.mean_opacity_and_scale(shown.opacities, shown.scales)
-    there = shown.opacities.detach() > 0.0
-    return shown.opacities.mean(), (shown.scales * there[:, None]).mean()
 
 
 def sky_cross_entropy(alpha: Float[Tensor, "h w"], sky: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:

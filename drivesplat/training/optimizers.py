@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels import torch_private
+from drivesplat.kernels.adam import adam_step
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
@@ -82,25 +83,10 @@ class ModelOptimizers:
                 rate = group["lr"] if rates is None else rates[name]
                 ready.append((parameter, optimizer.started(), rate, group))
         if ready:
-            torch._foreach_add_([state["step"] for _, state, _, _ in ready], 1)
+            torch_private.increment([state["step"] for _, state, _, _ in ready])
         for parameter, state, rate, group in ready:
-            _adam(parameter, state, rate, group["betas"], group["eps"])
+            adam_step(parameter, state, rate, group["betas"], group["eps"])
             parameter.grad = None
-
-
-def _adam(
-    parameter: nn.Parameter, state: dict[str, Tensor], rate: float | Tensor, betas: tuple[float, float], eps: float
-) -> None:
-    """A step that has been counted."""
-    if isinstance(rate, Tensor) and on_gpu.for_tensor(parameter):
-        from drivesplat.kernels.triton.adam import adam_step
-
-        adam_step(parameter, parameter.grad, state, rate, betas, eps)
-        return
-    torch._fused_adam_(
-        [parameter], [parameter.grad], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
-        lr=rate, beta1=betas[0], beta2=betas[1], eps=eps, weight_decay=0.0, amsgrad=False, maximize=False,
-    )  # fmt: skip
 
 
 class DeviceSchedule:

@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.quaternions import rotation_matrix
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.road import RoadSettings
 from drivesplat.training.cells import Cells

@@ -1,26 +1,23 @@
 """gsplat's densification strategies as this workflow runs them: capped, resetting, and on the CPU."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
-from unittest.mock import patch
 
 import torch
-from gsplat import DefaultStrategy, MCMCStrategy
-from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+from gsplat import MCMCStrategy
 from gsplat.strategy import ops
-from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels.exploration import explore
+from drivesplat.kernels.gsplat_private import HookedDefaultStrategy
 from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.cuda_graph.preallocation import activate, release_rows, reserve_rows
 from drivesplat.training.optimizers import Optimizers
 
 
-class CappedDefaultStrategy(DefaultStrategy):
+class CappedDefaultStrategy(HookedDefaultStrategy):
     """gsplat's DefaultStrategy with at most `cap_max` Gaussians: where more want to grow, the largest gradients do.
 
     It resets opacities every `reset_every` iterations, as 3DGS does; gsplat 1.5.3 never comes to it, since
@@ -37,14 +34,13 @@ class CappedDefaultStrategy(DefaultStrategy):
             ops.reset_opa(params=params, optimizers=optimizers, state=state, value=2.0 * self.prune_opa)
 
     @torch.no_grad()
-    def _grow_gs(self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
+    def before_growth(self, state: dict[str, Any]) -> None:
         gradients = state["grad2d"] / state["count"].clamp_min(1)
         room = max(0, self.cap_max - len(gradients))
         wanting = torch.nonzero(gradients > self.grow_grad2d)[:, 0]
         if len(wanting) > room:
             weakest_first = wanting[torch.argsort(gradients[wanting])]
             state["grad2d"][weakest_first[: len(wanting) - room]] = 0.0
-        return super()._grow_gs(params, optimizers, state, step)
 
 
 @dataclass
@@ -63,12 +59,12 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
     ) -> None:
         if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
             state["binoms"] = state["binoms"].to(params["means"].device)
-            self._relocate_gs(params, optimizers, state["binoms"])
-            self._add_new_gs(params, optimizers, state["binoms"])
-        _add_noise(params, optimizers, lr * self.noise_lr)
+            self.relocate_dead(params, optimizers, state["binoms"])
+            self.add_new(params, optimizers, state["binoms"])
+        explore(params, lr * self.noise_lr)
 
     @torch.no_grad()
-    def _relocate_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
+    def relocate_dead(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
         dead = torch.sigmoid(params["opacities"]) <= self.min_opacity
         dead[len(self.part) :] = False
         count = int(dead.sum())
@@ -77,7 +73,7 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
         return count
 
     @torch.no_grad()
-    def _add_new_gs(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
+    def add_new(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
         count = len(self.part)
         more = max(0, min(self.cap_max, int((1.0 + self.growth) * count)) - count)
         if more > self.part.preallocated:
@@ -90,20 +86,6 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
         elif more:
             ops.sample_add(params, optimizers, {}, more, binoms, self.min_opacity)
         return more
-
-
-def _add_noise(params: Any, optimizers: Optimizers, strength: float) -> None:
-    """Adds noise to positions, the more the more transparent and the larger a Gaussian is."""
-    if on_gpu.for_tensor(params["means"]):
-        from drivesplat.kernels.triton.exploration import explore
-
-        explore(params, strength)
-    elif params["means"].is_cuda:
-        ops.inject_noise_to_position(params, optimizers, {}, strength)
-    else:
-        from drivesplat.kernels.numba.exploration import explore
-
-        explore(params, strength)
 
 
 def make_strategy(
@@ -135,32 +117,3 @@ def make_strategy(
     )
     strategy.cap_max = cap_max
     return strategy
-
-
-@contextmanager
-def torch_twins() -> Iterator[None]:
-    """For its duration gsplat's strategies use torch twins of the two CUDA kernels they call."""
-    with (
-        patch.object(ops, "compute_relocation", relocation),
-        patch.object(ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
-    ):
-        yield
-
-
-def relocation(
-    opacities: Float[Tensor, " n"], scales: Float[Tensor, "n 3"], ratios: Tensor, binoms: Float[Tensor, "n_max n_max"]
-) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """Opacity and scale with which `ratios` (n,) copies at one place look like the one Gaussian that was there.
-
-    Equation 9 of Kheradmand et al. 2024; `binoms[i, k]` is the binomial coefficient. The twin of gsplat's
-    compute_relocation.
-    """
-    n_max = len(binoms)
-    ratios = ratios.clamp(1, n_max).long()
-    new_opacities = 1.0 - (1.0 - opacities) ** (1.0 / ratios)
-    k = torch.arange(n_max, device=opacities.device, dtype=torch.float64)  # the terms alternate and reach 1e14
-    series = (-1.0) ** k / torch.sqrt(k + 1.0) * new_opacities[:, None].double() ** (k + 1)
-    # sum over i < ratio of sum over k <= i of binom(i, k) * series_k; binom(i, k) = 0 beyond k = i
-    coefficients = torch.cumsum(binoms.double(), dim=0)[ratios - 1]
-    shrink = opacities / (coefficients * series).sum(dim=1).to(opacities.dtype)
-    return new_opacities, shrink[:, None] * scales

@@ -10,7 +10,7 @@ import torch
 
 from drivesplat.errors import TrainingError
 from drivesplat.io import checkpoint_file
-from drivesplat.kernels.cuda_graphs import own_stream
+from drivesplat.kernels.cuda_graphs import capture_stream
 from drivesplat.machine.device import device_name, explain_out_of_memory
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
@@ -75,7 +75,7 @@ def train(
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
-    with explain_out_of_memory(lambda: len(model)), own_stream(device):
+    with explain_out_of_memory(lambda: len(model)), capture_stream(device):
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, surroundings, clock)
         run = Run.begin(trainer, workspace)
         with Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label) as monitor:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from drivesplat.kernels import torch_private
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
@@ -139,7 +140,7 @@ class Trainer:
 
     def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]
-        norms = torch._foreach_norm([gradient for _, gradient in named])
+        norms = torch_private.norms([gradient for _, gradient in named])
         return {f"gradient of {self._readable(name)}": norm for (name, _), norm in zip(named, norms, strict=True)}
 
     def _readable(self, parameter: str) -> str:

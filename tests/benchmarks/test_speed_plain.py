@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.records import training_record_of
+from helpers.reference_rasterizer import rasterize_reference
 from PIL import Image
 from skimage.metrics import structural_similarity
 
@@ -18,7 +19,6 @@ from benchmarks.speed.plain_images import ImageFiles, endless, files_of_size, lo
 from benchmarks.speed.plain_ssim import Ssim, chosen_ssim, torch_ssim
 from benchmarks.speed.plain_training import PlainTraining, fit
 from drivesplat.io.checkpoint_file import load
-from drivesplat.rasterization import rasterize
 from drivesplat.scene.training_record import TrainingRecord
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -184,9 +184,8 @@ def test_the_loss_is_that_of_the_example_mcmc(record):
     s = {name: value.detach() for name, value in training.splats.items()}
     scales, opacities = torch.exp(s["scales"]), torch.sigmoid(s["opacities"])
     viewmat = torch.linalg.inv(batch["camtoworld"])
-    image = rasterize(
+    image = rasterize_reference(
         s["means"], s["quats"], scales, opacities, s["sh0"], viewmat, batch["K"], WIDTH, HEIGHT, sh_degree=0,
-        backend="reference",
     ).image  # fmt: skip
     pixels = batch["image"] / 255.0
     similarity = torch_ssim(image.permute(0, 3, 1, 2), pixels.permute(0, 3, 1, 2))

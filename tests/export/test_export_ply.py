@@ -157,7 +157,7 @@ def test_what_returns_renders_the_same_image(tmp_path):
     images = [
         rasterize(
             g.means, g.quats, g.scales, g.opacities, g.sh, torch.eye(4)[None], K[None], 32, 24,
-            sh_degree=g.sh_degree, backend="cpu",
+            sh_degree=g.sh_degree,
         ).image
         for g in (shown, read_splat_ply(tmp_path / "splat.ply"))
     ]  # fmt: skip

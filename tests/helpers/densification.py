@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.background import Background
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
@@ -13,7 +14,6 @@ from drivesplat.model.view import View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
 from drivesplat.training.densify import Densifier, Optimizers
-from drivesplat.training.losses import mean_opacity_and_scale
 
 ALL = slice(None)
 """The rows of a lone part."""
@@ -58,7 +58,8 @@ def train_step(
     picture.info["means2d"].retain_grad()
     loss = (picture.image - target).abs().mean()
     if learns_size:
-        loss = loss + 0.1 * sum(mean_opacity_and_scale(picture.gaussians)) / active_fraction(model.parts)
+        means = mean_opacity_and_scale(picture.gaussians.opacities, picture.gaussians.scales)
+        loss = loss + 0.1 * sum(means) / active_fraction(model.parts)
     loss.backward()
     for optimizer in optimizers.values():
         optimizer.step()

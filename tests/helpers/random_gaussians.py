@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from drivesplat.rasterization import Rendering, rasterize
+from drivesplat.rasterization import Rendering
+from helpers.reference_rasterizer import rasterize_reference
 
 
 @dataclass
@@ -24,7 +25,7 @@ class Scene:
     height: int
 
     def render(self, **options) -> Rendering:
-        return rasterize(**{f.name: getattr(self, f.name) for f in fields(self)}, backend="reference", **options)
+        return rasterize_reference(**{f.name: getattr(self, f.name) for f in fields(self)}, **options)
 
     def float(self) -> "Scene":
         """The scene in float32."""

@@ -19,7 +19,6 @@ from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
-from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.training_record import TrainingRecord
@@ -42,6 +41,7 @@ from drivesplat.training.views import LidarDepth, TrainingView
 from helpers import REPOSITORY
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
 from helpers.records import training_record_of
+from helpers.reference_rasterizer import rasterize_reference
 
 CPU = torch.device("cpu")
 
@@ -67,7 +67,7 @@ def recorded_views(count: int = 5, width: int = WIDTH, height: int = HEIGHT, dev
         camera_to_world[0, 3] = 2.0 * i / max(1, count - 1) - 1.0
         intrinsics = torch.tensor([[0.7 * width, 0.0, width / 2], [0.0, 0.7 * width, height / 2], [0.0, 0.0, 1.0]])
         view = View(intrinsics, camera_to_world, width, height, time=0.5 * i)
-        image = rasterize(*tensors, view.viewmat[None], view.K[None], width, height, backend="reference").image[0]
+        image = rasterize_reference(*tensors, view.viewmat[None], view.K[None], width, height).image[0]
         moved = View(view.K.to(device), camera_to_world.to(device), width, height, view.time)
         views.append(TrainingView(moved, (image.clamp(0, 1) * 255).to(torch.uint8).to(device), None))
     return views

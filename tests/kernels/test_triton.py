@@ -1,36 +1,70 @@
-"""Triton's kernels: each is what torch does, within rounding, and compiles for the GPUs there are.
+"""Triton's kernels agree with torch within rounding, and compile for GPUs.
 
-Where there is no GPU they run in Triton's interpreter, see conftest.py.
+Without a GPU they run in Triton's interpreter, see conftest.py.
 """
 
 import dataclasses
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from gsplat.cuda._torch_impl import _eval_sh_bases_fast, _quat_scale_to_covar_preci
 from helpers import REPOSITORY
 from helpers.trainings import ALL_TERMS, guided_views, settings_of, untrained_street
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels import triton_support
+from drivesplat.kernels.color_difference import color_difference
+from drivesplat.kernels.cube_map import CubeMap, over_cube_map
+from drivesplat.kernels.exploration import explore
+from drivesplat.kernels.gsplat_private import sh_basis
+from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, place
+from drivesplat.kernels.quaternions import rotation_matrix
+from drivesplat.kernels.regularizers import mean_opacity_and_scale
+from drivesplat.kernels.time_varying_colors import colors_in_world
+from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.harmonics import rotation_of_harmonics
-from drivesplat.model.quaternions import left_factor, rotation_matrix
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.view import View
 from drivesplat.settings.train import McmcSettings
-from drivesplat.training.colours import masked_l1
-from drivesplat.training.ssim import C1, C2, ssim_in_torch, weights
 from drivesplat.training.trainer import Trainer
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@contextmanager
+def triton(used: bool) -> Iterator[None]:
+    """Within this context the public functions run Triton's kernels, or those of torch and numba, on any device."""
+    with patch.object(triton_support, "usable_for", lambda tensor: used):
+        yield
+
+
+def both_ways(function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    """The results without Triton and with it."""
+    results = []
+    for used in (False, True):
+        with triton(used):
+            results.append(function(*arguments))
+    return results
+
+
+def assert_same_gradients(results: list[Any], inputs: list[torch.Tensor], atol: float, rtol: float) -> None:
+    """Of a random weighting of all values in both results."""
+    weights = [torch.randn_like(value) for value in results[0]]
+    expected, found = (
+        torch.autograd.grad(values, inputs, weights, allow_unused=True, materialize_grads=True) for values in results
+    )
+    for theirs, ours in zip(expected, found, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=atol, rtol=rtol)
 
 
 def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tensor:
@@ -40,47 +74,39 @@ def a_mask(height: int, width: int, seed: int, share: float = 0.2) -> torch.Tens
 @pytest.mark.parametrize(
     ("height", "width", "hidden", "moving"),
     [
-        pytest.param(10, 45, True, True, id="wider than a block, rows that fill none"),
+        pytest.param(10, 45, True, True, id="wider than a block, and no multiple of it"),
         pytest.param(10, 45, False, False, id="no masks"),
-        pytest.param(3, 4, False, True, id="less than a window"),
+        pytest.param(3, 4, False, True, id="smaller than a window"),
     ],
 )
-def test_colours_differ_by_what_torch_says_and_pull_as_it_does(height, width, hidden, moving):
-    from drivesplat.kernels.triton.colours import Window, colour_difference
-
+def test_color_differences_and_their_gradients_agree_with_torch(height, width, hidden, moving):
     rng = np.random.default_rng(0)
     image, recorded = (torch.from_numpy(rng.uniform(0, 1, (height, width, 3))).float().to(DEVICE) for _ in range(2))
-    pixels = (255 * recorded).to(torch.uint8)
-    body = a_mask(height, width, 1) if hidden else None
-    moves = a_mask(height, width, 2) if moving else None
-    window = Window(torch.from_numpy(weights()).float().to(DEVICE), C1, C2)
-    target, asked = pixels.float() / 255.0, image.clone().requires_grad_()
-    seen = asked if body is None else torch.where(body[..., None], target, asked)
-    expected = [F.l1_loss(seen, target), ssim_in_torch(seen, target)]
-    expected.append(asked.new_zeros(()) if moves is None else masked_l1(seen, target, moves))
-    found_for = image.clone().requires_grad_()
-    found = colour_difference(found_for, pixels, body, moves, window)
-    for name, mine, theirs in zip(("l1", "similarity", "moving"), found, expected, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5, msg=lambda said, name=name: f"{name}: {said}")
-    torch.stack([weight * value for weight, value in zip((0.8, -0.2, 0.3), expected, strict=True)]).sum().backward()
-    torch.stack([weight * value for weight, value in zip((0.8, -0.2, 0.3), found, strict=True)]).sum().backward()
-    assert float(asked.grad.abs().max()) > 0.0
-    torch.testing.assert_close(found_for.grad, asked.grad, atol=1e-8, rtol=1e-3)
+    masks = [a_mask(height, width, seed) if wanted else None for seed, wanted in ((1, hidden), (2, moving))]
+    image.requires_grad_()
+    results = both_ways(color_difference, image, (255 * recorded).to(torch.uint8), *masks)
+    values = [[value for value in vars(result).values() if value is not None] for result in results]
+    assert [len(found) for found in values] == [2 + moving] * 2
+    torch.testing.assert_close(values[1], values[0], atol=1e-5, rtol=1e-5)
+    weights = (0.8, -0.2, 0.3)
+    expected, found = (
+        torch.autograd.grad(sum(w * v for w, v in zip(weights, vs, strict=False)), image)[0] for vs in values
+    )
+    assert float(expected.abs().max()) > 0.0
+    torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-3)
 
 
-def test_nothing_that_moves_is_no_difference():
-    from drivesplat.kernels.triton.colours import Window, colour_difference
-
+def test_an_empty_moving_mask_gives_no_difference_and_no_gradient():
     image = torch.rand(4, 5, 3, device=DEVICE, requires_grad=True)
-    window = Window(torch.from_numpy(weights()).float().to(DEVICE), C1, C2)
     nowhere = torch.zeros(4, 5, dtype=torch.bool, device=DEVICE)
     pixels = torch.zeros(4, 5, 3, dtype=torch.uint8, device=DEVICE)
-    moving = colour_difference(image, pixels, None, nowhere, window)[2]
+    with triton(True):
+        moving = color_difference(image, pixels, None, nowhere).moving_l1
     moving.backward()
     assert float(moving.detach()) == 0.0 and not image.grad.any()
 
 
-def test_adams_steps_are_torchs():
+def test_adam_steps_agree_with_torch():
     from drivesplat.kernels.triton.adam import adam_step
 
     torch.manual_seed(0)
@@ -100,9 +126,7 @@ def test_adams_steps_are_torchs():
 
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("coefficients", [1, 4, 9])
-def test_a_camera_sees_the_colours_that_gsplat_says(degree, coefficients):
-    from drivesplat.kernels.triton.harmonics import seen_colours
-
+def test_fused_view_colors_agree_with_gsplats_basis(degree, coefficients):
     if degree == 1 and coefficients == 1:
         pytest.skip("there are none of that degree")
     torch.manual_seed(0)
@@ -110,40 +134,40 @@ def test_a_camera_sees_the_colours_that_gsplat_says(degree, coefficients):
     pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=0).as_matrix())
     pose[:3, 3] = torch.tensor([0.5, -1.0, 2.0])
     sizes = ((700, 3), (700, 1, 3), (700, coefficients - 1, 3))
-    given = [torch.randn(size, device=DEVICE).requires_grad_() for size in sizes]
-    basis = _eval_sh_bases_fast(coefficients, F.normalize(given[0] - pose[:3, 3].to(DEVICE), dim=1))
+    inputs = [torch.randn(size, device=DEVICE).requires_grad_() for size in sizes]
+    basis = sh_basis(coefficients, F.normalize(inputs[0] - pose[:3, 3].to(DEVICE), dim=1))
     used = (degree + 1) ** 2
-    expected = (basis[:, :used, None] * torch.cat(given[1:], dim=1)[:, :used]).sum(dim=1) + 0.5
-    found = seen_colours(*given, pose.to(DEVICE), degree)
+    expected = (basis[:, :used, None] * torch.cat(inputs[1:], dim=1)[:, :used]).sum(dim=1) + 0.5
     expected = expected.clamp(min=0.0)
+    with triton(True):
+        found = fused_view_colors(*inputs, pose.to(DEVICE), degree)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    weights = torch.randn_like(expected)
-    theirs = torch.autograd.grad(expected, given, weights, allow_unused=True, materialize_grads=True)
-    mine = torch.autograd.grad(found, given, weights)
-    for pulls in zip(mine, theirs, strict=True):
-        torch.testing.assert_close(*pulls, atol=1e-4, rtol=1e-4)
+    assert_same_gradients([[expected], [found]], inputs, atol=1e-4, rtol=1e-4)
 
 
-def test_regularisers_hold_down_what_torch_says_and_as_much():
-    from drivesplat.kernels.triton.regularisers import mean_opacity_and_scale
+def test_no_fused_view_colors_without_triton_or_for_a_learned_camera_or_a_high_degree():
+    values = [torch.zeros(2, *size, device=DEVICE) for size in ((3,), (1, 3), (8, 3))]
+    pose = torch.eye(4, device=DEVICE)
+    with triton(True):
+        assert fused_view_colors(*values, pose, 2) is None
+        assert fused_view_colors(*values, pose.clone().requires_grad_(), 1) is None
+    with triton(False):
+        assert fused_view_colors(*values, pose, 1) is None
 
+
+def test_regularized_means_and_their_gradients_agree_with_torch():
     torch.manual_seed(0)
     opacities, scales = torch.rand(1500, device=DEVICE), 5.0 * torch.rand(1500, 3, device=DEVICE)
     opacities[::3] = 0.0
-    given = [opacities.requires_grad_(), scales.requires_grad_()]
-    expected = opacities.mean(), (scales * (opacities.detach() > 0.0)[:, None]).mean()
-    found = mean_opacity_and_scale(*given)
-    torch.testing.assert_close(torch.stack(found), torch.stack(expected))
-    pulls = [torch.autograd.grad(2.0 * opacity + 0.5 * scale, given) for opacity, scale in (expected, found)]
-    for theirs, mine in zip(*pulls, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-9, rtol=1e-5)
+    inputs = [opacities.requires_grad_(), scales.requires_grad_()]
+    expected, found = both_ways(mean_opacity_and_scale, *inputs)
+    torch.testing.assert_close(found, expected)
+    assert_same_gradients([expected, found], inputs, atol=1e-9, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_sky_behind_is_that_of_torch_and_learns_as_much(seed):
-    """Cameras that look every way: over edges and corners of the cube, too; a long lens sees few texels."""
-    from drivesplat.kernels.triton.cube import Cube, before_cube
-
+def test_an_image_over_a_cube_map_and_its_gradients_agree_with_torch(seed):
+    """For cameras that see edges and corners of the cube, and with long focal lengths, which see few texels."""
     torch.manual_seed(seed)
     sky = CubemapSky(9, torch.tensor([0.3, 0.5, 0.7]), 1e-2).to(DEVICE)
     texels = sky.params["texels"]
@@ -153,23 +177,17 @@ def test_the_sky_behind_is_that_of_torch_and_learns_as_much(seed):
     K = torch.tensor([[10.0, 0.0, 14.0], [0.0, 11.0, 6.0], [0.0, 0.0, 1.0]])
     K[:2, :2] *= (seed % 2) * 9.0 + 1.0
     view = View(K.to(DEVICE), pose.to(DEVICE), 29, 13, 0.0)
-    splats, alpha = torch.rand(13, 29, 3, device=DEVICE), 0.99 * torch.rand(13, 29, 1, device=DEVICE)
+    image, alpha = torch.rand(13, 29, 3, device=DEVICE), 0.99 * torch.rand(13, 29, 1, device=DEVICE)
     alpha[3:5] = 1.0
-    given = [splats.requires_grad_(), alpha.requires_grad_(), texels]
-    weighed = torch.randn(13, 29, 3, device=DEVICE)
-    expected = splats + (1.0 - alpha) * sky.colors(view.rays())
-    found = before_cube(splats, alpha, Cube(texels, sky.index), view.K, view.camera_to_world)
+    inputs = [image.requires_grad_(), alpha.requires_grad_(), texels]
+    cube = CubeMap(texels, sky.index)
+    expected, found = both_ways(over_cube_map, image, alpha, cube, view.K, view.camera_to_world, view.rays)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
-    pulls = [torch.autograd.grad((image * weighed).sum(), given) for image in (expected, found)]
-    for theirs, mine in zip(*pulls, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-4)
+    assert_same_gradients([[expected], [found]], inputs, atol=1e-5, rtol=1e-4)
 
 
-def test_exploration_spreads_as_far_as_a_gaussian_reaches_and_less_where_it_is_seen():
-    """By the covariance of many draws: strength² times that of the Gaussian, squared, of a faint one; an opaque one
-    stays."""
-    from drivesplat.kernels.triton.exploration import explore
-
+def test_exploration_has_the_covariance_of_equation_8_and_leaves_opaque_gaussians_in_place():
+    """Over many draws: strength² times the squared covariance of the Gaussian, for a faint one."""
     torch.manual_seed(0)
     count, strength, logit = 20_000, 2.0, -6.0
     rows = {"means": [5.0, -3.0, 1.0], "quats": [1.0, 0.3, -0.2, 0.5], "scales": [0.0, -1.0, -0.5]}
@@ -177,21 +195,20 @@ def test_exploration_spreads_as_far_as_a_gaussian_reaches_and_less_where_it_is_s
     params["opacities"] = nn.Parameter(torch.full((count,), logit))
     params["opacities"].data[count // 2 :] = 3.0
     params = params.to(DEVICE)
-    explore(params, strength)
+    with triton(True):
+        explore(params, strength)
     moved = params["means"].detach().cpu().double() - torch.tensor(rows["means"])
     faint, opaque = moved[: count // 2], moved[count // 2 :]
     assert float(opaque.abs().max()) < 1e-5
-    covariance = _quat_scale_to_covar_preci(params["quats"][:1], params["scales"][:1].exp(), True, False)[0][0]
-    covariance = covariance.detach().cpu().double()
-    fades = 1.0 / (1.0 + np.exp(100.0 * (1.0 / (1.0 + np.exp(-logit)) - 0.005)))
-    expected = (strength * fades) ** 2 * covariance @ covariance.T
+    turn = Rotation.from_quat(rows["quats"], scalar_first=True).as_matrix()
+    covariance = torch.from_numpy(turn @ np.diag(np.exp(rows["scales"]) ** 2) @ turn.T)
+    factor = 1.0 / (1.0 + np.exp(100.0 * (1.0 / (1.0 + np.exp(-logit)) - 0.005)))
+    expected = (strength * factor) ** 2 * covariance @ covariance.T
     torch.testing.assert_close(torch.cov(faint.T), expected, rtol=0.06, atol=0.01)
     assert float(faint.mean(dim=0).abs().max()) < 5.0 * float(expected.diagonal().max().sqrt()) / np.sqrt(count // 2)
 
 
-def test_exploration_is_seeded():
-    from drivesplat.kernels.triton.exploration import explore
-
+def test_exploration_follows_from_the_seed():
     ends = []
     for seed in (1, 1, 2):
         params = nn.ParameterDict(
@@ -199,62 +216,43 @@ def test_exploration_is_seeded():
         ).to(DEVICE)
         params["opacities"] = torch.full((50,), -6.0, device=DEVICE)
         torch.manual_seed(seed)
-        explore(params, 1.0)
-        explore(params, 1.0)
+        with triton(True):
+            explore(params, 1.0)
+            explore(params, 1.0)
         ends.append(params["means"].detach().clone())
     assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
 
 
-def some_objects(requires_grad: bool = True) -> tuple[Any, torch.Tensor, torch.Tensor]:
-    """Five objects, one of them absent, two of other sizes; whose 150 Gaussians are, and the matrix of that."""
-    from drivesplat.kernels.triton.placing import Objects
-
+def some_objects(requires_grad: bool = True) -> tuple[ObjectPoses, torch.Tensor, torch.Tensor]:
+    """Five objects, one of them absent, two of other sizes; the owners of 150 Gaussians, and their one-hot matrix."""
     quats = F.normalize(torch.randn(5, 4, device=DEVICE), dim=1).requires_grad_(requires_grad)
     translations = torch.randn(5, 3, device=DEVICE).requires_grad_(requires_grad)
     sizes, presence = torch.tensor([[1.0, 1.0, 2.0, 0.5, 1.0], [1.0, 0.0, 1.0, 1.0, 1.0]], device=DEVICE)
     owner = torch.randint(5, (150,), device=DEVICE)
-    return Objects(quats, translations, sizes, presence), owner, F.one_hot(owner, 5).float()
+    return ObjectPoses(quats, translations, sizes, presence), owner, F.one_hot(owner, 5).float()
 
 
-def test_objects_are_placed_as_by_matrices_and_pull_alike():
-    from drivesplat.kernels.triton.placing import Shapes, placed
-
+def test_placed_gaussians_and_their_gradients_agree_with_torch():
     torch.manual_seed(0)
-    shapes = Shapes(*(torch.randn(150, *size, device=DEVICE).requires_grad_() for size in ((3,), (4,), (3,), ())))
+    sizes = ((3,), (4,), (3,), ())
+    local = LocalGaussians(*(torch.randn(150, *size, device=DEVICE).requires_grad_() for size in sizes))
     objects, owner, owns = some_objects()
-    rotations = rotation_matrix(objects.quats)[owner]
-    sizes = objects.sizes[owner][:, None]
-    expected = (
-        (rotations @ (sizes * shapes.means)[..., None])[..., 0] + objects.translations[owner],
-        (left_factor(objects.quats)[owner] @ F.normalize(shapes.quats, dim=-1)[..., None])[..., 0],
-        sizes * torch.exp(shapes.scales),
-        torch.sigmoid(shapes.opacities) * objects.presence[owner],
-    )
-    found = placed(shapes, objects, owner, owns)
-    for theirs, mine in zip(expected, found, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
-    weights, learned = [torch.randn_like(values) for values in expected], [*shapes, objects.quats, objects.translations]
-    pulls = [torch.autograd.grad(values, learned, weights) for values in (expected, found)]
-    for theirs, mine in zip(*pulls, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+    results = both_ways(place, local, objects, owner, owns)
+    torch.testing.assert_close(results[1], results[0], atol=1e-5, rtol=1e-5)
+    assert_same_gradients(results, [*local, objects.quats, objects.translations], atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("degree", "terms"), [(0, 5), (1, 5), (3, 2), (2, 1)])
-def test_colours_in_time_are_summed_and_turned_and_learn_alike(degree, terms):
-    from drivesplat.kernels.triton.colours_in_time import turned_colours
-
+def test_time_varying_colors_and_their_gradients_agree_with_torch(degree, terms):
     torch.manual_seed(1)
-    objects, owner, _ = some_objects(requires_grad=False)
+    objects, owner, owns = some_objects(requires_grad=False)
     k, series = (degree + 1) ** 2, torch.randn(5, terms, device=DEVICE)
-    turns = rotation_of_harmonics(rotation_matrix(objects.quats), k)
+    series[:, 0] = 1.0  # the constant term's cosine
+    rotations = rotation_of_harmonics(rotation_matrix(objects.quats), k)
     sh0, shN = (torch.randn(150, terms, size, 3, device=DEVICE).requires_grad_() for size in (1, k - 1))
-    expected = turns[owner] @ (series[owner][:, :, None, None] * torch.cat([sh0, shN], dim=2)).sum(dim=1)
-    found = turned_colours(sh0, shN, series, turns, owner)
+    expected, found = both_ways(colors_in_world, sh0, shN, series, rotations, owner, owns)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    weights = torch.randn_like(expected)
-    pulls = [torch.autograd.grad(values, [sh0, shN], weights) for values in (expected, found)]
-    for theirs, mine in zip(*pulls, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+    assert_same_gradients([[expected], [found]], [sh0, shN], atol=1e-5, rtol=1e-5)
 
 
 def stretch(model):
@@ -266,11 +264,11 @@ def stretch(model):
 
 
 @pytest.mark.parametrize("body", [False, True])
-def test_a_training_by_kernels_is_that_by_torch(body, monkeypatch):
+def test_a_training_with_triton_agrees_with_one_without(body, monkeypatch):
     """Two iterations of background, cars and a cube map, with every term of the loss, and the own car's body."""
     ends = []
     for kernels in (True, False):
-        monkeypatch.setattr(on_gpu, "for_tensor", lambda tensor, kernels=kernels: kernels)
+        monkeypatch.setattr(triton_support, "usable_for", lambda tensor, kernels=kernels: kernels)
         settings = settings_of(**ALL_TERMS, mcmc=McmcSettings(noise_lr=0.0), refine_start=1.0)
         model = untrained_street(settings)
         model.sky = CubemapSky(6, torch.full((3,), 0.5), 1e-2)
@@ -302,55 +300,55 @@ COMPILED = """
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from drivesplat.kernels.triton import adam, chunks, colours, colours_in_time, cube, exploration, harmonics, placing
-from drivesplat.kernels.triton import regularisers, tiles, trial
+from drivesplat.kernels.triton import adam, chunks, color_difference, cube_map, exploration, placement, probe
+from drivesplat.kernels.triton import regularizers, tiles, time_varying_colors, view_colors
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
-              "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "there": "*i1",
+              "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "exists": "*i1",
               "radii": "*i32", "counts": "*i32", "nearest": "*i64", "ends": "*i32", "keys": "*i16"}
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
-NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "room", "each"), "i32")
+NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each"), "i32")
 NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps"), "fp32")
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
-SIZES = {"TAPS": 11, "ROWS": colours.ROWS, "COLUMNS": colours.COLUMNS}
+SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.COLUMNS}
 
 def compiled(kernel, **constants):
     kinds = {name: "constexpr" if name in constants else {**IN, **NUMBERS}.get(name, FLOATS)
              for name in kernel.arg_names}
-    if kernel in (cube._blend, cube._gradients):
+    if kernel in (cube_map._blend, cube_map._gradients):
         kinds["pixels"] = "i32"
-    if kernel in (adam._step, chunks._take_apart, chunks._composite, chunks._pull_apart):
+    if kernel in (adam._step, chunks._split, chunks._composite, chunks._composite_backward):
         kinds["values"] = FLOATS
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
     source = ASTSource(fn=kernel, signature=kinds, constexprs=places)
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
 
-compiled(trial._count)
+compiled(probe._increment)
 for k, degree in ((1, 0), (4, 1), (9, 0), (9, 1)):
-    compiled(harmonics._colours, OTHERS=k - 1, DEGREE=degree, BLOCK=harmonics.BLOCK)
-    compiled(harmonics._colours_back, OTHERS=k - 1, DEGREE=degree, BLOCK=harmonics.BLOCK)
+    compiled(view_colors._colors, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
+    compiled(view_colors._colors_backward, OTHERS=k - 1, DEGREE=degree, BLOCK=view_colors.BLOCK)
 compiled(adam._step, BLOCK=adam.BLOCK)
-compiled(regularisers._sums, BLOCK=regularisers.BLOCK)
-compiled(regularisers._spread, BLOCK=regularisers.BLOCK)
+compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
+compiled(regularizers._spread, BLOCK=regularizers.BLOCK)
 compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
 compiled(tiles._list, BLOCK=tiles.BLOCK)
 compiled(chunks._count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
-for kernel in (chunks._take_apart, chunks._add_up):
+for kernel in (chunks._split, chunks._sum_copies):
     compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
-for kernel in (chunks._composite, chunks._pull_apart):
+for kernel in (chunks._composite, chunks._composite_backward):
     compiled(kernel, CHANNELS=3, WIDTH=4)
 compiled(exploration._move, BLOCK=exploration.BLOCK)
-compiled(cube._blend, BLOCK=cube.BLOCK)
-compiled(cube._gradients, BLOCK=cube.BLOCK)
-compiled(placing._place, BLOCK=placing.BLOCK)
-compiled(placing._place_back, BLOCK=placing.BLOCK)
-for kernel in (colours_in_time._colours, colours_in_time._colours_back):
+compiled(cube_map._blend, BLOCK=cube_map.BLOCK)
+compiled(cube_map._gradients, BLOCK=cube_map.BLOCK)
+compiled(placement._place, BLOCK=placement.BLOCK)
+compiled(placement._place_backward, BLOCK=placement.BLOCK)
+for kernel in (time_varying_colors._colors, time_varying_colors._colors_backward):
     for k in (1, 4, 16):
-        compiled(kernel, TERMS=5, K=k, PADDED=k, BLOCK=colours_in_time.VALUES // k)
-compiled(colours._window_along_rows, TAPS=11, BLOCK=colours.BLOCK)
-compiled(colours._means_along_rows, HIDDEN=True, TAPS=11, BLOCK=colours.BLOCK)
-compiled(colours._means_along_rows, HIDDEN=False, hidden=None, TAPS=11, BLOCK=colours.BLOCK)
-for kernel in (colours._similarity, colours._gradient):
+        compiled(kernel, TERMS=5, K=k, PADDED=k, BLOCK=time_varying_colors.COEFFICIENTS // k)
+compiled(color_difference._window_along_rows, TAPS=11, BLOCK=color_difference.BLOCK)
+compiled(color_difference._means_along_rows, HIDDEN=True, TAPS=11, BLOCK=color_difference.BLOCK)
+compiled(color_difference._means_along_rows, HIDDEN=False, hidden=None, TAPS=11, BLOCK=color_difference.BLOCK)
+for kernel in (color_difference._similarity, color_difference._gradient):
     compiled(kernel, HIDDEN=True, MOVING=True, **SIZES)
     compiled(kernel, HIDDEN=False, MOVING=False, hidden=None, moving=None, **SIZES)
 """
@@ -364,22 +362,22 @@ def test_every_kernel_compiles():
 
 
 @pytest.mark.parametrize("switch", ["0", "1"])
-def test_what_triton_cannot_do_torch_does(switch, monkeypatch, caplog):
-    """The user has switched it off, which needs no word; or it fails, which is told once."""
-    from drivesplat.kernels.triton import trial
+def test_without_triton_torch_is_used(switch, monkeypatch, caplog):
+    """No warning where the user has disabled Triton; one where it fails."""
+    from drivesplat.kernels.triton import probe
 
     def fail() -> None:
         raise RuntimeError("Failed to find C compiler.\nmore")
 
-    monkeypatch.setenv(on_gpu.SWITCH, switch)
-    monkeypatch.setattr(trial, "run", fail)
-    on_gpu.compiles.cache_clear()
+    monkeypatch.setenv(triton_support.SWITCH, switch)
+    monkeypatch.setattr(probe, "run", fail)
+    triton_support.compiles.cache_clear()
     try:
-        assert not on_gpu.compiles() and not on_gpu.compiles()
+        assert not triton_support.compiles() and not triton_support.compiles()
         assert [record.message.count("Failed to find C compiler.") for record in caplog.records] == [1] * int(switch)
     finally:
-        on_gpu.compiles.cache_clear()
+        triton_support.compiles.cache_clear()
 
 
-def test_tensors_on_a_cpu_are_not_theirs():
-    assert not on_gpu.for_tensor(torch.zeros(1))
+def test_triton_is_not_used_for_tensors_on_a_cpu():
+    assert not triton_support.usable_for(torch.zeros(1))

@@ -1,6 +1,6 @@
-"""Which Gaussians tiles show, and long lists of them cut into chunks, held to what torch says of every pixel.
+"""Tiles' lists of Gaussians, and long lists cut into chunks, compared with torch pixel by pixel.
 
-Where there is no GPU Triton's kernels run in its interpreter, see conftest.py.
+Without a GPU Triton's kernels run in its interpreter, see conftest.py.
 """
 
 from itertools import pairwise
@@ -11,9 +11,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("triton", reason="Triton is not there for this system")
-from drivesplat.kernels import capacity as rooms
+from drivesplat.kernels import capacity
 from drivesplat.kernels.triton import chunks
-from drivesplat.kernels.triton.tiles import Lists, Projected, lists_of
+from drivesplat.kernels.triton.tiles import Footprints, TileLists, tile_lists
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 TILE = 16
@@ -21,27 +21,27 @@ TILE = 16
 
 def ellipses(
     cameras: int, count: int, width: int, height: int, seed: int = 0
-) -> tuple[Projected, torch.Tensor, torch.Tensor]:
-    """Gaussians of all sizes and shapes in and around images, how far they reach across and down, and their depths."""
+) -> tuple[Footprints, torch.Tensor, torch.Tensor]:
+    """Gaussians of all sizes and shapes in and around images, their radii and their depths."""
     rng = np.random.default_rng(seed)
     axes = np.exp(rng.uniform(-1.0, 2.5, (cameras, count, 2)))
     turns = Rotation.from_euler("z", rng.uniform(0, np.pi, (cameras * count, 1))).as_matrix()[:, :2, :2]
     turns = turns.reshape(cameras, count, 2, 2)
     conics = turns @ ((1 / axes**2)[..., None] * turns.swapaxes(-1, -2))
-    shown = Projected(
+    shown = Footprints(
         rng.uniform(-20, [width + 20, height + 20], (cameras, count, 2)),
         conics[..., [0, 0, 1], [0, 1, 1]],
         rng.uniform(0, 1, (cameras, count, 3)),
         rng.uniform(0.0, 1.0, (cameras, count)) ** 3,
     )
-    on_device = Projected(*(torch.from_numpy(values).float().to(DEVICE) for values in shown))
+    on_device = Footprints(*(torch.from_numpy(values).float().to(DEVICE) for values in shown))
     spread = np.sqrt(np.diagonal(np.linalg.inv(conics), axis1=-2, axis2=-1))
     reach = np.sqrt(2.0 * np.log(np.maximum(255.0 * shown.opacities, 1.0)))
     radii = torch.from_numpy(np.ceil(reach[..., None] * spread)).to(torch.int32).to(DEVICE)
     return on_device, radii, torch.from_numpy(rng.uniform(1, 9, (cameras, count))).float().to(DEVICE)
 
 
-def covered(gaussians: Projected, width: int, height: int) -> np.ndarray:
+def covered(gaussians: Footprints, width: int, height: int) -> np.ndarray:
     """Which tiles (c, n, rows, columns) have a pixel that a Gaussian covers by 1/255 or more."""
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     means, conics, _, opacities = (values.cpu().double().numpy() for values in gaussians)
@@ -55,17 +55,17 @@ def covered(gaussians: Projected, width: int, height: int) -> np.ndarray:
     return full.reshape(*seen.shape[:2], full.shape[2] // TILE, TILE, full.shape[3] // TILE, TILE).any(axis=(3, 5))
 
 
-def by_tile(lists: Lists) -> list[list[int]]:
+def by_tile(lists: TileLists) -> list[list[int]]:
     ends = lists.offsets.tolist()
     return [lists.ids[lists.order[start:end]].tolist() for start, end in pairwise(ends)]
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_tiles_list_what_they_show_from_near_to_far_and_little_else(cameras):
+def test_tiles_list_the_gaussians_that_reach_them_front_to_back_and_few_others(cameras):
     width, height, count = 75, 40, 300
     gaussians, radii, depths = ellipses(cameras, count, width, height)
     radii[0, ::7, 0], radii[0, 1::7, 1] = 0, 0
-    lists = lists_of(gaussians, radii, depths, width, height)
+    lists = tile_lists(gaussians, radii, depths, width, height)
     shown = covered(gaussians, width, height) & (radii > 0).all(dim=-1).cpu().numpy()[..., None, None]
     assert lists.tiles == (cameras, *shown.shape[2:])
     wanted = [
@@ -80,16 +80,16 @@ def test_tiles_list_what_they_show_from_near_to_far_and_little_else(cameras):
     assert 100 * cameras < shown.sum() <= len(lists.ids) <= 1.05 * shown.sum()
 
 
-def test_without_room_for_all_the_farthest_are_left_out(monkeypatch):
+def test_a_planned_capacity_that_is_too_small_leaves_out_the_farthest_gaussians(monkeypatch):
     gaussians, radii, depths = ellipses(1, 200, 75, 40)
-    with rooms.counted() as needs:
-        every = lists_of(gaussians, radii, depths, 75, 40)
+    with capacity.exact() as needs:
+        every = tile_lists(gaussians, radii, depths, 75, 40)
     assert needs == [len(every.ids)]
-    monkeypatch.setattr(rooms, "LEAST", 0)
-    monkeypatch.setattr(rooms, "MARGIN", 1.0)
-    with rooms.given([150, 10_000]) as told:
-        some, ample = (lists_of(gaussians, radii, depths, 75, 40) for _ in range(2))
-    assert [(int(needed), room) for needed, room in told] == [(len(every.ids), 150), (len(every.ids), 10_000)]
+    monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
+    monkeypatch.setattr(capacity, "MARGIN", 1.0)
+    with capacity.planned([150, 10_000]) as lists_made:
+        some, ample = (tile_lists(gaussians, radii, depths, 75, 40) for _ in range(2))
+    assert [(int(needed), room) for needed, room in lists_made] == [(len(every.ids), 150), (len(every.ids), 10_000)]
     assert by_tile(ample) == by_tile(every)
     kept = [i for listed in by_tile(some) for i in listed]
     assert len(kept) == 150
@@ -98,33 +98,33 @@ def test_without_room_for_all_the_farthest_are_left_out(monkeypatch):
     assert left_out and depths[0, list(left_out)].min() >= depths[0, kept].max()
 
 
-def test_what_is_so_thin_that_rounding_leaves_no_determinant_is_listed_in_its_box():
-    """As gsplat bounds it, and nowhere else."""
+def test_a_gaussian_whose_conic_has_no_determinant_after_rounding_is_listed_within_its_box():
+    """The box is that of gsplat's radii."""
     wide, thin = 4000.0, 0.5
     turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0)
     conic = turn @ np.diag([1 / wide**2, 1 / thin**2]) @ turn.T
     rounded = torch.tensor([[[conic[0, 0], conic[0, 1], conic[1, 1]]]], dtype=torch.float32, device=DEVICE)
     rounded[..., 1] = -rounded[..., 0]
     means = torch.tensor([[[40.0, 40.0]]], device=DEVICE)
-    gaussian = Projected(means, rounded, torch.ones(1, 1, 3, device=DEVICE), torch.ones(1, 1, device=DEVICE))
+    gaussian = Footprints(means, rounded, torch.ones(1, 1, 3, device=DEVICE), torch.ones(1, 1, device=DEVICE))
     depths, radii = torch.ones(1, 1, device=DEVICE), torch.full((1, 1, 2), 20, dtype=torch.int32, device=DEVICE)
-    lists = lists_of(gaussian, radii, depths, 160, 160)
+    lists = tile_lists(gaussian, radii, depths, 160, 160)
     listed = [(tile // 10, tile % 10) for tile, found in enumerate(by_tile(lists)) if found]
     assert {(1, 1), (2, 2), (3, 3)} <= set(listed)
     assert all(1 <= row <= 3 and 1 <= column <= 3 for row, column in listed)
 
 
-def test_nothing_is_listed_of_what_is_not_there():
+def test_gaussians_out_of_view_and_empty_sets_are_not_listed():
     gaussians, _, depths = ellipses(1, 9, 20, 10)
-    unseen = lists_of(gaussians, torch.zeros(1, 9, 2, dtype=torch.int32, device=DEVICE), depths, 20, 10)
-    empty = Projected(*(values[:, :0] for values in gaussians))
-    none = lists_of(empty, torch.zeros(1, 0, 2, dtype=torch.int32, device=DEVICE), depths[:, :0], 20, 10)
+    unseen = tile_lists(gaussians, torch.zeros(1, 9, 2, dtype=torch.int32, device=DEVICE), depths, 20, 10)
+    empty = Footprints(*(values[:, :0] for values in gaussians))
+    none = tile_lists(empty, torch.zeros(1, 0, 2, dtype=torch.int32, device=DEVICE), depths[:, :0], 20, 10)
     for lists in (unseen, none):
         assert len(lists.ids) == 0 and lists.offsets.tolist() == [0, 0, 0]
 
 
 def rasterized(means, conics, values, opacities, width, height, tile, offsets, ids, masks=None, packed=False):
-    """What gsplat's `rasterize_to_pixels` does, in torch, list by list; nothing ends early."""
+    """gsplat's `rasterize_to_pixels` in torch, list by list; no ray ends early."""
     cameras, down, across = offsets.shape
     ends = [*offsets.flatten().tolist()[1:], len(ids)]
     means, conics, opacities = means.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()
@@ -132,7 +132,7 @@ def rasterized(means, conics, values, opacities, width, height, tile, offsets, i
     image = values.new_zeros(cameras, down * tile, across * tile, values.shape[1] + 1)
     for at, (start, end) in enumerate(zip(offsets.flatten().tolist(), ends, strict=True)):
         if masks is not None and not masks.flatten()[at]:
-            image[at // (down * across)] = torch.nan  # what is not rasterized is not written
+            image[at // (down * across)] = torch.nan  # gsplat leaves such tiles uninitialized
             continue
         camera, row, column = at // (down * across), at % (down * across) // across, at % across
         x, y = (torch.arange(tile, device=means.device) + 0.5 + tile * first for first in (column, row))
@@ -150,21 +150,21 @@ def rasterized(means, conics, values, opacities, width, height, tile, offsets, i
     return image[..., :-1], image[..., -1:]
 
 
-def shuffled(ids: torch.Tensor, offsets: torch.Tensor) -> Lists:
-    """Lists whose entries were not written down in their order, and with entries that are nobody's."""
+def shuffled(ids: torch.Tensor, offsets: torch.Tensor) -> TileLists:
+    """Lists whose entries are stored in another order, followed by undefined entries."""
     order = torch.cat([torch.randperm(len(ids)), torch.full((9,), 10**6)])
     written = torch.empty_like(ids)
     written[order[: len(ids)]] = ids
     room = torch.cat([written, torch.full((9,), 10**6)])
     ends = torch.cat([offsets.flatten(), torch.tensor([len(ids)])])
     made = (room.to(torch.int32), order, ends.to(torch.int32))
-    return Lists(*(values.to(DEVICE) for values in made), tuple(offsets.shape))
+    return TileLists(*(values.to(DEVICE) for values in made), tuple(offsets.shape))
 
 
 @pytest.mark.parametrize(("cameras", "channels"), [(1, 3), (2, 4), (1, 1)])
-def test_chunks_show_what_whole_lists_do(cameras, channels, monkeypatch):
-    """Tiles with nothing in them, with less than a chunk, with a chunk to the brim, and with several; images that fill
-    no tile to its edges."""
+def test_composited_chunks_equal_whole_lists(cameras, channels, monkeypatch):
+    """For tiles with no entries, less than a chunk, a full chunk, and several chunks; for images whose size is no
+    multiple of the tile's."""
     monkeypatch.setattr(chunks, "LENGTH", 4)
     torch.manual_seed(0)
     width, height, down, across, n = 39, 20, 2, 3, 30
@@ -180,7 +180,7 @@ def test_chunks_show_what_whole_lists_do(cameras, channels, monkeypatch):
     ]
     given = [values.to(DEVICE).requires_grad_() for values in given]
     expected = rasterized(*given, width, height, TILE, offsets, ids)
-    found = chunks.composited(Projected(*given), shuffled(ids, offsets), width, height, rasterized)
+    found = chunks.composite(Footprints(*given), shuffled(ids, offsets), width, height, rasterized)
     for mine, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
     assert float(found[1].detach().max()) > 0.5 and float(found[1].detach()[:, :16, :16].max()) == 0.0
@@ -194,9 +194,9 @@ def test_chunks_show_what_whole_lists_do(cameras, channels, monkeypatch):
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
 
 
-def test_where_nothing_is_chunks_show_nothing():
+def test_empty_lists_give_an_empty_image():
     nothing = torch.zeros(0, dtype=torch.int32, device=DEVICE)
-    lists = Lists(nothing, nothing.long(), torch.zeros(3, dtype=torch.int32, device=DEVICE), (1, 1, 2))
-    seen = Projected(*(torch.zeros(1, 5, *tail, device=DEVICE) for tail in ((2,), (3,), (3,), ())))
-    image, alpha = chunks.composited(seen, lists, 20, 10, rasterized)
+    lists = TileLists(nothing, nothing.long(), torch.zeros(3, dtype=torch.int32, device=DEVICE), (1, 1, 2))
+    seen = Footprints(*(torch.zeros(1, 5, *tail, device=DEVICE) for tail in ((2,), (3,), (3,), ())))
+    image, alpha = chunks.composite(seen, lists, 20, 10, rasterized)
     assert image.shape == (1, 10, 20, 3) and alpha.shape == (1, 10, 20, 1) and not image.any() and not alpha.any()

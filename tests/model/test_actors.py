@@ -8,9 +8,9 @@ import torch
 from helpers.hand_made import about_z, actors_of, looking_at, motion_through, track_of
 from scipy.spatial.transform import Rotation
 
+from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.actors import ActorPoses, Actors, track_penalties
 from drivesplat.model.gaussians import Gaussians
-from drivesplat.model.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.settings.actors import ActorSettings, TrackSettings

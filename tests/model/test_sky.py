@@ -8,7 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from drivesplat.model.sky import ConstantSky, CubemapSky, face_coordinates, shared_vertices
+from drivesplat.kernels.cube_map import face_coordinates
+from drivesplat.model.sky import ConstantSky, CubemapSky, shared_vertices
 
 AXES = {0: (1, 0, 0), 1: (-1, 0, 0), 2: (0, 1, 0), 3: (0, -1, 0), 4: (0, 0, 1), 5: (0, 0, -1)}
 """The outward normal of every face."""

@@ -1,16 +1,14 @@
 """The reference rasterizer against closed forms and a naive compositing of the whole image."""
 
 import math
-from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
 from gsplat import DefaultStrategy
 from helpers.random_gaussians import Scene, random_scene
+from helpers.reference_rasterizer import rasterize_reference
 from scipy.spatial.transform import Rotation
-
-from drivesplat.rasterization import rasterize
 
 DILATION = 0.3
 """Pixels squared that 3DGS adds to the variance of every projected Gaussian."""
@@ -234,9 +232,9 @@ def test_gradients_are_those_of_finite_differences(antialiased):
     inputs = [value.clone().requires_grad_() for value in (*inputs, coefficients)]
 
     def seen(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        rendering = rasterize(
+        rendering = rasterize_reference(
             *values, scene.viewmats, scene.Ks, scene.width, scene.height,
-            sh_degree=1, antialiased=antialiased, with_depth=True, backend="reference",
+            sh_degree=1, antialiased=antialiased, with_depth=True,
         )  # fmt: skip
         return rendering.image, rendering.alpha, rendering.depth
 
@@ -302,9 +300,9 @@ def test_info_feeds_gsplats_default_strategy():
     scene = random_scene(seed=12, n=20, width=32, height=24).float()
     scene.means[3, 2] = -4.0
     params = {name: torch.nn.Parameter(getattr(scene, name)) for name in ("means", "quats", "scales", "opacities")}
-    rendering = rasterize(
+    rendering = rasterize_reference(
         params["means"], params["quats"], params["scales"], params["opacities"], scene.colors,
-        scene.viewmats, scene.Ks, 32, 24, backend="reference",
+        scene.viewmats, scene.Ks, 32, 24,
     )  # fmt: skip
     strategy = DefaultStrategy(refine_stop_iter=1000)
     state = strategy.initialize_state()
@@ -332,12 +330,6 @@ def test_info_holds_projected_centres_and_sizes():
         pixels = (at / at[:, 2:]) @ k.T
         torch.testing.assert_close(info["means2d"][camera], pixels[:, :2])
     assert info["radii"].shape == (2, 20, 2)
-
-
-def test_an_unknown_backend_is_named_with_those_there_are():
-    scene = on_axis([4.0], [0.7])
-    with pytest.raises(ValueError, match=r"'vulkan'.*gsplat.*reference"):
-        rasterize(**{f.name: getattr(scene, f.name) for f in fields(scene)}, backend="vulkan")
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

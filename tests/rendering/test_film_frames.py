@@ -9,9 +9,8 @@ import torch
 from helpers.hand_made import looking_at, round_gaussians
 
 from drivesplat.errors import ResultError
-from drivesplat.kernels import capacity as rooms
-from drivesplat.kernels import triton as on_gpu
-from drivesplat.kernels.cuda_graphs import Graph
+from drivesplat.kernels import capacity, triton_support
+from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering import captured_frames
 from drivesplat.rendering.captured_frames import GpuFrameRenderer, PendingFrame, RenderedFrame
@@ -77,8 +76,8 @@ class Film:
         self.captured: list[list[int]] = []
         self.full = False
         self.model = SplatModel([round_gaussians([[0.0, 0.0, 0.0]])], None)
-        monkeypatch.setattr(on_gpu, "compiles", lambda: True)
-        monkeypatch.setattr(rooms, "LEAST", 0)
+        monkeypatch.setattr(triton_support, "compiles", lambda: True)
+        monkeypatch.setattr(capacity, "MIN_CAPACITY", 0)
         monkeypatch.setattr(torch.cuda, "Event", lambda: SimpleNamespace(record=int, synchronize=int))
         monkeypatch.setattr(torch.cuda, "empty_cache", int)
         monkeypatch.setattr(captured_frames, "_render", self.rendered)
@@ -87,12 +86,13 @@ class Film:
         self.renderer = GpuFrameRenderer(self.model)
 
     def rendered(self, model, view, gaussians):
-        rooms.room_for(torch.tensor(int(view.time)))
+        capacity.capacity_for(torch.tensor(int(view.time)))
         return RenderedFrame(torch.full((1, 1, 3), RENDERED, dtype=torch.uint8), torch.tensor(True))
 
     def capture(self, model, view, states, needs):
         self.captured.append(list(needs))
-        return captured_frames._FrameGraph(view, states, Replaying(self, [int(rooms.MARGIN * need) for need in needs]))
+        graph = Replaying(self, [int(capacity.MARGIN * need) for need in needs])
+        return captured_frames._FrameGraph(view, states, graph)
 
     def made(self, *views) -> list[int]:
         """For each view, or view with Gaussians of its own, whether it was RENDERED or REPLAYED."""
@@ -100,7 +100,7 @@ class Film:
         return [int(frame[0, 0, 0]) for frame in _pipelined(self.renderer.submit, pairs)]
 
 
-class Replaying(Graph):
+class Replaying(CudaGraph):
     """A graph that replays nothing."""
 
     def __init__(self, film: Film, room: list[int]):

@@ -11,7 +11,9 @@ from gsplat.strategy import ops
 from helpers.densification import ALL, a_model, a_view, settings_of, train_step
 from helpers.hand_made import actors_of, motion_through, round_gaussians, track_of
 
-from drivesplat.kernels.numba.exploration import explore
+from drivesplat.kernels.exploration import explore
+from drivesplat.kernels.gsplat_private import cpu_strategies
+from drivesplat.kernels.relocation import relocation, relocation_in_torch
 from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.actors import ActorSettings
@@ -19,7 +21,6 @@ from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings
 from drivesplat.training.densify import Densifier, few_at_first
 from drivesplat.training.optimizers import make_optimizers
-from drivesplat.training.strategies import relocation, torch_twins
 from drivesplat.training.trainer import Trainer
 
 BINOMS = MCMCStrategy().initialize_state()["binoms"]
@@ -80,17 +81,17 @@ def test_every_gaussian_is_relocated_by_its_own_ratio():
     torch.testing.assert_close(new_scales, scales * torch.tensor(factors)[:, None], rtol=1e-4, atol=0)
 
 
-def test_gsplats_own_functions_are_back_after_the_twins():
+def test_gsplats_own_functions_are_restored_after_cpu_strategies():
     before = ops.compute_relocation, ops.quat_scale_to_covar_preci
-    with pytest.raises(ZeroDivisionError), torch_twins():
-        assert ops.compute_relocation is relocation
+    with pytest.raises(ZeroDivisionError), cpu_strategies():
+        assert ops.compute_relocation is relocation_in_torch
         raise ZeroDivisionError
     assert (ops.compute_relocation, ops.quat_scale_to_covar_preci) == before
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_exploration_on_a_cpu_is_gsplats(threads):
-    """Of more Gaussians than are a piece, of all sizes and opacities; their quaternions need not be of length 1."""
+    """For more Gaussians than a chunk holds, of all sizes and opacities; their quaternions need not be of length 1."""
     count, random = 5000, torch.Generator().manual_seed(0)
     drawn = {name: torch.randn(count, *size, generator=random) for name, size in SIZES.items()}
     drawn["opacities"] -= 5.0
@@ -99,7 +100,7 @@ def test_exploration_on_a_cpu_is_gsplats(threads):
     for inject in (explore, lambda params, strength: ops.inject_noise_to_position(params, {}, {}, strength)):
         params = torch.nn.ParameterDict({name: torch.nn.Parameter(values.clone()) for name, values in drawn.items()})
         torch.manual_seed(3)
-        with torch_twins():
+        with cpu_strategies():
             inject(params, 0.2)
         moved.append(params["means"].detach() - drawn["means"])
     torch.set_num_threads(before)

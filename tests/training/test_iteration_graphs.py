@@ -7,9 +7,9 @@ import pytest
 import torch
 from helpers.trainings import guided_views
 
-from drivesplat.kernels import capacity as rooms
-from drivesplat.kernels import triton as on_gpu
-from drivesplat.kernels.cuda_graphs import Graph
+from drivesplat.kernels import triton_support
+from drivesplat.kernels.capacity import capacity_for
+from drivesplat.kernels.cuda_graphs import CudaGraph
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.cuda_graph import iteration_graphs
@@ -32,7 +32,7 @@ class FakeGraphs:
         self.log.append(("captured", image))
         self.capacities.append([need * gaussians for need in self.graphs._needs[image]])
         replay = partial(self.log.append, ("replayed", image))
-        self.graphs._graphs[image] = Graph(
+        self.graphs._graphs[image] = CudaGraph(
             replay, {"l1": torch.tensor(float(image))}, torch.tensor([self.needed], dtype=torch.int32), [self.needed],
             torch.tensor(0),
         )  # fmt: skip
@@ -41,7 +41,7 @@ class FakeGraphs:
     def run(self, image, layout=0, gaussians=HUNDRED):
         def iteration():
             self.log.append(("run", image))
-            rooms.room_for(torch.tensor(self.needed))
+            capacity_for(torch.tensor(self.needed))
             return {"l1": torch.tensor(float(image))}
 
         terms = self.graphs.run(image, layout, gaussians, iteration)
@@ -135,13 +135,13 @@ def test_disabled_graphs_run_every_iteration(monkeypatch):
     ],
 )
 def test_which_trainings_capture_graphs(settings, device, compiles, expected, monkeypatch):
-    monkeypatch.setattr(on_gpu, "compiles", lambda: compiles)
+    monkeypatch.setattr(triton_support, "compiles", lambda: compiles)
     chosen = TrainSettings(**settings)
     assert can_capture(chosen, TrainingImages(guided_views(), chosen, 0), torch.device(device)) == expected
 
 
 def test_classes_and_too_many_images_disable_graphs(monkeypatch):
-    monkeypatch.setattr(on_gpu, "compiles", lambda: True)
+    monkeypatch.setattr(triton_support, "compiles", lambda: True)
     views, gpu = guided_views(), torch.device("cuda")
     labelled = [dataclasses.replace(view, classes=torch.zeros_like(view.sky, dtype=torch.uint8)) for view in views]
     assert not can_capture(TrainSettings(), TrainingImages(labelled, TrainSettings(), 0), gpu)
@@ -164,14 +164,3 @@ def test_graphs_are_dropped_when_memory_runs_out(monkeypatch, caplog):
     full[:] = [True]
     with pytest.raises(torch.cuda.OutOfMemoryError):  # there are no graphs to drop
         fake.graphs.retry_without_graphs(work)
-
-
-def test_lists_have_exact_capacities_or_the_needed_entries_and_a_margin():
-    assert rooms.room_for(torch.tensor(7)) == 7
-    with rooms.counted() as needs:
-        assert [rooms.room_for(torch.tensor(need)) for need in (5000, 0)] == [5000, 0]
-    assert needs == [5000, 0]
-    with rooms.given(needs) as lists:
-        assert [rooms.room_for(torch.tensor(need)) for need in (9, 8)] == [rooms.LEAST + 7500, rooms.LEAST]
-    assert [(int(needed), room) for needed, room in lists] == [(9, rooms.LEAST + 7500), (8, rooms.LEAST)]
-    assert rooms.room_for(torch.tensor(3)) == 3

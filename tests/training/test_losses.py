@@ -9,13 +9,14 @@ import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, track_of
 from skimage.metrics import structural_similarity
 
+from drivesplat.kernels.color_difference import masked_l1
+from drivesplat.kernels.ssim import ssim, ssim_in_torch
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.colours import masked_l1
 from drivesplat.training.losses import (
     class_cross_entropy,
     depth_loss,
@@ -24,7 +25,6 @@ from drivesplat.training.losses import (
     sky_alpha_loss,
     sky_cross_entropy,
 )
-from drivesplat.training.ssim import ssim, ssim_in_torch
 from drivesplat.training.views import LidarDepth, TrainingView
 
 WIDTH, HEIGHT = 20, 14
@@ -103,7 +103,7 @@ def test_ssim_has_the_gradient_of_finite_differences():
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_ssim_on_a_cpu_has_torchs_gradient(threads):
-    """Of an image that is not contiguous, and larger than a piece."""
+    """Of an image that is not contiguous, and larger than a chunk."""
     image, target = random_image(11, 40, 70).transpose(0, 1), random_image(12, 70, 40)
     gradients, before = [], torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers.hand_made import actors_of, motion_through, track_of
 
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels import triton_support
 from drivesplat.model.background import Background
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
@@ -73,7 +73,7 @@ def test_a_cpu_reads_the_rates_of_the_optimizers():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.mark.parametrize("kernels", [True, False])
 def test_steps_at_device_rates_equal_those_of_adam(kernels, monkeypatch):
-    monkeypatch.setattr(on_gpu, "for_tensor", lambda _: kernels)
+    monkeypatch.setattr(triton_support, "usable_for", lambda _: kernels)
     settings, ends, places = TrainSettings(iterations=10), [], {}
     for device in ("cuda", "cpu"):
         model = a_model(device)

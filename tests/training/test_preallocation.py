@@ -9,6 +9,7 @@ from helpers.densification import ALL, a_model, a_view, settings_of, train_step
 from helpers.trainings import ALL_TERMS, EndedError, EndingViews, guided_views, trained, untrained_street
 from helpers.trainings import settings_of as settings_of_training
 
+from drivesplat.kernels.regularizers import mean_opacity_and_scale
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.road import RoadSettings
@@ -16,7 +17,7 @@ from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier, Optimizers
-from drivesplat.training.losses import loss_terms, mean_opacity_and_scale
+from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.road import driven_road, road_loss
 from drivesplat.training.surfaces import NOTHING_KNOWN, surface_terms
@@ -33,15 +34,14 @@ def grown(preallocates: bool, steps: int, **changes: Any) -> tuple[SplatModel, D
     means = []
     for step in range(steps):
         train_step(model, densifier, step, optimizers, learns_size=True)
-        opacity, scale = (
-            float(m.detach() / active_fraction(model.parts)) for m in mean_opacity_and_scale(model.gaussians_at(0.0))
-        )
-        means += [opacity, scale]
+        shown = model.gaussians_at(0.0)
+        opacity, scale = mean_opacity_and_scale(shown.opacities, shown.scales)
+        means += [float(mean.detach() / active_fraction(model.parts)) for mean in (opacity, scale)]
     return model, densifier, optimizers, means
 
 
 def test_preallocated_rows_do_not_change_growth(monkeypatch):
-    monkeypatch.setattr(strategies, "_add_noise", lambda *_: None)  # draws for every row, on a CPU
+    monkeypatch.setattr(strategies, "explore", lambda *_: None)  # draws for every row, on a CPU
     model, _, _, means = grown(True, 8)
     other, _, _, expected = grown(False, 8)
     part, count = model.parts[0], len(other.parts[0])

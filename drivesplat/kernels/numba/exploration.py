@@ -1,5 +1,4 @@
-"""The noise by which MCMC's Gaussians explore (Kheradmand et al. 2024, equation 8): along their own extent, and the
-more the fainter they are."""
+"""The noise with which MCMC's Gaussians explore (Kheradmand et al. 2024, equation 8), in one pass."""
 
 import math
 from typing import no_type_check
@@ -11,28 +10,27 @@ from drivesplat.kernels.cache import kernel
 from drivesplat.kernels.numba.projection import arrays
 from drivesplat.kernels.numba.threads import parallel_for
 
-STEEPNESS, TURNING_POINT = 100.0, 0.005
-"""Of the logistic function of opacity by which the noise fades, as in gsplat."""
-GRAIN = 4096
-"""Gaussians a piece."""
+STEEPNESS, MIDPOINT = 100.0, 0.005
+"""Of the logistic function by which the noise decreases with opacity, as in gsplat."""
+CHUNK = 4096
+"""Gaussians per chunk."""
 
 
 @torch.no_grad()
 def explore(params: nn.ParameterDict, strength: float) -> None:
-    """What gsplat's `inject_noise_to_position` does, in one pass: moves `means` (n, 3) at random, drawing from torch's
-    global generator; `quats` (n, 4), log `scales` (n, 3) and `opacities` (n,), logits, say how far."""
+    """See `drivesplat.kernels.exploration.explore`; all random numbers are drawn from torch's global generator."""
     means, noise = params["means"], torch.randn_like(params["means"])
     shapes = arrays(params["quats"], params["scales"], params["opacities"])
-    parallel_for(_move, len(means), GRAIN, means.numpy(), noise.numpy(), *shapes, strength)
+    parallel_for(_move, len(means), CHUNK, means.numpy(), noise.numpy(), *shapes, strength)
 
 
 @kernel
 @no_type_check
 def _move(start, stop, means, noise, quats, log_scales, logits, strength):
-    """Adds to each mean its covariance times the noise, which fades with opacity."""
+    """Adds to each mean its covariance times the noise, which decreases with opacity."""
     for i in range(start, stop):
         opacity = 1 / (1 + math.exp(-logits[i]))
-        length = strength / (1 + math.exp(STEEPNESS * (opacity - TURNING_POINT)))
+        length = strength / (1 + math.exp(STEEPNESS * (opacity - MIDPOINT)))
         w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
         norm = 1 / math.sqrt(w * w + x * x + y * y + z * z)
         w, x, y, z = w * norm, x * norm, y * norm, z * norm

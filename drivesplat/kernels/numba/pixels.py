@@ -5,7 +5,7 @@ loads and stores at constant distances and needs no checks for overlap. A Gaussi
 tile, without branches. Constants are cast to the pixels' type, or arithmetic would be in float64.
 
 The backward pass runs front to back like the forward pass and repeats its decisions exactly. With the loss's gradients
-g of a pixel's channels (alpha is one more, of value 1), weights w = T alpha and what is yet to come
+g of a pixel's channels (alpha is one more, of value 1), weights w = T alpha and the remaining sum
 R_i = sum over j > i of w_j (g · value_j), the gradient of alpha_i is T_i (g · value_i) - R_i / (1 - alpha_i); the sum
 over all j is known from the rendered image (Kerbl et al. 2023 run back to front instead).
 """
@@ -18,16 +18,16 @@ from numba import njit, types
 from numba.extending import overload
 
 from drivesplat.kernels.cache import OPTIONS, callee, kernel
-from drivesplat.kernels.numba import tiles
-from drivesplat.kernels.numba.gradients import MOMENTS
+from drivesplat.kernels.numba import layout
+from drivesplat.kernels.numba.layout import MOMENTS
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
-PIXELS = tiles.TILE_WIDTH * tiles.TILE_HEIGHT
+PIXELS = layout.TILE_WIDTH * layout.TILE_HEIGHT
 ROWS = 2
-"""Rows of a tile that are composited together at least: 32 pixels, for loops without a remainder."""
-PATIENCE = 16
-"""Gaussians after which a tile is asked whether all its rays have ended."""
+"""Minimum number of a tile's rows that are composited together: 32 pixels, for loops without a remainder."""
+CHECK_EVERY = 16
+"""Number of Gaussians between two checks whether all rays of a tile have ended."""
 X, Y, TRANSMITTANCE, WEIGHT = range(4)
 OUT = 4
 """Plane of alpha in the forward pass, which the channels follow."""
@@ -37,7 +37,7 @@ fast_callee = njit(**OPTIONS, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 
 def _exp(x):
-    """exp(x) for -25 <= x <= 0, in kernels alone."""
+    """exp(x) for -25 <= x <= 0; callable from kernels only."""
 
 
 @overload(_exp)
@@ -66,42 +66,42 @@ def _exp_overload(x):
 @njit(nogil=True)
 @no_type_check
 def _at(plane):
-    """Where a plane begins; unsigned, for signed indices could be negative and would be checked."""
+    """The first index of a plane; unsigned, since signed indices are checked for being negative."""
     return np.uint64(plane * PIXELS)
 
 
 @callee
 @no_type_check
 def _rows(shape, x0, y0):
-    """First and last pixel (excluded) of a tile's rows that a Gaussian reaches; the tile's corner is `x0`, `y0`."""
-    a, b, c = float(shape[tiles.CONIC_XX]), float(shape[tiles.CONIC_XY]), float(shape[tiles.CONIC_YY])
-    reach = float(shape[tiles.RADIUS_Y])
+    """First and last pixel (excluded) of the rows of a tile that a Gaussian reaches; the tile begins at `x0`, `y0`."""
+    a, b, c = float(shape[layout.CONIC_XX]), float(shape[layout.CONIC_XY]), float(shape[layout.CONIC_YY])
+    reach = float(shape[layout.RADIUS_Y])
     low, high = -reach, reach
     determinant = a * c - b * b
     if determinant > 0.0 and a > 0.0 and c > 0.0:
-        quadratic = float(shape[tiles.REACH])
-        x_max = math.sqrt(quadratic * c / determinant) + tiles.SLACK
-        left = max(x0 + 0.5 - shape[tiles.MEAN_X], -x_max)
-        right = min(x0 + tiles.TILE_WIDTH - 0.5 - shape[tiles.MEAN_X], x_max)
+        quadratic = float(shape[layout.REACH])
+        x_max = math.sqrt(quadratic * c / determinant) + layout.SLACK
+        left = max(x0 + 0.5 - shape[layout.MEAN_X], -x_max)
+        right = min(x0 + layout.TILE_WIDTH - 0.5 - shape[layout.MEAN_X], x_max)
         turn = b * math.sqrt(quadratic * a / determinant) / a
         x = min(max(-turn, left), right)
-        high = (math.sqrt(max(c * quadratic - determinant * x * x, 0.0)) - b * x) / c + tiles.SLACK
+        high = (math.sqrt(max(c * quadratic - determinant * x * x, 0.0)) - b * x) / c + layout.SLACK
         x = min(max(turn, left), right)
-        low = (-math.sqrt(max(c * quadratic - determinant * x * x, 0.0)) - b * x) / c - tiles.SLACK
-    top = shape[tiles.MEAN_Y] - 0.5 - y0
+        low = (-math.sqrt(max(c * quadratic - determinant * x * x, 0.0)) - b * x) / c - layout.SLACK
+    top = shape[layout.MEAN_Y] - 0.5 - y0
     begin = max(math.ceil((top + low) / ROWS - (ROWS - 1) / ROWS), 0.0)
-    end = min(math.floor((top + high) / ROWS) + 1.0, float(tiles.TILE_HEIGHT // ROWS))
+    end = min(math.floor((top + high) / ROWS) + 1.0, float(layout.TILE_HEIGHT // ROWS))
     if not begin < end:
         return np.uint64(0), np.uint64(0)
-    return np.uint64(int(begin) * (ROWS * tiles.TILE_WIDTH)), np.uint64(int(end) * (ROWS * tiles.TILE_WIDTH))
+    return np.uint64(int(begin) * (ROWS * layout.TILE_WIDTH)), np.uint64(int(end) * (ROWS * layout.TILE_WIDTH))
 
 
 @callee
 @no_type_check
 def _begin_tile(s, x0, y0, width, height):
-    """Coordinates of the pixels' centres, and transmittance: 1, and 0 beyond the image."""
+    """Writes the coordinates of the pixels' centres, and transmittance: 1, and 0 outside the image."""
     for p in range(PIXELS):
-        x, y = x0 + p % tiles.TILE_WIDTH, y0 + p // tiles.TILE_WIDTH
+        x, y = x0 + p % layout.TILE_WIDTH, y0 + p // layout.TILE_WIDTH
         s[X * PIXELS + p], s[Y * PIXELS + p] = x + 0.5, y + 0.5
         s[TRANSMITTANCE * PIXELS + p] = 1.0 if x < width and y < height else 0.0
 
@@ -109,7 +109,7 @@ def _begin_tile(s, x0, y0, width, height):
 @callee
 @no_type_check
 def _ended(s):
-    """Whether no ray of the tile is left."""
+    """Whether all rays of the tile have ended."""
     total = s[0] * 0
     for p in range(np.uint64(0), np.uint64(PIXELS)):
         total += s[_at(TRANSMITTANCE) + p]
@@ -119,14 +119,14 @@ def _ended(s):
 @fast_callee
 @no_type_check
 def _alpha(dx, dy, a, b, c, opacity):
-    """The opacity that a Gaussian has at an offset from its centre, before it is held at 0.999; 0 below 1/255."""
+    """A Gaussian's alpha at an offset from its centre, before it is limited to 0.999; 0 below 1/255."""
     real = type(dx)
     half, zero, far = real(0.5), real(0.0), real(-25.0)
     exponent = -(half * a * dx + b * dy) * dx - half * c * dy * dy
-    held = exponent if exponent > far else far
-    held = held if held < zero else zero
-    alpha = opacity * _exp(held)
-    return alpha if (exponent <= zero) & (alpha >= real(tiles.MIN_ALPHA)) else zero
+    limited = exponent if exponent > far else far
+    limited = limited if limited < zero else zero
+    alpha = opacity * _exp(limited)
+    return alpha if (exponent <= zero) & (alpha >= real(layout.MIN_ALPHA)) else zero
 
 
 @fast_callee
@@ -137,8 +137,8 @@ def _weigh(s, begin, end, shape):
     A ray that has ended has transmittance 0.
     """
     real = s.dtype.type
-    mean_x, mean_y, opacity = shape[tiles.MEAN_X], shape[tiles.MEAN_Y], shape[tiles.OPACITY]
-    a, b, c = shape[tiles.CONIC_XX], shape[tiles.CONIC_XY], shape[tiles.CONIC_YY]
+    mean_x, mean_y, opacity = shape[layout.MEAN_X], shape[layout.MEAN_Y], shape[layout.OPACITY]
+    a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     zero, one, max_alpha, min_transmittance = real(0.0), real(1.0), real(MAX_ALPHA), real(MIN_TRANSMITTANCE)
     for p in range(begin, end):
         alpha = _alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
@@ -164,11 +164,11 @@ def composite_tiles(start, stop, first, offsets, ranks, shapes, values, columns,
     height, width, channels = image.shape
     s = np.empty((OUT + 1 + channels) * PIXELS, image.dtype)
     for tile in range(start, stop):
-        x0, y0 = (first + tile) % columns * tiles.TILE_WIDTH, (first + tile) // columns * tiles.TILE_HEIGHT
+        x0, y0 = (first + tile) % columns * layout.TILE_WIDTH, (first + tile) // columns * layout.TILE_HEIGHT
         _begin_tile(s, x0, y0, width, height)
         s[OUT * PIXELS :] = 0.0
         for i in range(offsets[tile], offsets[tile + 1]):
-            if (i - offsets[tile]) % PATIENCE == PATIENCE - 1 and _ended(s):
+            if (i - offsets[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and _ended(s):
                 break
             r = ranks[i]
             begin, end = _rows(shapes[r], x0, y0)
@@ -176,9 +176,9 @@ def composite_tiles(start, stop, first, offsets, ranks, shapes, values, columns,
             _add(s, begin, end, OUT, WEIGHT, image.dtype.type(1.0))
             for k in range(channels):
                 _add(s, begin, end, OUT + 1 + k, WEIGHT, values[r, k])
-        for y in range(y0, min(y0 + tiles.TILE_HEIGHT, height)):
-            for x in range(x0, min(x0 + tiles.TILE_WIDTH, width)):
-                p = (y - y0) * tiles.TILE_WIDTH + x - x0
+        for y in range(y0, min(y0 + layout.TILE_HEIGHT, height)):
+            for x in range(x0, min(x0 + layout.TILE_WIDTH, width)):
+                p = (y - y0) * layout.TILE_WIDTH + x - x0
                 alpha[y, x, 0] = s[OUT * PIXELS + p]
                 for k in range(channels):
                     image[y, x, k] = s[(OUT + 1 + k) * PIXELS + p]
@@ -187,12 +187,12 @@ def composite_tiles(start, stop, first, offsets, ranks, shapes, values, columns,
 @callee
 @no_type_check
 def _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha):
-    """Loads the gradients of a tile's pixels, and what its rays have to come at their beginning."""
+    """Loads the gradients of a tile's pixels, and the initial REST of its rays."""
     height, width, channels = image.shape
     s[REST * PIXELS :] = 0.0
-    for y in range(y0, min(y0 + tiles.TILE_HEIGHT, height)):
-        for x in range(x0, min(x0 + tiles.TILE_WIDTH, width)):
-            p = (y - y0) * tiles.TILE_WIDTH + x - x0
+    for y in range(y0, min(y0 + layout.TILE_HEIGHT, height)):
+        for x in range(x0, min(x0 + layout.TILE_WIDTH, width)):
+            p = (y - y0) * layout.TILE_WIDTH + x - x0
             s[GRADIENT * PIXELS + p] = v_alpha[y, x, 0]
             rest = alpha[y, x, 0] * v_alpha[y, x, 0]
             for k in range(channels):
@@ -203,10 +203,10 @@ def _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha):
 
 @fast_callee
 @no_type_check
-def _weigh_again(s, begin, end, shape):
-    """As _weigh; RAW gets alpha before it is held at 0.999, and VALUE the gradient of alpha as a channel."""
-    mean_x, mean_y, opacity = shape[tiles.MEAN_X], shape[tiles.MEAN_Y], shape[tiles.OPACITY]
-    a, b, c = shape[tiles.CONIC_XX], shape[tiles.CONIC_XY], shape[tiles.CONIC_YY]
+def _begin_backward(s, begin, end, shape):
+    """Writes alpha before it is limited to 0.999 to RAW, and the gradient of alpha as a channel to VALUE."""
+    mean_x, mean_y, opacity = shape[layout.MEAN_X], shape[layout.MEAN_Y], shape[layout.OPACITY]
+    a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     for p in range(begin, end):
         s[_at(RAW) + p] = _alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
         s[_at(VALUE) + p] = s[_at(GRADIENT) + p]
@@ -217,7 +217,7 @@ def _weigh_again(s, begin, end, shape):
 def _moments(s, begin, end, shape, out):
     """Advances transmittance and REST, and writes weights, gradients of exponents (to RAW) and their moments."""
     real = s.dtype.type
-    mean_x, mean_y = shape[tiles.MEAN_X], shape[tiles.MEAN_Y]
+    mean_x, mean_y = shape[layout.MEAN_X], shape[layout.MEAN_Y]
     zero, one = real(0.0), real(1.0)
     max_alpha, min_transmittance = real(MAX_ALPHA), real(MIN_TRANSMITTANCE)
     m = m_x = m_y = m_xx = m_xy = m_yy = zero
@@ -226,14 +226,14 @@ def _moments(s, begin, end, shape, out):
         raw, before, value = s[_at(RAW) + p], s[_at(TRANSMITTANCE) + p], s[_at(VALUE) + p]
         alpha = raw if raw < max_alpha else max_alpha
         after = before * (one - alpha)
-        lit = after > min_transmittance
-        weight = alpha * before if lit else zero
+        continues = after > min_transmittance
+        weight = alpha * before if continues else zero
         rest = s[_at(REST) + p] - weight * value
         s[_at(REST) + p] = rest
         s[_at(WEIGHT) + p] = weight
-        s[_at(TRANSMITTANCE) + p] = after if lit else zero
+        s[_at(TRANSMITTANCE) + p] = after if continues else zero
         v = raw * (before * value - rest / (one - alpha))
-        v = v if lit & (raw <= max_alpha) else zero
+        v = v if continues & (raw <= max_alpha) else zero
         s[_at(RAW) + p] = v
         m += v
         m_x, m_y = m_x + v * dx, m_y + v * dy
@@ -255,8 +255,8 @@ def _weighted_sum(s, begin, end, plane):
 @no_type_check
 def _absolute_sums(s, begin, end, shape):
     """The sums over pixels of the absolute gradients of the Gaussian's centre."""
-    mean_x, mean_y = shape[tiles.MEAN_X], shape[tiles.MEAN_Y]
-    a, b, c = shape[tiles.CONIC_XX], shape[tiles.CONIC_XY], shape[tiles.CONIC_YY]
+    mean_x, mean_y = shape[layout.MEAN_X], shape[layout.MEAN_Y]
+    a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     total_x = total_y = s.dtype.type(0.0)
     for p in range(begin, end):
         dx, dy = s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y
@@ -268,23 +268,23 @@ def _absolute_sums(s, begin, end, shape):
 @kernel
 @no_type_check
 def composite_tiles_backward(
-    start, stop, first, offsets, ranks, slots, shapes, values, columns, image, alpha, v_image, v_alpha, absolute, parts
+    start, stop, first, offsets, ranks, slots, shapes, values, columns, image, alpha, v_image, v_alpha, absolute, sums
 ):
-    """Writes each list entry's part of its Gaussian's gradients into its row of `parts`: moments, channels and, where
-    `absolute`, the sums of absolute gradients of the centre. Rows of Gaussians behind all rays' ends stay as they are.
+    """Writes each list entry's share of its Gaussian's gradients to its row of `sums`: moments, channels and, with
+    `absolute`, the sums of absolute gradients of the centre. Rows of Gaussians behind the ends of all rays stay as is.
     """
     height, width, channels = image.shape
     s = np.empty((GRADIENT + 1 + channels) * PIXELS, image.dtype)
     for tile in range(start, stop):
-        x0, y0 = (first + tile) % columns * tiles.TILE_WIDTH, (first + tile) // columns * tiles.TILE_HEIGHT
+        x0, y0 = (first + tile) % columns * layout.TILE_WIDTH, (first + tile) // columns * layout.TILE_HEIGHT
         _begin_tile(s, x0, y0, width, height)
         _begin_gradients(s, x0, y0, image, alpha, v_image, v_alpha)
         for i in range(offsets[tile], offsets[tile + 1]):
-            if (i - offsets[tile]) % PATIENCE == PATIENCE - 1 and _ended(s):
+            if (i - offsets[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and _ended(s):
                 break
-            r, out = ranks[i], parts[slots[i]]
+            r, out = ranks[i], sums[slots[i]]
             begin, end = _rows(shapes[r], x0, y0)
-            _weigh_again(s, begin, end, shapes[r])
+            _begin_backward(s, begin, end, shapes[r])
             for k in range(channels):
                 _add(s, begin, end, VALUE, GRADIENT + 1 + k, values[r, k])
             _moments(s, begin, end, shapes[r], out)

@@ -25,19 +25,19 @@ EPS2D = 0.3
 NEAR_PLANE = 0.01
 FAR_PLANE = 1e10
 EXTENT = 3.33
-"""Standard deviations within which an opacity of 1 falls to 1/255."""
+"""Standard deviations at which an opacity of 1 has decreased to 1/255."""
 MIN_AREA_RATIO = 1e-12
 """Where the filter leaves less of a Gaussian's area, the compensation is constant: its slope would be infinite."""
 MAX_RADIUS = 2**30
-GRAIN = 2048
-"""Gaussians a piece; the sums over Gaussians are made piece by piece."""
+CHUNK = 2048
+"""Gaussians per chunk; sums over Gaussians are made chunk by chunk."""
 
 
 class Projection(torch.autograd.Function):
     """Means (c, n, 2) in pixels, depths (c, n), conics (c, n, 3), compensations (c, n) and radii (c, n, 2) in pixels.
 
     Conics are the upper triangle of the inverse covariance. Compensations are the factors by which `antialiased` lowers
-    opacities (Yu et al. 2024, eq. 7). Gaussians out of view have radius 0; those not before the camera are zeros.
+    opacities (Yu et al. 2024, eq. 7). Gaussians out of view have radius 0; those behind the near plane are zeros.
     """
 
     @staticmethod
@@ -63,7 +63,7 @@ class Projection(torch.autograd.Function):
         inputs = arrays(means, quats, scales)
         for c in range(cameras):
             camera = pinhole(viewmats[c], Ks[c], width, height)
-            parallel_for(_project, n, GRAIN, *inputs, camera, *arrays(*(o[c] for o in outputs), radii[c]))
+            parallel_for(_project, n, CHUNK, *inputs, camera, *arrays(*(o[c] for o in outputs), radii[c]))
         ctx.save_for_backward(means, quats, scales, viewmats, Ks, radii)
         ctx.size = (width, height)
         ctx.mark_non_differentiable(radii)
@@ -77,11 +77,11 @@ class Projection(torch.autograd.Function):
         v_inputs = [torch.zeros_like(value, memory_format=torch.contiguous_format) for value in (means, quats, scales)]
         v_viewmats = torch.zeros_like(viewmats, memory_format=torch.contiguous_format)
         for c in range(len(viewmats)):
-            sums = np.zeros((-(-len(means) // GRAIN), 12))
+            sums = np.zeros((-(-len(means) // CHUNK), 12))
             v_camera = arrays(*(v[c] for v in v_outputs[:4]))
             camera = pinhole(viewmats[c], Ks[c], *ctx.size)
             parallel_for(
-                _project_backward, len(means), GRAIN,
+                _project_backward, len(means), CHUNK,
                 *inputs, camera, radii[c].numpy(), *v_camera, *arrays(*v_inputs), sums,
             )  # fmt: skip
             v_viewmats[c, :3] = torch.from_numpy(sums.sum(axis=0)).reshape(3, 4)
@@ -94,10 +94,10 @@ def arrays(*tensors: Tensor) -> list[np.ndarray]:
 
 
 def pinhole(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int) -> np.ndarray:
-    """A camera as one array (24,): rotation (9), translation (3), first two rows of K (6), then between which x/z and
-    y/z Gaussians are linearised (lowest and highest x, then y), width and height.
+    """A camera as one array (24,): rotation (9), translation (3), first two rows of K (6), the lowest and highest x/z,
+    then y/z, at which Gaussians are linearised, width and height.
 
-    3D Gaussian Splatting linearises no farther than 30 % of the half image beyond its border.
+    As in 3D Gaussian Splatting these limits are 30 % of the half image beyond its border.
     """
     k = K.detach().double().numpy()
     size = np.array([width, height])
@@ -199,7 +199,7 @@ def _project_backward(
     start, stop, means, quats, scales, camera, radii, v_means2d, v_depths, v_conics, v_compensations,
     v_means, v_quats, v_scales, v_viewmat,
 ):  # fmt: skip
-    """Adds to `v_means`, `v_quats` and `v_scales`; writes this piece's sum for rotation and translation (3, 4)."""
+    """Adds to `v_means`, `v_quats` and `v_scales`; writes this chunk's sum for rotation and translation (3, 4)."""
     at, v_at = np.empty(3), np.empty(3)
     axes, in_camera, v_in_camera, v_axes = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     t, v_t, sums = np.empty((2, 3)), np.empty((2, 3)), np.zeros((3, 4))
@@ -244,7 +244,7 @@ def _project_backward(
                     + camera[6 + j] * v_in_camera[2, k]
                 )
         _axes_backward(quats[g], scales[g], v_axes, v_quats[g], v_scales[g])
-    v_viewmat[start // GRAIN] = sums.ravel()
+    v_viewmat[start // CHUNK] = sums.ravel()
 
 
 @callee

@@ -1,8 +1,8 @@
-"""Kernels spread over threads.
+"""Kernels distributed over threads.
 
-The kernels release the GIL and are called from plain Python threads, begun and ended within each call, and not from
-numba's own threading layers: those either abort in a forked process (OpenMP) or when two threads render at once
-(workqueue). Nothing here outlives a call, so a fork finds nothing to inherit.
+The kernels release the GIL and run in plain Python threads that start and end within each call. numba's own threading
+layers abort either in a forked process (OpenMP) or when two threads render at the same time (workqueue). No thread
+outlives a call, so none is lost in a fork.
 """
 
 from collections.abc import Callable
@@ -12,19 +12,19 @@ from typing import Any
 import torch
 
 
-def parallel_for(piece: Callable[..., None], count: int, grain: int, *args: Any) -> None:
-    """Calls `piece(start, stop, *args)` for pieces of at most `grain` items that together make up range(count).
+def parallel_for(kernel: Callable[..., None], count: int, chunk: int, *args: Any) -> None:
+    """Calls `kernel(start, stop, *args)` for chunks of at most `chunk` items that together cover range(count).
 
-    As many threads as torch uses take the pieces; `piece` must release the GIL. The pieces do not depend on the
-    number of threads, so neither need the results.
+    Uses as many threads as torch; `kernel` must release the GIL. The chunks, and so the results, do not depend on the
+    number of threads.
     """
-    starts = range(0, count, grain)
+    starts = range(0, count, chunk)
     others = min(torch.get_num_threads(), len(starts)) - 1
-    left = iter(starts)  # one for all threads: each takes the next piece when it is done with its own
+    remaining = iter(starts)  # shared: each thread takes the next chunk when it has finished one
 
     def work() -> None:
-        for start in left:
-            piece(start, min(start + grain, count), *args)
+        for start in remaining:
+            kernel(start, min(start + chunk, count), *args)
 
     if others <= 0:
         work()
@@ -33,4 +33,4 @@ def parallel_for(piece: Callable[..., None], count: int, grain: int, *args: Any)
         helpers = [pool.submit(work) for _ in range(others)]
         work()
     for helper in helpers:
-        helper.result()  # what a piece raises is raised here
+        helper.result()  # raises what its chunks raised

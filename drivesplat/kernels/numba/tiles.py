@@ -1,8 +1,8 @@
-"""Which Gaussians reach which tiles of an image, front to back.
+"""Lists of the Gaussians that reach each tile of an image, front to back.
 
-A Gaussian is listed for a tile where its ellipse alpha = 1/255 meets the pixel centres' rectangle: elsewhere nothing of
-it is drawn. An image's lists are made window by window: consecutive tiles with at most `BUDGET` entries together, or
-one tile with at most as many as there are Gaussians. This bounds memory whatever the scene holds.
+A tile lists a Gaussian where the ellipse alpha = 1/255 meets the rectangle of the tile's pixel centres: it is drawn
+nowhere else. An image's lists are made window by window: consecutive tiles with at most `MAX_ENTRIES` entries together,
+or a single tile. This bounds the memory for any scene.
 """
 
 import math
@@ -13,26 +13,36 @@ from typing import no_type_check
 import numpy as np
 
 from drivesplat.kernels.cache import callee, kernel
+from drivesplat.kernels.numba.layout import (
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    MEAN_X,
+    MEAN_Y,
+    MIN_ALPHA,
+    OPACITY,
+    RADIUS_X,
+    RADIUS_Y,
+    REACH,
+    SLACK,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
 from drivesplat.kernels.numba.threads import parallel_for
 
-TILE_WIDTH = 16
-TILE_HEIGHT = 16
-MIN_ALPHA = 1.0 / 255.0
-BUDGET = 4_000_000
-"""Entries a window: 32 MB of lists, and in the backward pass 36 bytes each of gradients with three float32 channels."""
-PIECES = 16
-"""Pieces in which Gaussians are listed, each with its own count for every tile."""
-SLACK = 0.02
-"""Pixels by which ellipses are taken larger, beyond what rounding in float32 can move them."""
-MEAN_X, MEAN_Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, REACH, RADIUS_X, RADIUS_Y = range(9)
-"""Columns of `Splats.shapes`. A Gaussian is drawn where its exponent's quadratic form is at most REACH."""
+MAX_ENTRIES = 4_000_000
+"""Maximum number of entries in a window: 32 MB of lists; the backward pass adds 36 bytes per entry for three float32
+channels."""
+CHUNKS = 16
+"""Chunks in which Gaussians are listed, each with its own count for every tile."""
 
 
 @dataclass(frozen=True)
 class Splats:
     """The m Gaussians in view of one camera, front to back.
 
-    `order` (m,) are their numbers in the scene, `shapes` (m, 9) and `values` (m, channels) what is drawn of them.
+    `order` (m,) are their numbers in the scene; `shapes` (m, 9), by the columns of `layout`, and `values` (m,
+    channels) are drawn.
     """
 
     order: np.ndarray
@@ -70,11 +80,11 @@ def front_to_back(
     radii: np.ndarray,
     values: np.ndarray,
 ) -> Splats:
-    """The Gaussians in view whose opacity is at least 1/255; of equal depths the first comes first."""
-    seen = np.flatnonzero((radii[:, 0] > 0) & (radii[:, 1] > 0) & (opacities >= MIN_ALPHA)).astype(np.int32)
-    keys = depths[seen]
+    """The Gaussians in view whose opacity is at least 1/255; the order of equal depths is kept."""
+    visible = np.flatnonzero((radii[:, 0] > 0) & (radii[:, 1] > 0) & (opacities >= MIN_ALPHA)).astype(np.int32)
+    keys = depths[visible]
     keys = keys.view(np.uint32 if keys.dtype == np.float32 else np.uint64)  # of positive numbers, in the same order
-    order = _sorted_by(seen, keys)
+    order = _sorted_by(visible, keys)
     shapes = np.empty((len(order), 9), means2d.dtype)
     gathered = np.empty((len(order), values.shape[1]), means2d.dtype)
     parallel_for(
@@ -94,10 +104,10 @@ def tile_lists(splats: Splats, columns: int, rows: int) -> Iterator[TileLists]:
 
 
 def _windows(counts: np.ndarray) -> list[tuple[int, int]]:
-    """First and last tile (excluded) of consecutive windows with at most BUDGET entries, or one tile."""
+    """First and last tile (excluded) of consecutive windows with at most MAX_ENTRIES entries, or one tile."""
     windows, first, total = [], 0, 0
     for tile, count in enumerate(counts.tolist()):
-        if total + count > BUDGET and tile > first:
+        if total + count > MAX_ENTRIES and tile > first:
             windows.append((first, tile))
             first, total = tile, 0
         total += count
@@ -107,24 +117,24 @@ def _windows(counts: np.ndarray) -> list[tuple[int, int]]:
 def _list(splats: Splats, columns: int, first: int, last: int, counts: np.ndarray, tiles_of: np.ndarray) -> TileLists:
     slot_offsets = np.concatenate([[0], np.cumsum(tiles_of)])
     offsets = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
-    cursors = np.cumsum(counts, axis=0) - counts + offsets[:-1]  # where a piece's entries of a tile begin
+    cursors = np.cumsum(counts, axis=0) - counts + offsets[:-1]  # the first entry of a chunk in a tile
     ranks, slots = np.empty(offsets[-1], np.int32), np.empty(offsets[-1], np.int32)
-    grain = _piece(len(splats.order))
+    chunk = _chunk_size(len(splats.order))
     parallel_for(
-        _fill, len(splats.order), grain, splats.shapes, columns, first, last, grain, slot_offsets, cursors, ranks, slots
+        _fill, len(splats.order), chunk, splats.shapes, columns, first, last, chunk, slot_offsets, cursors, ranks, slots
     )
     return TileLists(first, last, offsets, ranks, slots, slot_offsets)
 
 
-def _piece(m: int) -> int:
-    return max(1, -(-m // PIECES))
+def _chunk_size(m: int) -> int:
+    return max(1, -(-m // CHUNKS))
 
 
 def _count(splats: Splats, columns: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Entries by piece and tile, and by Gaussian."""
+    """Entries by chunk and tile, and by Gaussian."""
     m = len(splats.order)
-    counts, tiles_of = np.zeros((PIECES, last - first), np.int64), np.zeros(m, np.int64)
-    parallel_for(_count_piece, m, _piece(m), splats.shapes, columns, first, last, _piece(m), counts, tiles_of)
+    chunk, counts, tiles_of = _chunk_size(m), np.zeros((CHUNKS, last - first), np.int64), np.zeros(m, np.int64)
+    parallel_for(_count_chunk, m, chunk, splats.shapes, columns, first, last, chunk, counts, tiles_of)
     return counts, tiles_of
 
 
@@ -176,10 +186,10 @@ def _gather(start, stop, order, means2d, conics, opacities, radii, values, shape
 def _span(a, b, c, reach, low, high, bound):
     """The range of u in which a u² + 2 b u v + c v² <= reach for some v in [low, high], within ±bound.
 
-    An empty range ends before it begins.
+    The end of an empty range is below its start.
     """
     determinant = a * c - b * b
-    if not (determinant > 0.0 and a > 0.0 and c > 0.0):  # rounding has left no ellipse
+    if not (determinant > 0.0 and a > 0.0 and c > 0.0):  # no ellipse, after rounding
         return -bound, bound
     v_max = math.sqrt(reach * a / determinant) + SLACK
     low, high = max(low, -v_max), min(high, v_max)
@@ -226,21 +236,21 @@ def _tile_columns(shape, row, columns, first, last):
 
 @kernel
 @no_type_check
-def _count_piece(start, stop, shapes, columns, first, last, grain, counts, tiles_of):
-    piece = counts[start // grain]
+def _count_chunk(start, stop, shapes, columns, first, last, chunk, counts, tiles_of):
+    own = counts[start // chunk]
     for r in range(start, stop):
         begin, end = _tile_rows(shapes[r], columns, first, last)
         for row in range(begin, end):
             left, right = _tile_columns(shapes[r], row, columns, first, last)
             for tile in range(left, right):
-                piece[tile - first] += 1
+                own[tile - first] += 1
             tiles_of[r] += max(right - left, 0)
 
 
 @kernel
 @no_type_check
-def _fill(start, stop, shapes, columns, first, last, grain, slot_offsets, cursors, ranks, slots):
-    cursor = cursors[start // grain]
+def _fill(start, stop, shapes, columns, first, last, chunk, slot_offsets, cursors, ranks, slots):
+    cursor = cursors[start // chunk]
     for r in range(start, stop):
         slot = slot_offsets[r]
         begin, end = _tile_rows(shapes[r], columns, first, last)

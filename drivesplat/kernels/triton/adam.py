@@ -1,4 +1,4 @@
-"""A step of Adam (Kingma and Ba 2015, algorithm 1), in one pass at the speed of memory."""
+"""One step of Adam (Kingma and Ba 2015, algorithm 1), limited by memory bandwidth alone."""
 
 import math
 from typing import no_type_check
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 BLOCK = 1024
-"""Values a program."""
+"""Values per program."""
 
 
 @torch.no_grad()
@@ -22,8 +22,7 @@ def adam_step(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """What torch.optim.Adam does with its `state` of a parameter, whose step has been counted; the `rate` is known to
-    the device."""
+    """See `drivesplat.kernels.adam.adam_step`; `gradient` is the parameter's."""
     count = parameter.numel()
     if count == 0:
         return

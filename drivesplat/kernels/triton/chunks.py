@@ -1,8 +1,8 @@
-"""Tiles' lists of Gaussians cut into chunks, and what chunks show put together again.
+"""Tiles' lists of Gaussians cut into chunks, which are rasterized in parallel and then composited.
 
-A block of the rasterizer goes through the list of a tile, one Gaussian after the other. On a drive what lies far ahead
-is in a few tiles: their lists are tens of times as long as others', and all wait for them. Chunks are rasterized side
-by side, each an image of a tile's size, and composited front to back.
+A block of gsplat's rasterizer processes the list of one tile, one Gaussian after the other. On a drive most distant
+Gaussians fall into a few tiles, whose lists are tens of times as long as the others': the image waits for them. Each
+chunk becomes an image of a tile's size, and these are composited front to back.
 """
 
 from collections.abc import Callable
@@ -15,70 +15,73 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.triton.tiles import TILE, Lists, Projected
+from drivesplat.kernels.triton.tiles import TILE, Footprints, TileLists
 
 LENGTH = 512
-"""Most Gaussians of a chunk."""
-MOST_VALUES = 8
-"""Of a Gaussian: every entry of a list has its own copy of them."""
+"""Maximum number of Gaussians in a chunk."""
+MAX_VALUES = 8
+"""Maximum number of values of a Gaussian: every entry of a list gets its own copy of them."""
 BLOCK = 4096
-"""Tiles that are counted at a time."""
+"""Tiles counted at a time."""
 
 Rasterizer = Callable[..., tuple[Tensor, Tensor]]
 
 
-def composited(
-    gaussians: Projected, lists: Lists, width: int, height: int, rasterizer: Rasterizer
+def composite(
+    gaussians: Footprints, lists: TileLists, width: int, height: int, rasterizer: Rasterizer
 ) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
-    """What gsplat's `rasterize_to_pixels` makes of the same, values and alpha; `rasterizer` is that, for chunks.
+    """Images of values, and alpha, equal to those of gsplat's `rasterize_to_pixels`, which is the `rasterizer`.
 
-    Within rounding: a pixel ends where a chunk lets less than 1e-4 of the light through, which further ones may add to.
+    Equal within rounding: a ray ends within a chunk where its transmittance there falls below 1e-4; later chunks may
+    still contribute.
     """
-    *apart, starts, there, firsts = _Cut.apply(*gaussians, lists)
+    *copies, starts, exists, firsts = _Split.apply(*gaussians, lists)
     edge = TILE.value
     each = torch.arange(len(lists.ids), dtype=torch.int32, device=lists.ids.device)
-    values, alpha = rasterizer(*apart, edge, edge, edge, starts, each, masks=there, packed=True)
-    return _PutTogether.apply(values, alpha, firsts, lists.tiles, width, height)
+    values, alpha = rasterizer(*copies, edge, edge, edge, starts, each, masks=exists, packed=True)
+    return _Join.apply(values, alpha, firsts, lists.tiles, width, height)
 
 
-class _Cut(torch.autograd.Function):
-    """Gaussians tile by tile, in coordinates of their tile, with where chunks start (m, 1, 1), which of them there are
-    (m, 1, 1), and which is every tile's first."""
+class _Split(torch.autograd.Function):
+    """Copies of the Gaussians for every list entry, in coordinates of their tile; where chunks start (m, 1, 1), which
+    chunks exist (m, 1, 1), and every tile's first chunk."""
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, conics: Tensor, values: Tensor, opacities: Tensor, lists: Lists
+        ctx: Any, means: Tensor, conics: Tensor, values: Tensor, opacities: Tensor, lists: TileLists
     ) -> tuple[Tensor, ...]:
         given = [tensor.contiguous() for tensor in (means, conics, values, opacities)]
-        room, (cameras, down, across) = len(lists.ids), lists.tiles
+        capacity, (cameras, down, across) = len(lists.ids), lists.tiles
         tiles = cameras * down * across
-        chunks = tiles + room // LENGTH + 1  # every chunk is followed by another, which is where it ends
+        chunks = tiles + capacity // LENGTH + 1  # a chunk ends where the next one starts: one more than needed
         starts, firsts = lists.ids.new_empty(chunks, 1, 1), lists.ids.new_empty(tiles + 1)
-        there = torch.empty(chunks, 1, 1, dtype=torch.bool, device=means.device)
-        apart = [means.new_empty(room, width) for width in (2, 3, values.shape[-1])] + [means.new_empty(room)]
+        exists = torch.empty(chunks, 1, 1, dtype=torch.bool, device=means.device)
+        copies = [means.new_empty(capacity, width) for width in (2, 3, values.shape[-1])] + [means.new_empty(capacity)]
         _count_chunks[(1,)](lists.offsets, firsts, tiles, LENGTH, BLOCK)
-        _take_apart[(chunks,)](
-            *given, *lists[:3], firsts, *apart, starts, there,
+        _split[(chunks,)](
+            *given, *lists[:3], firsts, *copies, starts, exists,
             tiles, down * across, across, tiles.bit_length(), values.shape[-1], LENGTH,
         )  # fmt: skip
         ctx.save_for_backward(*lists[:3], firsts, starts)
         ctx.shapes = [tensor.shape for tensor in given]
-        ctx.mark_non_differentiable(starts, there, firsts)
-        return *apart, starts, there, firsts
+        ctx.mark_non_differentiable(starts, exists, firsts)
+        return *copies, starts, exists, firsts
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *pulls: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         ids, order, offsets, firsts, starts = ctx.saved_tensors
-        apart = [tensor.contiguous() for tensor in pulls[:4]]
-        summed = [tensor.new_zeros(shape) for tensor, shape in zip(apart, ctx.shapes, strict=True)]
+        copies = [tensor.contiguous() for tensor in gradients[:4]]
+        summed = [tensor.new_zeros(shape) for tensor, shape in zip(copies, ctx.shapes, strict=True)]
         tiles = len(offsets) - 1
-        _add_up[(len(starts),)](*apart, ids, order, offsets, firsts, starts, *summed, tiles, ctx.shapes[2][-1], LENGTH)
+        _sum_copies[(len(starts),)](
+            *copies, ids, order, offsets, firsts, starts, *summed, tiles, ctx.shapes[2][-1], LENGTH
+        )
         return *summed, None
 
 
-class _PutTogether(torch.autograd.Function):
-    """Images (c, h, w, v) and their alpha (c, h, w, 1) of what chunks show."""
+class _Join(torch.autograd.Function):
+    """Composites chunks to images (c, h, w, v) and alpha (c, h, w, 1)."""
 
     @staticmethod
     def forward(
@@ -99,7 +102,7 @@ class _PutTogether(torch.autograd.Function):
     def backward(ctx: Any, v_image: Tensor, v_whole: Tensor) -> tuple[Tensor | None, ...]:
         values, alpha, firsts, before = ctx.saved_tensors
         v_values, v_alpha = torch.empty_like(values), torch.empty_like(alpha)
-        _pull_apart[(len(firsts) - 1,)](
+        _composite_backward[(len(firsts) - 1,)](
             values, alpha, firsts, before, v_image.contiguous(), v_whole.contiguous(), v_values, v_alpha, *ctx.sizes
         )
         return v_values, v_alpha, None, None, None, None
@@ -108,7 +111,7 @@ class _PutTogether(torch.autograd.Function):
 @triton.jit(do_not_specialize=["tiles"])
 @no_type_check
 def _count_chunks(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.constexpr):
-    """The first chunk of every tile, and behind them how many chunks there are."""
+    """Writes the first chunk of every tile, and after them the number of chunks."""
     found = 0
     for begin in range(0, tiles, BLOCK):
         tile = begin + tl.arange(0, BLOCK)
@@ -122,69 +125,69 @@ def _count_chunks(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.conste
 
 @triton.jit(do_not_specialize=["tiles", "per_camera", "across", "steps"])
 @no_type_check
-def _take_apart(
-    means, conics, values, opacities, ids, order, offsets, firsts, means_apart, conics_apart, values_apart,
-    opacities_apart, starts, there, tiles, per_camera, across, steps, CHANNELS: tl.constexpr, LENGTH: tl.constexpr,
+def _split(
+    means, conics, values, opacities, ids, order, offsets, firsts, means_copies, conics_copies, values_copies,
+    opacities_copies, starts, exists, tiles, per_camera, across, steps, CHANNELS: tl.constexpr, LENGTH: tl.constexpr,
 ):  # fmt: skip
-    """The Gaussians of a chunk; a chunk that there is not starts where all end."""
+    """Copies the Gaussians of a chunk. Chunks beyond the last one are empty and start at the end of all entries."""
     chunk = tl.program_id(0)
     is_one = chunk < tl.load(firsts + tiles)
     low, high = 0, tiles
-    for _ in range(steps):  # the last tile whose first chunk is not behind this one
+    for _ in range(steps):  # finds the last tile whose first chunk is not after this one
         middle = (low + high) // 2
         behind = tl.load(firsts + middle) <= chunk
         low, high = tl.where(behind, middle, low), tl.where(behind, high, middle)
     start = tl.load(offsets + low) + (chunk - tl.load(firsts + low)) * LENGTH
     start = tl.where(is_one, start, tl.load(offsets + tiles))
     tl.store(starts + chunk, start)
-    tl.store(there + chunk, is_one)
+    tl.store(exists + chunk, is_one)
     place = start.to(tl.int64) + tl.arange(0, LENGTH)
     inside = is_one & (place < tl.load(offsets + low + 1))
     i = tl.load(ids + tl.load(order + place, mask=inside, other=0), mask=inside, other=0).to(tl.int64)
     left, top = (low % per_camera) % across * TILE, (low % per_camera) // across * TILE
-    tl.store(means_apart + 2 * place, tl.load(means + 2 * i, mask=inside, other=0.0) - left, mask=inside)
-    tl.store(means_apart + 2 * place + 1, tl.load(means + 2 * i + 1, mask=inside, other=0.0) - top, mask=inside)
+    tl.store(means_copies + 2 * place, tl.load(means + 2 * i, mask=inside, other=0.0) - left, mask=inside)
+    tl.store(means_copies + 2 * place + 1, tl.load(means + 2 * i + 1, mask=inside, other=0.0) - top, mask=inside)
     for k in tl.static_range(3):
-        tl.store(conics_apart + 3 * place + k, tl.load(conics + 3 * i + k, mask=inside, other=0.0), mask=inside)
+        tl.store(conics_copies + 3 * place + k, tl.load(conics + 3 * i + k, mask=inside, other=0.0), mask=inside)
     for k in tl.static_range(CHANNELS):
         value = tl.load(values + CHANNELS * i + k, mask=inside, other=0.0)
-        tl.store(values_apart + CHANNELS * place + k, value, mask=inside)
-    tl.store(opacities_apart + place, tl.load(opacities + i, mask=inside, other=0.0), mask=inside)
+        tl.store(values_copies + CHANNELS * place + k, value, mask=inside)
+    tl.store(opacities_copies + place, tl.load(opacities + i, mask=inside, other=0.0), mask=inside)
 
 
 @triton.jit
 @no_type_check
 def _add(total, value, inside):
-    """Adds what is not 0."""
+    """Adds values other than 0."""
     tl.atomic_add(total, value, mask=inside & (value != 0.0), sem="relaxed")
 
 
 @triton.jit(do_not_specialize=["tiles"])
 @no_type_check
-def _add_up(
-    v_means_apart, v_conics_apart, v_values_apart, v_opacities_apart, ids, order, offsets, firsts, starts, v_means,
+def _sum_copies(
+    v_means_copies, v_conics_copies, v_values_copies, v_opacities_copies, ids, order, offsets, firsts, starts, v_means,
     v_conics, v_values, v_opacities, tiles, CHANNELS: tl.constexpr, LENGTH: tl.constexpr,
 ):  # fmt: skip
-    """The gradients of a chunk's Gaussians, added to those of all."""
+    """Adds the gradients of a chunk's copies to those of their Gaussians."""
     chunk = tl.program_id(0)
     is_one = chunk < tl.load(firsts + tiles)
     place = tl.load(starts + chunk).to(tl.int64) + tl.arange(0, LENGTH)
     inside = is_one & (place < tl.load(starts + chunk + 1, mask=is_one, other=0))
     i = tl.load(ids + tl.load(order + place, mask=inside, other=0), mask=inside, other=0).to(tl.int64)
     for k in tl.static_range(2):
-        _add(v_means + 2 * i + k, tl.load(v_means_apart + 2 * place + k, mask=inside, other=0.0), inside)
+        _add(v_means + 2 * i + k, tl.load(v_means_copies + 2 * place + k, mask=inside, other=0.0), inside)
     for k in tl.static_range(3):
-        _add(v_conics + 3 * i + k, tl.load(v_conics_apart + 3 * place + k, mask=inside, other=0.0), inside)
+        _add(v_conics + 3 * i + k, tl.load(v_conics_copies + 3 * place + k, mask=inside, other=0.0), inside)
     for k in tl.static_range(CHANNELS):
-        value = tl.load(v_values_apart + CHANNELS * place + k, mask=inside, other=0.0)
+        value = tl.load(v_values_copies + CHANNELS * place + k, mask=inside, other=0.0)
         _add(v_values + CHANNELS * i + k, value, inside)
-    _add(v_opacities + i, tl.load(v_opacities_apart + place, mask=inside, other=0.0), inside)
+    _add(v_opacities + i, tl.load(v_opacities_copies + place, mask=inside, other=0.0), inside)
 
 
 @triton.jit
 @no_type_check
 def _pixels(tile, width, height, across, per_camera):
-    """The places of a tile's pixels among all cameras', and which of them are in the image."""
+    """The indices of a tile's pixels among those of all cameras, and which of them are in the image."""
     pixel = tl.arange(0, TILE * TILE)
     camera, within = tile // per_camera, tile % per_camera
     x, y = within % across * TILE + pixel % TILE, within // across * TILE + pixel // TILE
@@ -197,7 +200,7 @@ def _composite(
     values, alpha, firsts, before, image, whole, width, height, across, per_camera,
     CHANNELS: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """A tile of the image, and how much light comes through to each of its chunks."""
+    """Composites a tile of the image; writes to `before` the transmittance in front of each of its chunks."""
     tile = tl.program_id(0)
     at, inside = _pixels(tile, width, height, across, per_camera)
     pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
@@ -215,25 +218,25 @@ def _composite(
 
 @triton.jit(do_not_specialize=["width", "height", "across", "per_camera"])
 @no_type_check
-def _pull_apart(
+def _composite_backward(
     values, alpha, firsts, before, v_image, v_whole, v_values, v_alpha, width, height, across, per_camera,
     CHANNELS: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """The gradients of a tile's chunks, from the last to the first."""
+    """Writes the gradients of a tile's chunks, from the last to the first."""
     tile = tl.program_id(0)
     at, inside = _pixels(tile, width, height, across, per_camera)
     pixel, channel = tl.arange(0, TILE * TILE).to(tl.int64), tl.arange(0, WIDTH)
-    there = (channel < CHANNELS)[None, :]
-    pull = tl.load(v_image + at[:, None] * CHANNELS + channel, mask=inside[:, None] & there, other=0.0)
-    pull_alpha = tl.load(v_whole + at, mask=inside, other=0.0)
+    valid = (channel < CHANNELS)[None, :]
+    v_pixel = tl.load(v_image + at[:, None] * CHANNELS + channel, mask=inside[:, None] & valid, other=0.0)
+    v_pixel_alpha = tl.load(v_whole + at, mask=inside, other=0.0)
     passes = tl.full((TILE * TILE,), 1.0, tl.float32)
     behind = tl.zeros((TILE * TILE, WIDTH), tl.float32)
     first, last = tl.load(firsts + tile), tl.load(firsts + tile + 1)
     for step in range(last - first):
         own = (last - 1 - step) * TILE * TILE + pixel
         reaches, left = tl.load(before + own), 1.0 - tl.load(alpha + own)
-        tl.store(v_values + own[:, None] * CHANNELS + channel, reaches[:, None] * pull, mask=there)
-        tl.store(v_alpha + own, reaches * (pull_alpha * passes - tl.sum(pull * behind, 1)))
-        shown = tl.load(values + own[:, None] * CHANNELS + channel, mask=there, other=0.0)
+        tl.store(v_values + own[:, None] * CHANNELS + channel, reaches[:, None] * v_pixel, mask=valid)
+        tl.store(v_alpha + own, reaches * (v_pixel_alpha * passes - tl.sum(v_pixel * behind, 1)))
+        shown = tl.load(values + own[:, None] * CHANNELS + channel, mask=valid, other=0.0)
         behind = shown + left[:, None] * behind
         passes *= left

@@ -13,7 +13,7 @@ from typing import Any
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.free_disk import free_bytes
 from drivesplat.io.storage import sha256_file
-from drivesplat.kernels import triton as on_gpu
+from drivesplat.kernels import triton_support
 from drivesplat.machine.compute_capability import Capability
 from drivesplat.machine.doctor.torch_builds import Gpu, read_gpus
 from drivesplat.machine.gsplat_build.diagnose import missing_prerequisite
@@ -116,7 +116,7 @@ def gather(root: Path, config_files: Sequence[Path]) -> Facts:
         backbone_sha256=sha256_file(root / BACKBONE) if (root / BACKBONE).is_file() else None,
         backbone_failure=_backbone_failure(root),
         ffmpeg=_ffmpeg(),
-        triton_problem=on_gpu.problem() if torch and torch.gpu else None,
+        triton_problem=triton_support.problem() if torch and torch.gpu else None,
         uncached_modules=_uncached_modules(),
     )
 

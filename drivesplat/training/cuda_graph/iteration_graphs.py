@@ -14,9 +14,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from drivesplat.kernels import capacity as rooms
-from drivesplat.kernels import triton as on_gpu
-from drivesplat.kernels.cuda_graphs import Graph, Pool, captured, fresh_pool
+from drivesplat.kernels import capacity
+from drivesplat.kernels.cuda_graphs import CudaGraph, MemoryPool, capture, graphs_supported, new_pool
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
 
@@ -40,8 +39,7 @@ def can_capture(settings: TrainSettings, images: TrainingImages, device: torch.d
     """Whether iterations can and shall be captured. Densification by gradient reads intermediate results of an
     iteration; class logits have too many values for lists of planned capacity."""
     wanted = settings.cuda_graphs and settings.strategy == "mcmc" and len(images.views) <= MAX_IMAGES
-    possible = device.type == "cuda" and on_gpu.compiles()
-    return wanted and possible and all(view.classes is None for view in images.views)
+    return wanted and graphs_supported(device) and all(view.classes is None for view in images.views)
 
 
 @dataclass
@@ -53,9 +51,9 @@ class IterationGraphs:
     _layout: Hashable = None
     _needs: dict[Hashable, list[float]] = field(default_factory=dict)
     """By image, the entries per Gaussian that each of its lists last needed."""
-    _graphs: dict[Hashable, Graph[Terms]] = field(default_factory=dict)
+    _graphs: dict[Hashable, CudaGraph[Terms]] = field(default_factory=dict)
     _count: int = 1
-    _pool: Pool | None = None
+    _pool: MemoryPool | None = None
 
     def run(self, image: Hashable, layout: Hashable, gaussians: GaussianCount, iteration: Callable[[], Terms]) -> Terms:
         """Runs an iteration with an image, by its graph where there is one. Graphs are invalid once `layout`
@@ -70,7 +68,7 @@ class IterationGraphs:
         if graph is None and image in self._needs:
             graph = self._capture(image, self._count * gaussians.headroom, iteration)
         if graph is None:
-            with rooms.counted() as needs:
+            with capacity.exact() as needs:
                 terms = self.retry_without_graphs(iteration)
             self._needs[image] = [need / self._count for need in needs]
             return terms
@@ -122,12 +120,12 @@ class IterationGraphs:
         self._graphs.clear()
         self._pool = None
 
-    def _capture(self, image: Hashable, gaussians: float, iteration: Callable[[], Terms]) -> Graph[Terms] | None:
+    def _capture(self, image: Hashable, gaussians: float, iteration: Callable[[], Terms]) -> CudaGraph[Terms] | None:
         """The graph of an iteration with lists for so many Gaussians; the capture does not run it. Where the GPU or its
         driver refuses, returns None and disables graphs."""
-        self._pool = self._pool or fresh_pool()
+        self._pool = self._pool or new_pool()
         expected = [int(need * gaussians) for need in self._needs[image]]
-        graph = captured(iteration, expected, self._pool, self.device, "iterations")
+        graph = capture(iteration, expected, self._pool, self.device, "iterations")
         if graph is None:
             self._disable()
         else:

@@ -6,10 +6,11 @@ gradient, and is moved neither by Adam nor by the noise of MCMC.
 """
 
 import torch
-from gsplat.strategy import ops
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from drivesplat.kernels import gsplat_private
+from drivesplat.kernels.relocation import relocation
 from drivesplat.model.part import Part
 from drivesplat.training.optimizers import Optimizers
 
@@ -31,7 +32,7 @@ def reserve_rows(part: Part, optimizers: Optimizers, rows: int) -> None:
     def unmoved(_: str, moments: Tensor) -> Tensor:
         return torch.cat([moments, moments.new_zeros(more, *moments.shape[1:])])
 
-    ops._update_param_with_optimizer(longer, unmoved, part.params, optimizers)
+    gsplat_private.update_parameters(longer, unmoved, part.params, optimizers)
     part.preallocated = rows - active
 
 
@@ -43,7 +44,7 @@ def release_rows(part: Part, optimizers: Optimizers) -> None:
     def shorter(_: str, values: Tensor) -> nn.Parameter:
         return nn.Parameter(values[:active].clone(), requires_grad=values.requires_grad)
 
-    ops._update_param_with_optimizer(shorter, lambda _, moments: moments[:active].clone(), part.params, optimizers)
+    gsplat_private.update_parameters(shorter, lambda _, moments: moments[:active].clone(), part.params, optimizers)
     part.preallocated = 0
 
 
@@ -53,9 +54,9 @@ def activate(part: Part, count: int, binoms: Float[Tensor, "n_max n_max"], min_o
     drawn by opacity, and both together look as that one did (Kheradmand et al. 2024, equation 9)."""
     params, active = part.params, len(part)
     opacities, scales = torch.sigmoid(params["opacities"][:active]), torch.exp(params["scales"][:active])
-    drawn = ops._multinomial_sample(opacities, count)
+    drawn = gsplat_private.sample_rows(opacities, count)
     times = torch.bincount(drawn)[drawn] + 1
-    opacities, scales = ops.compute_relocation(opacities[drawn], scales[drawn], times, binoms)
+    opacities, scales = relocation(opacities[drawn], scales[drawn], times, binoms)
     most = 1.0 - torch.finfo(torch.float32).eps
     params["opacities"][drawn] = torch.logit(opacities.clamp(min_opacity, most))
     params["scales"][drawn] = torch.log(scales)

@@ -1,5 +1,4 @@
-"""Structural similarity and its gradient: OpenCV's separable filter for the windows, and a compiled kernel for what is
-done pixel by pixel."""
+"""Structural similarity and its gradient: OpenCV computes local means, a compiled kernel the rest."""
 
 from typing import Any, no_type_check
 
@@ -14,15 +13,15 @@ from drivesplat.kernels.cache import kernel
 from drivesplat.kernels.numba.threads import parallel_for
 
 ROWS = 16
-"""Rows of an image a piece."""
+"""Rows of an image per chunk."""
 
 
 class Similarity(torch.autograd.Function):
-    """The mean similarity of an image to a target, both (h, w, 3), with the gradient of `image` alone; `taps` of the
+    """The mean similarity of an image to a target, both (h, w, 3), with gradients for `image` only; `taps` of the
     window along each axis, and the two constants that keep it finite.
 
-    The window is symmetric and zero-padded, so that it is its own adjoint: the gradient is the sum of three filtered
-    maps, of what the similarity changes by with the local means of x, x² and xy.
+    The window is symmetric and zero-padded, hence its own adjoint: the gradient is the sum of three filtered maps, the
+    derivatives of the similarity by the local means of x, x² and xy.
     """
 
     @staticmethod
@@ -47,14 +46,14 @@ class Similarity(torch.autograd.Function):
 
 
 def _windowed(values: np.ndarray, taps: np.ndarray) -> np.ndarray:
-    """Local means (h, w, 3), beyond whose border there is nothing."""
+    """Local means (h, w, 3), zero-padded."""
     return cv2.sepFilter2D(values, -1, taps, taps, borderType=cv2.BORDER_CONSTANT)
 
 
 @kernel
 @no_type_check
 def _similarity(start, stop, mean_x, mean_y, mean_xx, mean_yy, mean_xy, by_x, by_xx, by_xy, sums, c1, c2):
-    """Rows `start` to `stop` of the similarity, summed, and what it changes by with three of the local means."""
+    """Sums the similarity over rows `start` to `stop`, and writes its derivatives by three of the local means."""
     total = 0.0
     for row in range(start, stop):
         for column in range(mean_x.shape[1]):

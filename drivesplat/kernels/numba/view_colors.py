@@ -1,4 +1,4 @@
-"""Colours from spherical harmonics, and their gradients.
+"""Colors from spherical harmonics, and their gradients.
 
 The real basis up to degree 3 with the signs of Kerbl et al. 2023; see Sloan, "Efficient Spherical Harmonic Evaluation"
 (JCGT 2013). Arithmetic and `no_type_check`: as in projection.py.
@@ -18,8 +18,8 @@ from drivesplat.kernels.numba.projection import arrays
 from drivesplat.kernels.numba.threads import parallel_for
 
 MAX_DEGREE = 3
-GRAIN = 2048
-"""Gaussians a piece; the sums over Gaussians are made piece by piece."""
+CHUNK = 2048
+"""Gaussians per chunk; sums over Gaussians are made chunk by chunk."""
 
 C0 = 0.5 / math.sqrt(math.pi)
 C1 = math.sqrt(3.0 / (4.0 * math.pi))
@@ -32,9 +32,9 @@ C30 = math.sqrt(7.0 / (16.0 * math.pi))
 
 
 class ViewColors(torch.autograd.Function):
-    """The colours (c, n, 3) that Gaussians with coefficients (n, k, 3) show towards each camera, at least 0.
+    """The colors (c, n, 3), at least 0, that each camera sees of Gaussians with coefficients (n, k, 3).
 
-    Gaussians with radius 0 are out of view; their colours are 0.
+    Gaussians with radius 0 are out of view; their colors are 0.
     """
 
     @staticmethod
@@ -50,7 +50,7 @@ class ViewColors(torch.autograd.Function):
         inputs = arrays(means, coefficients)
         for c in range(len(viewmats)):
             parallel_for(
-                _view_colors, len(means), GRAIN, *inputs, _center(viewmats[c]), *arrays(radii[c], colors[c]), degree
+                _view_colors, len(means), CHUNK, *inputs, _center(viewmats[c]), *arrays(radii[c], colors[c]), degree
             )
         ctx.save_for_backward(means, coefficients, viewmats, radii)
         ctx.degree = degree
@@ -65,9 +65,9 @@ class ViewColors(torch.autograd.Function):
         v_coefficients = torch.zeros_like(coefficients, memory_format=torch.contiguous_format)
         v_viewmats = torch.zeros_like(viewmats, memory_format=torch.contiguous_format)
         for c in range(len(viewmats)):
-            sums = np.zeros((-(-len(means) // GRAIN), 3))
+            sums = np.zeros((-(-len(means) // CHUNK), 3))
             parallel_for(
-                _view_colors_backward, len(means), GRAIN,
+                _view_colors_backward, len(means), CHUNK,
                 *inputs, _center(viewmats[c]), *arrays(radii[c], v_colors[c], v_means, v_coefficients),
                 sums, ctx.degree,
             )  # fmt: skip
@@ -160,7 +160,7 @@ def _view_colors(start, stop, means, coefficients, center, radii, colors, degree
 def _view_colors_backward(
     start, stop, means, coefficients, center, radii, v_colors, v_means, v_coefficients, v_center, degree
 ):
-    """Adds to `v_means` and `v_coefficients`; writes this piece's sum of the gradients of mean - center."""
+    """Adds to `v_means` and `v_coefficients`; writes this chunk's sum of the gradients of mean - center."""
     basis, v_basis, used = np.empty(16), np.empty(16), (degree + 1) ** 2
     sum_x, sum_y, sum_z = 0.0, 0.0, 0.0
     for g in range(start, stop):
@@ -171,7 +171,7 @@ def _view_colors_backward(
         x, y, z, distance = _direction(means[g], center)
         _basis(degree, x, y, z, basis)
         red, green, blue = _color(basis, used, coefficients[g])
-        v_red = float(v_colors[g, 0]) if red >= 0.0 else 0.0  # a black point's colour is exactly 0, and can brighten
+        v_red = float(v_colors[g, 0]) if red >= 0.0 else 0.0  # a black point's color is exactly 0, and can increase
         v_green = float(v_colors[g, 1]) if green >= 0.0 else 0.0
         v_blue = float(v_colors[g, 2]) if blue >= 0.0 else 0.0
         for k in range(used):
@@ -189,4 +189,4 @@ def _view_colors_backward(
         sum_x += v_x
         sum_y += v_y
         sum_z += v_z
-    v_center[start // GRAIN, 0], v_center[start // GRAIN, 1], v_center[start // GRAIN, 2] = sum_x, sum_y, sum_z
+    v_center[start // CHUNK, 0], v_center[start // CHUNK, 1], v_center[start // CHUNK, 2] = sum_x, sum_y, sum_z

@@ -1,54 +1,37 @@
-"""The sky's cube map behind an image, in one pass, and its gradient in another: rays, faces, texels and blending."""
+"""An image over a cube map in one pass, and its gradient in another: rays, faces, texels and blending."""
 
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, no_type_check
 
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 BLOCK = 256
-"""Pixels a program."""
-HARDLY_SEEN = tl.constexpr(1e-3)
-"""Where less than this comes through to the sky, it learns nothing: all that is opaque lets a trace of it through."""
+"""Pixels per program."""
+MIN_TRANSMITTANCE = tl.constexpr(1e-3)
+"""Texels get no gradient from pixels with less: every opaque surface lets a trace of the background through."""
 RUN = tl.constexpr(4)
-"""Neighbouring pixels that most often look at the same texels."""
+"""Neighbouring pixels that mostly see the same texels."""
 
 
-class Cube(NamedTuple):
-    """A cube map: `texels` (n, 3), logits of colours, and for every texel of a face (face, v, u) which one it is."""
+class OverCubeMap(torch.autograd.Function):
+    """`drivesplat.kernels.cube_map.over_cube_map`, without gradient for the camera."""
 
-    texels: Float[Tensor, "n 3"]
-    index: Int[Tensor, "6 r r"]
-
-
-def before_cube(
-    splats: Float[Tensor, "h w 3"],
-    alpha: Float[Tensor, "h w 1"],
-    cube: Cube,
-    K: Float[Tensor, "3 3"],
-    camera_to_world: Float[Tensor, "4 4"],
-) -> Float[Tensor, "h w 3"]:
-    """`splats` (premultiplied by `alpha`) before the sky that a pinhole camera sees; there is no gradient for it."""
-    return _BeforeCube.apply(splats, alpha, cube.texels, cube.index, K, camera_to_world)
-
-
-class _BeforeCube(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, splats: Tensor, alpha: Tensor, texels: Tensor, index: Tensor, K: Tensor, camera_to_world: Tensor
+        ctx: Any, image: Tensor, alpha: Tensor, texels: Tensor, index: Tensor, K: Tensor, camera_to_world: Tensor
     ) -> Tensor:
         camera = K.contiguous(), camera_to_world.contiguous()
-        splats, alpha = splats.contiguous(), alpha.contiguous()
-        image = torch.empty_like(splats)
+        image, alpha = image.contiguous(), alpha.contiguous()
+        blended = torch.empty_like(image)
         pixels = alpha.numel()
         _blend[(triton.cdiv(pixels, BLOCK),)](
-            splats, alpha, texels, index, *camera, image, pixels, splats.shape[1], index.shape[1], BLOCK
+            image, alpha, texels, index, *camera, blended, pixels, image.shape[1], index.shape[1], BLOCK
         )
         ctx.save_for_backward(alpha, texels, index, *camera)
-        return image
+        return blended
 
     @staticmethod
     @once_differentiable
@@ -66,7 +49,7 @@ class _BeforeCube(torch.autograd.Function):
 @triton.jit
 @no_type_check
 def _ray(K, camera_to_world, pixel, width):
-    """The directions of pixels' centres in the world, of any length."""
+    """World directions of the pixels' centres, not normalized."""
     x = ((pixel % width).to(tl.float32) + 0.5 - tl.load(K + 2)) / tl.load(K)
     y = ((pixel // width).to(tl.float32) + 0.5 - tl.load(K + 5)) / tl.load(K + 4)
     pose = camera_to_world
@@ -79,7 +62,8 @@ def _ray(K, camera_to_world, pixel, width):
 @triton.jit
 @no_type_check
 def _corners(index, K, camera_to_world, pixel, width, resolution, inside):
-    """The four texels around where pixels look, and how far it is from the first one along each edge of the face."""
+    """The four texels around the points that pixels see, and the offsets from the first one along both edges of the
+    face."""
     ray_x, ray_y, ray_z = _ray(K, camera_to_world, pixel, width)
     far_x, far_y, far_z = tl.abs(ray_x), tl.abs(ray_y), tl.abs(ray_z)
     on_x = (far_x >= far_y) & (far_x >= far_z)
@@ -104,7 +88,7 @@ def _corners(index, K, camera_to_world, pixel, width, resolution, inside):
 @triton.jit
 @no_type_check
 def _color(texels, channel, texel_00, texel_01, texel_10, texel_11, part_u, part_v, inside):
-    """One channel of the sky."""
+    """One channel of the cube map's color, interpolated."""
     above = (1.0 - part_u) * tl.load(texels + 3 * texel_00 + channel, mask=inside, other=0.0)
     above += part_u * tl.load(texels + 3 * texel_01 + channel, mask=inside, other=0.0)
     below = (1.0 - part_u) * tl.load(texels + 3 * texel_10 + channel, mask=inside, other=0.0)
@@ -114,32 +98,31 @@ def _color(texels, channel, texel_00, texel_01, texel_10, texel_11, part_u, part
 
 @triton.jit(do_not_specialize=["pixels", "width"])
 @no_type_check
-def _blend(splats, alpha, texels, index, K, camera_to_world, image, pixels, width, resolution, BLOCK: tl.constexpr):
-    """The image."""
+def _blend(image, alpha, texels, index, K, camera_to_world, blended, pixels, width, resolution, BLOCK: tl.constexpr):
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < pixels
     a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, pixel, width, resolution, inside)
     left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
     for channel in tl.static_range(3):
         sky = _color(texels, channel, a, b, c, d, part_u, part_v, inside)
-        before = tl.load(splats + 3 * pixel + channel, mask=inside, other=0.0)
-        tl.store(image + 3 * pixel + channel, before + left * sky, mask=inside)
+        front = tl.load(image + 3 * pixel + channel, mask=inside, other=0.0)
+        tl.store(blended + 3 * pixel + channel, front + left * sky, mask=inside)
 
 
 @triton.jit
 @no_type_check
 def _alike(texel, BLOCK: tl.constexpr):
-    """Of which runs of pixels all look at the same texel."""
+    """The runs of pixels that all see the same texel."""
     runs = tl.reshape(texel, (BLOCK // RUN, RUN))
     return tl.max(runs, 1) == tl.min(runs, 1)
 
 
 @triton.jit
 @no_type_check
-def _add(place, value, seen, alike, BLOCK: tl.constexpr):
-    """Adds values up where their texels' gradients are, those of a run that is alike together: hardly any place has to
-    take more than a few."""
-    value = tl.where(seen, value, 0.0)
+def _add(place, value, visible, alike, BLOCK: tl.constexpr):
+    """Adds values to their texels' gradients, one sum for each run that sees the same texel: fewer atomic additions to
+    one place."""
+    value = tl.where(visible, value, 0.0)
     together = tl.sum(tl.reshape(value, (BLOCK // RUN, RUN)), 1)
     first = tl.min(tl.reshape(place.to(tl.int64), (BLOCK // RUN, RUN)), 1).to(place.dtype)
     tl.atomic_add(first, together, mask=alike & (together != 0.0), sem="relaxed")
@@ -152,21 +135,21 @@ def _add(place, value, seen, alike, BLOCK: tl.constexpr):
 def _gradients(
     v_image, alpha, texels, index, K, camera_to_world, v_alpha, v_texels, pixels, width, resolution, BLOCK: tl.constexpr
 ):
-    """Those of alpha, and those of texels, added up."""
+    """The gradients of alpha, and the sums of those of texels."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < pixels
     a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, pixel, width, resolution, inside)
     left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
     hidden = tl.zeros((BLOCK,), tl.float32)
-    seen = inside & (left > HARDLY_SEEN)
+    visible = inside & (left > MIN_TRANSMITTANCE)
     alike = _alike(a, BLOCK) & _alike(b, BLOCK) & _alike(c, BLOCK) & _alike(d, BLOCK)
     for channel in tl.static_range(3):
         sky = _color(texels, channel, a, b, c, d, part_u, part_v, inside)
         by_pixel = tl.load(v_image + 3 * pixel + channel, mask=inside, other=0.0)
         hidden += by_pixel * sky
         by_logit = by_pixel * left * sky * (1.0 - sky)
-        _add(v_texels + 3 * a + channel, by_logit * (1.0 - part_u) * (1.0 - part_v), seen, alike, BLOCK)
-        _add(v_texels + 3 * b + channel, by_logit * part_u * (1.0 - part_v), seen, alike, BLOCK)
-        _add(v_texels + 3 * c + channel, by_logit * (1.0 - part_u) * part_v, seen, alike, BLOCK)
-        _add(v_texels + 3 * d + channel, by_logit * part_u * part_v, seen, alike, BLOCK)
+        _add(v_texels + 3 * a + channel, by_logit * (1.0 - part_u) * (1.0 - part_v), visible, alike, BLOCK)
+        _add(v_texels + 3 * b + channel, by_logit * part_u * (1.0 - part_v), visible, alike, BLOCK)
+        _add(v_texels + 3 * c + channel, by_logit * (1.0 - part_u) * part_v, visible, alike, BLOCK)
+        _add(v_texels + 3 * d + channel, by_logit * part_u * part_v, visible, alike, BLOCK)
     tl.store(v_alpha + pixel, -hidden, mask=inside)

@@ -1,27 +1,20 @@
-"""The means that MCMC's regularisers hold down, of opacities and of scales, in one pass over all Gaussians."""
+"""The mean opacity and scale of Gaussians in one pass, and their gradients in another."""
 
 from typing import Any, no_type_check
 
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 BLOCK = 1024
-"""Gaussians a program."""
+"""Gaussians per program."""
 
 
-def mean_opacity_and_scale(
-    opacities: Float[Tensor, " n"], scales: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """The mean of `opacities`, and that of all `scales` with 0 for those of Gaussians that are not there, of opacity
-    0."""
-    return _Means.apply(opacities, scales)
+class MeanOpacityAndScale(torch.autograd.Function):
+    """`drivesplat.kernels.regularizers.mean_opacity_and_scale`, of at least one Gaussian."""
 
-
-class _Means(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, opacities: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
         opacities, scales, count = opacities.contiguous(), scales.contiguous(), len(opacities)
@@ -45,13 +38,13 @@ class _Means(torch.autograd.Function):
 @triton.jit(do_not_specialize=["count"])
 @no_type_check
 def _sums(opacities, scales, partial, count, BLOCK: tl.constexpr):
-    """A block's sums of opacities, and of the scales of what is there."""
+    """A block's sums of opacities, and of the scales of Gaussians with an opacity."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     opacity = tl.load(opacities + i, mask=i < count, other=0.0)
-    there = opacity > 0.0
-    length = tl.load(scales + 3 * i, mask=there, other=0.0)
-    length += tl.load(scales + 3 * i + 1, mask=there, other=0.0)
-    length += tl.load(scales + 3 * i + 2, mask=there, other=0.0)
+    present = opacity > 0.0
+    length = tl.load(scales + 3 * i, mask=present, other=0.0)
+    length += tl.load(scales + 3 * i + 1, mask=present, other=0.0)
+    length += tl.load(scales + 3 * i + 2, mask=present, other=0.0)
     tl.store(partial + tl.program_id(0), tl.sum(opacity))
     tl.store(partial + tl.num_programs(0) + tl.program_id(0), tl.sum(length))
 
@@ -59,12 +52,12 @@ def _sums(opacities, scales, partial, count, BLOCK: tl.constexpr):
 @triton.jit(do_not_specialize=["count"])
 @no_type_check
 def _spread(opacities, v_opacity, v_scale, v_opacities, v_scales, count, BLOCK: tl.constexpr):
-    """The gradients of both means."""
+    """Writes the gradients of opacities and scales."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < count
-    there = tl.load(opacities + i, mask=inside, other=0.0) > 0.0
+    present = tl.load(opacities + i, mask=inside, other=0.0) > 0.0
     by_opacity = tl.load(v_opacity) / count
-    by_scale = tl.where(there, tl.load(v_scale) / (3.0 * count), 0.0)
+    by_scale = tl.where(present, tl.load(v_scale) / (3.0 * count), 0.0)
     tl.store(v_opacities + i, tl.full((BLOCK,), 1.0, tl.float32) * by_opacity, mask=inside)
     for axis in tl.static_range(3):
         tl.store(v_scales + 3 * i + axis, by_scale, mask=inside)

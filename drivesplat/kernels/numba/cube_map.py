@@ -8,11 +8,11 @@ from drivesplat.kernels.cache import kernel
 from drivesplat.kernels.numba.threads import parallel_for
 
 ROWS = 16
-"""Rows of an image a piece."""
+"""Rows of an image per chunk."""
 
 
-def face_coordinates_of(rays: np.ndarray) -> np.ndarray:
-    """`drivesplat.model.sky.face_coordinates` of directions (h, w, 3), in one pass."""
+def face_coordinates(rays: np.ndarray) -> np.ndarray:
+    """`drivesplat.kernels.cube_map.face_coordinates` of directions (h, w, 3), in one pass."""
     coordinates = np.empty_like(rays)
     parallel_for(_face_coordinates, len(rays), ROWS, rays, coordinates)
     return coordinates
@@ -21,7 +21,7 @@ def face_coordinates_of(rays: np.ndarray) -> np.ndarray:
 @kernel
 @no_type_check
 def _face_coordinates(start, stop, rays, coordinates):
-    """Rows `start` to `stop` of directions."""
+    """Processes rows `start` to `stop` of directions."""
     for row in range(start, stop):
         for column in range(rays.shape[1]):
             ray = rays[row, column]

@@ -1,4 +1,4 @@
-"""The structural similarity that trainings are held to (Wang et al. 2004), as 3DGS trains with: 11 Gaussian taps, sigma
+"""The structural similarity of the training loss (Wang et al. 2004), as in 3DGS: an 11-tap Gaussian window with sigma
 1.5, data range 1, zero-padded."""
 
 import numpy as np
@@ -13,16 +13,16 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """The mean of the similarity over pixels and channels, with gradients for `image`; for `target` on a GPU alone."""
+    """The mean similarity over pixels and channels. Gradients reach `image`, and on a GPU also `target`."""
     if image.device.type != "cpu":
         return ssim_in_torch(image, target)
-    from drivesplat.kernels.numba.similarity import Similarity
+    from drivesplat.kernels.numba.ssim import Similarity
 
-    return Similarity.apply(image, target, weights(), C1, C2)
+    return Similarity.apply(image, target, window_taps(), C1, C2)
 
 
 def ssim_in_torch(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """The same by torch's convolutions, on any device: what the other is held to."""
+    """The same by torch's convolutions, on any device: the reference for the compiled form."""
     offsets = torch.arange(TAPS, device=image.device, dtype=image.dtype) - TAPS // 2
     taps = torch.softmax(-(offsets**2) / (2 * SIGMA**2), dim=0)
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
@@ -37,7 +37,7 @@ def ssim_in_torch(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"])
     ).mean()
 
 
-def weights() -> np.ndarray:
-    """The taps (11,), which sum to 1."""
+def window_taps() -> np.ndarray:
+    """The taps (11,) of the window along one axis; their sum is 1."""
     taps = np.exp(-((np.arange(TAPS) - TAPS // 2) ** 2) / (2 * SIGMA**2))
     return taps / taps.sum()

@@ -1,4 +1,4 @@
-"""The readable rasterizer in plain torch: what the others are held to, and what small scenes train with on a CPU.
+"""A readable rasterizer in plain torch, with which the others are compared.
 
 Projection and spherical harmonics are gsplat's own torch implementations; compositing follows Kerbl et al. 2023, with
 gsplat's cut-offs: alpha at most 0.999, contributions under 1/255 dropped, a ray ends before its transmittance reaches
@@ -9,7 +9,6 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
-from drivesplat.errors import ConfigError
 from drivesplat.rasterization.rendering import Rendering, assembled
 
 MAX_ALPHA = 0.999
@@ -23,14 +22,9 @@ EPS2D = 0.3
 
 def rasterize_reference(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, *, sh_degree: int | None, antialiased: bool, absgrad: bool, with_depth: bool,
+    width: int, height: int, *, sh_degree: int | None = None, antialiased: bool = False, with_depth: bool = False,
 ) -> Rendering:  # fmt: skip
-    """See `drivesplat.rasterization.rasterize`.
-
-    Works in float32 and float64; autograd gives every gradient but `absgrad`.
-    """
-    if absgrad:
-        raise ConfigError("the reference rasterizer has no absolute gradients: set train.default.absgrad: false")
+    """As `drivesplat.rasterization.rasterize`, in float32 and float64; autograd gives every gradient but `absgrad`."""
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_covar=True, compute_preci=False)
     projected = [_project(means, covars, viewmat, k, width, height) for viewmat, k in zip(viewmats, Ks, strict=True)]
     radii, means2d, depths, conics = (torch.stack(values) for values in zip(*projected, strict=True))
@@ -56,13 +50,13 @@ def rasterize_reference(
 def _project(means: Tensor, covars: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, ...]:
     """Radii (n, 2), means (n, 2), depths (n,) and conics (n, 3) of Gaussians in one image.
 
-    What is not before the camera stands in at a harmless place, out of reach of gradients, with radius 0.
+    Gaussians behind the near plane are replaced by a harmless one without gradient, and get radius 0.
     """
-    ahead = means.detach() @ viewmat[2, :3] + viewmat[2, 3] > NEAR_PLANE
+    in_front = means.detach() @ viewmat[2, :3] + viewmat[2, 3] > NEAR_PLANE
     before_camera = viewmat[:3, :3].T @ (torch.tensor([0.0, 0.0, 1.0]).to(means) - viewmat[:3, 3])
-    safe = torch.where(ahead[:, None], means, before_camera)
+    safe = torch.where(in_front[:, None], means, before_camera)
     radii, means2d, depths, conics, _ = _fully_fused_projection(safe, covars, viewmat[None], K[None], width, height)
-    return radii[0] * ahead[:, None], means2d[0], depths[0], conics[0]
+    return radii[0] * in_front[:, None], means2d[0], depths[0], conics[0]
 
 
 def _compensation(conics: Tensor) -> Tensor:

@@ -1,0 +1,23 @@
+"""One step of Adam (Kingma and Ba 2015, algorithm 1)."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.kernels import torch_private, triton_support
+
+
+def adam_step(
+    parameter: Float[Tensor, "*n"],
+    state: dict[str, Tensor],
+    rate: float | Float[Tensor, ""],
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """Updates a parameter by its gradient, as torch.optim.Adam does with its `state`, whose step is already
+    incremented. A `rate` that is a tensor is read on the device, without host synchronisation."""
+    if isinstance(rate, Tensor) and triton_support.usable_for(parameter):
+        from drivesplat.kernels.triton.adam import adam_step as fused_step
+
+        fused_step(parameter, parameter.grad, state, rate, betas, eps)
+    else:
+        torch_private.fused_adam_step(parameter, parameter.grad, state, rate, betas, eps)

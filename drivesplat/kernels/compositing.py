@@ -1,0 +1,43 @@
+"""Alpha compositing of projected Gaussians, front to back (Kerbl et al. 2023)."""
+
+import math
+
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.kernels import triton_support
+from drivesplat.kernels.projection import ProjectedGaussians
+
+TILE = 16
+"""Edge of gsplat's tiles in pixels."""
+
+
+def composite(
+    gaussians: ProjectedGaussians, values: Float[Tensor, "c n v"], width: int, height: int, absgrad: bool
+) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w 1"]]:
+    """Images of the Gaussians' `values`, premultiplied by alpha, and alpha.
+
+    With `absgrad` the backward pass leaves the sums over pixels of the absolute gradients of `means2d` in
+    `means2d.absgrad`. Runs gsplat on a GPU, numba elsewhere. Where Triton compiles, long lists of Gaussians are cut
+    into chunks, so that no tile waits for the longest one.
+    """
+    means2d, depths, conics, radii, opacities = gaussians
+    if not means2d.is_cuda:
+        from drivesplat.kernels.numba.compositing import Compositing
+
+        return Compositing.apply(*gaussians, values, width, height, absgrad)
+    from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
+
+    if not absgrad and triton_support.usable_for(means2d):
+        from drivesplat.kernels.triton import chunks, tiles
+
+        if values.shape[-1] <= chunks.MAX_VALUES:
+            footprints = tiles.Footprints(means2d, conics, values, opacities)
+            lists = tiles.tile_lists(footprints, radii, depths, width, height)
+            return chunks.composite(footprints, lists, width, height, rasterize_to_pixels)
+    cameras, across, down = len(radii), math.ceil(width / TILE), math.ceil(height / TILE)
+    _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, across, down, n_images=cameras)
+    offsets = isect_offset_encode(isect_ids, cameras, across, down).reshape(cameras, down, across)
+    return rasterize_to_pixels(
+        means2d, conics, values, opacities, width, height, TILE, offsets, flatten_ids, absgrad=absgrad
+    )

@@ -1,0 +1,67 @@
+"""A cube map seen behind an image."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from drivesplat.kernels import triton_support
+
+
+class CubeMap(NamedTuple):
+    """`texels` (n, 3), logits of colors, and `index`, which of them every texel of a face (face, v, u) is."""
+
+    texels: Float[Tensor, "n 3"]
+    index: Int[Tensor, "6 r r"]
+
+
+def over_cube_map(
+    image: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w 1"],
+    cube: CubeMap,
+    K: Float[Tensor, "3 3"],
+    camera_to_world: Float[Tensor, "4 4"],
+    rays: Callable[[], Float[Tensor, "h w 3"]],
+) -> Float[Tensor, "h w 3"]:
+    """`image`, premultiplied by `alpha`, over the cube map that a pinhole camera sees (OpenCV axes, K in pixels).
+
+    `rays` returns the world directions of the pixels' centres; it is called where no kernel computes them. Gradients
+    reach the image, alpha and texels, and the camera through `rays`.
+    """
+    if triton_support.usable_for(image) and not camera_to_world.requires_grad:
+        from drivesplat.kernels.triton.cube_map import OverCubeMap
+
+        return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world)
+    return image + (1.0 - alpha) * cube_map_colors(cube, rays())
+
+
+def cube_map_colors(cube: CubeMap, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """RGB in [0, 1] along world directions of any length, interpolated bilinearly on a face."""
+    faces = cube.texels[cube.index]
+    sampled = F.grid_sample(
+        faces.permute(3, 0, 1, 2)[None],
+        face_coordinates(rays)[None, None],
+        align_corners=True,
+        padding_mode="border",
+    )
+    return torch.sigmoid(sampled[0, :, 0].permute(1, 2, 0))
+
+
+def face_coordinates(rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Where directions meet the cube, as grid_sample's x, y (on the face) and z (which face), all in [-1, 1].
+
+    Faces 0 to 5 are +x, -x, +y, -y, +z, -z. On a face with axis i, x and y are the coordinates of axes i + 1 and i + 2.
+    """
+    if rays.device.type == "cpu" and not rays.requires_grad:
+        from drivesplat.kernels.numba import cube_map
+
+        return torch.from_numpy(cube_map.face_coordinates(rays.contiguous().numpy()))
+    axis = rays.abs().argmax(dim=-1, keepdim=True)
+    along = rays.gather(-1, axis)
+    u = rays.gather(-1, (axis + 1) % 3) / along.abs()
+    v = rays.gather(-1, (axis + 2) % 3) / along.abs()
+    face = 2 * axis + (along < 0)
+    return torch.cat([u, v, face * (2.0 / 5.0) - 1.0], dim=-1)

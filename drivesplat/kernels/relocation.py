@@ -1,0 +1,40 @@
+"""Opacity and scale of Gaussians that MCMC relocates or copies (Kheradmand et al. 2024, equation 9)."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def relocation(
+    opacities: Float[Tensor, " n"],
+    scales: Float[Tensor, "n 3"],
+    ratios: Int[Tensor, " n"],
+    binoms: Float[Tensor, "n_max n_max"],
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Opacity (in [0, 1]) and scale (metres) with which `ratios` copies in one place look like the one Gaussian before.
+
+    `binoms[i, k]` is the binomial coefficient. Runs gsplat's kernel on a GPU and torch elsewhere.
+    """
+    if not opacities.is_cuda:
+        return relocation_in_torch(opacities, scales, ratios, binoms)
+    from gsplat.relocation import compute_relocation
+
+    return compute_relocation(opacities, scales, ratios, binoms)
+
+
+def relocation_in_torch(
+    opacities: Float[Tensor, " n"],
+    scales: Float[Tensor, "n 3"],
+    ratios: Int[Tensor, " n"],
+    binoms: Float[Tensor, "n_max n_max"],
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """The same in torch; takes the arguments of gsplat's `compute_relocation`."""
+    n_max = len(binoms)
+    ratios = ratios.clamp(1, n_max).long()
+    new_opacities = 1.0 - (1.0 - opacities) ** (1.0 / ratios)
+    k = torch.arange(n_max, device=opacities.device, dtype=torch.float64)  # the terms alternate and reach 1e14
+    series = (-1.0) ** k / torch.sqrt(k + 1.0) * new_opacities[:, None].double() ** (k + 1)
+    # sum over i < ratio of sum over k <= i of binom(i, k) * series_k; binom(i, k) = 0 beyond k = i
+    coefficients = torch.cumsum(binoms.double(), dim=0)[ratios - 1]
+    shrink = opacities / (coefficients * series).sum(dim=1).to(opacities.dtype)
+    return new_opacities, shrink[:, None] * scales

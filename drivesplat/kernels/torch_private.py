@@ -1,0 +1,44 @@
+"""torch's private functions, each behind one function of ours. tests/kernels/test_private.py checks their signatures.
+
+There is no public way to update many tensors in one call, to run one fused Adam step, or to end a broken capture.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def increment(tensors: Sequence[Tensor]) -> None:
+    """Adds 1 to every tensor in place, in one call."""
+    torch._foreach_add_(tensors, 1)
+
+
+def norms(tensors: Sequence[Tensor]) -> Sequence[Float[Tensor, ""]]:
+    """The Euclidean norm of every tensor, in one call."""
+    return torch._foreach_norm(tensors)
+
+
+def fused_adam_step(
+    parameter: Tensor, gradient: Tensor, state: dict[str, Tensor], rate: float | Tensor, betas: tuple[float, float],
+    eps: float,
+) -> None:  # fmt: skip
+    """One step of torch.optim.Adam with `fused=True`; `state["step"]` is already incremented."""
+    torch._fused_adam_(
+        [parameter], [gradient], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
+        lr=rate, beta1=betas[0], beta2=betas[1], eps=eps, weight_decay=0.0, amsgrad=False, maximize=False,
+    )  # fmt: skip
+
+
+def write_count(tensor: Tensor) -> int:
+    """A number that grows with every write to the tensor."""
+    return tensor._version
+
+
+def release_graph_pool(device_index: int, pool: tuple[int, int]) -> None:
+    """Ends allocation from a CUDA graph's memory pool whose capture broke off, and releases the pool."""
+    for name in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
+        with suppress(AttributeError, RuntimeError):
+            getattr(torch._C, name)(device_index, pool)

@@ -1,0 +1,39 @@
+"""Whether Triton can be used: it needs a GPU, a C compiler and Python's headers."""
+
+import logging
+import os
+from functools import cache
+
+from torch import Tensor
+
+log = logging.getLogger(__name__)
+
+SWITCH = "DRIVESPLAT_TRITON"
+"""Environment variable; 0 replaces all Triton kernels by torch."""
+
+
+def usable_for(tensor: Tensor) -> bool:
+    """Whether Triton kernels can process a tensor: it is on a GPU, and Triton compiles for it."""
+    return tensor.is_cuda and compiles()
+
+
+@cache
+def compiles() -> bool:
+    """Whether Triton compiles for the GPU of this process. Logs one warning where it does not."""
+    if os.environ.get(SWITCH) == "0":
+        return False
+    reason = problem()
+    if reason is not None:
+        log.warning("Triton cannot be used (%s): trainings take longer; see docs/troubleshooting.md", reason)
+    return reason is None
+
+
+def problem() -> str | None:
+    """Why Triton cannot compile for the GPU of this process; None where it can."""
+    try:
+        from drivesplat.kernels.triton import probe
+
+        probe.run()
+    except Exception as error:  # no Triton for this system, no C compiler, no headers of Python, an unsupported GPU
+        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return None
