@@ -23,6 +23,6 @@ with job(snakemake, dataset=("images", "sweeps")) as current:
     digests = {"truth": sha256_file(truth)} if truth else {}
     provenance = current.provenance(*upstream, checkpoint["provenance"], inputs=digests)
     evaluation = evaluate_method(inputs, current.settings(EvaluateJob), current.device())
-    write_image(current.output.recorded, evaluation.shown.recorded)
-    write_image(current.output.rendered, evaluation.shown.rendered)
+    write_image(current.output.recorded, evaluation.sample.recorded)
+    write_image(current.output.rendered, evaluation.sample.rendered)
     write_json(current.output.metrics, {**evaluation.record, "provenance": provenance})

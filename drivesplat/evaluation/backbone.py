@@ -1,4 +1,4 @@
-"""The stage `lpips_backbone`: AlexNet's weights, fetched once or found where a user put them."""
+"""The stage `lpips_backbone`: AlexNet's weights, downloaded once or supplied by the user."""
 
 import hashlib
 import http.client
@@ -18,11 +18,11 @@ CHUNK = 1 << 20
 
 
 def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
-    """Makes sure of the backbone at `path`. Returns a record: `file`, `sha256`, and `unavailable` (None, or why in a
-    line).
+    """Downloads the backbone to `path` unless it is there. Returns a record with `file`, `sha256`, and `unavailable`
+    (None, or the reason in one line).
 
-    Never raises for a missing network or a wrong file: LPIPS is then null with that reason. A file that does not match
-    the checksum is reported and left alone where a user put it, and not kept where it was fetched.
+    Raises nothing for a missing network or a wrong file: LPIPS is then null, with the reason. A user's file with
+    another checksum is reported and stays; a downloaded one is not kept.
     """
     reason = None if path.is_file() else _fetch(settings, path)
     digest = sha256_file(path) if path.is_file() else None
@@ -34,12 +34,12 @@ def provide_backbone(settings: LpipsSettings, path: Path) -> dict[str, Any]:
 
 
 def read_backbone(path: str | Path) -> dict[str, Any]:
-    """Reads the record that `provide_backbone` made. Raises ResultError where it is not one."""
+    """Reads the record of `provide_backbone`. Raises ResultError if it is invalid."""
     return read_record(path, "lpips_backbone", "file", "sha256", "unavailable")
 
 
 def _fetch(settings: LpipsSettings, path: Path) -> str | None:
-    """Downloads the backbone to `path`; None, or in a line why that failed."""
+    """Downloads the backbone to `path`. Returns None, or why that failed in one line."""
     try:
         content = _download(settings)
         with atomic_write(path) as file:
@@ -54,7 +54,7 @@ def _fetch(settings: LpipsSettings, path: Path) -> str | None:
 
 
 def _download(settings: LpipsSettings) -> bytes:
-    """The file at `settings.url`, whole and of the right checksum; raises OSError, ValueError or HTTPException."""
+    """The complete and verified file at `settings.url`. Raises OSError, ValueError or HTTPException."""
     content = bytearray()
     with urllib.request.urlopen(settings.url, timeout=settings.timeout_s) as response:
         while chunk := response.read(CHUNK):

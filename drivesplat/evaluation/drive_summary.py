@@ -1,5 +1,5 @@
-"""What a drive was like, beside its figures: how far the car came, how near held-out images are to training images, and
-how bright they are."""
+"""The properties of a drive that its figures depend on: distance driven, distance of held-out images from training
+images, and brightness."""
 
 from typing import Any
 
@@ -11,11 +11,11 @@ from drivesplat.scene.regions import region_mask
 from drivesplat.scene.scene_warnings import REC_709, moved, seconds_long, standing
 
 
-def drive_record(recording: Recording, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
+def summarize_drive(recording: Recording, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
     """The `drive` of metrics.json; `measured` are the images by held-out group.
 
-    `moved_m`: metres between the two places where the car was farthest apart; `standing_s` of `seconds`. A group is
-    None where it holds no image.
+    `moved_m`: the largest distance in metres between two ego positions; `standing_s`: seconds at standstill, of
+    `seconds`. A group without images is None.
     """
     scene = recording.scene
     groups = {group: _group(recording, camera, images) if images else None for group, images in measured.items()}
@@ -23,10 +23,9 @@ def drive_record(recording: Recording, camera: str, measured: dict[str, list[int
 
 
 def _group(recording: Recording, camera: str, images: list[int]) -> dict[str, float | None]:
-    """`from_training_m`: metres from a held-out image to where the nearest training image of `camera` was taken, the
-    mean over `images`; None without any. `luminance`: the mean luma of their pixels. `flat_psnr`: the PSNR in dB that
-    their static pixels' mean colour has in place of a rendering, which a model has to beat; None without such pixels or
-    where all are alike.
+    """`from_training_m`: distance in metres from a held-out image to the nearest training image of `camera`, mean over
+    `images`; None without training images. `luminance`: mean luma (Rec. 709) of their pixels. `flat_psnr`: PSNR in dB
+    of the mean colour of their static pixels, the trivial baseline; None without such pixels or if all are equal.
     """
     places = recording.record.camtoworlds[:, :3, 3]
     training = [i for i in recording.record.train_images if recording.frame(i).camera == camera]

@@ -1,4 +1,4 @@
-"""The stage `evaluate`: held-out images against renderings, split into static and moving pixels."""
+"""The stage `evaluate`: renderings compared with held-out images, by region."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ import numpy as np
 import torch
 
 from drivesplat.evaluation.depth import DepthErrors
-from drivesplat.evaluation.drive_summary import drive_record
+from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.held_out import held_out_images, measured_images
-from drivesplat.evaluation.lpips_map import unavailable_or_map
+from drivesplat.evaluation.lpips_map import load_lpips
 from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
-from drivesplat.evaluation.sample_pair import Shown, held_out_pair
-from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered_with_depth
+from drivesplat.evaluation.sample_pair import SamplePair, render_sample_pair
+from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.io.prefetch import ahead
 from drivesplat.lidar.depth import Depths, clouds_of, depths_in
 from drivesplat.machine.device import explain_out_of_memory
@@ -39,8 +39,8 @@ VEHICLE_FINDING_DB = 18.0
 
 @dataclass(frozen=True)
 class EvaluationInputs:
-    """What an evaluation reads: the contents of checkpoint.pt, train.json, masks.json and LPIPS's backbone.json (None
-    where LPIPS is not wanted), the recording, and the path `truth` of a synthetic world's truth.json (None for a
+    """The inputs of an evaluation: the contents of checkpoint.pt, train.json, masks.json and LPIPS's backbone.json
+    (None if LPIPS is disabled), the recording, and the path `truth` of a synthetic world's truth.json (None for a
     recorded drive)."""
 
     checkpoint: dict[str, Any]
@@ -53,31 +53,31 @@ class EvaluationInputs:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A method measured on a scene: the content of its eval.json, provenance aside, and the image that is `shown`."""
+    """The content of a method's eval.json, without provenance, and a sample image with its rendering."""
 
     record: dict[str, Any]
-    shown: Shown
+    sample: SamplePair
 
 
 def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings: DeviceSettings) -> Evaluation:
-    """One method on the images that it has not seen, and against the truth where there is any."""
+    """Measures one method on the held-out images of a scene, and against truth if there is any."""
     model, device = open_model(inputs.checkpoint, device_settings)
-    unavailable, lpips_map = unavailable_or_map(inputs.lpips_record, device)
-    record, summary = inputs.recording.record, inputs.summary
+    unavailable, lpips_map = load_lpips(inputs.lpips_record, device)
+    training, summary = inputs.recording.record, inputs.summary
     with explain_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
         groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
-        against = against_truth(model, inputs, job, lpips_map, device)
-        shown = held_out_pair(model, inputs.recording, job.eval_camera, device)
+        against_truth = truth_metrics(model, inputs, job, lpips_map, device)
+        sample = render_sample_pair(model, inputs.recording, job.eval_camera, device)
     record = {
         "schema": 1,
-        "scene": record.scene.name,
-        "dataset": record.scene.dataset,
-        "protocol": protocol(record, inputs.masks_record, job),
-        "drive": drive_record(inputs.recording, job.eval_camera, measured_images(record, job.eval_camera)),
+        "scene": training.scene.name,
+        "dataset": training.scene.dataset,
+        "protocol": protocol(training, inputs.masks_record, job),
+        "drive": summarize_drive(inputs.recording, job.eval_camera, measured_images(training, job.eval_camera)),
         "result": {
             **groups,
-            **against,
+            **against_truth,
             "gaussians": summary["gaussians"],
             "train_seconds": summary["seconds"],
             "train_iterations": summary["iterations"],
@@ -85,27 +85,27 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
             "device": summary["device"],
             "random_seed": summary["random_seed"],
             "findings": findings(groups["interpolation"]),
-            "shown": {"group": shown.group, "key_frame": inputs.recording.frame(shown.index).sample_index},
+            "shown": {"group": sample.group, "key_frame": inputs.recording.frame(sample.index).sample_index},
             **({"lpips_unavailable": unavailable} if unavailable else {}),
         },
     }
-    return Evaluation(record, shown)
+    return Evaluation(record, sample)
 
 
-def against_truth(
+def truth_metrics(
     model: SplatModel, inputs: EvaluationInputs, job: EvaluateJob, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any]:
-    """`lateral` and `removal`, where truth for them exists: for a synthetic world, not for a recorded drive."""
+    """`lateral` and `removal` for a synthetic world, as far as it has truth for them; empty for a recorded drive."""
     if inputs.truth is None or job.removal is None:
         return {}
-    known = KnownTruth(read_truth(inputs.truth), inputs.truth, inputs.recording)
+    known = DriveTruth(read_truth(inputs.truth), inputs.truth, inputs.recording)
     lateral = lateral_metrics(model, known, job.eval_camera, lpips_map, device)
     removal = removal_metrics(model, known, job.eval_camera, job.removal.margin, lpips_map, device)
     return {**({"lateral": lateral} if lateral else {}), **({"removal": removal} if removal else {})}
 
 
 def protocol(record: TrainingRecord, masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
-    """What every figure must be read with."""
+    """The protocol of every figure."""
     measured = [i for images in measured_images(record, job.eval_camera).values() for i in images]
     width, height = record.image_size(measured[0] if measured else 0)
     return {
@@ -129,7 +129,7 @@ def protocol(record: TrainingRecord, masks_record: dict[str, Any], job: Evaluate
 
 
 def findings(group: dict[str, Any]) -> dict[str, bool | None]:
-    """Whether the scene shows what is expected of a static model. Never a gate; None where a region is null."""
+    """Whether a static model behaves as expected: findings, never gates; None if a region is null."""
 
     def of(region: str) -> float | None:
         return group[region]["psnr"] if group[region] else None
@@ -142,8 +142,8 @@ def findings(group: dict[str, Any]) -> dict[str, bool | None]:
 
 
 def held_out_depths(recording: Recording, camera: str, job: LidarDepthJob) -> dict[int, Depths]:
-    """What LiDAR says of the images that are measured, by their numbers: each by the sweep of its own key frame; those
-    whose sweep is missing are left out."""
+    """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
+    missing."""
     scene = recording.scene
     clouds = {cloud.sample_index: cloud for cloud in clouds_of(scene, job, HELD_OUT_GROUPS)}
     images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.record, group, camera)]
@@ -159,14 +159,13 @@ def evaluate_groups(
     device: torch.device,
     depths: Mapping[int, Depths] = MappingProxyType({}),
 ) -> dict[str, dict[str, Any]]:
-    """The metrics of every held-out group, by region; `depth` where LiDAR tells the `depths` of held-out images, by
-    their numbers; with several cameras `overlap` and `no_overlap`, the static pixels where others look, too, and where
-    none does."""
-    of_group = partial(_group, model, recording, lpips_map, device, depths)
+    """The metrics of every held-out group by region. With LiDAR `depths` of images, by index, also `depth`; with
+    several cameras also `overlap` and `no_overlap`, the static pixels that other cameras see as well, and the rest."""
+    of_group = partial(_group_metrics, model, recording, lpips_map, device, depths)
     return {group: of_group(images) for group, images in measured_images(recording.record, camera).items()}
 
 
-def _group(
+def _group_metrics(
     model: SplatModel,
     recording: Recording,
     lpips_map: LpipsMap | None,
@@ -176,23 +175,23 @@ def _group(
 ) -> dict[str, Any]:
     """The metrics of a held-out group of `images`."""
     record = recording.record
-    rig = len(record.camera_names) > 1
-    metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if rig else ()))), DepthErrors()
+    several_cameras = len(record.camera_names) > 1
+    metrics, depth = RegionMetrics(lpips_map, (*REGIONS, *(OVERLAP_REGIONS if several_cameras else ()))), DepthErrors()
 
-    def shown() -> Iterator[tuple[int, np.ndarray]]:
+    def renderings() -> Iterator[tuple[int, np.ndarray]]:
         for index in images:
             image, metres = rendered_with_depth(model, view_of(record, index, device))
             if index in depths:
                 depth.add(metres, depths[index])
             yield index, image
 
-    def measured(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:
+    def measure(one: tuple[int, np.ndarray]) -> dict[str, FrameErrors]:
         index, image = one
         masks = region_masks(recording.labels(index))
-        if rig:
+        if several_cameras:
             masks |= overlap_masks(record, index, masks["static"])
-        return metrics.measured(image, recording.image(index), masks)
+        return metrics.measure(image, recording.image(index), masks)
 
-    for frame in ahead(measured, shown(), measuring_threads()):
+    for frame in ahead(measure, renderings(), measuring_threads()):
         metrics.add(frame)
     return {**with_gap(metrics.summary()), **depth.summary()}

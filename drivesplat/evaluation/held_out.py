@@ -1,4 +1,4 @@
-"""The images that are measured."""
+"""The images on which metrics are computed."""
 
 from drivesplat.errors import DatasetError
 from drivesplat.scene.splits import HELD_OUT_GROUPS
@@ -6,9 +6,9 @@ from drivesplat.scene.training_record import TrainingRecord
 
 
 def held_out_images(record: TrainingRecord, group: str, camera: str) -> list[int]:
-    """The images of `group` that are measured: key frames of the evaluated camera. Of 'train' likewise.
+    """The indices of the images of `group` (or 'train') that are measured: key frames of the evaluated camera.
 
-    Raises DatasetError where the scene does not hold that camera.
+    Raises DatasetError if the scene lacks that camera.
     """
     if camera not in record.camera_names:
         raise DatasetError(
@@ -19,5 +19,5 @@ def held_out_images(record: TrainingRecord, group: str, camera: str) -> list[int
 
 
 def measured_images(record: TrainingRecord, camera: str) -> dict[str, list[int]]:
-    """The images that are measured, by held-out group. Raises what `held_out_images` raises."""
+    """The indices of the measured images by held-out group. Raises DatasetError as `held_out_images` does."""
     return {group: held_out_images(record, group, camera) for group in HELD_OUT_GROUPS}

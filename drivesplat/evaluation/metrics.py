@@ -15,30 +15,34 @@ from skimage.metrics import structural_similarity
 from drivesplat.errors import ResultError
 from drivesplat.scene.regions import REGIONS
 
-LEAST_REGION_PIXELS = 1000
+MIN_REGION_PIXELS = 1000
 """A region with fewer pixels in a group is null."""
-LEAST_FRAME_PIXELS = 100
-"""A frame with fewer pixels of a region does not count in its frame mean."""
+MIN_FRAME_PIXELS = 100
+"""A frame with fewer pixels of a region is left out of the region's frame mean."""
 
-FRAMES_AT_ONCE = 4
-"""So many frames are measured at a time, at most: one of 1600x900 takes 0.3 GB meanwhile."""
+MAX_PARALLEL_FRAMES = 4
+"""Maximum number of frames measured in parallel; one of 1600x900 takes 0.3 GB."""
 
 LpipsMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def measuring_threads() -> int:
-    """How many threads measure frames: as many as torch may have, up to FRAMES_AT_ONCE."""
-    return min(FRAMES_AT_ONCE, torch.get_num_threads())
+    """The number of threads that measure frames: that of torch, up to MAX_PARALLEL_FRAMES."""
+    return min(MAX_PARALLEL_FRAMES, torch.get_num_threads())
 
 
 def psnr(squared_error: float) -> float | None:
-    """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]; None where it is 0."""
+    """Peak signal-to-noise ratio in dB, -10 log10(MSE), of a mean squared error of values in [0, 1]; None for 0.
+
+    >>> psnr(0.01), psnr(0.0)
+    (20.0, None)
+    """
     return -10.0 * math.log10(squared_error) if squared_error > 0 else None
 
 
 def psnr_record(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, Any] | None:
-    """`psnr` of one image (h, w, 3) against another over a mask (h, w) bool, `identical` where they are, and `pixels`;
-    None where the mask is empty."""
+    """`psnr` in dB between two images (h, w, 3) in [0, 1] over a mask (h, w) bool, `identical` if they are, and
+    `pixels`; None for an empty mask."""
     pixels = int(mask.sum())
     if pixels == 0:
         return None
@@ -47,7 +51,8 @@ def psnr_record(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[
 
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """The structural similarity (h, w) of two images (h, w, 3) in [0, 1], mean over channels: 11 taps, sigma 1.5."""
+    """Structural similarity per pixel (h, w) of two images (h, w, 3) in [0, 1], mean over channels (Wang et al. 2004):
+    Gaussian window with sigma 1.5 and 11 taps, no border cropped."""
     _, full = structural_similarity(
         image,
         truth,
@@ -63,7 +68,7 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """What a frame adds to a region of `pixels`: sums over these of the squared error, of SSIM and of LPIPS."""
+    """A frame's sums of squared error, SSIM and LPIPS over the `pixels` of a region."""
 
     pixels: int
     squared_error: float
@@ -87,25 +92,34 @@ class _Sums:
         self.ssim += errors.ssim
         self.lpips += errors.lpips
         frame_psnr = psnr(errors.squared_error / errors.pixels)
-        if errors.pixels >= LEAST_FRAME_PIXELS and frame_psnr is not None:
+        if errors.pixels >= MIN_FRAME_PIXELS and frame_psnr is not None:
             self.frame_psnrs.append(frame_psnr)
 
 
 class RegionMetrics:
-    """Metrics of one group of frames over named regions: `add` what is `measured` of each frame, then `summary`."""
+    """Metrics of a group of frames, pooled over the pixels of named regions.
+
+    >>> metrics = RegionMetrics(lpips_map=None, regions=["all"])
+    >>> truth = np.zeros((40, 50, 3))
+    >>> metrics.add(metrics.measure(truth + 0.1, truth, {"all": np.ones((40, 50), bool)}))
+    >>> round(metrics.summary()["all"]["psnr"], 6)
+    20.0
+    """
 
     def __init__(self, lpips_map: LpipsMap | None, regions: Iterable[str] = REGIONS):
         self._lpips_map = lpips_map
         self._sums = {region: _Sums() for region in regions}
 
-    def measured(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> dict[str, FrameErrors]:
-        """What a rendered and a true image (h, w, 3) in [0, 1] add to each region, whose pixels are `masks` (h, w)
-        bool. Nothing is added yet: several threads may measure frames.
+    def measure(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> dict[str, FrameErrors]:
+        """The errors of a rendered image against a true one, both (h, w, 3) in [0, 1], over each region's mask (h, w)
+        bool. Changes nothing, so several threads may measure frames.
 
-        Raises ResultError where the rendering is not finite.
+        Raises ResultError if the rendering contains NaN or Inf.
         """
         if not np.isfinite(image).all():
-            raise ResultError("a held-out image was rendered as no numbers; delete its checkpoint.pt and rerun")
+            raise ResultError(
+                "the rendering of a held-out image contains NaN or Inf; delete its checkpoint.pt and rerun"
+            )
         image, truth = image.clip(0.0, 1.0).astype(np.float64), truth.astype(np.float64)
         maps = [((image - truth) ** 2).mean(axis=2), ssim_map(image, truth)]
         maps.append(self._lpips_map(image, truth) if self._lpips_map else np.zeros_like(maps[0]))
@@ -115,17 +129,16 @@ class RegionMetrics:
         }
 
     def add(self, frame: Mapping[str, FrameErrors]) -> None:
-        """Adds what was measured of a frame. In whatever order frames are measured, they are added in their own:
-        sums are then the same to the last bit."""
+        """Adds the errors of a frame. Add frames in a fixed order: the sums are then reproducible to the last bit."""
         for region, sums in self._sums.items():
             sums.add(frame[region])
 
     def summary(self) -> dict[str, dict[str, Any] | None]:
-        """A record per region; None where a region has too few pixels."""
+        """A record per region; None for a region with too few pixels."""
         return {region: self._record(sums) for region, sums in self._sums.items()}
 
     def _record(self, sums: _Sums) -> dict[str, Any] | None:
-        if sums.pixels < LEAST_REGION_PIXELS:
+        if sums.pixels < MIN_REGION_PIXELS:
             return None
         pooled = psnr(sums.squared_error / sums.pixels)
         return {
@@ -139,12 +152,12 @@ class RegionMetrics:
 
 
 def with_gap(regions: dict[str, dict[str, Any] | None]) -> dict[str, Any]:
-    """The record of a group of held-out frames: `gap_db` before its regions."""
+    """The record of a group of held-out frames: `gap_db`, then its regions."""
     return {"gap_db": gap_db(regions), **regions}
 
 
 def gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
-    """Static minus moving-vehicle PSNR; vehicle where nothing moves; None where there is neither."""
+    """PSNR of static minus that of moving vehicles in dB, or of all vehicles if none moves; None if there are none."""
     static, moving = regions["static"], regions["moving_vehicle"] or regions["vehicle"]
     if static is None or moving is None or static["psnr"] is None or moving["psnr"] is None:
         return None

@@ -1,4 +1,4 @@
-"""One image of a drive, as it was recorded and as a model shows it: what a person is shown beside the figures."""
+"""A recorded image and its rendering, as a sample beside the figures."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 
 @dataclass(frozen=True)
-class Shown:
+class SamplePair:
     """Image `index` of a recording, of held-out `group` (or 'train'): `recorded` and `rendered` (h, w, 3) in [0, 1]."""
 
     group: str
@@ -24,14 +24,14 @@ class Shown:
     rendered: np.ndarray
 
 
-def held_out_pair(model: SplatModel, recording: Recording, camera: str, device: torch.device) -> Shown:
-    """The held-out key frame of `camera` that shows most of vehicles that move, between training frames where any are
-    held out there, else beyond the last; where nothing is held out, a key frame that was trained on."""
+def render_sample_pair(model: SplatModel, recording: Recording, camera: str, device: torch.device) -> SamplePair:
+    """The held-out key frame of `camera` with the most pixels of moving vehicles, from the first group with held-out
+    frames; a training key frame if nothing is held out."""
     group, images = _candidates(recording, camera)
     moving = [int(region_mask(recording.labels(index), "moving_vehicle").sum()) for index in images]
     index = images[int(np.argmax(moving))] if any(moving) else images[len(images) // 2]
     picture = rendered(model, view_of(recording.record, index, device))
-    return Shown(group, index, recording.image(index), picture.clip(0.0, 1.0))
+    return SamplePair(group, index, recording.image(index), picture.clip(0.0, 1.0))
 
 
 def _candidates(recording: Recording, camera: str) -> tuple[str, list[int]]:

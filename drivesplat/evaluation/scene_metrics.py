@@ -1,4 +1,4 @@
-"""The stage `scene_metrics`: the methods of a scene side by side in metrics.json."""
+"""The stage `scene_metrics`: all methods of a scene in one metrics.json."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,16 +11,15 @@ SCHEMA = 1
 
 
 def read_evaluations(paths: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """The content of every eval.json, by the name of the method, whose folder it lies in. Raises ResultError where one
-    is none."""
+    """The content of every eval.json, by the name of its folder, the method. Raises ResultError if one is invalid."""
     keys = ("scene", "dataset", "protocol", "drive", "result", "provenance")
     return {Path(path).parent.name: read_record(path, "evaluate", *keys) for path in paths}
 
 
 def side_by_side(evals: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The content of metrics.json from the eval.json of every method, by name, provenance aside.
+    """The content of metrics.json, without provenance, from the eval.json of every method by name.
 
-    Raises ResultError where two methods were measured under different protocols: their figures cannot stand together.
+    Raises ResultError if two methods were measured under different protocols: their figures do not compare.
     """
     (first_name, first), *others = evals.items()
     for name, record in others:

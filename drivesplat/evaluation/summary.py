@@ -1,4 +1,4 @@
-"""What a metrics.json says, in sentences: `python -m drivesplat.evaluation.summary results/demo/metrics.json`."""
+"""A metrics.json in sentences: `python -m drivesplat.evaluation.summary results/demo/metrics.json`."""
 
 import sys
 from pathlib import Path
@@ -10,19 +10,19 @@ from drivesplat.io.storage import read_json
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.scene.scene_warnings import DARK
 
-LOOKS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
-SAME_PLACE = 0.1
-"""Metres. A point 10 m away is then seen, at nuScenes' focal length, within a dozen pixels of where it was."""
+OUTPUTS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
+MIN_NOVEL_DISTANCE = 0.1
+"""Metres. At nuScenes' focal length a smaller step moves a point 10 m away by less than a dozen pixels."""
 
 
-def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
-    """A sentence per method and group of held-out frames, more where there is truth, and where to look."""
-    lines = _circumstances(metrics["drive"]) if "drive" in metrics else []
+def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
+    """A sentence for each method and group of held-out frames, for comparisons with truth, and for output files."""
+    lines = _caveats(metrics["drive"]) if "drive" in metrics else []
     for name, method in metrics["methods"].items():
         for group, where in GROUP_PLACES.items():
             gap = method[group].get("gap_db")
             if (static := _psnr(method[group], "static")) is not None:
-                lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_movers(method[group], gap)}")
+                lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_moving_vehicles(method[group], gap)}")
         for metres, regions in method.get("lateral", {}).items():
             if (static := _psnr(regions, "static")) is not None:
                 lines.append(f"{name}, from {float(metres):g} m to the left, against truth: static {static:.1f} dB")
@@ -38,38 +38,38 @@ def in_words(metrics: dict[str, Any], path: str | Path) -> list[str]:
     folder = Path(path).parent
     lines.append(f"All figures: {path}; training curves and pictures: tensorboard --logdir {folder}")
     for name in metrics["methods"]:
-        there = [look for look in LOOKS if (folder / name / look).is_file()]
+        there = [output for output in OUTPUTS if (folder / name / output).is_file()]
         there += ["edits/"] if (folder / name / "edits").is_dir() else []
         if there:
             lines.append(f"To look at, in {folder / name}: {', '.join(there)}")
     return lines
 
 
-def _circumstances(drive: dict[str, Any]) -> list[str]:
-    """What makes the figures say less than they seem to, a sentence each."""
+def _caveats(drive: dict[str, Any]) -> list[str]:
+    """A sentence for each property of the drive that limits what the figures mean."""
     lines = []
     for group, where in GROUP_PLACES.items():
         held_out = drive[group] or {}
         distance, flat = held_out.get("from_training_m"), held_out.get("flat_psnr")
-        if distance is not None and distance < SAME_PLACE:
+        if distance is not None and distance < MIN_NOVEL_DISTANCE:
             lines.append(
-                f"Frames {where} were taken {distance:.2f} m from training frames: a PSNR there tells what was "
-                "remembered, not what can be seen from elsewhere"
+                f"Frames {where} were taken {distance:.2f} m from training frames: their PSNR measures memorised "
+                "views, not novel ones"
             )
         if flat is not None and held_out["luminance"] < DARK:
             lines.append(
-                f"Frames {where} are dark (mean luminance {held_out['luminance']:.2f}): their mean colour alone has "
-                f"{flat:.1f} dB static; read the figures against that"
+                f"Frames {where} are dark (mean luminance {held_out['luminance']:.2f}): the trivial baseline, their "
+                f"mean colour, has {flat:.1f} dB static"
             )
     return lines
 
 
 def _psnr(regions: dict[str, Any], region: str) -> float | None:
-    """The PSNR of a region, None where that is null or missing."""
+    """The PSNR of a region, None if it is null or missing."""
     return (regions.get(region) or {}).get("psnr")
 
 
-def _movers(group: dict[str, Any], gap: float | None) -> str:
+def _moving_vehicles(group: dict[str, Any], gap: float | None) -> str:
     moving = _psnr(group, "moving_vehicle")
     if gap is None or moving is None:
         return "no moving vehicle to compare with"
@@ -80,6 +80,6 @@ if __name__ == "__main__":
     try:
         metrics = read_json(sys.argv[1], rule="scene_metrics")
         checked_digest(sys.argv[1], warn=False)
-        print("\n".join(in_words(metrics, sys.argv[1])))
+        print("\n".join(sentences(metrics, sys.argv[1])))
     except DriveSplatError as error:
         sys.exit(f"drivesplat: {error}")

@@ -1,5 +1,5 @@
-"""Renderings against the truth that only a synthetic world knows: the street from beside the recorded path, and the
-street without the car ahead."""
+"""Renderings compared with the truth of a synthetic world: views from beside the recorded path, and the street without
+the leading car."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -29,15 +29,15 @@ REMOVAL_REGIONS = ("box", "outside")
 
 
 @dataclass(frozen=True)
-class KnownTruth:
-    """The truth of a recording; `path` is that of its truth.json."""
+class DriveTruth:
+    """The truth of a synthetic drive; `path` is that of its truth.json."""
 
     truth: Truth
     path: Path
     recording: Recording
 
     def frames(self, camera: str) -> Iterator[tuple[int, TruthFrame]]:
-        """The images of `camera` that have truth, by their numbers in the recording."""
+        """The indices of the images of `camera` that have truth, each with its truth."""
         by_image = self.truth.by_image()
         for index, frame in enumerate(self.recording.scene.frames):
             if frame.camera == camera and frame.token in by_image:
@@ -48,8 +48,7 @@ class KnownTruth:
         return read_image(truth_image(self.path, name), size) / 255.0
 
     def leading_in(self, index: int) -> tuple[Box, np.ndarray] | None:
-        """The car that `without_leading` lacks in an image, and the pixels (h, w) bool of its hull; None where it is
-        not to be seen."""
+        """The box of the leading car in an image and the pixels (h, w) bool of its hull; None if it is not visible."""
         scene, frame, size = self.recording.scene, self.recording.frame(index), self.recording.size(index)
         leading = scene.track(self.truth.leading) if self.truth.leading else None
         box = box_at(leading, frame.timestamp, scene.key_frame_interval) if leading else None
@@ -61,9 +60,9 @@ class KnownTruth:
 
 
 @dataclass(frozen=True)
-class Emptied:
-    """Image `index` as a model shows it (h, w, 3), with the leading car `removed` and `untouched`, beside the name of
-    the true image of the empty `street`; `inside` (h, w) bool are the pixels of the car's hull."""
+class RemovalRenderings:
+    """Renderings (h, w, 3) of image `index` with the leading car `removed` and `untouched`, the name of the true image
+    of the empty `street`, and the pixels `inside` (h, w) bool of the car's hull."""
 
     index: int
     street: str
@@ -74,30 +73,30 @@ class Emptied:
 
 @torch.no_grad()
 def rendered(model: SplatModel, view: View, gaussians: Gaussians | None = None) -> np.ndarray:
-    """What the model shows (h, w, 3) float32, not clamped; with `gaussians` in place of its own where given."""
+    """The rendering (h, w, 3) float32, not clamped; of `gaussians` in place of the model's own if given."""
     return model.render(view, gaussians=gaussians).image.float().cpu().numpy()
 
 
 @torch.no_grad()
 def rendered_with_depth(model: SplatModel, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """What the model shows, as `rendered`, and how far away it is (h, w), metres along the camera's axis."""
+    """The rendering, as of `rendered`, and its depth (h, w) in metres along the camera's axis."""
     picture = model.render(view, with_depth=True)
     return picture.image.float().cpu().numpy(), picture.depth.float().cpu().numpy()
 
 
 def lateral_metrics(
-    model: SplatModel, known: KnownTruth, camera: str, lpips_map: LpipsMap | None, device: torch.device
+    model: SplatModel, known: DriveTruth, camera: str, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any] | None:
-    """Per distance to the left, in metres, the metrics over all key frames of `camera` seen from there; None where
-    there is no truth. What moves there is known from the boxes, whatever masks a user gave for the recorded images.
+    """The metrics over all key frames of `camera`, by the distance to the left in metres from which they are rendered;
+    None without truth. Moving objects are known from boxes, whatever masks the user supplies for recorded images.
 
-    The view lies from the recorded pose as the true one does from the true pose: where recorded poses are off, the
-    picture is not held to an image of another place.
+    The offset from the recorded pose is that between the true poses, so that errors of recorded poses do not shift the
+    view against its true image.
     """
     metrics, recording = RegionMetrics(lpips_map, LATERAL_REGIONS), known.recording
     frames = list(known.frames(camera))
 
-    def shown() -> Iterator[tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]]:
+    def renderings() -> Iterator[tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]]:
         for index, truth in frames:
             frame = recording.frame(index)
             to_left = inverse(np.array(truth.camera_to_global)) @ np.array(truth.lateral_camera_to_global)
@@ -106,26 +105,26 @@ def lateral_metrics(
             view = dataclasses.replace(view_of(recording.record, index, device), camera_to_world=pose)
             yield aside, rendered(model, view), truth, recording.size(index)
 
-    def measured(one: tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]) -> dict[str, FrameErrors]:
+    def measure(one: tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]) -> dict[str, FrameErrors]:
         aside, image, truth, size = one
         masks = region_masks(label_image(recording.scene, aside, size))
-        return metrics.measured(image, known.image(truth.lateral, size), masks)
+        return metrics.measure(image, known.image(truth.lateral, size), masks)
 
-    for errors in ahead(measured, shown(), measuring_threads()):
+    for errors in ahead(measure, renderings(), measuring_threads()):
         metrics.add(errors)
     return {str(known.truth.lateral_left_m): metrics.summary()} if frames else None
 
 
 def removal_metrics(
-    model: SplatModel, known: KnownTruth, camera: str, margin: float, lpips_map: LpipsMap | None, device: torch.device
+    model: SplatModel, known: DriveTruth, camera: str, margin: float, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any] | None:
-    """The street with the leading car removed against the street without it, over all key frames of `camera` that see
-    the car: the pixels of its `box`, and those `outside`; under `not_removed` the same of the model as it is, which is
-    what the removal is to beat. None where there is no truth."""
+    """The rendering without the leading car against the true empty street, over all key frames of `camera` that see
+    the car: metrics of the pixels in its `box` and `outside`. `not_removed` holds those of the unchanged model, the
+    trivial baseline. None without truth."""
     recording = known.recording
     removed, untouched = RegionMetrics(lpips_map, REMOVAL_REGIONS), RegionMetrics(lpips_map, REMOVAL_REGIONS)
 
-    def shown() -> Iterator[Emptied]:
+    def renderings() -> Iterator[RemovalRenderings]:
         for index, truth in known.frames(camera):
             seen = known.leading_in(index) if truth.without_leading else None
             if seen is None:
@@ -136,14 +135,14 @@ def removal_metrics(
                 gaussians = model.gaussians_at(view.time)
                 kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
             pictures = rendered(model, view, kept), rendered(model, view, gaussians)
-            yield Emptied(index, truth.without_leading, inside, *pictures)
+            yield RemovalRenderings(index, truth.without_leading, inside, *pictures)
 
-    def measured(one: Emptied) -> tuple[dict[str, FrameErrors], dict[str, FrameErrors]]:
+    def measure(one: RemovalRenderings) -> tuple[dict[str, FrameErrors], dict[str, FrameErrors]]:
         street, own_car = known.image(one.street, recording.size(one.index)), recording.own_car(one.index)
         masks = {"box": one.inside & ~own_car, "outside": ~one.inside & ~own_car}
-        return removed.measured(one.removed, street, masks), untouched.measured(one.untouched, street, masks)
+        return removed.measure(one.removed, street, masks), untouched.measure(one.untouched, street, masks)
 
-    frames = list(ahead(measured, shown(), measuring_threads()))
+    frames = list(ahead(measure, renderings(), measuring_threads()))
     for without, with_it in frames:
         removed.add(without)
         untouched.add(with_it)

@@ -8,7 +8,7 @@ from helpers.small_drives import HELD_OUT
 from helpers.tiny_world import World
 from PIL import Image
 
-from drivesplat.evaluation.drive_summary import drive_record
+from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.evaluate import measured_images
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.preprocess.parser import training_record
@@ -24,7 +24,7 @@ def recording_of(scene: Scene, holdout=HELD_OUT) -> Recording:
 
 
 def record_of(recording: Recording) -> dict:
-    return drive_record(recording, "CAM_FRONT", measured_images(recording.record, "CAM_FRONT"))
+    return summarize_drive(recording, "CAM_FRONT", measured_images(recording.record, "CAM_FRONT"))
 
 
 def test_held_out_images_are_as_far_from_training_images_as_the_car_came_between(tiny_scene):

@@ -12,7 +12,7 @@ from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
 
 from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.evaluate import evaluate_groups, held_out_depths
-from drivesplat.evaluation.metrics import LEAST_REGION_PIXELS
+from drivesplat.evaluation.metrics import MIN_REGION_PIXELS
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth import Depths
 from drivesplat.model.splat_model import SplatModel
@@ -53,7 +53,7 @@ def test_the_figure_is_the_median_over_all_pixels_of_the_group():
 
 
 @pytest.mark.parametrize(
-    ("count", "summary"), [(None, {}), (0, {"depth": None}), (LEAST_REGION_PIXELS - 1, {"depth": None})]
+    ("count", "summary"), [(None, {}), (0, {"depth": None}), (MIN_REGION_PIXELS - 1, {"depth": None})]
 )
 def test_too_few_pixels_are_no_figure_and_no_sweep_is_no_entry(count, summary):
     errors = DepthErrors()

@@ -18,7 +18,7 @@ import torchvision
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.backbone import provide_backbone
-from drivesplat.evaluation.lpips_map import lpips_map, unavailable_or_map
+from drivesplat.evaluation.lpips_map import load_lpips, lpips_map
 from drivesplat.evaluation.metrics import LpipsMap
 from drivesplat.settings.evaluate import LpipsSettings
 
@@ -128,7 +128,7 @@ def broken_backbone(kind: str, path: Path, alexnet: dict[str, torch.Tensor]) -> 
 def test_what_is_no_alexnet_is_a_reason_in_one_line_and_nothing_of_it_runs(kind, tmp_path, alexnet):
     path = tmp_path / "alexnet.pth"
     broken_backbone(kind, path, alexnet)
-    reason, made = unavailable_or_map({"file": str(path), "sha256": "", "unavailable": None}, CPU)
+    reason, made = load_lpips({"file": str(path), "sha256": "", "unavailable": None}, CPU)
     assert made is None
     assert str(path) in reason and "\n" not in reason
     assert not (tmp_path / "executed").exists()
@@ -140,7 +140,7 @@ def test_a_wrong_backbone_is_an_error_that_names_the_rule_to_run(tmp_path):
 
 
 def test_a_good_backbone_is_a_map_and_no_reason(backbone):
-    reason, made = unavailable_or_map({"file": str(backbone), "sha256": "", "unavailable": None}, CPU)
+    reason, made = load_lpips({"file": str(backbone), "sha256": "", "unavailable": None}, CPU)
     assert reason is None
     assert made(*images(4)).shape == (70, 90)
 
@@ -153,7 +153,7 @@ def test_a_good_backbone_is_a_map_and_no_reason(backbone):
     ],
 )
 def test_without_a_backbone_there_is_the_reason_alone(record, reason):
-    assert unavailable_or_map(record, CPU) == (reason, None)
+    assert load_lpips(record, CPU) == (reason, None)
 
 
 Answer = Callable[[BaseHTTPRequestHandler], None]

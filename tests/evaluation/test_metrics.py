@@ -37,7 +37,7 @@ def measured(*frames: tuple[np.ndarray, np.ndarray, np.ndarray], lpips_map: Any 
     metrics = RegionMetrics(lpips_map)
     for frame in frames:
         image, truth, labels = frame
-        metrics.add(metrics.measured(image, truth, region_masks(labels)))
+        metrics.add(metrics.measure(image, truth, region_masks(labels)))
     return with_gap(metrics.summary())
 
 

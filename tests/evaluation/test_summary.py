@@ -6,7 +6,7 @@ import sys
 
 from helpers import REPOSITORY
 
-from drivesplat.evaluation.summary import in_words
+from drivesplat.evaluation.summary import sentences
 
 
 def method(**groups) -> dict:
@@ -26,7 +26,7 @@ def group(static: float | None, moving: float | None) -> dict:
 
 def test_each_group_is_a_sentence_with_its_gap():
     metrics = {"methods": {"vanilla": method(interpolation=group(27.1, 16.0), extrapolation=group(22.0, 12.5))}}
-    lines = in_words(metrics, "results/demo/metrics.json")
+    lines = sentences(metrics, "results/demo/metrics.json")
     assert "vanilla, frames between training frames: static 27.1 dB, moving vehicles 16.0 dB: a gap of 11.1 dB" in lines
     assert (
         "vanilla, frames beyond the last training frame: static 22.0 dB, moving vehicles 12.5 dB: a gap of 9.5 dB"
@@ -38,12 +38,12 @@ def test_each_group_is_a_sentence_with_its_gap():
 
 
 def test_a_group_that_is_off_is_not_spoken_of():
-    lines = in_words({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}, "m.json")
+    lines = sentences({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}, "m.json")
     assert not any("beyond" in line for line in lines)
 
 
 def test_a_scene_where_nothing_moves_has_no_gap():
-    lines = in_words({"methods": {"vanilla": method(interpolation=group(27.1, None))}}, "m.json")
+    lines = sentences({"methods": {"vanilla": method(interpolation=group(27.1, None))}}, "m.json")
     assert lines[0].endswith("static 27.1 dB, no moving vehicle to compare with")
 
 
@@ -52,7 +52,7 @@ def test_what_was_measured_against_truth_is_told():
     before = {"box": {"psnr": 14.3}, "outside": {"psnr": 25.9}}
     removal = {"box": {"psnr": 17.0}, "outside": {"psnr": 26.2}, "not_removed": before}
     metrics = {"methods": {"vanilla": {**method(), "lateral": lateral, "removal": removal}}}
-    lines = in_words(metrics, "m.json")
+    lines = sentences(metrics, "m.json")
     assert "vanilla, from 2 m to the left, against truth: static 22.7 dB" in lines
     expected = "vanilla, the car ahead removed, against the empty street: 17.0 dB in its box (14.3 dB before)"
     assert expected in lines
@@ -68,7 +68,7 @@ def test_what_there_is_to_look_at_is_named_last_by_method(tmp_path):
     (tmp_path / "plain" / "original.mp4").mkdir()
     (tmp_path / "plain" / "edits").mkdir()
     metrics = {"methods": {name: method() for name in ("vanilla", "plain", "bare", "absent")}}
-    lines = in_words(metrics, tmp_path / "metrics.json")
+    lines = sentences(metrics, tmp_path / "metrics.json")
     assert lines[-2:] == [
         f"To look at, in {tmp_path}/vanilla: original.mp4, removal.png, viewer.html",
         f"To look at, in {tmp_path}/plain: ghost_panel.png, edits/",
@@ -79,7 +79,7 @@ def test_what_there_is_to_look_at_is_named_last_by_method(tmp_path):
 def test_truth_over_too_few_pixels_is_not_spoken_of():
     removal = {"box": None, "outside": {"psnr": 20.0}, "not_removed": {"box": None, "outside": {"psnr": 20.0}}}
     metrics = {"methods": {"vanilla": {**method(), "lateral": {"2.0": {"static": None}}, "removal": removal}}}
-    lines = in_words(metrics, "m.json")
+    lines = sentences(metrics, "m.json")
     assert not any("truth" in line or "removed" in line for line in lines)
 
 

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 
 from drivesplat.errors import DatasetError, ResultError
-from drivesplat.evaluation.evaluate import EvaluationInputs, against_truth
+from drivesplat.evaluation.evaluate import EvaluationInputs, truth_metrics
 from drivesplat.evaluation.metrics import RegionMetrics, measuring_threads
-from drivesplat.evaluation.synthetic import KnownTruth, lateral_metrics, removal_metrics, rendered
+from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
@@ -49,7 +49,7 @@ OWN_CAR_ROWS = 12
 
 
 @pytest.fixture(scope="module")
-def known(demo_root, tmp_path_factory) -> KnownTruth:
+def known(demo_root, tmp_path_factory) -> DriveTruth:
     source = SceneSource(
         dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None,
         cameras=("CAM_FRONT", "CAM_BACK"), sweeps=False, on_missing="stop",
@@ -59,7 +59,7 @@ def known(demo_root, tmp_path_factory) -> KnownTruth:
     labels[90 - OWN_CAR_ROWS :] = LABELS["own_car"]
     masks = write_labels(tmp_path_factory.mktemp("masks"), scene, labels)
     path = demo_root / "truth" / "truth.json"
-    return KnownTruth(read_truth(path), path, recording_of(scene, masks, **HOLDOUT.model_dump()))
+    return DriveTruth(read_truth(path), path, recording_of(scene, masks, **HOLDOUT.model_dump()))
 
 
 def flat_model(color=GREY, parts=()) -> SplatModel:
@@ -71,12 +71,12 @@ def purple(places) -> Background:
     return round_gaussians(places, 0.3, 0.98, (0.9, 0.1, 0.9))
 
 
-def front_frames(known: KnownTruth) -> list[tuple[Frame, TruthFrame]]:
+def front_frames(known: DriveTruth) -> list[tuple[Frame, TruthFrame]]:
     frames = [frame for frame in known.recording.scene.frames if frame.camera == "CAM_FRONT"]
     return list(zip(frames, known.truth.frames, strict=True))
 
 
-def pixels_of(known: KnownTruth, name: str) -> np.ndarray:
+def pixels_of(known: DriveTruth, name: str) -> np.ndarray:
     return np.asarray(Image.open(known.path.parent / name).convert("RGB")) / 255.0
 
 
@@ -91,13 +91,13 @@ def rays_meet(box: Box, camera_to_world: np.ndarray, frame: Frame) -> np.ndarray
     return (enter < leave) & (leave > 0)
 
 
-def lateral_pose(known: KnownTruth, truth: TruthFrame) -> np.ndarray:
+def lateral_pose(known: DriveTruth, truth: TruthFrame) -> np.ndarray:
     pose = np.array(truth.lateral_camera_to_global)
     pose[:3, 3] -= known.recording.scene.origin
     return pose
 
 
-def leading_box(known: KnownTruth, frame: Frame) -> Box:
+def leading_box(known: DriveTruth, frame: Frame) -> Box:
     track = next(track for track in known.recording.scene.tracks if track.id == known.truth.leading)
     return box_at(track, frame.timestamp, known.recording.scene.key_frame_interval)
 
@@ -177,7 +177,7 @@ def test_the_model_is_looked_at_from_two_metres_to_the_own_cars_left(known, demo
         assert (view.width, view.height) == (160, 90)
 
 
-def nudged(known: KnownTruth, seed: int) -> KnownTruth:
+def nudged(known: DriveTruth, seed: int) -> DriveTruth:
     """The same truth with recorded poses that are off by decimetres and degrees, each otherwise."""
     random = np.random.default_rng(seed)
     frames = []
@@ -216,7 +216,7 @@ def test_where_recorded_poses_are_off_what_moves_is_left_out_where_it_is_seen_fr
     assert result["pixels"] == pytest.approx(count, rel=1e-4)
 
 
-def hulls(known: KnownTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def hulls(known: DriveTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Per key frame: the street without the leading car, the pixels of its box, and the others; own car aside."""
     free = np.arange(90)[:, None] < 90 - OWN_CAR_ROWS
     for frame, truth in front_frames(known):
@@ -255,7 +255,7 @@ def test_the_own_cars_pixels_are_neither_of_the_removals_box_nor_outside_of_it(k
 class Riding(Own):
     """Gaussians in a grid that fills the leading car's box and rides with it; its own where `knows` says so."""
 
-    def __init__(self, known: KnownTruth, knows: bool, beside: float = 0.0):
+    def __init__(self, known: DriveTruth, knows: bool, beside: float = 0.0):
         axes = [np.linspace(-0.5, 0.5, n) * share for n, share in ((5, 0.95), (4, 0.95), (4, 0.95))]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         frames = [frame for frame, _ in front_frames(known)]
@@ -272,12 +272,12 @@ class Riding(Own):
         return dataclasses.replace(still, means=still.means @ pose[:3, :3].T + pose[:3, 3])
 
 
-def unremoved(model: SplatModel, known: KnownTruth) -> dict[str, Any]:
+def unremoved(model: SplatModel, known: DriveTruth) -> dict[str, Any]:
     """The model with the car against the street without it."""
     metrics = RegionMetrics(None, ("box", "outside"))
     for (frame, _), (image, inside, outside) in zip(front_frames(known), hulls(known), strict=True):
         view = view_of(known.recording.record, known.recording.scene.frames.index(frame), CPU)
-        metrics.add(metrics.measured(rendered(model, view), image, {"box": inside, "outside": outside}))
+        metrics.add(metrics.measure(rendered(model, view), image, {"box": inside, "outside": outside}))
     return metrics.summary()
 
 
@@ -339,7 +339,7 @@ def test_of_another_camera_there_is_no_truth(known, camera):
     assert removal_metrics(flat_model(), known, camera, MARGIN, None, CPU) is None
 
 
-def inputs_of(known: KnownTruth, truth: Path | None) -> EvaluationInputs:
+def inputs_of(known: DriveTruth, truth: Path | None) -> EvaluationInputs:
     return EvaluationInputs(
         checkpoint={}, summary={}, recording=known.recording, masks_record={}, lpips_record=None, truth=truth
     )  # fmt: skip
@@ -357,7 +357,7 @@ def job_of(camera: str, synthetic: bool = True) -> EvaluateJob:
     [(True, "CAM_FRONT", {"lateral", "removal"}), (True, "CAM_BACK", set()), (False, "CAM_FRONT", set())],
 )
 def test_figures_against_truth_exist_only_where_truth_does(known, has_truth, camera, keys):
-    found = against_truth(flat_model(), inputs_of(known, known.path if has_truth else None), job_of(camera), None, CPU)
+    found = truth_metrics(flat_model(), inputs_of(known, known.path if has_truth else None), job_of(camera), None, CPU)
     assert found.keys() == keys
     json.dumps(found, allow_nan=False)
 
@@ -365,7 +365,7 @@ def test_figures_against_truth_exist_only_where_truth_does(known, has_truth, cam
 def test_a_recorded_drives_evaluation_is_held_to_no_truth(known):
     """Its job says nothing of a removal; a truth.json that lies beside its tables is none of it."""
     job = job_of("CAM_FRONT", synthetic=False)
-    assert against_truth(flat_model(), inputs_of(known, known.path), job, None, CPU) == {}
+    assert truth_metrics(flat_model(), inputs_of(known, known.path), job, None, CPU) == {}
 
 
 def test_frames_that_have_truth_are_those_of_its_camera_by_their_numbers(known):
@@ -376,7 +376,7 @@ def test_frames_that_have_truth_are_those_of_its_camera_by_their_numbers(known):
     assert not list(known.frames("CAM_BACK"))
 
 
-def changed(known: KnownTruth, leading: str | None = None, **changes: Any) -> KnownTruth:
+def changed(known: DriveTruth, leading: str | None = None, **changes: Any) -> DriveTruth:
     """The truth with every frame changed."""
     frames = tuple(dataclasses.replace(frame, **changes) for frame in known.truth.frames)
     return dataclasses.replace(known, truth=dataclasses.replace(known.truth, frames=frames, leading=leading))
@@ -402,7 +402,7 @@ def test_frames_without_the_leading_car_are_not_measured(known):
     assert result["outside"]["pixels"] == pytest.approx(sum(outside.sum() for _, _, outside in seen), abs=4)
 
 
-def good(known: KnownTruth) -> dict[str, Any]:
+def good(known: DriveTruth) -> dict[str, Any]:
     return json.loads(known.path.read_text())
 
 

@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.editing.film import editable_actors
 from drivesplat.errors import ConfigError
-from drivesplat.evaluation.summary import in_words
+from drivesplat.evaluation.summary import sentences
 from drivesplat.inspection.ghost_panel import ghost_panel
 from drivesplat.inspection.removal import remove_actor
 from drivesplat.rendering.trajectory import film_path
@@ -63,11 +63,11 @@ def test_what_the_drives_were_like_stands_beside_their_figures(drives):
 
 
 def test_in_words_they_are_read_with_a_grain_of_salt(drives):
-    stands, still, night = ("\n".join(in_words(drives[name].metrics, "metrics.json")) for name in WORLDS)
+    stands, still, night = ("\n".join(sentences(drives[name].metrics, "metrics.json")) for name in WORLDS)
     assert stands.count("were taken 0.00 m from training frames") == 2 and "dark" not in stands
-    assert night.count("are dark (mean luminance 0.1") == 2 and "remembered" not in night
+    assert night.count("are dark (mean luminance 0.1") == 2 and "memorised" not in night
     assert "no moving vehicle to compare with" in still and "a gap of" not in still
-    assert "remembered" not in still and "dark" not in still
+    assert "memorised" not in still and "dark" not in still
 
 
 def test_a_standing_car_has_a_scale_and_seeds(drives):

@@ -1,0 +1,13 @@
+"""The worked examples in the docstrings of evaluation."""
+
+import doctest
+
+import pytest
+
+from drivesplat.evaluation import comparison, metrics
+
+
+@pytest.mark.parametrize("module", [comparison, metrics], ids=lambda module: module.__name__)
+def test_worked_examples_give_what_they_show(module):
+    result = doctest.testmod(module)
+    assert result.attempted and not result.failed
