@@ -2,14 +2,14 @@
 
 from drivesplat.workflow.job import job
 from drivesplat.inspection.figures import save_figure
-from drivesplat.inspection.track_table import draw_tracks, sightings_of, track_rows, write_tracks
+from drivesplat.inspection.track_table import draw_tracks, subjects_by_image, track_rows, write_tracks
 from drivesplat.scene.prepared_drive import read_recording
 from drivesplat.settings.inspection import TracksJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, camera = current.input, current.settings(TracksJob).eval_camera
     recording, _ = read_recording(files.scene, files.parser, files.masks)
-    sightings = sightings_of(recording, camera)
-    rows = track_rows(recording, sightings)
+    subjects = subjects_by_image(recording, camera)
+    rows = track_rows(recording, subjects)
     write_tracks(current.output.table, rows)
-    save_figure(current.output.picture, draw_tracks(recording, sightings, rows, camera))
+    save_figure(current.output.picture, draw_tracks(recording, subjects, rows, camera))

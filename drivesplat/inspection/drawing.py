@@ -1,4 +1,4 @@
-"""The ghost panel and the removal as pictures."""
+"""Figures of the ghost panel and of a removal."""
 
 from typing import Any
 
@@ -6,78 +6,86 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from drivesplat.inspection.figures import draw_outline, sheet, show
-from drivesplat.inspection.ghost_panel import Panel
+from drivesplat.inspection.figures import draw_outline, image_grid, show
+from drivesplat.inspection.ghost_panel import GhostPanel
 from drivesplat.inspection.removal import RemovalPair
 
-LARGEST_ERROR = 0.5
-WAY = "#4cc9f0"
+MAX_ERROR = 0.5
+PATH_COLOR = "#4cc9f0"
 
 
-def draw_panel(panel: Panel, record: dict[str, Any], method: str) -> Figure:
-    """ground truth | render over absolute error | ghosts."""
+def draw_panel(panel: GhostPanel, record: dict[str, Any], method: str) -> Figure:
+    """Ground truth and rendering above absolute error and ghosts."""
     title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
     subject = record["subject"]
     if subject is None:
         title += f"\n{record['why_null']}"
     else:
-        seen = "training image" if subject["split"] == "train" else f"held out: {subject['split']}"
-        title += f" ({seen})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m away"
-    figure, axes = sheet(panel.truth.shape, rows=2, columns=2, title=title)
+        split = "training image" if subject["split"] == "train" else f"held out: {subject['split']}"
+        title += (
+            f" ({split})\n{subject['category']}, {subject['speed_m_s']:.1f} m/s, {subject['distance_m']:.0f} m away"
+        )
+    figure, axes = image_grid(panel.truth.shape, rows=2, columns=2, title=title)
     show(axes[0], panel.truth, "Ground truth")
-    show(axes[1], panel.render, f"Render: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}")
+    show(
+        axes[1],
+        panel.render,
+        f"Rendering: vehicle {_decibels(record['vehicle'])}, static {_decibels(record['static'])}",
+    )
     _show_error(axes[2], panel.render, panel.truth, "Absolute error, mean over the channels")
-    show(axes[3], panel.haunted, _ghosts_in_words(record["ghosts"]))
-    if len(panel.way) > 1:
-        axes[3].plot(*_clipped(panel.way, panel.truth.shape).T, color=WAY, linewidth=2.0, alpha=0.9)
+    show(axes[3], panel.ghosts, _ghosts_title(record["ghosts"]))
+    if len(panel.path) > 1:
+        axes[3].plot(*_clipped(panel.path, panel.truth.shape).T, color=PATH_COLOR, linewidth=2.0, alpha=0.9)
     _outline(axes, panel.outline)
     return figure
 
 
-def _ghosts_in_words(ghosts: dict[str, Any] | None) -> str:
+def _ghosts_title(ghosts: dict[str, Any] | None) -> str:
     if ghosts is None:
-        return "Ghosts: none, nothing moves"
+        return "Ghosts: none, no moving vehicle"
     if not ghosts["gaussians"]:
-        return "Ghosts: none on the vehicle's way (blue)"
+        return "Ghosts: none along the vehicle's path (blue)"
     count, mean = ghosts["gaussians"], ghosts["opacity_mean"]
-    drawn = f" (drawn {ghosts['drawn_times']:.1f}x)" if ghosts["drawn_times"] > 1.0 else ""
-    return f"Ghosts{drawn} along its way (blue): {count:,}, mean opacity {mean:.2f}"
+    amplified = f" (amplified {ghosts['drawn_times']:.1f}x)" if ghosts["drawn_times"] > 1.0 else ""
+    return f"Ghosts{amplified} along its path (blue): {count:,}, mean opacity {mean:.2f}"
 
 
 def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figure:
-    """with | without | difference."""
+    """Rendering with and without the vehicle, and their difference."""
     title = f"Scene {record['scene']} · {method} · key frame {record['key_frame']}"
-    without = "Without its Gaussians" if record["removed_by"] == "actor" else "Without the Gaussians in its box"
+    without = (
+        "Without the vehicle's Gaussians" if record["removed_by"] == "actor" else "Without the Gaussians in the box"
+    )
     if record["subject"] is None:
         title += f"\n{record['why_null']}"
     else:
         changed = record["box"]["changed_share"] or 0.0
-        title += f"\n{record['gaussians_removed']:,} Gaussians removed, which changes {changed:.0%} of its box's pixels"
-    figure, axes = sheet(pair.with_car.shape, rows=1, columns=3, title=title)
-    show(axes[0], pair.with_car, "Render")
+        title += f"\n{record['gaussians_removed']:,} Gaussians removed, {changed:.0%} of the pixels of the box changed"
+    figure, axes = image_grid(pair.with_car.shape, rows=1, columns=3, title=title)
+    show(axes[0], pair.with_car, "Rendering")
     show(axes[1], pair.without_car, without)
-    _show_error(axes[2], pair.without_car, pair.with_car, "Difference, mean over the channels")
+    _show_error(axes[2], pair.without_car, pair.with_car, "Absolute difference, mean over the channels")
     _outline(axes, pair.outline)
     return figure
 
 
 def _show_error(axis: Axes, image: np.ndarray, truth: np.ndarray, title: str) -> None:
-    error = axis.imshow(np.abs(image - truth).mean(axis=2), cmap="inferno", vmin=0.0, vmax=LARGEST_ERROR)
+    error = axis.imshow(np.abs(image - truth).mean(axis=2), cmap="inferno", vmin=0.0, vmax=MAX_ERROR)
     axis.set_autoscale_on(False)
     axis.set_title(title, loc="left", fontsize=15)
     bar = axis.inset_axes((0.7, 0.12, 0.26, 0.03))
-    axis.figure.colorbar(error, cax=bar, orientation="horizontal", ticks=[0.0, LARGEST_ERROR])
+    axis.figure.colorbar(error, cax=bar, orientation="horizontal", ticks=[0.0, MAX_ERROR])
     bar.tick_params(colors="white", labelsize=11)
 
 
 def _outline(axes: list[Axes], outline: np.ndarray) -> None:
-    """Draws the box (n, 2) in continuous pixels into every picture, where there is one."""
+    """Draws the outline (n, 2) of the box, in continuous pixels, into every image; nothing if it is empty."""
     for axis in axes if len(outline) else ():
         draw_outline(axis, outline)
 
 
 def _clipped(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A line (m, 2) of continuous pixels in an image's coordinates, NaN (a gap) outside of it."""
+    """A line (m, 2) of continuous pixels in the coordinates of axes, NaN (a gap) outside of the image."""
     inside = ((pixels >= 0) & (pixels <= [shape[1], shape[0]])).all(axis=1)
     return np.where(inside[:, None], pixels - 0.5, np.nan)
 

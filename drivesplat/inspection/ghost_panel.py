@@ -1,4 +1,4 @@
-"""The stage `ghost_panel`: a moving vehicle as it was, as a model shows it, where that fails, and what it leaves."""
+"""The stage `ghost_panel`: ground truth and rendering of a moving vehicle, the error, and the ghosts along its path."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from drivesplat.evaluation.metrics import psnr_record
-from drivesplat.inspection.ghosts import COVERING, STEP, boxes_along, ghosts_of
-from drivesplat.inspection.rendered_view import Drive, Sight, colors_of
-from drivesplat.inspection.subject import Subject, choose_subject, described
+from drivesplat.inspection.ghosts import MIN_COVERING_OPACITY, SAMPLE_DISTANCE, boxes_along_path, ghosts_of
+from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive, colors_of
+from drivesplat.inspection.subject import Subject, choose_subject, no_subject_reason, subject_record
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.regions import region_mask
 from drivesplat.scene.rigid import inverse
@@ -16,81 +16,80 @@ from drivesplat.settings.inspection import GhostSettings, PanelJob
 
 SCHEMA = 1
 DIMMED = 0.3
-LARGEST_STRENGTH = 4.0
-"""Ghosts are drawn at most so many times more opaque than they are: they are faint, and they are to be seen."""
-WELL_SEEN = 0.9
-"""The opacity at which nearly all of them should stay below."""
-IN_FRONT = 0.5
+MAX_AMPLIFICATION = 4.0
+"""Maximum factor by which the opacity of ghosts is amplified to make them visible."""
+TARGET_OPACITY = 0.9
+"""The amplified opacity of the 95th percentile."""
+MIN_DEPTH = 0.5
+"""Metres; points of the path nearer to the camera, or behind it, are not drawn."""
 
 
 @dataclass(frozen=True)
-class Panel:
-    """What is drawn: pictures (h, w, 3) in [0, 1], `haunted` the dimmed image under the strengthened ghosts; and in
-    continuous pixels the `outline` (n, 2) of the box and the `way` (m, 2) of its centre over the ground, both empty
-    where nothing moves."""
+class GhostPanel:
+    """Images (h, w, 3) in [0, 1], `ghosts` being the dimmed image under the amplified ghosts; and in continuous pixels
+    the `outline` (n, 2) of the box and the `path` (m, 2) of its centre on the ground, both empty without a moving
+    vehicle."""
 
     truth: np.ndarray
     render: np.ndarray
-    haunted: np.ndarray
+    ghosts: np.ndarray
     outline: np.ndarray
-    way: np.ndarray
+    path: np.ndarray
 
 
-def ghost_panel(drive: Drive, job: PanelJob) -> tuple[Panel, dict[str, Any]]:
-    """What is drawn, and the content of ghost_panel.json, provenance aside.
+def ghost_panel(drive: TrainedDrive, job: PanelJob) -> tuple[GhostPanel, dict[str, Any]]:
+    """The panel, and the content of ghost_panel.json without provenance.
 
-    Where no vehicle moves before the camera the middle key frame is shown, and the figures of the vehicle and its
-    ghosts are None, with the reason.
+    If no moving vehicle is visible, the panel shows the middle key frame, and the figures of vehicle and ghosts are
+    None, with the reason.
     """
     recording = drive.recording
     subject = choose_subject(recording, job.eval_camera, job.subject)
-    sight = Sight(drive, subject.index if subject else recording.scene.middle_key_frame(job.eval_camera))
-    truth, render = recording.image(sight.index), colors_of(sight.of().image)
-    static = region_mask(recording.labels(sight.index), "static")
+    view = RenderedView(drive, subject.index if subject else recording.scene.middle_key_frame(job.eval_camera))
+    truth, render = recording.image(view.index), colors_of(view.render().image)
+    static = region_mask(recording.labels(view.index), "static")
     record = {
         "schema": SCHEMA,
         "scene": recording.scene.name,
-        "key_frame": sight.frame.sample_index,
-        "subject": described(subject, recording) if subject else None,
+        "key_frame": view.frame.sample_index,
+        "subject": subject_record(subject, recording) if subject else None,
         "static": psnr_record(render, truth, static),
         "vehicle": psnr_record(render, truth, subject.visible) if subject else None,
         "ghosts": None,
-        "why_null": None if subject else f"no vehicle moves before {job.eval_camera} in this scene",
+        "why_null": None if subject else no_subject_reason(job.eval_camera),
     }
     dimmed = DIMMED * np.repeat(truth.mean(axis=2, keepdims=True), 3, axis=2)
     if subject is None:
-        return Panel(truth, render, dimmed, np.zeros((0, 2)), np.zeros((0, 2))), record
-    haunted, record["ghosts"] = _haunting(sight, subject, dimmed, job.ghosts)
-    return Panel(truth, render, haunted, subject.hull.polygon, _way(sight, subject)), record
+        return GhostPanel(truth, render, dimmed, np.zeros((0, 2)), np.zeros((0, 2))), record
+    image, record["ghosts"] = _ghost_image(view, subject, dimmed, job.ghosts)
+    return GhostPanel(truth, render, image, subject.hull.polygon, _ground_path(view, subject)), record
 
 
-def _haunting(
-    sight: Sight, subject: Subject, dimmed: np.ndarray, settings: GhostSettings
+def _ghost_image(
+    view: RenderedView, subject: Subject, dimmed: np.ndarray, settings: GhostSettings
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """The ghosts in their own colours over the `dimmed` image (h, w, 3), strengthened to be seen, and their figures."""
-    ghosts = ghosts_of(sight, subject.box, settings)
-    alone = sight.of(ghosts.rows)
+    """The amplified ghosts in their own colours over the `dimmed` image (h, w, 3), and their figures."""
+    ghosts = ghosts_of(view, subject.box, settings)
+    alone = view.render(ghosts.rows)
     opacity = colors_of(alone.alpha)
-    covered = opacity >= COVERING
-    strength = 1.0
+    covered = opacity >= MIN_COVERING_OPACITY
+    amplification = 1.0
     if covered.any():
-        strength = float(np.clip(WELL_SEEN / np.quantile(opacity[covered], 0.95), 1.0, LARGEST_STRENGTH))
+        amplification = float(np.clip(TARGET_OPACITY / np.quantile(opacity[covered], 0.95), 1.0, MAX_AMPLIFICATION))
     own_color = colors_of(alone.splats) / np.maximum(opacity, 1e-6)[..., None]
-    shown = np.minimum(strength * opacity, 1.0)[..., None]
-    haunted = shown * own_color.clip(0.0, 1.0) + (1.0 - shown) * dimmed
-    figures = {"covered_share": float(covered.mean()), "drawn_times": strength}
-    return haunted, {**ghosts.figures(sight.gaussians), **figures}
+    weight = np.minimum(amplification * opacity, 1.0)[..., None]
+    image = weight * own_color.clip(0.0, 1.0) + (1.0 - weight) * dimmed
+    figures = {"covered_share": float(covered.mean()), "drawn_times": amplification}
+    return image, {**ghosts.figures(view.gaussians), **figures}
 
 
-def _way(sight: Sight, subject: Subject) -> np.ndarray:
-    """Where the vehicle's way over the ground lies in the image: (m, 2) continuous pixels, NaN behind the camera and
-    where the annotation has a gap."""
-    scene = sight.drive.recording.scene
-    boxes = boxes_along(scene.track(subject.box.track_id), scene.key_frame_interval)
+def _ground_path(view: RenderedView, subject: Subject) -> np.ndarray:
+    """The vehicle's path on the ground in the image: (m, 2) continuous pixels, NaN behind the camera and in gaps of the
+    annotation."""
+    scene = view.drive.recording.scene
+    boxes = boxes_along_path(scene.track(subject.box.track_id), scene.key_frame_interval)
     ground = np.array([box.object_to_world[:3, 3] - box.object_to_world[:3, 2] * box.size[2] / 2 for box in boxes])
-    pixels, depth = project(
-        ground, inverse(sight.frame.camera_to_world), continuous_intrinsics(sight.frame, sight.size)
-    )
-    pixels[depth <= IN_FRONT] = np.nan
-    gaps = np.flatnonzero(np.linalg.norm(np.diff(ground, axis=0), axis=1) > 2 * STEP)
+    pixels, depth = project(ground, inverse(view.frame.camera_to_world), continuous_intrinsics(view.frame, view.size))
+    pixels[depth <= MIN_DEPTH] = np.nan
+    gaps = np.flatnonzero(np.linalg.norm(np.diff(ground, axis=0), axis=1) > 2 * SAMPLE_DISTANCE)
     return np.insert(pixels, gaps + 1, np.nan, axis=0)

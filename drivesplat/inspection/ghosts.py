@@ -1,4 +1,4 @@
-"""Ghosts: the Gaussians that a static model leaves along the way of something that moved."""
+"""Ghosts: Gaussians that a static model leaves along the path of a moving object."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,38 +9,40 @@ from jaxtyping import Bool
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from drivesplat.inspection.rendered_view import Sight
+from drivesplat.inspection.rendered_view import RenderedView
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.scene.scene import Track
 from drivesplat.scene.tracks import Box, box_at
 from drivesplat.settings.inspection import GhostSettings
 
-STEP = 0.25
-"""The box is looked at every so many metres of its way."""
-LONGEST_PAUSE = 0.25
-"""... and every so many seconds."""
-COVERING = 0.05
-"""Ghosts cover a pixel where they alone are at least so opaque."""
+SAMPLE_DISTANCE = 0.25
+"""Metres between the boxes that sample a path."""
+MAX_SAMPLE_INTERVAL = 0.25
+"""Seconds between them at most."""
+MIN_COVERING_OPACITY = 0.05
+"""Opacity of the ghosts alone from which they cover a pixel."""
 
 
-def boxes_along(track: Track, interval: float) -> list[Box]:
-    """The boxes of a track's way over the scene, in time, so close that together they fill the volume it swept.
+def boxes_along_path(track: Track, interval: float) -> list[Box]:
+    """The boxes along a track's path in time, so close that they fill the volume that the object swept.
 
     `interval` is the scene's key-frame interval in microseconds.
     """
     annotated = (box_at(track, int(time), interval) for time in track.timestamps)
     fastest = max(box.speed for box in annotated if box is not None)
-    step = int(1e6 * min(LONGEST_PAUSE, STEP / max(fastest, 1e-6)))
+    step = int(1e6 * min(MAX_SAMPLE_INTERVAL, SAMPLE_DISTANCE / max(fastest, 1e-6)))
     times = range(int(track.timestamps[0] - interval / 2), int(track.timestamps[-1] + interval / 2) + 1, step)
     boxes = (box_at(track, time, interval) for time in times)
     return [box for box in boxes if box is not None]
 
 
-def swept(track: Track, interval: float, points: np.ndarray, floor: float = 0.0) -> np.ndarray:
-    """Which world points (n, 3) lie in the volume that a track's box swept, its floor raised by `floor` metres: (n,)
-    bool."""
+def in_swept_volume(track: Track, interval: float, points: np.ndarray, floor: float = 0.0) -> np.ndarray:
+    """Which world points (n, 3) lie in the volume that a track's box swept, its floor raised by `floor` metres: (n,).
+
+    `interval` is the scene's key-frame interval in microseconds.
+    """
     inside = np.zeros(len(points), dtype=bool)
-    boxes = boxes_along(track, interval)
+    boxes = boxes_along_path(track, interval)
     if not boxes or len(points) == 0:
         return inside
     corners = np.concatenate([box.corners for box in boxes])
@@ -56,12 +58,12 @@ def swept(track: Track, interval: float, points: np.ndarray, floor: float = 0.0)
 
 @dataclass(frozen=True)
 class Ghosts:
-    """`rows` (n,) bool: which Gaussians are ghosts of a box at one moment."""
+    """`rows` (n,) bool: which Gaussians are ghosts of a box at one time."""
 
     rows: Bool[Tensor, " n"]
 
     def figures(self, gaussians: Gaussians) -> dict[str, Any]:
-        """How many there are and how opaque: sums and means over them, None where there are none."""
+        """Their number, and sum, mean and median of their opacities; mean and median are None without ghosts."""
         opacities = gaussians.opacities[self.rows]
         count = len(opacities)
         return {
@@ -72,12 +74,12 @@ class Ghosts:
         }
 
 
-def ghosts_of(sight: Sight, box: Box, settings: GhostSettings) -> Ghosts:
-    """The ghosts of what is at `box` now: Gaussians in the volume that its box swept over the scene, but outside the
-    box. Those of parts that move are none: they go where their objects go."""
-    scene, gaussians = sight.drive.recording.scene, sight.gaussians
+def ghosts_of(view: RenderedView, box: Box, settings: GhostSettings) -> Ghosts:
+    """The ghosts of the object at `box`: Gaussians in the volume that its box sweeps during the scene, but outside of
+    the box now. Gaussians of dynamic parts move with their objects and are no ghosts."""
+    scene, gaussians = view.drive.recording.scene, view.gaussians
     track = scene.track(box.track_id)
     points = gaussians.means.cpu().double().numpy()
-    rows = swept(track, scene.key_frame_interval, points, settings.clearance) & ~box.holds(points)
-    moving = sight.drive.model.moving()
+    rows = in_swept_volume(track, scene.key_frame_interval, points, settings.clearance) & ~box.holds(points)
+    moving = view.drive.model.moving()
     return Ghosts(torch.from_numpy(rows).to(moving.device) & ~moving)

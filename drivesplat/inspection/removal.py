@@ -1,4 +1,4 @@
-"""The stage `remove_actor`: a vehicle taken out of a trained model, and what that leaves, in pictures and figures."""
+"""The stage `remove_actor`: a trained model with and without a vehicle, as images and figures."""
 
 import logging
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from skimage.color import rgb2gray
 from skimage.filters import sobel
 
 from drivesplat.evaluation.metrics import psnr_record
-from drivesplat.inspection.ghosts import COVERING, ghosts_of
-from drivesplat.inspection.rendered_view import Drive, Sight, colors_of
-from drivesplat.inspection.subject import Subject, choose_subject, described
+from drivesplat.inspection.ghosts import MIN_COVERING_OPACITY, ghosts_of
+from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive, colors_of
+from drivesplat.inspection.subject import Subject, choose_subject, no_subject_reason, subject_record
 from drivesplat.model.removal import Removal, removal_of
 from drivesplat.scene.regions import fill
 from drivesplat.settings.inspection import RemovalJob
@@ -20,19 +20,19 @@ from drivesplat.settings.inspection import RemovalJob
 log = logging.getLogger(__name__)
 
 SCHEMA = 1
-CHANGED = 8 / 255
-"""A pixel has changed where any channel differs by more."""
-HOLE = 0.5
-"""A pixel is a hole where the opacity fell below this from above it."""
+CHANGE_THRESHOLD = 8 / 255
+"""A pixel has changed if any channel differs by more."""
+HOLE_OPACITY = 0.5
+"""A pixel is a hole if its opacity has fallen below this value."""
 EDGE_BAND = 2.0
-"""Half the width (pixels) of the band along the hull in which an edge is looked for."""
+"""Half the width (pixels) of the band along the hull in which gradients are measured."""
 
 
 @dataclass(frozen=True)
 class RemovalPair:
-    """One view with and without the vehicle: images (h, w, 3) in [0, 1], opacities (h, w), `footprint` (h, w) bool the
-    pixels that the removed Gaussians reach, `inside` and `outside` those of the box and the others, without the own
-    car's body; `outline` (n, 2) of the box in continuous pixels, empty without a vehicle."""
+    """A view with and without the vehicle: images (h, w, 3) in [0, 1] and opacities (h, w); masks (h, w) bool:
+    `footprint` of the pixels that the removed Gaussians reach, `inside` and `outside` of the box, both without the ego
+    mask; `outline` (n, 2) of the box in continuous pixels, empty without a vehicle."""
 
     with_car: np.ndarray
     without_car: np.ndarray
@@ -44,127 +44,127 @@ class RemovalPair:
     outline: np.ndarray
 
 
-def remove_actor(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
-    """The pair of pictures and the content of removal.json, provenance aside.
+def remove_actor(drive: TrainedDrive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
+    """The pair of images and the content of removal.json without provenance.
 
-    Where no vehicle moves before the camera, both pictures are the middle key frame's and the figures are None, with
-    the reason.
+    If no moving vehicle is visible, both images are those of the middle key frame, and the figures are None, with the
+    reason.
     """
     subject = choose_subject(drive.recording, job.eval_camera, job.subject)
     if subject is None:
         return _nothing_to_remove(drive, job)
-    sight = Sight(drive, subject.index)
-    removal = removal_of(drive.model, sight.gaussians, subject.box, job.removal.margin)
-    pair = _pair(sight, subject, removal)
+    view = RenderedView(drive, subject.index)
+    removal = removal_of(drive.model, view.gaussians, subject.box, job.removal.margin)
+    pair = _pair(view, subject, removal)
     count = int(removal.removed.sum())
     log.info("%s: %d Gaussians removed by %s", drive.recording.scene.name, count, removal.by)
     if removal.by == "box":
         log.info(
-            "what the box held is gone; the vehicle's shadow, and its ghosts along its way, stay. A learned "
-            "decomposition (Street Gaussians, the method 'street') gives the vehicle Gaussians of its own: leaving "
-            "these out shows the background behind it as other images saw it"
+            "the Gaussians in the box are removed; the vehicle's shadow and its ghosts along its path remain. With a "
+            "learned decomposition (Street Gaussians, the method 'street') the vehicle has its own Gaussians: without "
+            "them the rendering shows the background as other images observed it"
         )
     return pair, {
         "schema": SCHEMA,
         "scene": drive.recording.scene.name,
-        "key_frame": sight.frame.sample_index,
-        "subject": described(subject, drive.recording),
+        "key_frame": view.frame.sample_index,
+        "subject": subject_record(subject, drive.recording),
         "why_null": None,
         "removed_by": removal.by,
         "margin_m": job.removal.margin,
         "gaussians_removed": count,
         **figures(pair),
-        "ghosts": _ghost_figures(sight, subject, pair, job),
+        "ghosts": _ghost_figures(view, subject, pair, job),
     }
 
 
-def _pair(sight: Sight, subject: Subject, removal: Removal) -> RemovalPair:
-    before, after, alone = sight.of(), sight.of(~removal.removed), sight.of(removal.removed)
-    hull, seen = fill(subject.hull.polygon, sight.size), ~sight.drive.recording.own_car(sight.index)
+def _pair(view: RenderedView, subject: Subject, removal: Removal) -> RemovalPair:
+    before, after, alone = view.render(), view.render(~removal.removed), view.render(removal.removed)
+    hull, visible = fill(subject.hull.polygon, view.size), ~view.drive.recording.own_car(view.index)
     return RemovalPair(
         with_car=colors_of(before.image),
         without_car=colors_of(after.image),
         alpha_with=colors_of(before.alpha),
         alpha_without=colors_of(after.alpha),
         footprint=colors_of(alone.alpha) > 0.0,
-        inside=hull & seen,
-        outside=~hull & seen,
+        inside=hull & visible,
+        outside=~hull & visible,
         outline=subject.hull.polygon,
     )
 
 
 def figures(pair: RemovalPair) -> dict[str, Any]:
-    """What the removal changed: nothing here is a gate, all of it is to be known.
+    """The changes made by the removal; informative, never a criterion.
 
-    `box`: pixels of the hull, the share that changed, and how much of what they show is the sky behind all Gaussians,
-    where a learned sky may have kept the vehicle. `holes`: pixels of the image that lost their surface, and the share
-    of the box that did. `edge`: mean gradient of the luminance along the hull, with and without. `outside`: PSNR
-    between both pictures off the hull, the share that changed there and how far (pixels) from the hull the change
-    reaches. `outside_footprint`: the same PSNR where no removed Gaussian reaches, which is to be infinite.
+    `box`: pixels of the hull, their changed share, and the weight of the sky in them, in which a learned sky may have
+    absorbed the vehicle. `holes`: pixels whose opacity has fallen below HOLE_OPACITY, and their share of the box.
+    `edge`: mean luminance gradient along the hull, with and without the vehicle. `outside`: PSNR between both images
+    outside of the hull, the changed share there, and the maximum distance (pixels) of a change from the hull.
+    `outside_footprint`: the same PSNR where no removed Gaussian reaches; infinite if the removal is exact.
     """
-    changed = (np.abs(pair.with_car - pair.without_car) > CHANGED).any(axis=2)
-    holes = (pair.alpha_without < HOLE) & (pair.alpha_with >= HOLE)
+    changed = (np.abs(pair.with_car - pair.without_car) > CHANGE_THRESHOLD).any(axis=2)
+    holes = (pair.alpha_without < HOLE_OPACITY) & (pair.alpha_with >= HOLE_OPACITY)
     distance = distance_transform_edt(~pair.inside)
-    leaked = distance[pair.outside & changed]
+    distances = distance[pair.outside & changed]
     return {
         "box": {
             "pixels": int(pair.inside.sum()),
-            "changed_share": _share(changed, pair.inside),
+            "changed_share": _mean(changed, pair.inside),
             "sky_share_with": _mean(1.0 - pair.alpha_with, pair.inside),
             "sky_share_without": _mean(1.0 - pair.alpha_without, pair.inside),
         },
-        "holes": {"pixels": int(holes.sum()), "share_of_box": _share(holes, pair.inside)},
+        "holes": {"pixels": int(holes.sum()), "share_of_box": _mean(holes, pair.inside)},
         "edge": _edge(pair, distance),
         "outside": {
             **(psnr_record(pair.without_car, pair.with_car, pair.outside) or {"psnr": None, "pixels": 0}),
-            "changed_share": _share(changed, pair.outside),
-            "reach_px": float(leaked.max()) if len(leaked) else 0.0,
+            "changed_share": _mean(changed, pair.outside),
+            "reach_px": float(distances.max()) if len(distances) else 0.0,
         },
         "outside_footprint": psnr_record(pair.without_car, pair.with_car, ~pair.footprint),
     }
 
 
 def _edge(pair: RemovalPair, distance_outside: np.ndarray) -> dict[str, float | None]:
-    """The mean gradient along the hull in both pictures, and their ratio: above 1, the removal draws an outline.
+    """The mean gradient along the hull in both images, and their ratio; above 1 the removal has added an outline.
 
-    None where the hull has no edge in the image. Where the own car cuts the hull is no edge.
+    None if the hull has no edge in the image. The boundary with the ego mask is not an edge.
     """
-    nothing = {"with_car": None, "without_car": None, "ratio": None}
+    no_edge = {"with_car": None, "without_car": None, "ratio": None}
     if pair.inside.all() or not pair.inside.any():
-        return nothing
-    seen = pair.inside | pair.outside
-    clear = seen if seen.all() else distance_transform_edt(seen) > EDGE_BAND + 1.0
+        return no_edge
+    visible = pair.inside | pair.outside
+    clear = visible if visible.all() else distance_transform_edt(visible) > EDGE_BAND + 1.0
     band = clear & (distance_outside <= EDGE_BAND) & (distance_transform_edt(pair.inside) <= EDGE_BAND)
     if not band.any():
-        return nothing
+        return no_edge
     before, after = (float(sobel(rgb2gray(image))[band].mean()) for image in (pair.with_car, pair.without_car))
     return {"with_car": before, "without_car": after, "ratio": after / before if before > 0 else None}
 
 
-def _ghost_figures(sight: Sight, subject: Subject, pair: RemovalPair, job: RemovalJob) -> dict[str, Any]:
-    """The ghosts that stay, and whether they are seen outside the box."""
-    ghosts = ghosts_of(sight, subject.box, job.ghosts)
-    opacity = colors_of(sight.of(ghosts.rows).alpha)
-    covered = (opacity >= COVERING) & pair.outside
+def _ghost_figures(view: RenderedView, subject: Subject, pair: RemovalPair, job: RemovalJob) -> dict[str, Any]:
+    """The ghosts that remain, and whether they are visible outside the box."""
+    ghosts = ghosts_of(view, subject.box, job.ghosts)
+    opacity = colors_of(view.render(ghosts.rows).alpha)
+    covered = (opacity >= MIN_COVERING_OPACITY) & pair.outside
     return {
-        **ghosts.figures(sight.gaussians),
-        "covered_share_outside": _share(covered, pair.outside),
+        **ghosts.figures(view.gaussians),
+        "covered_share_outside": _mean(covered, pair.outside),
         "reach_outside_box": bool(covered.any()),
     }
 
 
-def _nothing_to_remove(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
-    sight = Sight(drive, drive.recording.scene.middle_key_frame(job.eval_camera))
-    picture = sight.of()
+def _nothing_to_remove(drive: TrainedDrive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
+    view = RenderedView(drive, drive.recording.scene.middle_key_frame(job.eval_camera))
+    picture = view.render()
     image, alpha = colors_of(picture.image), colors_of(picture.alpha)
-    nowhere = np.zeros(alpha.shape, dtype=bool)
+    empty = np.zeros(alpha.shape, dtype=bool)
     nulls = ("subject", "removed_by", "box", "holes", "edge", "outside", "outside_footprint", "ghosts")
-    reason = f"no vehicle moves before {job.eval_camera} in this scene"
+    reason = no_subject_reason(job.eval_camera)
     log.warning("%s: nothing to remove: %s", drive.recording.scene.name, reason)
-    return RemovalPair(image, image, alpha, alpha, nowhere, nowhere, ~nowhere, np.zeros((0, 2))), {
+    return RemovalPair(image, image, alpha, alpha, empty, empty, ~empty, np.zeros((0, 2))), {
         "schema": SCHEMA,
         "scene": drive.recording.scene.name,
-        "key_frame": sight.frame.sample_index,
+        "key_frame": view.frame.sample_index,
         "why_null": reason,
         "margin_m": job.removal.margin,
         "gaussians_removed": 0,
@@ -172,11 +172,6 @@ def _nothing_to_remove(drive: Drive, job: RemovalJob) -> tuple[RemovalPair, dict
     }
 
 
-def _mean(values: np.ndarray, among: np.ndarray) -> float | None:
-    """The mean of values over a mask; None for an empty one."""
-    return float(values[among].mean()) if among.any() else None
-
-
-def _share(chosen: np.ndarray, among: np.ndarray) -> float | None:
-    """How much of a mask another one holds; None for an empty mask."""
-    return _mean(chosen, among)
+def _mean(values: np.ndarray, mask: np.ndarray) -> float | None:
+    """The mean of values over a mask; None if it is empty."""
+    return float(values[mask].mean()) if mask.any() else None

@@ -1,4 +1,4 @@
-"""A trained model before one of its scene's images."""
+"""Renderings of a trained model at the images of its scene."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,29 +21,31 @@ from drivesplat.settings.device import DeviceSettings
 
 
 @dataclass(frozen=True)
-class Drive:
-    """A trained model with the recording it was trained on."""
+class TrainedDrive:
+    """A trained model with the recording that it was trained on."""
 
     model: SplatModel
     recording: Recording
     device: torch.device
 
 
-def open_drive(checkpoint: dict[str, Any], recording: Recording, device_settings: DeviceSettings) -> Drive:
-    """The model of a checkpoint's content on the device, with its recording."""
+def open_trained_drive(
+    checkpoint: dict[str, Any], recording: Recording, device_settings: DeviceSettings
+) -> TrainedDrive:
+    """The model of a checkpoint (its content) on the device, with its recording. Raises DeviceError."""
     model, device = open_model(checkpoint, device_settings)
-    return Drive(model, recording, device)
+    return TrainedDrive(model, recording, device)
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What the model of `drive` shows at image `index`."""
+class RenderedView:
+    """Renderings of the model of `drive` at the image `index` of the training record."""
 
-    drive: Drive
+    drive: TrainedDrive
     index: int
 
     @cached_property
-    def view(self) -> View:
+    def camera(self) -> View:
         return view_of(self.drive.recording.record, self.index, self.drive.device)
 
     @property
@@ -59,22 +61,22 @@ class Sight:
     def gaussians(self) -> Gaussians:
         """The model's Gaussians at the image's time, in world coordinates."""
         with torch.no_grad():
-            return self.drive.model.gaussians_at(self.view.time)
+            return self.drive.model.gaussians_at(self.camera.time)
 
     @torch.no_grad()
-    def of(self, rows: Bool[Tensor, " n"] | None = None) -> Picture:
-        """The picture, of some of `gaussians` alone where `rows` says which.
+    def render(self, rows: Bool[Tensor, " n"] | None = None) -> Picture:
+        """The rendering of all `gaussians`, or of those that the mask `rows` selects.
 
-        Raises ResultError where it is not finite, DeviceError where the card is full.
+        Raises ResultError if it contains NaN or Inf, DeviceError if the GPU runs out of memory.
         """
-        shown = self.gaussians if rows is None else self.gaussians[rows]
-        with explain_out_of_memory(lambda: len(shown)):
-            picture = self.drive.model.render(self.view, gaussians=shown)
+        gaussians = self.gaussians if rows is None else self.gaussians[rows]
+        with explain_out_of_memory(lambda: len(gaussians)):
+            picture = self.drive.model.render(self.camera, gaussians=gaussians)
         if not bool(torch.isfinite(picture.image).all()):
-            raise ResultError("the model shows no numbers; delete its checkpoint.pt and rerun")
+            raise ResultError("the rendering contains NaN or Inf; delete checkpoint.pt and rerun")
         return picture
 
 
 def colors_of(image: Tensor) -> np.ndarray:
-    """A picture's colours (h, w, 3) or opacities (h, w) as float64 in [0, 1], on the CPU."""
+    """Colours (h, w, 3) or opacities (h, w) of a rendering as float64 in [0, 1], on the CPU."""
     return image.double().clamp(0.0, 1.0).cpu().numpy()

@@ -1,4 +1,4 @@
-"""The vehicle that is looked at, and when: what moves and fills most pixels, or what the user named."""
+"""The vehicle that is inspected, and its key frame: the largest moving one, or the one that the user named."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box
 from drivesplat.settings.inspection import SubjectSettings
 
-MOVERS = REGIONS["moving_vehicle"]
+MOVING_VEHICLE_LABELS = REGIONS["moving_vehicle"]
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A vehicle in one image. `index` counts the scene's frames, and the training record's images; `label` is one of
-    `regions.LABELS`; `visible` (h, w) bool the pixels of its hull that neither a nearer box nor the own car hides."""
+    """A vehicle in one image: `index` is that of the scene's frame and of the training record's image, `label` one of
+    `regions.LABELS`, `visible` (h, w) bool the pixels of its hull not hidden by a nearer box or the ego vehicle."""
 
     index: int
     frame: Frame
@@ -33,26 +33,26 @@ class Subject:
 
     @property
     def pixels(self) -> int:
-        """How many pixels it fills."""
+        """The number of its visible pixels."""
         return int(self.visible.sum())
 
 
 def choose_subject(recording: Recording, camera: str, settings: SubjectSettings) -> Subject | None:
-    """The subject in the key frames of `camera` at training resolution; None where no vehicle moves before it.
+    """The subject in the key frames of `camera` at training resolution; None if no moving vehicle is visible there.
 
-    Raises ConfigError, saying what there is, where the settings name a track or a key frame that has no such vehicle.
+    Raises ConfigError, listing the candidates, if the settings name a track or a key frame without such a vehicle.
     """
     best: Subject | None = None
     for subject in _candidates(recording, camera, settings):
         if best is None or subject.pixels > best.pixels:
             best = subject
     if best is None and (settings.track is not None or settings.key_frame is not None):
-        raise ConfigError(_nothing_there(recording, camera, settings))
+        raise ConfigError(_not_found_message(recording, camera, settings))
     return best
 
 
-def seen_in(recording: Recording, index: int) -> list[Subject]:
-    """Everything in an image that is annotated, can move and is to be seen, farthest first."""
+def visible_subjects(recording: Recording, index: int) -> list[Subject]:
+    """The visible annotated objects of dynamic classes in an image, farthest first."""
     frame, size = recording.frame(index), recording.size(index)
     hulls = hulls_in(recording.scene, frame, size)
     owners, covered = owner_image(hulls, size)
@@ -66,29 +66,38 @@ def seen_in(recording: Recording, index: int) -> list[Subject]:
 
 
 def _candidates(recording: Recording, camera: str, settings: SubjectSettings) -> Iterator[Subject]:
-    """Everything in the key frames asked for that may be looked at: what moves, or the track asked for."""
+    """The candidates in the requested key frames: moving vehicles, or the requested track."""
     for index in recording.scene.key_frames(camera):
         if settings.key_frame not in (None, recording.frame(index).sample_index):
             continue
-        for subject in seen_in(recording, index):
-            if subject.label in MOVERS if settings.track is None else subject.box.track_id == settings.track:
+        for subject in visible_subjects(recording, index):
+            if (
+                subject.label in MOVING_VEHICLE_LABELS
+                if settings.track is None
+                else subject.box.track_id == settings.track
+            ):
                 yield subject
 
 
-def _nothing_there(recording: Recording, camera: str, settings: SubjectSettings) -> str:
+def _not_found_message(recording: Recording, camera: str, settings: SubjectSettings) -> str:
     asked = " and ".join(f"{name} {value}" for name, value in settings if value is not None)
-    anywhere: dict[str, list[int]] = {}
+    by_track: dict[str, list[int]] = {}
     for subject in _candidates(recording, camera, SubjectSettings()):
-        anywhere.setdefault(subject.box.track_id, []).append(subject.frame.sample_index)
-    known = "; ".join(f"{track} in {min(frames)}-{max(frames)}" for track, frames in anywhere.items())
+        by_track.setdefault(subject.box.track_id, []).append(subject.frame.sample_index)
+    known = "; ".join(f"{track} in {min(frames)}-{max(frames)}" for track, frames in by_track.items())
     return (
-        f"subjects.{recording.scene.name}: {camera} sees no vehicle that moves, or not the one asked for ({asked}); "
-        f"what moves, with its first and last key frame: {known or 'nothing'}"
+        f"subjects.{recording.scene.name}: {camera} shows no vehicle that matches {asked}; "
+        f"moving vehicles with their first and last key frame: {known or 'none'}"
     )
 
 
-def described(subject: Subject, recording: Recording) -> dict[str, Any]:
-    """What the stages' JSON files say of their subject."""
+def no_subject_reason(camera: str) -> str:
+    """Why a scene has no subject, for JSON files and titles."""
+    return f"no moving vehicle is visible from {camera} in this scene"
+
+
+def subject_record(subject: Subject, recording: Recording) -> dict[str, Any]:
+    """The subject in the stages' JSON files: metres, m/s, microseconds; `object_to_world` (4, 4) at the box centre."""
     box = subject.box
     return {
         "track": box.track_id,

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from drivesplat.evaluation.evaluate import EvaluationInputs, evaluate_method
 from drivesplat.evaluation.scene_metrics import side_by_side
-from drivesplat.inspection.rendered_view import Drive, open_drive
+from drivesplat.inspection.rendered_view import TrainedDrive, open_trained_drive
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
@@ -57,7 +57,7 @@ class Finished:
     folder: Path
     config: Config
     metrics: dict[str, Any]
-    drives: dict[str, Drive]
+    drives: dict[str, TrainedDrive]
 
     def job(self, stage: str, kind: type[S], method: str | None = None, film: str | None = None) -> S:
         """The settings of a stage."""
@@ -87,6 +87,6 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
         checkpoint, summary = read_checkpoint(files.checkpoint), json.loads(files.summary.read_text())
         measured = EvaluationInputs(checkpoint, summary, recording, masks, None, None)
         evals[method] = evaluate_method(measured, made.job("evaluate", EvaluateJob, method), CPU).record
-        made.drives[method] = open_drive(checkpoint, recording, CPU)
+        made.drives[method] = open_trained_drive(checkpoint, recording, CPU)
     made.metrics.update(side_by_side(evals))
     return made

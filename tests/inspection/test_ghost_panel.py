@@ -1,4 +1,4 @@
-"""The ghost panel and the removal's pictures: what is shown, measured and drawn."""
+"""The ghost panel and the figure of a removal: images, figures and drawing."""
 
 import dataclasses
 import json
@@ -17,9 +17,9 @@ from skimage.metrics import peak_signal_noise_ratio
 from drivesplat.errors import DeviceError, ResultError
 from drivesplat.inspection.drawing import draw_panel, draw_removal
 from drivesplat.inspection.figures import save_figure
-from drivesplat.inspection.ghost_panel import Panel, ghost_panel
+from drivesplat.inspection.ghost_panel import GhostPanel, ghost_panel
 from drivesplat.inspection.removal import RemovalPair, remove_actor
-from drivesplat.inspection.rendered_view import Drive, Sight
+from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
@@ -59,12 +59,12 @@ def drive_of(
     places=(GHOST_AT, ROAD_AT),
     opacities=0.6,
     colors=(0.9, 0.1, 0.1),
-) -> Drive:
+) -> TrainedDrive:
     """A background of Gaussians at `places`, and `parts`. Every fourth key frame, from HELD_OUT on, is held out."""
     background = round_gaussians(places, 0.1, opacities, colors)
     model = SplatModel([background, *parts], ConstantSky(SKY, 1e-2))
     recording = recording_of(scene, masks, every_nth=4, offset=HELD_OUT)
-    return Drive(model.requires_grad_(False), recording, torch.device("cpu"))
+    return TrainedDrive(model.requires_grad_(False), recording, torch.device("cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +80,12 @@ def job_of(key_frame: int | None = HELD_OUT) -> PanelJob:
 
 
 @pytest.fixture(scope="module")
-def haunted(tiny_scene, masks) -> tuple[Panel, dict[str, Any], Drive]:
+def panel_of_car(tiny_scene, masks) -> tuple[GhostPanel, dict[str, Any], TrainedDrive]:
     drive = drive_of(one_car(tiny_scene), masks)
     return *ghost_panel(drive, job_of()), drive
 
 
-def seen_at(drive: Drive, key_frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def seen_at(drive: TrainedDrive, key_frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Continuous pixels (n, 2) of world points and their depths, by the camera's matrix."""
     frame = drive.recording.scene.frames[2 * key_frame]
     in_camera = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_to_world).T
@@ -98,22 +98,22 @@ def near(pixel: np.ndarray, radius: float) -> np.ndarray:
     return np.hypot(x - pixel[0], y - pixel[1]) < radius
 
 
-def test_the_truth_is_the_recorded_image(haunted):
-    panel, record, drive = haunted
+def test_the_truth_is_the_recorded_image(panel_of_car):
+    panel, record, drive = panel_of_car
     recorded = np.asarray(Image.open(drive.recording.scene.frames[2 * HELD_OUT].image_path).convert("RGB"))
     np.testing.assert_allclose(panel.truth * 255.0, recorded)
     assert record["key_frame"] == HELD_OUT and record["subject"]["split"] == "interpolation"
 
 
-def test_the_render_is_the_models(haunted):
-    panel, _, drive = haunted
+def test_the_rendering_is_that_of_the_model(panel_of_car):
+    panel, _, drive = panel_of_car
     expected = drive.model.render(view_of(drive.recording.record, 2 * HELD_OUT, drive.device)).image
     np.testing.assert_allclose(panel.render, expected.clamp(0, 1), atol=1e-6)
-    assert (np.abs(panel.render - SKY.numpy()).max(axis=2) > 0.1).any(), "Gaussians must be seen"
+    assert (np.abs(panel.render - SKY.numpy()).max(axis=2) > 0.1).any(), "Gaussians must be visible"
 
 
-def test_psnr_of_vehicle_and_static_pixels_is_skimages(haunted, masks):
-    panel, record, _ = haunted
+def test_psnr_of_vehicle_and_static_pixels_equals_skimage(panel_of_car, masks):
+    panel, record, _ = panel_of_car
     static = np.zeros((54, 96), dtype=bool)
     static[10:OWN_CAR_FROM] = True
     assert record["static"]["psnr"] == pytest.approx(
@@ -142,36 +142,36 @@ def near_face(key_frame: int) -> np.ndarray:
     return np.stack([x, y], axis=1)
 
 
-def test_the_outline_is_the_box_in_the_image(haunted):
-    panel, _, _ = haunted
+def test_the_outline_is_the_box_in_the_image(panel_of_car):
+    panel, _, _ = panel_of_car
     found = np.stack([panel.outline.min(axis=0), panel.outline.max(axis=0)])
     np.testing.assert_allclose(found, near_face(HELD_OUT), atol=1e-3)
 
 
-def test_the_way_is_that_of_the_boxs_centre_over_the_ground(haunted):
+def test_the_path_is_that_of_the_box_centre_on_the_ground(panel_of_car):
     """From x = 4.5 to 34.5 at y = 0.4 on the road, as far as it is half a metre before the camera."""
-    panel, _, drive = haunted
+    panel, _, drive = panel_of_car
     x = np.arange(4.5, 34.5, 0.001)
     line, depth = seen_at(drive, HELD_OUT, np.stack([x, np.full_like(x, 0.4), np.zeros_like(x)], axis=1))
     line = line[depth > 0.5]
-    way = panel.way[np.isfinite(panel.way).all(axis=1)]
-    away = np.abs(way[:, None] - line[None]).max(axis=2).min(axis=1)
+    path = panel.path[np.isfinite(panel.path).all(axis=1)]
+    away = np.abs(path[:, None] - line[None]).max(axis=2).min(axis=1)
     assert (away < 0.2).all()
-    assert np.abs(way[-1] - line[-1]).max() < 0.5
-    assert way[0, 1] > 54, "it begins nearer than the image's lower border"
-    assert (np.diff(way[:, 1]) < 0).all(), "it leads away"
+    assert np.abs(path[-1] - line[-1]).max() < 0.5
+    assert path[0, 1] > 54, "it starts below the lower border of the image"
+    assert (np.diff(path[:, 1]) < 0).all(), "it leads away from the camera"
 
 
-def test_no_pixel_of_the_way_is_of_what_lies_behind_the_camera(tiny_scene, masks):
+def test_the_path_has_no_pixels_behind_the_camera(tiny_scene, masks):
     """At the ninth key frame the camera has driven past where the car began."""
     drive = drive_of(one_car(tiny_scene), masks)
     panel, _ = ghost_panel(drive, job_of(8))
-    in_front = np.isfinite(panel.way).all(axis=1)
-    assert 0 < in_front.sum() < len(in_front) and (panel.way[in_front, 1] > 27.0).all()
+    in_front = np.isfinite(panel.path).all(axis=1)
+    assert 0 < in_front.sum() < len(in_front) and (panel.path[in_front, 1] > 27.0).all()
 
 
 @pytest.mark.parametrize("missing", [(), (6,), (5, 6)])
-def test_the_way_is_broken_where_the_annotation_has_a_gap(tiny_scene, masks, missing):
+def test_the_path_is_interrupted_in_gaps_of_the_annotation(tiny_scene, masks, missing):
     """Boxes reach a quarter of a second into a gap: a key frame that is missing leaves half a second, 3 m, open."""
     scene = one_car(tiny_scene)
     (it,) = scene.tracks
@@ -180,43 +180,45 @@ def test_the_way_is_broken_where_the_annotation_has_a_gap(tiny_scene, masks, mis
     gappy = dataclasses.replace(it, **{name: getattr(it, name)[kept] for name in arrays})
     drive = drive_of(dataclasses.replace(scene, tracks=(gappy,)), masks)
     panel, _ = ghost_panel(drive, job_of())
-    seen = np.flatnonzero(np.isfinite(panel.way).all(axis=1))
+    seen = np.flatnonzero(np.isfinite(panel.path).all(axis=1))
     breaks = np.flatnonzero(np.diff(seen) > 1)
     assert len(breaks) == bool(missing)
-    assert (np.diff(seen)[breaks] == 2).all(), "one row without numbers parts the line"
+    assert (np.diff(seen)[breaks] == 2).all(), "one row of NaN interrupts the line"
     if missing:
         sides = 6.0 + SPEED * np.array([0.5 * (min(missing) - 1) + 0.25, 0.5 * (max(missing) + 1) - 0.25])
         ends, _ = seen_at(drive, HELD_OUT, np.stack([sides, np.full(2, 0.4), np.zeros(2)], axis=1))
-        np.testing.assert_allclose(panel.way[seen[[breaks[0], breaks[0] + 1]]], ends, atol=0.6)
+        np.testing.assert_allclose(panel.path[seen[[breaks[0], breaks[0] + 1]]], ends, atol=0.6)
 
 
-def test_haunted_is_the_dimmed_image_but_for_the_ghost(haunted):
-    panel, record, drive = haunted
+def test_the_ghost_image_is_the_dimmed_image_except_for_the_ghost(panel_of_car):
+    panel, record, drive = panel_of_car
     pixel = seen_at(drive, HELD_OUT, GHOST_AT[None])[0][0]
     dimmed = 0.3 * panel.truth.mean(axis=2)[..., None]
-    changed = (np.abs(panel.haunted - dimmed) > 1e-6).any(axis=2)
+    changed = (np.abs(panel.ghosts - dimmed) > 1e-6).any(axis=2)
     assert record["ghosts"]["gaussians"] == 1
     assert near(pixel, 3.0).sum() > 20
     assert changed[near(pixel, 3.0)].all() and not changed[~near(pixel, 9.0)].any()
     road = seen_at(drive, HELD_OUT, ROAD_AT[None])[0][0]
-    assert (np.abs(panel.render - SKY.numpy()).max(axis=2) > 0.05)[near(road, 1.5)].all(), "the other is in the render"
-    assert near(road, 1.5).any() and not changed[near(road, 1.5)].any(), "and is no ghost"
+    assert (np.abs(panel.render - SKY.numpy()).max(axis=2) > 0.05)[near(road, 1.5)].all(), (
+        "the other Gaussian is rendered"
+    )
+    assert near(road, 1.5).any() and not changed[near(road, 1.5)].any(), "and is not a ghost"
 
 
-def test_a_ghost_is_drawn_in_its_own_colour_and_stronger_than_it_is(tiny_scene, masks):
+def test_a_ghost_is_drawn_amplified_in_its_own_colour(tiny_scene, masks):
     """Opacity 0.1 at the centre's pixel, drawn four times as strong: the most there is."""
     drive = drive_of(one_car(tiny_scene), masks, places=[GHOST_AT], opacities=0.1, colors=(0.9, 0.1, 0.2))
     panel, record = ghost_panel(drive, job_of())
     column, row = np.floor(seen_at(drive, HELD_OUT, GHOST_AT[None])[0][0]).astype(int)
     dimmed = 0.3 * panel.truth[row, column].mean()
     expected = 0.4 * np.array([0.9, 0.1, 0.2]) + 0.6 * dimmed
-    np.testing.assert_allclose(panel.haunted[row, column], expected, atol=0.02)
+    np.testing.assert_allclose(panel.ghosts[row, column], expected, atol=0.02)
     assert record["ghosts"]["opacity_mean"] == pytest.approx(0.1, abs=1e-6)
     assert record["ghosts"]["drawn_times"] == 4.0
 
 
 @pytest.mark.parametrize("opacity", [0.3, 0.6, 0.99])
-def test_ghosts_are_strengthened_until_nearly_all_stay_below_nine_tenths(tiny_scene, masks, opacity):
+def test_ghosts_are_amplified_to_an_opacity_of_nine_tenths(tiny_scene, masks, opacity):
     _, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[GHOST_AT], opacities=opacity), job_of())
     pixel, depth = seen_at(drive_of(one_car(tiny_scene)), HELD_OUT, GHOST_AT[None])
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
@@ -226,9 +228,9 @@ def test_ghosts_are_strengthened_until_nearly_all_stay_below_nine_tenths(tiny_sc
     assert record["ghosts"]["drawn_times"] == pytest.approx(np.clip(strength, 1.0, 4.0), rel=0.08)
 
 
-def test_the_covered_share_is_that_of_the_ghosts_alone(haunted):
+def test_the_covered_share_counts_only_ghosts(panel_of_car):
     """A Gaussian's profile: opacity times exp(-r²/2) over its size in pixels, which the low-pass filter widens."""
-    _, record, drive = haunted
+    _, record, drive = panel_of_car
     pixel, depth = seen_at(drive, HELD_OUT, GHOST_AT[None])
     variance = (59.52 * 0.1 / depth[0]) ** 2 + 0.3
     radius = np.sqrt(-2.0 * variance * np.log(0.05 / 0.6))
@@ -237,43 +239,43 @@ def test_the_covered_share_is_that_of_the_ghosts_alone(haunted):
     json.dumps(record, allow_nan=False)
 
 
-def test_a_model_without_ghosts_shows_the_dimmed_image(tiny_scene, masks):
+def test_without_ghosts_the_ghost_image_is_the_dimmed_image(tiny_scene, masks):
     panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[ROAD_AT]), job_of())
-    np.testing.assert_allclose(panel.haunted, 0.3 * panel.truth.mean(axis=2)[..., None].repeat(3, axis=2))
+    np.testing.assert_allclose(panel.ghosts, 0.3 * panel.truth.mean(axis=2)[..., None].repeat(3, axis=2))
     assert record["ghosts"]["gaussians"] == 0 and record["ghosts"]["covered_share"] == 0.0
     assert record["ghosts"]["opacity_mean"] is None
     json.dumps(record, allow_nan=False)
 
 
 @pytest.fixture(scope="module")
-def still(tiny_scene, masks) -> tuple[Panel, dict[str, Any]]:
+def still(tiny_scene, masks) -> tuple[GhostPanel, dict[str, Any]]:
     return ghost_panel(drive_of(one_car(tiny_scene, speed=0.0), masks), job_of(None))
 
 
-def test_where_nothing_moves_the_middle_key_frame_is_shown_and_figures_are_null(still, tiny_scene):
+def test_without_a_moving_vehicle_the_middle_key_frame_is_shown_and_figures_are_null(still, tiny_scene):
     panel, record = still
     recorded = np.asarray(Image.open(tiny_scene.frames[10].image_path).convert("RGB"))
     np.testing.assert_allclose(panel.truth * 255.0, recorded)
-    np.testing.assert_allclose(panel.haunted, 0.3 * panel.truth.mean(axis=2)[..., None].repeat(3, axis=2))
-    assert len(panel.outline) == len(panel.way) == 0
+    np.testing.assert_allclose(panel.ghosts, 0.3 * panel.truth.mean(axis=2)[..., None].repeat(3, axis=2))
+    assert len(panel.outline) == len(panel.path) == 0
     assert record["key_frame"] == 5 and record["static"]["psnr"] > 0
     assert record["subject"] is None and record["vehicle"] is None and record["ghosts"] is None
-    assert record["why_null"] == "no vehicle moves before CAM_FRONT in this scene"
+    assert record["why_null"] == "no moving vehicle is visible from CAM_FRONT in this scene"
     json.dumps(record, allow_nan=False)
 
 
-def test_the_record_has_the_same_fields_whether_something_moves_or_not(haunted, still):
-    assert haunted[1].keys() == still[1].keys()
+def test_the_record_always_has_the_same_fields(panel_of_car, still):
+    assert panel_of_car[1].keys() == still[1].keys()
 
 
-def test_a_model_that_shows_no_numbers_is_refused(tiny_scene, masks):
+def test_a_rendering_with_nan_is_refused(tiny_scene, masks):
     drive = drive_of(one_car(tiny_scene), masks)
     drive.model.parts[0].params["sh0"].data.fill_(float("nan"))
     with pytest.raises(ResultError, match=r"checkpoint\.pt"):
         ghost_panel(drive, job_of())
 
 
-def test_a_card_that_is_full_is_told_in_a_sentence(tiny_scene, masks, monkeypatch):
+def test_gpu_out_of_memory_is_one_sentence(tiny_scene, masks, monkeypatch):
     def full(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
@@ -281,7 +283,7 @@ def test_a_card_that_is_full_is_told_in_a_sentence(tiny_scene, masks, monkeypatc
     monkeypatch.setattr(SplatModel, "render", full)
     for rows, count in ((None, 2), (torch.tensor([True, False]), 1)):
         with pytest.raises(DeviceError) as refusal:
-            Sight(drive, 0).of(rows)
+            RenderedView(drive, 0).render(rows)
         message = str(refusal.value)
         assert f"with {count} Gaussians" in message and "train.cap_max" in message and "\n" not in message
 
@@ -294,66 +296,66 @@ def shown(figure: Figure, index: int) -> np.ndarray:
     return np.asarray(figure.axes[index].images[0].get_array())
 
 
-def test_the_panel_has_four_titled_pictures(haunted):
-    panel, record, _ = haunted
+def test_the_panel_has_four_titled_images(panel_of_car):
+    panel, record, _ = panel_of_car
     figure = draw_panel(panel, record, "vanilla")
     assert len(figure.axes) == 4
     first, second, third, fourth = titles(figure)
     assert first == "Ground truth" and third.startswith("Absolute error")
     vehicle, static = record["vehicle"]["psnr"], record["static"]["psnr"]
-    assert second == f"Render: vehicle {vehicle:.1f} dB, static {static:.1f} dB"
+    assert second == f"Rendering: vehicle {vehicle:.1f} dB, static {static:.1f} dB"
     assert fourth.startswith("Ghosts") and ": 1, mean opacity 0.60" in fourth
     heading = figure.get_suptitle()
     for words in ("0001", "vanilla", "key frame 2", "held out: interpolation", "vehicle.car", "6.0 m/s", "6 m away"):
         assert words in heading, words
 
 
-def test_the_four_pictures_are_truth_render_error_and_ghosts(haunted):
-    panel, record, _ = haunted
+def test_the_four_images_are_truth_rendering_error_and_ghosts(panel_of_car):
+    panel, record, _ = panel_of_car
     figure = draw_panel(panel, record, "vanilla")
     np.testing.assert_array_equal(shown(figure, 0), panel.truth)
     np.testing.assert_array_equal(shown(figure, 1), panel.render)
     np.testing.assert_allclose(shown(figure, 2), np.abs(panel.render - panel.truth).mean(axis=2))
-    np.testing.assert_array_equal(shown(figure, 3), panel.haunted)
+    np.testing.assert_array_equal(shown(figure, 3), panel.ghosts)
 
 
-def test_outline_and_way_are_drawn_where_they_lie_in_the_image(haunted):
+def test_outline_and_path_are_drawn_at_their_pixels(panel_of_car):
     """matplotlib's pixel centres are integers, the panel's are halves."""
-    panel, record, _ = haunted
+    panel, record, _ = panel_of_car
     figure = draw_panel(panel, record, "vanilla")
     for axis in figure.axes:
         (polygon,) = axis.patches
         np.testing.assert_allclose(polygon.get_xy()[:-1], panel.outline - 0.5, atol=1e-6)
     (line,) = figure.axes[3].lines
     drawn = line.get_xydata()
-    inside = ((panel.way >= 0) & (panel.way <= [96, 54])).all(axis=1)
-    np.testing.assert_allclose(drawn[inside], panel.way[inside] - 0.5)
+    inside = ((panel.path >= 0) & (panel.path <= [96, 54])).all(axis=1)
+    np.testing.assert_allclose(drawn[inside], panel.path[inside] - 0.5)
     assert np.isnan(drawn[~inside]).all() and inside.any() and not inside.all()
 
 
-def test_what_is_drawn_over_a_picture_does_not_shrink_it(haunted):
-    """Way and box may reach far beyond the image."""
-    panel, record, _ = haunted
+def test_overlays_do_not_change_the_axes_limits(panel_of_car):
+    """Path and box may extend far beyond the image."""
+    panel, record, _ = panel_of_car
     beyond = dataclasses.replace(panel, outline=panel.outline * 5.0 - 200.0)
     for axis in draw_panel(beyond, record, "vanilla").axes:
         assert axis.get_xlim() == (-0.5, 95.5) and axis.get_ylim() == (53.5, -0.5)
 
 
-def test_a_training_image_is_called_one(tiny_scene, masks):
+def test_a_training_image_is_named_in_the_title(tiny_scene, masks):
     panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks), job_of(3))
     assert "(training image)" in draw_panel(panel, record, "vanilla").get_suptitle()
 
 
-def test_where_nothing_moves_the_drawn_panel_says_so(still):
+def test_without_a_moving_vehicle_the_figure_says_so(still):
     panel, record = still
     figure = draw_panel(panel, record, "vanilla")
-    assert "no vehicle moves before CAM_FRONT" in figure.get_suptitle()
+    assert "no moving vehicle is visible from CAM_FRONT" in figure.get_suptitle()
     assert len(figure.axes) == 4 and "vehicle none" in titles(figure)[1]
-    assert titles(figure)[3] == "Ghosts: none, nothing moves"
+    assert titles(figure)[3] == "Ghosts: none, no moving vehicle"
     assert not any(axis.patches for axis in figure.axes) and not figure.axes[3].lines
 
 
-def test_without_ghosts_the_drawn_panel_says_so(tiny_scene, masks):
+def test_without_ghosts_the_figure_says_so(tiny_scene, masks):
     panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[ROAD_AT]), job_of())
     assert titles(draw_panel(panel, record, "vanilla"))[3].startswith("Ghosts: none")
 
@@ -368,37 +370,37 @@ def removal(scene: Scene, key_frame: int | None, *parts: Part) -> tuple[RemovalP
     return remove_actor(drive_of(scene, None, *parts, places=[[7.0, 0.4, 0.8], ROAD_AT]), job)
 
 
-def test_the_removal_is_drawn_with_without_and_their_difference(tiny_scene):
+def test_a_removal_is_drawn_with_without_and_difference(tiny_scene):
     pair, record = removal(one_car(tiny_scene), 0)
     figure = draw_removal(pair, record, "street")
-    assert titles(figure)[:2] == ["Render", "Without the Gaussians in its box"]
-    assert titles(figure)[2].startswith("Difference")
+    assert titles(figure)[:2] == ["Rendering", "Without the Gaussians in the box"]
+    assert titles(figure)[2].startswith("Absolute difference")
     np.testing.assert_array_equal(shown(figure, 0), pair.with_car)
     np.testing.assert_array_equal(shown(figure, 1), pair.without_car)
     np.testing.assert_allclose(shown(figure, 2), np.abs(pair.with_car - pair.without_car).mean(axis=2))
     assert shown(figure, 2).max() > 0.01
     heading = figure.get_suptitle()
     assert "street" in heading
-    assert f"1 Gaussians removed, which changes {record['box']['changed_share']:.0%} of its box's pixels" in heading
+    assert f"1 Gaussians removed, {record['box']['changed_share']:.0%} of the pixels of the box changed" in heading
     assert 0.01 < record["box"]["changed_share"] < 0.99
 
 
-def test_a_removal_of_the_actors_own_gaussians_is_called_one(tiny_scene):
+def test_the_title_names_a_removal_of_the_actors_gaussians(tiny_scene):
     pair, record = removal(one_car(tiny_scene), 0, Own(round_gaussians([[7.0, 0.4, 0.8]]), "it"))
     assert record["removed_by"] == "actor"
-    assert titles(draw_removal(pair, record, "street"))[1] == "Without its Gaussians"
+    assert titles(draw_removal(pair, record, "street"))[1] == "Without the vehicle's Gaussians"
 
 
-def test_a_removal_of_nothing_is_drawn_and_says_so(tiny_scene):
+def test_a_removal_without_a_vehicle_says_so(tiny_scene):
     pair, record = removal(one_car(tiny_scene, speed=0.0), None)
     figure = draw_removal(pair, record, "vanilla")
-    assert len(figure.axes) == 3 and "no vehicle moves" in figure.get_suptitle()
+    assert len(figure.axes) == 3 and "no moving vehicle" in figure.get_suptitle()
     assert shown(figure, 2).max() == 0.0
 
 
-def test_saved_pictures_are_landscape_pngs_1600_pixels_wide(haunted, still, tiny_scene, tmp_path):
+def test_saved_figures_are_landscape_pngs_1600_pixels_wide(panel_of_car, still, tiny_scene, tmp_path):
     figures = {
-        "panel.png": draw_panel(*haunted[:2], "vanilla"),
+        "panel.png": draw_panel(*panel_of_car[:2], "vanilla"),
         "still.png": draw_panel(*still, "vanilla"),
         "removal.png": draw_removal(*removal(one_car(tiny_scene), 0), "vanilla"),
     }
@@ -411,14 +413,14 @@ def test_saved_pictures_are_landscape_pngs_1600_pixels_wide(haunted, still, tiny
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(figures)
 
 
-def test_a_picture_that_cannot_be_written_is_named(still, tmp_path):
+def test_a_figure_that_cannot_be_written_is_named(still, tmp_path):
     (tmp_path / "file").write_text("not a folder")
     path = tmp_path / "file" / "panel.png"
     with pytest.raises(ResultError, match=str(path)):
         save_figure(path, draw_panel(*still, "vanilla"))
 
 
-def test_a_picture_cut_short_leaves_the_older_one(still, tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_previous_figure(still, tmp_path, monkeypatch):
     path = tmp_path / "panel.png"
     path.write_bytes(b"older")
 

@@ -10,8 +10,8 @@ from helpers.classed import classed
 from helpers.hand_made import Own, recording_of, round_gaussians
 from scipy.spatial.transform import Rotation
 
-from drivesplat.inspection.ghosts import Ghosts, boxes_along, ghosts_of, swept
-from drivesplat.inspection.rendered_view import Drive, Sight
+from drivesplat.inspection.ghosts import Ghosts, boxes_along_path, ghosts_of, in_swept_volume
+from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive
 from drivesplat.model.part import Part
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scene import Scene, Track
@@ -61,13 +61,13 @@ def grid(size=SIZE, shrunk: float = 0.05) -> np.ndarray:
 
 @pytest.mark.parametrize("heading", [0.0, 1.1, -2.5])
 @pytest.mark.parametrize("speed", [0.0, 1.5, 10.0, 30.0, 60.0])
-def test_a_straight_way_sweeps_a_long_box(speed, heading):
+def test_a_straight_path_sweeps_a_long_box(speed, heading):
     """From half a key-frame interval before the first box to as long after the last: length + 3.5 s of way."""
     it = straight(speed, heading=heading)
     random = np.random.default_rng(0)
     low, high = np.array([-0.25 * speed - 5.0, -2.5, -2.0]), np.array([3.25 * speed + 5.0, 2.5, 2.0])
     along = random.uniform(low, high, (20_000, 3))
-    found = swept(it, INTERVAL, around(pose(0, 0, angle=heading), along))
+    found = in_swept_volume(it, INTERVAL, around(pose(0, 0, angle=heading), along))
     beyond = np.maximum(-0.25 * speed - 2.0 - along[:, 0], along[:, 0] - 3.25 * speed - 2.0)
     beside = np.maximum(np.abs(along[:, 1]) - 1.0, np.abs(along[:, 2]) - 0.8)
     assert not found[(beyond > 1e-6) | (beside > 1e-6)].any()
@@ -78,7 +78,7 @@ def test_a_straight_way_sweeps_a_long_box(speed, heading):
 @pytest.mark.parametrize("speed", [3.0, 12.0, 30.0])
 @pytest.mark.parametrize("size", [SIZE, np.array([0.6, 0.5, 1.7]), np.array([12.0, 2.6, 3.4])])
 @pytest.mark.parametrize("turn", [0.0, 0.4, -0.8])
-def test_the_box_leaves_nothing_out_between_annotations(speed, size, turn):
+def test_the_swept_volume_is_complete_between_annotations(speed, size, turn):
     """Points moving with the box, within its faces, at every 4 ms; `turn` in radians a key frame.
 
     Half a step of the way and half a step of turning may be missed at the faces.
@@ -95,11 +95,11 @@ def test_the_box_leaves_nothing_out_between_annotations(speed, size, turn):
         share = seconds / 0.5 - i
         x, y = (1.0 - share) * places[i] + share * places[i + 1]
         points.append(around(pose(x, y, angle=turn * (i + share)), inner[step % 7 :: 7]))
-    assert swept(it, INTERVAL, np.concatenate(points)).all()
+    assert in_swept_volume(it, INTERVAL, np.concatenate(points)).all()
 
 
 @pytest.mark.parametrize("turn", [0.4, -0.8])
-def test_a_turning_box_sweeps_nothing_beside_its_way(turn):
+def test_a_turning_box_sweeps_nothing_beside_its_path(turn):
     """Random points against boxes every 10 ms, posed by the protocol's interpolation."""
     it = track_of([pose(8.0 * np.cos(turn * i), 8.0 * np.sin(turn * i), 0.0, turn * i) for i in range(6)])
     points = np.random.default_rng(1).uniform([-14, -14, -2], [14, 14, 2], (20_000, 3))
@@ -110,22 +110,22 @@ def test_a_turning_box_sweeps_nothing_beside_its_way(turn):
         in_box = np.abs((points - place[:3, 3]) @ place[:3, :3]) - SIZE / 2
         perhaps |= (in_box < 0.05).all(axis=1)
         surely |= (in_box < -0.25).all(axis=1)
-    found = swept(it, INTERVAL, points)
+    found = in_swept_volume(it, INTERVAL, points)
     assert surely.sum() > 300 and found[surely].all()
     assert not found[~perhaps].any() and not found.all()
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.2, 0.5])
-def test_what_lies_under_the_clearance_is_road(clearance):
+def test_points_below_the_clearance_are_not_swept(clearance):
     height = np.linspace(-1.2, 1.2, 481)
     points = np.stack([np.full_like(height, 7.3), np.full_like(height, 0.4), height], axis=1)
     expected = (height > clearance - 0.8 + 1e-9) & (height < 0.8 - 1e-9)
     sure = np.abs(height - (clearance - 0.8)) > 1e-6
-    found = swept(straight(10.0), INTERVAL, points, floor=clearance)
+    found = in_swept_volume(straight(10.0), INTERVAL, points, floor=clearance)
     np.testing.assert_array_equal(found[sure], expected[sure])
 
 
-def test_clearance_is_over_the_boxes_own_floor_on_a_slope():
+def test_clearance_is_above_the_floor_of_the_box_on_a_slope():
     """Uphill by a fifth, the boxes tilted with the road."""
     tilt = np.arctan(0.2)
     slope = np.eye(4)
@@ -136,7 +136,7 @@ def test_clearance_is_over_the_boxes_own_floor_on_a_slope():
         place[:3, 3] = slope[:3, 0] * 4.0 * i
         poses.append(place)
     above = np.array([[9.0, 0.3, 0.3 - 0.8], [9.0, 0.3, 0.1 - 0.8], [9.0, 0.3, 0.79], [9.0, 0.3, 0.81]])
-    found = swept(track_of(poses), INTERVAL, around(slope, above), floor=0.2)
+    found = in_swept_volume(track_of(poses), INTERVAL, around(slope, above), floor=0.2)
     np.testing.assert_array_equal(found, [True, False, True, False])
 
 
@@ -146,7 +146,7 @@ def test_a_single_box_sweeps_itself(index):
     it = track_of([place], indices=[index])
     points = np.random.default_rng(2).uniform([0, -8, -1], [10, 2, 3], (5000, 3))
     in_box = np.abs((points - place[:3, 3]) @ place[:3, :3]) < SIZE / 2
-    np.testing.assert_array_equal(swept(it, INTERVAL, points), in_box.all(axis=1))
+    np.testing.assert_array_equal(in_swept_volume(it, INTERVAL, points), in_box.all(axis=1))
     assert in_box.all(axis=1).sum() > 50
 
 
@@ -157,13 +157,13 @@ def axis_points(start: float, end: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("speed", [2.0, 10.0, 30.0])
-def test_nothing_is_swept_where_the_annotation_has_a_gap(speed):
+def test_nothing_is_swept_in_a_gap_of_the_annotation(speed):
     """Key frames 3 to 6 do not hold it; it reaches a quarter of a second into the gap at both ends."""
     indices = [0, 1, 2, 7, 8, 9]
     it = track_of([pose(0.5 * i * speed, 0.0) for i in indices], indices=indices)
     points = axis_points(-20.0, 5.0 * speed + 20.0)
     x = points[:, 0]
-    found = swept(it, INTERVAL, points)
+    found = in_swept_volume(it, INTERVAL, points)
     margins = []
     for first, last in ((0.0, 1.0), (3.5, 4.5)):
         margins.append(np.maximum((first - 0.25) * speed - 2.0 - x, x - (last + 0.25) * speed - 2.0))
@@ -173,39 +173,39 @@ def test_nothing_is_swept_where_the_annotation_has_a_gap(speed):
 
 
 @pytest.mark.parametrize("late", [0.01, 0.1])
-def test_after_a_gap_the_way_begins_as_early_as_at_the_start(late):
+def test_after_a_gap_the_path_starts_as_early_as_at_the_beginning(late):
     """Key frames are not quite half a second apart: the way back is met between two looks."""
     seconds = np.array([0.0, 0.5, 1.5 + late, 2.0 + late])
     it = track_of([pose(30.0 * s, 0.0) for s in seconds], seconds=seconds, indices=[0, 1, 3, 4])
     begins = 30.0 * (1.25 + late) - 2.0
-    assert swept(it, INTERVAL, axis_points(begins + SLACK, begins + 10.0)).all()
+    assert in_swept_volume(it, INTERVAL, axis_points(begins + SLACK, begins + 10.0)).all()
 
 
-def test_a_box_that_jumps_off_leaves_nothing_out():
+def test_the_swept_volume_of_an_accelerating_box_is_complete():
     """A crash of the annotation, or a coarse one: still for a segment, then 30 m/s; a short box shows the hole."""
     seconds = np.array([0.0, 0.45, 0.95, 1.45])
     places = [pose(x, 0.0) for x in (0.0, 0.0, 15.0, 30.0)]
     it = track_of(places, seconds=seconds, size=(0.8, 0.8, 1.5))
-    assert swept(it, INTERVAL, axis_points(0.0, 30.0)).all()
+    assert in_swept_volume(it, INTERVAL, axis_points(0.0, 30.0)).all()
 
 
-def test_no_points_are_not_swept():
-    assert swept(straight(5.0), INTERVAL, np.zeros((0, 3))).shape == (0,)
-    assert not swept(straight(5.0), INTERVAL, np.full((3, 3), 1e4)).any()
+def test_without_points_the_result_is_empty():
+    assert in_swept_volume(straight(5.0), INTERVAL, np.zeros((0, 3))).shape == (0,)
+    assert not in_swept_volume(straight(5.0), INTERVAL, np.full((3, 3), 1e4)).any()
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.3, 15.0, 40.0])
-def test_boxes_along_a_way_are_in_time_and_close(speed):
-    boxes = boxes_along(straight(speed), INTERVAL)
+def test_boxes_along_a_path_are_ordered_and_close(speed):
+    boxes = boxes_along_path(straight(speed), INTERVAL)
     x = np.array([box.object_to_world[0, 3] for box in boxes])
     assert (np.diff(x) <= 0.2501).all() and (np.diff(x) >= 0).all()
     assert x[0] == pytest.approx(-0.25 * speed) and 3.25 * speed - 0.2501 <= x[-1] <= 3.25 * speed + 1e-9
     assert 14 <= len(boxes) < 3.5 * max(speed / 0.25, 4.0) + 2
 
 
-def sight_of(scene: Scene, *parts: Part, index: int = 0) -> Sight:
+def sight_of(scene: Scene, *parts: Part, index: int = 0) -> RenderedView:
     model = SplatModel(parts, None).requires_grad_(False)
-    return Sight(Drive(model, recording_of(scene), torch.device("cpu")), index)
+    return RenderedView(TrainedDrive(model, recording_of(scene), torch.device("cpu")), index)
 
 
 def drive_ahead(tiny_scene: Scene) -> Scene:
@@ -234,36 +234,36 @@ PLACES = np.array(
 GHOSTS = np.array([True, True, False, False, False, False, False, False, True])
 
 
-def ghosts_at(sight: Sight, clearance: float = 0.2) -> Ghosts:
+def ghosts_at(sight: RenderedView, clearance: float = 0.2) -> Ghosts:
     scene = sight.drive.recording.scene
     box = box_at(scene.tracks[0], sight.frame.timestamp, scene.key_frame_interval)
     return ghosts_of(sight, box, GhostSettings(clearance=clearance))
 
 
-def test_ghosts_lie_on_the_way_but_not_in_the_box_now(tiny_scene):
+def test_ghosts_lie_on_the_path_but_not_in_the_present_box(tiny_scene):
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER))
     np.testing.assert_array_equal(found.rows, GHOSTS)
 
 
-def test_ghosts_are_other_ones_at_another_time(tiny_scene):
+def test_ghosts_depend_on_the_time(tiny_scene):
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:4]), index=1))
     np.testing.assert_array_equal(found.rows, [True, True, True, False])
 
 
-def test_without_clearance_the_road_that_was_driven_over_counts(tiny_scene):
+def test_without_clearance_the_road_counts_as_ghosts(tiny_scene):
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER), clearance=0.0)
     np.testing.assert_array_equal(np.flatnonzero(found.rows & ~torch.from_numpy(GHOSTS)), [4])
 
 
 @pytest.mark.parametrize("whose", ["it", "another"])
-def test_what_moves_is_no_ghost_whoever_it_belongs_to(tiny_scene, whose):
+def test_gaussians_of_dynamic_parts_are_no_ghosts(tiny_scene, whose):
     """Two parts of the same Gaussians: those that go where their object goes are no ghosts wherever they lie."""
     parts = round_gaussians(PLACES), Own(round_gaussians(PLACES), whose)
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), *parts, index=LATER))
     np.testing.assert_array_equal(found.rows, [*GHOSTS, *np.zeros_like(GHOSTS)])
 
 
-def test_what_a_still_part_knows_as_the_objects_own_may_be_a_ghost(tiny_scene, monkeypatch):
+def test_gaussians_of_the_object_in_a_static_part_can_be_ghosts(tiny_scene, monkeypatch):
     """That it is known does not make it go: the part has to move."""
     monkeypatch.setattr(Own, "moves", False)
     parts = Own(round_gaussians(PLACES), "it"), round_gaussians(PLACES)
@@ -271,7 +271,7 @@ def test_what_a_still_part_knows_as_the_objects_own_may_be_a_ghost(tiny_scene, m
     np.testing.assert_array_equal(found.rows, [*GHOSTS, *GHOSTS])
 
 
-def test_ghosts_in_figures(tiny_scene):
+def test_figures_of_ghosts(tiny_scene):
     opacities = [0.1, 0.4, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9, 0.7]
     sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES, opacities=opacities), index=LATER)
     figures = ghosts_at(sight).figures(sight.gaussians)
@@ -281,13 +281,13 @@ def test_ghosts_in_figures(tiny_scene):
     assert figures["opacity_median"] == pytest.approx(0.4, abs=1e-6)
 
 
-def test_the_median_of_two_lies_between_them(tiny_scene):
+def test_the_median_of_two_is_their_mean(tiny_scene):
     sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:2], opacities=[0.2, 0.6]), index=LATER)
     assert ghosts_at(sight).figures(sight.gaussians)["opacity_median"] == pytest.approx(0.4, abs=1e-6)
 
 
 @pytest.mark.parametrize("places", [PLACES[4:6], PLACES[:0]])
-def test_no_ghosts_are_no_number_of_means(tiny_scene, places):
+def test_without_ghosts_the_means_are_null(tiny_scene, places):
     """Nothing on the way, or no Gaussian at all."""
     sight = sight_of(drive_ahead(tiny_scene), round_gaussians(places), index=LATER)
     figures = json.loads(json.dumps(ghosts_at(sight).figures(sight.gaussians), allow_nan=False))

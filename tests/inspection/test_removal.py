@@ -1,4 +1,4 @@
-"""A vehicle taken out of a model of a few Gaussians that are placed by hand, and what is said of it."""
+"""Removal of a vehicle from a model of a few Gaussians, and its figures."""
 
 import dataclasses
 import json
@@ -12,7 +12,7 @@ from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
 from scipy.ndimage import convolve
 
 from drivesplat.inspection.removal import RemovalPair, figures, remove_actor
-from drivesplat.inspection.rendered_view import Drive
+from drivesplat.inspection.rendered_view import TrainedDrive
 from drivesplat.model.part import Part
 from drivesplat.model.removal import removal_of
 from drivesplat.model.sky import ConstantSky
@@ -53,7 +53,7 @@ def turned_box(angle: float = 0.7) -> Box:
     ],
 )
 @pytest.mark.parametrize("size", [0.01, 1.0])
-def test_what_has_its_centre_in_the_box_goes_whatever_its_size(place, goes_without, goes_with, size):
+def test_gaussians_with_their_centre_in_the_box_are_removed_at_any_size(place, goes_without, goes_with, size):
     """Places are the box's own coordinates; the margin 0.1 m grows sides and roof, not the floor."""
     box = turned_box()
     world = np.array(place) @ box.object_to_world[:3, :3].T + box.object_to_world[:3, 3]
@@ -63,7 +63,7 @@ def test_what_has_its_centre_in_the_box_goes_whatever_its_size(place, goes_witho
         assert removal.by == "box" and removal.removed.tolist() == [goes, False]
 
 
-def test_an_actors_own_gaussians_are_removed_and_nothing_by_box():
+def test_of_an_actor_only_its_own_gaussians_are_removed():
     box = turned_box()
     middle = box.object_to_world[:3, 3]
     parts = round_gaussians([middle, middle + 50.0]), Own(round_gaussians([middle, middle + 9.0]), "it")
@@ -72,7 +72,7 @@ def test_an_actors_own_gaussians_are_removed_and_nothing_by_box():
     assert removal.by == "actor" and removal.removed.tolist() == [False, False, True, True, False]
 
 
-def test_of_a_model_that_knows_other_objects_only_the_box_is_emptied():
+def test_of_an_object_without_an_actor_the_box_is_emptied():
     box = turned_box()
     model = model_of(round_gaussians([box.object_to_world[:3, 3]]), Own(round_gaussians([[0.0, 0.0, 0.0]]), "another"))
     removal = removal_of(model, model.gaussians_at(0.0), box, 0.1)
@@ -102,8 +102,8 @@ def one_car(tiny_scene: Scene, speed: float = 4.0) -> Scene:
     return dataclasses.replace(tiny_scene, tracks=(it,))
 
 
-def drive_of(scene: Scene, *parts: Part, masks: Path | None = None) -> Drive:
-    return Drive(model_of(*parts), recording_of(scene, masks), torch.device("cpu"))
+def drive_of(scene: Scene, *parts: Part, masks: Path | None = None) -> TrainedDrive:
+    return TrainedDrive(model_of(*parts), recording_of(scene, masks), torch.device("cpu"))
 
 
 def job_of(margin: float = 0.1, key_frame: int | None = 0) -> RemovalJob:
@@ -124,7 +124,7 @@ PLACES = [
 ]
 
 
-def test_what_lies_in_the_box_goes_from_the_picture_and_the_rest_stays(tiny_scene):
+def test_only_gaussians_in_the_box_disappear_from_the_image(tiny_scene):
     part = round_gaussians(PLACES, 0.2, colors=[[0.0, 0.0, 0.0], [0.9, 0.1, 0.1], [0.1, 0.9, 0.1], [0.9, 0.9, 0.1]])
     pair, record = remove_actor(drive_of(one_car(tiny_scene), part), job_of())
     assert record["removed_by"] == "box" and record["gaussians_removed"] == 3 and record["margin_m"] == 0.1
@@ -137,12 +137,12 @@ def test_what_lies_in_the_box_goes_from_the_picture_and_the_rest_stays(tiny_scen
     json.dumps(record, allow_nan=False)
 
 
-def test_without_a_margin_what_straddles_the_box_stays(tiny_scene):
+def test_without_a_margin_gaussians_across_the_boundary_stay(tiny_scene):
     _, record = remove_actor(drive_of(one_car(tiny_scene), round_gaussians(PLACES, 0.2)), job_of(margin=0.0))
     assert record["gaussians_removed"] == 2
 
 
-def test_off_the_footprint_of_what_was_removed_both_pictures_are_the_same(tiny_scene):
+def test_outside_the_footprint_both_images_are_equal(tiny_scene):
     random = np.random.default_rng(0)
     around = random.uniform([4.0, -4.0, 0.0], [30.0, 4.0, 4.0], (300, 3))
     part = round_gaussians(around, 0.25, opacities=0.7, colors=random.uniform(0, 1, (300, 3)).tolist())
@@ -156,7 +156,7 @@ def test_off_the_footprint_of_what_was_removed_both_pictures_are_the_same(tiny_s
     assert (np.abs(pair.with_car - pair.without_car) > 0.1).any()
 
 
-def test_the_footprint_is_where_the_removed_gaussian_reaches(tiny_scene):
+def test_the_footprint_covers_the_removed_gaussian(tiny_scene):
     """One Gaussian of 0.2 m at 6.84 m from the camera: a disc around where its centre is projected."""
     pair, _ = remove_actor(drive_of(one_car(tiny_scene), round_gaussians([CAR_AT], 0.2)), job_of())
     frame = tiny_scene.frames[0]
@@ -170,7 +170,7 @@ def test_the_footprint_is_where_the_removed_gaussian_reaches(tiny_scene):
     assert not pair.footprint[distance > 4.0 * deviation].any()
 
 
-def test_an_actors_gaussians_leave_the_picture_wherever_they_are(tiny_scene):
+def test_an_actors_gaussians_are_removed_at_any_place(tiny_scene):
     """A method that takes the car apart: its Gaussian beside the box goes, the background's in the box stays."""
     parts = round_gaussians([CAR_AT], 0.2), Own(round_gaussians([[9.0, 2.5, 1.0]], 0.2), "it")
     pair, record = remove_actor(drive_of(one_car(tiny_scene), *parts), job_of())
@@ -185,7 +185,7 @@ OWN_CAR_FROM = 36
 """The row from which on the own car's body hides what is in the image, the lower part of the car's box as well."""
 
 
-def test_the_own_cars_pixels_are_neither_of_the_box_nor_outside_of_it(tiny_scene, tmp_path):
+def test_pixels_of_the_ego_mask_are_neither_inside_nor_outside(tiny_scene, tmp_path):
     labels = np.full((54, 96), LABELS["static"], dtype=np.uint8)
     labels[OWN_CAR_FROM:] = LABELS["own_car"]
     scene, part = one_car(tiny_scene, speed=6.0), round_gaussians([*PLACES, BEFORE_THE_BOX], 0.2)
@@ -234,7 +234,7 @@ def ghosts_record(tiny_scene: Scene, place, opacity: float = 0.95) -> dict:
         pytest.param([12.0, 3.0, 0.8], 0, False, id="beside the way: no ghost"),
     ],
 )
-def test_ghosts_that_stay_are_counted_and_said_to_be_seen_outside_the_box_or_not(tiny_scene, place, count, seen):
+def test_remaining_ghosts_are_counted_and_their_visibility_outside_the_box_is_reported(tiny_scene, place, count, seen):
     record = ghosts_record(tiny_scene, place)
     assert record["gaussians"] == count and record["reach_outside_box"] is seen
     assert (record["covered_share_outside"] > 0) is seen
@@ -242,24 +242,24 @@ def test_ghosts_that_stay_are_counted_and_said_to_be_seen_outside_the_box_or_not
 
 
 @pytest.mark.parametrize(("opacity", "seen"), [(0.04, False), (0.07, True)])
-def test_ghosts_are_seen_where_they_cover_a_twentieth_of_a_pixels_light(tiny_scene, opacity, seen):
+def test_ghosts_are_visible_from_an_opacity_of_a_twentieth(tiny_scene, opacity, seen):
     record = ghosts_record(tiny_scene, BEFORE_THE_BOX, opacity)
     assert record["gaussians"] == 1 and record["reach_outside_box"] is seen
 
 
-def test_where_nothing_moves_both_pictures_are_the_middle_ones_and_figures_are_null(tiny_scene):
+def test_without_a_moving_vehicle_both_images_are_the_middle_key_frame(tiny_scene):
     scene = one_car(tiny_scene, speed=0.0)
     pair, record = remove_actor(drive_of(scene, round_gaussians(PLACES, 0.2)), job_of(key_frame=None))
     np.testing.assert_array_equal(pair.with_car, pair.without_car)
     assert pair.with_car.shape == (54, 96, 3) and not pair.footprint.any() and len(pair.outline) == 0
     record = json.loads(json.dumps(record, allow_nan=False))
     assert record["key_frame"] == 5 and record["gaussians_removed"] == 0
-    assert "no vehicle moves before CAM_FRONT" in record["why_null"]
+    assert "no moving vehicle is visible from CAM_FRONT" in record["why_null"]
     for name in ("subject", "removed_by", "box", "holes", "edge", "outside", "outside_footprint", "ghosts"):
         assert record[name] is None, name
 
 
-def test_the_record_has_the_same_fields_whether_something_moves_or_not(tiny_scene):
+def test_the_record_always_has_the_same_fields(tiny_scene):
     records = [
         remove_actor(drive_of(one_car(tiny_scene, speed), round_gaussians(PLACES, 0.2)), job_of(key_frame=None))[1]
         for speed in (4.0, 0.0)
@@ -288,7 +288,7 @@ def pair_of(seed: int = 0, **changes) -> RemovalPair:
     return dataclasses.replace(pair, **changes)
 
 
-def test_changed_shares_and_reach_of_a_pair_made_by_hand():
+def test_changed_shares_and_reach_of_a_synthetic_pair():
     """The hull is columns 10 to 23 and rows 8 to 19; columns 24 to 28 of the block lie outside."""
     found = figures(pair_of())
     assert found["box"]["pixels"] == 14 * 12
@@ -302,7 +302,7 @@ def test_changed_shares_and_reach_of_a_pair_made_by_hand():
     }  # fmt: skip
 
 
-def test_a_change_counts_from_eight_levels_of_one_channel_on():
+def test_a_change_counts_from_eight_levels_of_one_channel():
     before = np.full((HEIGHT, WIDTH, 3), 0.5)
     after = before.copy()
     after[10, 12, 2] += 8.5 / 255
@@ -319,7 +319,7 @@ def test_the_reach_is_the_distance_to_the_nearest_pixel_of_the_box():
     assert found["box"]["changed_share"] == 0.0
 
 
-def test_holes_are_pixels_that_lose_their_surface():
+def test_holes_are_pixels_whose_opacity_falls():
     alpha, after = np.full((HEIGHT, WIDTH), 0.9), np.full((HEIGHT, WIDTH), 0.9)
     alpha[:, :12] = 0.2
     after[10, 10:20] = 0.1  # two of ten had no surface before
@@ -330,7 +330,7 @@ def test_holes_are_pixels_that_lose_their_surface():
     assert found["share_of_box"] == pytest.approx(8 / 168)
 
 
-def test_the_skys_share_of_the_box_is_what_the_gaussians_leave_there():
+def test_the_sky_share_of_the_box_is_one_minus_the_opacity():
     """Opacity 0.9 everywhere; nine pixels of the hull fall to 0.3."""
     found = figures(pair_of())["box"]
     assert found["sky_share_with"] == pytest.approx(0.1)
@@ -353,7 +353,7 @@ def along_the_hull(inside: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("outside", [True, False])
-def test_what_changes_on_the_own_car_is_counted_nowhere(outside):
+def test_changes_in_the_ego_mask_are_not_counted(outside):
     """The hull's upper half, and the rows from 14 on, which hold most of the change."""
     seen = np.arange(HEIGHT)[:, None] < 14
     inside = pair_of().inside
@@ -374,14 +374,14 @@ def test_the_edge_is_the_mean_gradient_along_the_hull_with_and_without(seed):
     assert found["ratio"] == pytest.approx(after / before)
 
 
-def test_an_outline_drawn_by_the_removal_makes_the_ratio_large():
+def test_an_added_outline_makes_the_edge_ratio_large():
     smooth = np.full((HEIGHT, WIDTH, 3), 0.5) + np.linspace(0, 0.1, WIDTH)[None, :, None]
     outlined = np.where(pair_of().inside[..., None], 0.2, smooth)
     assert figures(pair_of(with_car=smooth, without_car=outlined))["edge"]["ratio"] > 10
     assert figures(pair_of(with_car=outlined, without_car=smooth))["edge"]["ratio"] < 0.1
 
 
-def test_where_there_was_no_edge_there_is_no_ratio():
+def test_without_an_edge_there_is_no_ratio():
     flat = np.full((HEIGHT, WIDTH, 3), 0.5)
     found = figures(pair_of(with_car=flat))
     assert found["edge"]["with_car"] == pytest.approx(0.0, abs=1e-12) and found["edge"]["ratio"] is None
@@ -389,7 +389,7 @@ def test_where_there_was_no_edge_there_is_no_ratio():
 
 
 @pytest.mark.parametrize("share", ["all", "left half", "one pixel"])
-def test_figures_of_boxes_of_any_size_are_numbers(share):
+def test_figures_of_boxes_of_any_size_are_finite(share):
     inside = np.zeros((HEIGHT, WIDTH), dtype=bool)
     inside[{"all": np.s_[:], "left half": np.s_[:, : WIDTH // 2], "one pixel": np.s_[3, 4]}[share]] = True
     found = figures(pair_of(inside=inside, outside=~inside))
@@ -403,7 +403,7 @@ def test_a_box_that_fills_the_image_has_no_edge():
     assert found["edge"]["ratio"] is None
 
 
-def test_where_the_own_car_cuts_the_box_is_no_edge():
+def test_the_boundary_of_the_ego_mask_is_no_edge():
     """Nothing changes but on the own car, in the rows below 14, which cross the hull's rows 8 to 19."""
     seen = np.repeat(np.arange(HEIGHT)[:, None] < 14, WIDTH, axis=1)
     inside = pair_of().inside
@@ -415,6 +415,6 @@ def test_where_the_own_car_cuts_the_box_is_no_edge():
 
 
 @pytest.mark.parametrize("footprint", [True, False])
-def test_a_footprint_of_everything_or_nothing_is_told(footprint):
+def test_a_footprint_of_everything_or_nothing(footprint):
     found = figures(pair_of(footprint=np.full((HEIGHT, WIDTH), footprint)))["outside_footprint"]
     assert found is None if footprint else found["pixels"] == HEIGHT * WIDTH

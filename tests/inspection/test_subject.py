@@ -1,4 +1,4 @@
-"""Which vehicle is looked at, and when: against rays cast through every pixel at boxes placed in closed form."""
+"""The inspected vehicle and its key frame, compared with rays cast through every pixel at boxes in closed form."""
 
 import dataclasses
 import json
@@ -10,7 +10,7 @@ from helpers.classed import classed
 from helpers.hand_made import recording_of, write_labels
 
 from drivesplat.errors import ConfigError, DatasetError
-from drivesplat.inspection.subject import choose_subject, described
+from drivesplat.inspection.subject import choose_subject, subject_record
 from drivesplat.scene.prepared_drive import Recording
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.rigid import rigid
@@ -100,7 +100,7 @@ PARKED = Actor("parked", (11.0, -4.0, 1.3), size=(6.0, 2.4, 2.6), category="vehi
 WALKER = Actor("walker", (7.0, 2.0, 0.9), (4.0, 0.0), size=(0.8, 0.8, 1.8), category="human.pedestrian.adult")
 
 
-def test_of_the_tiny_drive_the_car_ahead_is_chosen_when_nearest(tiny_scene):
+def test_of_the_tiny_drive_the_car_ahead_is_chosen_at_its_nearest(tiny_scene):
     """It drives off slowly: nearest in the first key frame. The parked truck is passed much nearer."""
     subject = chosen(tiny_scene, width=96)
     assert (subject.box.category, subject.frame.sample_index, subject.index) == ("vehicle.car", 0, 0)
@@ -118,7 +118,7 @@ def test_of_the_tiny_drive_the_car_ahead_is_chosen_when_nearest(tiny_scene):
         pytest.param([dataclasses.replace(LEADING, seen=range(3, 6))], id="there for a while"),
     ],
 )
-def test_what_moves_and_fills_most_pixels_is_chosen_when_it_does(tiny_scene, actors):
+def test_the_moving_vehicle_with_the_most_pixels_is_chosen(tiny_scene, actors):
     scene = with_actors(tiny_scene, *actors)
     counts = pixels_of(scene, *actors)
     subject = chosen(scene)
@@ -127,7 +127,7 @@ def test_what_moves_and_fills_most_pixels_is_chosen_when_it_does(tiny_scene, act
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_in_random_traffic_it_is_the_largest_that_moves(tiny_scene, seed):
+def test_in_random_traffic_the_largest_moving_vehicle_is_chosen(tiny_scene, seed):
     random = np.random.default_rng(seed)
     actors = []
     for i in range(6):
@@ -155,15 +155,15 @@ def test_in_random_traffic_it_is_the_largest_that_moves(tiny_scene, seed):
         pytest.param(dataclasses.replace(LEADING, position=(9.0, 90.0, 0.8)), id="beside the image"),
     ],
 )
-def test_what_the_protocol_does_not_call_a_moving_vehicle_is_never_chosen(tiny_scene, still):
+def test_only_moving_vehicles_of_the_protocol_are_chosen(tiny_scene, still):
     assert chosen(with_actors(tiny_scene, still)) is None
 
 
-def test_a_drive_without_any_track_has_no_subject(tiny_scene):
+def test_a_drive_without_tracks_has_no_subject(tiny_scene):
     assert chosen(with_actors(tiny_scene)) is None
 
 
-def test_nearer_boxes_hide_what_is_behind_them(tiny_scene):
+def test_nearer_boxes_hide_farther_ones(tiny_scene):
     van = Actor("van", (6.5, 1.2, 1.1), size=(3.0, 1.0, 2.2), seen=range(1))
     scene = with_actors(tiny_scene, LEADING, van)
     alone, counts = pixels_of(scene, LEADING), pixels_of(scene, LEADING, van)
@@ -184,7 +184,7 @@ def own_car_below(scene: Scene, row: int, folder: Path) -> Path:
     return write_labels(folder, scene, labels)
 
 
-def test_pixels_of_the_own_car_are_not_the_subjects(tiny_scene, tmp_path):
+def test_pixels_of_the_ego_mask_do_not_count(tiny_scene, tmp_path):
     scene = with_actors(tiny_scene, LEADING)
     free = chosen(scene, SubjectSettings(key_frame=0))
     recording = recorded(scene, masks=own_car_below(scene, 70, tmp_path))
@@ -194,7 +194,7 @@ def test_pixels_of_the_own_car_are_not_the_subjects(tiny_scene, tmp_path):
     assert not subject.visible[70:].any() and subject.pixels == free.visible[:70].sum()
 
 
-def test_a_vehicle_that_is_largest_behind_the_own_car_is_not_chosen_then(tiny_scene, tmp_path):
+def test_pixels_behind_the_ego_mask_do_not_count_in_the_choice(tiny_scene, tmp_path):
     """Its hull without hidden pixels is largest elsewhen: it is nearest, but mostly hidden, in the first key frame."""
     low = dataclasses.replace(LEADING, size=(4.0, 2.0, 1.0), position=(9.0, 0.3, 0.5), velocity=(7.0, 0.0))
     scene = with_actors(tiny_scene, low)
@@ -204,17 +204,17 @@ def test_a_vehicle_that_is_largest_behind_the_own_car_is_not_chosen_then(tiny_sc
     assert subject.frame.sample_index > 0 and subject.visible[row:].sum() == 0
 
 
-def test_a_vehicle_behind_the_own_car_altogether_is_not_chosen(tiny_scene, tmp_path):
+def test_a_vehicle_completely_behind_the_ego_mask_is_not_chosen(tiny_scene, tmp_path):
     scene = with_actors(tiny_scene, LEADING)
     assert choose_subject(recorded(scene, masks=own_car_below(scene, 0, tmp_path)), "CAM_FRONT", ANY) is None
 
 
-def test_what_is_hidden_altogether_is_not_chosen(tiny_scene):
+def test_a_completely_hidden_vehicle_is_not_chosen(tiny_scene):
     wall = Actor("wall", (7.0, 0.0, 1.5), (4.0, 0.0), size=(0.5, 7.0, 7.0), category="animal")
     assert chosen(with_actors(tiny_scene, LEADING, wall)) is None
 
 
-def test_images_between_key_frames_are_never_looked_at(tiny_scene):
+def test_images_between_key_frames_are_ignored(tiny_scene):
     """Were the best key frame an image between two, the second best would be chosen."""
     scene = with_actors(tiny_scene, dataclasses.replace(LEADING, velocity=(3.6, 0.0)))
     best = chosen(scene)
@@ -228,7 +228,7 @@ def test_images_between_key_frames_are_never_looked_at(tiny_scene):
     assert all(frame.is_key_frame for frame in (best.frame, second.frame))
 
 
-def test_the_index_counts_all_images_and_the_camera_decides(tiny_scene):
+def test_the_index_is_that_of_all_images_of_all_cameras(tiny_scene):
     scene = with_actors(tiny_scene, LEADING)
     back = [dataclasses.replace(frame, camera="CAM_BACK") for frame in scene.frames[:3]]
     both = dataclasses.replace(scene, frames=(*back, *scene.frames[3:]))
@@ -246,14 +246,14 @@ def test_pixels_are_those_of_the_training_resolution(tiny_scene):
     assert large.pixels / small.pixels == pytest.approx(4.0, rel=0.1)
 
 
-def test_a_track_of_the_users_is_looked_at_when_it_is_largest_though_it_is_parked(tiny_scene):
+def test_a_requested_track_is_chosen_at_its_largest_even_if_parked(tiny_scene):
     scene = with_actors(tiny_scene, LEADING, PARKED)
     subject = chosen(scene, SubjectSettings(track="parked"))
     assert found(subject) == largest(pixels_of(scene, LEADING, PARKED), "parked")
     assert subject.label == "parked_other_vehicle"
 
 
-def test_a_key_frame_of_the_users_is_looked_at_with_what_is_largest_then(tiny_scene):
+def test_in_a_requested_key_frame_the_largest_vehicle_is_chosen(tiny_scene):
     scene = with_actors(tiny_scene, LEADING, ONCOMING)
     counts = pixels_of(scene, LEADING, ONCOMING)
     for key_frame in (0, 5, 9):
@@ -261,7 +261,7 @@ def test_a_key_frame_of_the_users_is_looked_at_with_what_is_largest_then(tiny_sc
         assert found(chosen(scene, SubjectSettings(key_frame=key_frame))) == largest(then, "leading", "oncoming")
 
 
-def test_track_and_key_frame_of_the_users_go_together(tiny_scene):
+def test_track_and_key_frame_can_be_requested_together(tiny_scene):
     scene = with_actors(tiny_scene, LEADING, ONCOMING)
     assert found(chosen(scene, SubjectSettings(track="oncoming", key_frame=6))) == ("oncoming", 6)
 
@@ -275,7 +275,7 @@ def test_track_and_key_frame_of_the_users_go_together(tiny_scene):
         pytest.param({"track": "behind"}, ["track behind"], id="it is not before the camera"),
     ],
 )
-def test_what_is_not_there_is_refused_with_what_there_is(tiny_scene, settings, asked):
+def test_a_missing_subject_is_refused_with_the_candidates(tiny_scene, settings, asked):
     late = dataclasses.replace(LEADING, name="late", position=(12.0, 2.5, 0.8), seen=range(4, 8))
     behind = dataclasses.replace(LEADING, name="behind", position=(-20.0, 0.0, 0.8))
     scene = with_actors(tiny_scene, LEADING, late, behind, PARKED)
@@ -289,19 +289,19 @@ def test_what_is_not_there_is_refused_with_what_there_is(tiny_scene, settings, a
     assert "behind" not in known and "parked" not in known
 
 
-def test_where_nothing_moves_a_users_wish_is_refused_with_just_that(tiny_scene):
-    with pytest.raises(ConfigError, match=r"key_frame 3.*: nothing$"):
+def test_without_moving_vehicles_a_request_is_refused(tiny_scene):
+    with pytest.raises(ConfigError, match=r"key_frame 3.*: none$"):
         chosen(with_actors(tiny_scene, PARKED), SubjectSettings(key_frame=3, track="nobody"))
 
 
 @pytest.mark.parametrize(
     ("key_frame", "split"), [(0, "train"), (2, "interpolation"), (6, "interpolation"), (9, "extrapolation")]
 )
-def test_a_subject_is_described_in_plain_figures(tiny_scene, key_frame, split):
+def test_the_record_of_a_subject(tiny_scene, key_frame, split):
     actor = dataclasses.replace(LEADING, velocity=(4.0, 0.5))
     scene = with_actors(tiny_scene, actor)
     subject = chosen(scene, SubjectSettings(key_frame=key_frame))
-    record = json.loads(json.dumps(described(subject, recorded(scene)), allow_nan=False))
+    record = json.loads(json.dumps(subject_record(subject, recorded(scene)), allow_nan=False))
     frame = scene.frames[2 * key_frame]
     place = actor.place((frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6)
     away = float(np.linalg.norm(place - frame.camera_to_world[:3, 3]))
@@ -323,7 +323,7 @@ def test_a_subject_is_described_in_plain_figures(tiny_scene, key_frame, split):
     }
 
 
-def test_the_middle_key_frame_of_a_camera_is_that_in_the_middle_of_the_drive(tiny_scene):
+def test_the_middle_key_frame_is_that_in_the_middle_of_the_drive(tiny_scene):
     """Of ten key frames, 0 to 9, the sixth; images between them do not count."""
     index = tiny_scene.middle_key_frame("CAM_FRONT")
     assert tiny_scene.frames[index].is_key_frame and tiny_scene.frames[index].sample_index == 5
@@ -334,7 +334,7 @@ def test_the_middle_key_frame_of_a_camera_is_that_in_the_middle_of_the_drive(tin
 
 
 @pytest.mark.parametrize("camera", ["CAM_BACK", "CAM_LEFT"])
-def test_without_key_frames_of_the_camera_there_is_no_middle_and_those_with_some_are_named(tiny_scene, camera):
+def test_a_camera_without_key_frames_is_refused_with_those_that_have_some(tiny_scene, camera):
     between = [dataclasses.replace(frame, camera="CAM_BACK") for frame in tiny_scene.frames if not frame.is_key_frame]
     scene = dataclasses.replace(tiny_scene, frames=(*tiny_scene.frames, *between))
     with pytest.raises(DatasetError, match=f"{scene.name}.*eval_camera {camera} has no key frame; .* CAM_FRONT$"):

@@ -1,4 +1,4 @@
-"""What moves in a drive, as a table and as pictures with labels."""
+"""The dynamic objects of a drive as a table and as images with labels."""
 
 import csv
 import dataclasses
@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from drivesplat.errors import ResultError
 from drivesplat.inspection.track_table import (
-    MOST_PICTURES,
+    MAX_IMAGES,
+    covering_images,
     draw_tracks,
-    fewest_that_show_all,
-    sightings_of,
+    subjects_by_image,
     track_rows,
     write_tracks,
 )
@@ -28,19 +28,19 @@ def recording(tiny_scene) -> Recording:
 
 
 def rows_of(recording: Recording) -> list:
-    return track_rows(recording, sightings_of(recording, "CAM_FRONT"))
+    return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"))
 
 
 def drawn(recording: Recording) -> Figure:
-    sightings = sightings_of(recording, "CAM_FRONT")
-    return draw_tracks(recording, sightings, track_rows(recording, sightings), "CAM_FRONT")
+    subjects = subjects_by_image(recording, "CAM_FRONT")
+    return draw_tracks(recording, subjects, track_rows(recording, subjects), "CAM_FRONT")
 
 
 def texts(figure: Figure) -> list[str]:
     return [text.get_text() for axis in figure.axes for text in axis.texts]
 
 
-def test_everything_that_can_move_is_a_row_and_movers_come_first(recording):
+def test_every_dynamic_object_has_a_row_and_moving_ones_come_first(recording):
     """The tiny street: a car at 4.2 m/s, a walker at 1.2 m/s, a parked truck; a cone cannot move."""
     rows = rows_of(recording)
     assert {row.category for row in rows[:2]} == {"vehicle.car", "human.pedestrian.adult"}
@@ -53,21 +53,21 @@ def test_everything_that_can_move_is_a_row_and_movers_come_first(recording):
     assert (truck.length, truck.width, truck.height, truck.speed_max) == (6.0, 2.4, 2.6, 0.0)
 
 
-def test_times_are_those_of_the_annotations_and_of_the_images_that_show_it(recording, tiny_scene):
+def test_times_are_those_of_annotations_and_images(recording, tiny_scene):
     car = next(row for row in rows_of(recording) if row.category == "vehicle.car")
     track = next(track for track in tiny_scene.tracks if track.id == car.id)
     assert car.seconds == pytest.approx((track.timestamps[-1] - track.timestamps[0]) * 1e-6)
-    sightings = sightings_of(recording, "CAM_FRONT")
-    showing = sum(any(s.box.track_id == car.id for s in seen) for seen in sightings.values())
+    subjects = subjects_by_image(recording, "CAM_FRONT")
+    showing = sum(any(s.box.track_id == car.id for s in seen) for seen in subjects.values())
     assert showing == len(track.timestamps) and car.seconds_visible == car.seconds, "in all of it"
     pixels = {
-        recording.frame(i).sample_index: s.pixels for i, seen in sightings.items() for s in seen
+        recording.frame(i).sample_index: s.pixels for i, seen in subjects.items() for s in seen
         if s.box.track_id == car.id
     }  # fmt: skip
     assert car.pixels == max(pixels.values()) == pixels[car.key_frame]
 
 
-def test_what_is_never_seen_has_a_row_without_a_key_frame(tiny_scene):
+def test_an_object_that_is_never_visible_has_no_key_frame(tiny_scene):
     behind = [
         dataclasses.replace(track, object_to_world=_moved(track, [-500.0, 0.0, 0.0])) for track in tiny_scene.tracks
     ]
@@ -93,7 +93,7 @@ def test_the_table_reads_back(recording, tmp_path):
         write_tracks(tmp_path / "file" / "tracks.csv", rows)
 
 
-def test_every_mover_is_labelled_and_what_stands_is_not(recording):
+def test_only_moving_objects_are_labelled(recording):
     rows = rows_of(recording)
     found = set(texts(drawn(recording)))
     movers = [row.id for row in rows if row.moves and row.pixels >= 100]
@@ -111,14 +111,14 @@ def test_every_mover_is_labelled_and_what_stands_is_not(recording):
         (["a"], 1),
     ],
 )
-def test_labels_are_short_and_tell_all_apart(ids, length):
+def test_labels_are_short_and_unique(ids, length):
     names = beginnings(ids)
     assert list(names) == ids and len(set(names.values())) == len(ids)
     assert all(name == names[name] or name.startswith(names[name]) for name in ids)
     assert {len(name) for name in names.values()} <= {length}
 
 
-def test_where_nothing_moves_the_picture_says_so(tiny_scene):
+def test_without_moving_objects_the_title_says_so(tiny_scene):
     figure = drawn(recording_of(standing(tiny_scene)))
     assert "nothing moves" in figure.get_suptitle() and texts(figure) == [] and len(figure.axes) == 1
 
@@ -139,8 +139,8 @@ def standing(scene: Scene) -> Scene:
         ({0: {"a": 5}, 1: {"a": 9}}, [1]),
         ({0: {"a": 5, "b": 5}, 1: {"a": 900}}, [0]),
         ({0: {"a": 1}, 1: {"b": 1}, 2: {"a": 1, "c": 1}}, [1, 2]),
-        ({i: {str(i): 1} for i in range(9)}, list(range(MOST_PICTURES))),
+        ({i: {str(i): 1} for i in range(9)}, list(range(MAX_IMAGES))),
     ],
 )
-def test_few_images_show_all(pixels, expected):
-    assert fewest_that_show_all(pixels) == expected
+def test_few_images_cover_all_objects(pixels, expected):
+    assert covering_images(pixels) == expected
