@@ -41,37 +41,29 @@ include: "rules/report.smk"
 include: "rules/ablation.smk"
 
 
-of_methods = expand("<results>/{scene}/{method}", scene=plan.config.batch_scenes, method=plan.config.methods)
-
-
 rule metrics:
     input:
-        expand("<results>/{scene}/metrics.json", scene=plan.config.batch_scenes),
+        plan.metrics,
 
 
 rule films:
     input:
-        plan.films(plan.config.batch_scenes),
+        plan.films,
 
 
 rule edits:
     input:
-        edited,
+        plan.edits,
 
 
 rule looks:
     input:
-        expand("<results>/{scene}/tracks.png", scene=plan.config.batch_scenes),
-        expand("{folder}/{look}", folder=of_methods, look=["ghost_panel.png", "removal.png"]),
+        plan.looks,
 
 
 rule exports:
     input:
-        expand(
-            "{folder}/{asset}",
-            folder=of_methods,
-            asset=["splat.ply", "parts/parts.json", "scene.usdz", "viewer.html"],
-        ),
+        plan.exports,
 
 
 rule report:

@@ -24,11 +24,12 @@ if ESTIMATE in asked.targets and asked.no_hooks:
 try:
     plan = Plan(config, workflow.basedir)
     run_costs = RunCosts(plan, workflow, asked.targets)
-    edited = plan.edits(plan.config.batch_scenes)
+    across_scenes = plan.report(wanted)
+    plan.edits()
     if workflow.is_main_process and not asked.lint:
         plan.refuse_unknown(wanted)
         plan.refuse_download(wanted)
-        plan.report(wanted).refuse_empty()
+        across_scenes.refuse_empty()
         if wanted != [COSTS]:
             plan.refuse_absent_data(wanted)
 except DriveSplatError as error:

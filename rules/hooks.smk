@@ -39,7 +39,7 @@ onsuccess:
 
 onerror:
     if workflow.is_main_process:
-        if plan.report(wanted).wanted:
+        if across_scenes.wanted:
             from drivesplat.report.partial import write_partial_report
 
             write_partial_report(plan)

@@ -11,10 +11,10 @@ rule gap_report:
     settings or code than the config's are left out and named.
     """
     input:
-        metrics=plan.report(wanted).metrics,
-        pictures=plan.report(wanted).pictures,
+        metrics=across_scenes.metrics,
+        pictures=across_scenes.pictures,
         # linked, not read: a film that is made anew is no other report
-        links=ancient(plan.report(wanted).links),
+        links=ancient(across_scenes.links),
     output:
         page=report(
             "<results>/gap_report.html",
@@ -36,7 +36,7 @@ rule gap_report:
     conda:
         "../envs/drivesplat.yaml"
     params:
-        settings=plan.report(wanted).settings,
+        settings=across_scenes.settings,
         code=plan.code("gap_report"),
     script:
         "../workflow_scripts/gap_report.py"

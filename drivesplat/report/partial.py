@@ -15,9 +15,9 @@ def write_partial_report(plan: Plan) -> None:
     on the console where it lies, or why there is none."""
     there, results = plan.report([*REPORT_RULES]), Path(plan.config.results_dir)
     page, record, table = (results / name for name in REPORT_FILES)
-    files, job = ReportFiles(page, record, table, results / "logs"), ReportJob.model_validate_json(there.settings)
+    files, job = ReportFiles(page, record, table, results / "logs"), ReportJob.model_validate_json(there.settings())
     try:
-        write_report(files, job, there.metrics, there.pictures, there.links)
+        write_report(files, job, there.metrics(), there.pictures(), there.links())
     except (DriveSplatError, OSError) as error:
         print(f"drivesplat: there is no report of what was finished: {error}", file=sys.stderr, flush=True)
         return

@@ -160,10 +160,15 @@ class Config(Settings):
         """The configured methods and those of the ablation."""
         return {**self.methods, **self.ablated}
 
+    @cached_property
+    def dataset_names(self) -> dict[str, str]:
+        """The name of every scene's dataset, by scene, in order."""
+        return {scene: name for name, dataset in self.datasets.items() for scene in dataset.scenes}
+
     @property
     def scenes(self) -> list[str]:
         """All configured scenes, in order."""
-        return [scene for dataset in self.datasets.values() for scene in dataset.scenes]
+        return list(self.dataset_names)
 
     @property
     def batch_scenes(self) -> list[str]:
@@ -172,13 +177,12 @@ class Config(Settings):
 
     def dataset_of(self, scene: str) -> str:
         """The name of a scene's dataset. Raises ConfigError, with the list of scenes, for an unknown scene."""
-        for name, dataset in self.datasets.items():
-            if scene in dataset.scenes:
-                return name
-        raise ConfigError(
-            f"scene {scene!r} is not in the config; "
-            f"there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
-        )
+        if scene not in self.dataset_names:
+            raise ConfigError(
+                f"scene {scene!r} is not in the config; "
+                f"there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
+            )
+        return self.dataset_names[scene]
 
 
 def load(values: Mapping[str, Any]) -> Config:

@@ -12,10 +12,9 @@ def without_effect(config: Config, places: Iterable[tuple[str, str]]) -> list[st
     given, defaults = dict(_leaves(config.model_dump())), dict(_leaves(Config().model_dump()))
     told = {key: value for key, value in given.items() if defaults.get(key) != value}
     sentences: dict[str, None] = {}
-    for scene, method in sorted(set(places)):
-        if scene not in config.scenes:
-            continue
-        dataset, below = config.dataset_of(scene), given
+    scenes = {(config.dataset_of(scene), method): scene for scene, method in places if scene in config.dataset_names}
+    for (dataset, method), scene in sorted(scenes.items()):
+        below = given
         layers = [("dataset", dataset, for_scene(config, scene))]
         if method in config.methods:
             layers.append(("method", method, for_scene(config, scene, method)))

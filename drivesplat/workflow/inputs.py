@@ -17,10 +17,17 @@ class Inputs:
 
     def __init__(self, config: Config):
         self.config = config
+        self._tables: dict[str, list[str]] = {}
 
     def tables(self, wildcards: Any) -> list[str]:
         """The dataset files that decide a scene's scene.json."""
-        dataset = self.config.datasets[self.config.dataset_of(wildcards.scene)]
+        name = self.config.dataset_of(wildcards.scene)
+        if name not in self._tables:
+            self._tables[name] = self._tables_of(name)
+        return self._tables[name]
+
+    def _tables_of(self, name: str) -> list[str]:
+        dataset = self.config.datasets[name]
         files = layout(dataset.reader)
         if dataset.world:
             return [f"{dataset.world_root}/{dataset.version}/{table}.json" for table in files.TABLES]

@@ -11,6 +11,7 @@ from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.stages import (
     METHOD_STAGES,
+    OF_ONE_SCENE,
     SIDE_BY_SIDE,
     scene_edits,
     scene_stages,
@@ -19,6 +20,8 @@ from drivesplat.workflow.stages import (
 )
 
 SCRIPTS = "workflow_scripts"
+LOOKS = ("ghost_panel.png", "removal.png")
+EXPORTS = ("splat.ply", "parts/parts.json", "scene.usdz", "viewer.html")
 PARTS_FILM = "parts"
 """The film of a method's parts."""
 
@@ -29,15 +32,27 @@ class Outputs(Inputs):
     def __init__(self, config: Config, scripts: Path):
         super().__init__(config)
         self._scripts = scripts
+        self._codes: dict[str, str] = {}
+        self._settings: dict[tuple[str | None, ...], str] = {}
 
     def code(self, stage: str) -> str:
         """The digest of all code a stage runs."""
-        return code_digest(self._scripts / f"{stage}.py")
+        if stage not in self._codes:
+            self._codes[stage] = code_digest(self._scripts / f"{stage}.py")
+        return self._codes[stage]
+
+    def stage_settings(self, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:
+        """`stage_settings` of the config, computed once per dataset where the scene itself does not matter."""
+        key = (stage, scene if stage in OF_ONE_SCENE else self.config.dataset_of(scene), method, film)
+        if key not in self._settings:
+            self._settings[key] = stage_settings(self.config, stage, scene, method, film)
+        return self._settings[key]
 
     @property
     def all_trajectories(self) -> list[str]:
         """The names of all films of any scene."""
-        films = (for_scene(self.config, scene).render.trajectories for scene in self.config.scenes)
+        first = (dataset.scenes[0] for dataset in self.config.datasets.values() if dataset.scenes)
+        films = (for_scene(self.config, scene).render.trajectories for scene in first)
         return list(dict.fromkeys(name for trajectories in films for name in trajectories))
 
     @property
@@ -45,29 +60,46 @@ class Outputs(Inputs):
         """The methods whose models know objects that move: those that can be taken apart and edited."""
         return [name for name, method in self.config.all_methods.items() if set(method.parts) & MOVING_PARTS]
 
-    def films(self, scenes: list[str]) -> list[str]:
+    def metrics(self, _: Any = None) -> list[str]:
+        """The metrics.json of the batch's scenes."""
+        return [f"{self.config.results_dir}/{scene}/metrics.json" for scene in self.config.batch_scenes]
+
+    def films(self, _: Any = None) -> list[str]:
+        """The films of the batch's scenes."""
+        return self.films_of(self.config.batch_scenes)
+
+    def edits(self, _: Any = None) -> list[str]:
+        """The edited films of the batch's scenes. Raises ConfigError where an edits file is wrong."""
+        return self.edits_of(self.config.batch_scenes)
+
+    def looks(self, _: Any = None) -> list[str]:
+        """The pictures of the batch's scenes and methods."""
+        tracks = [f"{self.config.results_dir}/{scene}/tracks.png" for scene in self.config.batch_scenes]
+        return [*tracks, *self._of_methods(self.config.batch_scenes, lambda *_: LOOKS)]
+
+    def exports(self, _: Any = None) -> list[str]:
+        """The exported files of the batch's scenes and methods."""
+        return self._of_methods(self.config.batch_scenes, lambda *_: EXPORTS)
+
+    def films_of(self, scenes: Iterable[str]) -> list[str]:
         """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
-        return self._films(scenes, self._films_of)
+        return self._of_methods(scenes, lambda *place: [f"{film}.mp4" for film in self._film_names(*place)])
 
-    def edits(self, scenes: list[str]) -> list[str]:
+    def edits_of(self, scenes: Iterable[str]) -> list[str]:
         """The films of every edit of `scenes`, by every method that can be edited."""
-        return self._films(scenes, self._edits_of)
+        return self._of_methods(scenes, lambda *place: [f"edits/{edit}.mp4" for edit in self._edit_names(*place)])
 
-    def _films(self, scenes: list[str], names_of: Callable[[str, str], list[str]]) -> list[str]:
-        return [
-            f"{self.config.results_dir}/{scene}/{method}/{name}.mp4"
-            for scene in scenes
-            for method in self.config.methods
-            for name in names_of(scene, method)
-        ]
+    def _of_methods(self, scenes: Iterable[str], names: Callable[[str, str], Iterable[str]]) -> list[str]:
+        """The files below the folders of all methods of `scenes`; `names` gives those of a scene and a method."""
+        results, methods = self.config.results_dir, self.config.methods
+        return [f"{results}/{s}/{m}/{name}" for s in scenes for m in methods for name in names(s, m)]
 
-    def _films_of(self, scene: str, method: str) -> list[str]:
+    def _film_names(self, scene: str, method: str) -> list[str]:
         parts = [PARTS_FILM] if method in self.methods_with_actors else []
         return [*for_scene(self.config, scene).render.trajectories, *parts]
 
-    def _edits_of(self, scene: str, method: str) -> list[str]:
-        edits = scene_edits(self.config, scene) if method in self.methods_with_actors else {}
-        return [f"edits/{edit}" for edit in edits]
+    def _edit_names(self, scene: str, method: str) -> Iterable[str]:
+        return scene_edits(self.config, scene) if method in self.methods_with_actors else ()
 
     def metrics_stages(self, scene: str) -> dict[str, Any]:
         """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
@@ -83,4 +115,4 @@ class Outputs(Inputs):
         return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
 
     def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:
-        return {"settings": json.loads(stage_settings(self.config, stage, scene, method)), "code": self.code(stage)}
+        return {"settings": json.loads(self.stage_settings(stage, scene, method)), "code": self.code(stage)}

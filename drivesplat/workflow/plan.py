@@ -4,7 +4,6 @@ Everything here is cheap to import and to compute; it runs once in the main proc
 """
 
 import fcntl
-import json
 import os
 import re
 from collections.abc import Callable, Mapping
@@ -26,7 +25,6 @@ from drivesplat.workflow.stages import (
     no_such_edit,
     no_such_film,
     scene_edits,
-    stage_settings,
 )
 
 ABLATION_FILES = ("ablation.json", "ablation.csv")
@@ -44,19 +42,20 @@ class Plan(Outputs):
     def __init__(self, values: Mapping[str, Any], basedir: str):
         super().__init__(load(values), Path(basedir) / SCRIPTS)
         self._held_lock: Any = None
+        self._devices: dict[str, tuple[str, int]] = {}
 
     def settings(self, stage: str) -> Callable[[Any], str]:
         """The function of wildcards that gives a stage's settings as canonical JSON."""
 
         def settings_of(wildcards: Any) -> str:
             method, trajectory, edit = (getattr(wildcards, name, None) for name in ("method", "trajectory", "edit"))
-            return stage_settings(self.config, stage, wildcards.scene, method, trajectory or edit)
+            return self.stage_settings(stage, wildcards.scene, method, trajectory or edit)
 
         return settings_of
 
     def world_settings(self, dataset: str) -> str:
         """The settings of a dataset's synthetic world."""
-        return stage_settings(self.config, "demo_world", self.worlds[dataset])
+        return self.stage_settings("demo_world", self.worlds[dataset])
 
     def download_settings(self, _: Any) -> str:
         """The settings of the download of nuScenes mini. Raises ConfigError where no dataset takes it."""
@@ -64,15 +63,23 @@ class Plan(Outputs):
 
     def device(self, wildcards: Any) -> str:
         """Where a scene's jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
-        device = for_scene(self.config, wildcards.scene).device.model_dump(mode="json")
-        synthetic = self.config.datasets[self.config.dataset_of(wildcards.scene)].world is not None
-        return canonical_json({**device, "kind": "any"} if synthetic and device["kind"] == "auto" else device)
+        return self._device(wildcards.scene)[0]
+
+    def _device(self, scene: str) -> tuple[str, int]:
+        """The device of a scene's jobs as canonical JSON, and how many GPUs each takes."""
+        name = self.config.dataset_of(scene)
+        if name not in self._devices:
+            device = for_scene(self.config, scene).device.model_dump(mode="json")
+            if self.config.datasets[name].world is not None and device["kind"] == "auto":
+                device["kind"] = "any"
+            on_gpu = device["kind"] != "cpu" and (device["kind"] != "any" or any_card())
+            self._devices[name] = canonical_json(device), int(on_gpu)
+        return self._devices[name]
 
     def cards(self, wildcards: Any) -> int:
         """How many GPUs a scene's trainings and renderings take each: one, or none where they run on the CPU; by what
         can be told on this machine, whose GPUs are those of the jobs."""
-        kind = json.loads(self.device(wildcards))["kind"]
-        return int(kind != "cpu" and (kind != "any" or any_card()))
+        return self._device(wildcards.scene)[1]
 
     def threads(self, on_gpu: int) -> Callable[[Any], int]:
         """The threads of such a job, `on_gpu` where it has one. On the CPU half of the processors: two jobs beside one
@@ -134,8 +141,8 @@ class Plan(Outputs):
             )
         if edit is not None and edit not in scene_edits(self.config, scene):
             raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
-        if film not in (path[-1], *self._films_of(scene, method)):
-            raise ConfigError(no_such_film(for_scene(self.config, scene), scene, film))
+        if film not in (path[-1], *self._film_names(scene, method)):
+            raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
 
     def refuse_download(self, targets: list[str]) -> None:
         """Raises ConfigError where nuScenes mini is asked for and may not be fetched."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
@@ -15,9 +16,11 @@ REPORT_FILES = ("gap_report.html", "gap_report.json", "gap_report.csv")
 
 
 class ReportPlan:
-    """The report of a `plan` where `targets` are asked for: of all scenes, or, where nothing but the report is asked
-    for, of those that have been measured. It shows what there is to see, and waits for it where everything is asked
-    for."""
+    """The report of a `plan` for some `targets`: of all scenes, or of the measured ones where it is the only target. It
+    shows the pictures and films that exist; where everything is a target, it waits for them.
+
+    The inputs and settings are functions of wildcards: Snakemake calls them only if the report is to be made.
+    """
 
     def __init__(self, plan: Outputs, targets: list[str]):
         self._plan = plan
@@ -38,7 +41,8 @@ class ReportPlan:
     def refuse_empty(self) -> None:
         """Raises ConfigError where the report is asked for by itself and would hold none of the scenes that have been
         measured, since their datasets do not belong to it."""
-        others = [scene for scene in self._plan.config.scenes if scene not in self._plan.config.batch_scenes]
+        batch = set(self._plan.config.batch_scenes)
+        others = [scene for scene in self._plan.config.scenes if scene not in batch]
         measured = [scene for scene in others if Path(self._results, scene, "metrics.json").is_file()]
         if self._alone and measured and not self.scenes:
             raise ConfigError(
@@ -46,26 +50,22 @@ class ReportPlan:
                 "(datasets.<name>.batch: false): with --configfile presets/demo.yaml -- report it is the demo's report"
             )
 
-    @property
-    def metrics(self) -> list[str]:
+    def metrics(self, _: Any = None) -> list[str]:
         """The metrics.json of its scenes."""
         return [f"{self._results}/{scene}/metrics.json" for scene in self.scenes]
 
-    @property
-    def pictures(self) -> list[str]:
+    def pictures(self, _: Any = None) -> list[str]:
         """The pictures that its page shows. Those that come with the figures are there when the figures are."""
         with_figures = self._of_methods(HELD_OUT_PAIR.values())
         return [*(_there(with_figures) if self._alone else with_figures), *self._seen(self._of_methods(LOOKS.values()))]
 
-    @property
-    def links(self) -> list[str]:
+    def links(self, _: Any = None) -> list[str]:
         """What its page links to: films, edits, and what opens in a browser."""
-        films, edits = self._plan.films(self.scenes), self._plan.edits(self.scenes)
+        films, edits = self._plan.films_of(self.scenes), self._plan.edits_of(self.scenes)
         return self._seen([*films, *edits, *self._of_methods(["viewer.html"])])
 
-    @property
-    def settings(self) -> str:
-        """What its job is told, as canonical JSON."""
+    def settings(self, _: Any = None) -> str:
+        """The settings of its job as canonical JSON."""
         config = self._plan.config
         standing = (name for name, method in config.methods.items() if not set(method.parts) & MOVING_PARTS)
         job = ReportJob(

@@ -38,6 +38,8 @@ ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """And that behind those of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The one of them that no eval.json comes from."""
+OF_ONE_SCENE = ("demo_world", "extract", "edit", "ghost_panel", "remove_actor")
+"""Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
 
@@ -45,16 +47,17 @@ TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 @dataclass(frozen=True)
 class Place:
     """What a job is about; `config` as it holds there. A stage of a scene has no method, one of a method no film: the
-    name of a trajectory or of an edit."""
+    name of a trajectory or of an edit. `scene` is empty for stages that are not among OF_ONE_SCENE."""
 
     config: Config
+    dataset_name: str
     scene: str
     method: str
     film: str
 
     @property
     def dataset(self) -> DatasetSettings:
-        return self.config.datasets[self.config.dataset_of(self.scene)]
+        return self.config.datasets[self.dataset_name]
 
     @property
     def subject(self) -> SubjectSettings:
@@ -69,7 +72,8 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
     """
     if stage not in _RECORDS:
         raise ValueError(f"no stage is called {stage!r}")
-    place = Place(for_scene(config, scene, method), scene, method or "", film or "")
+    there, dataset = for_scene(config, scene, method), config.dataset_of(scene)
+    place = Place(there, dataset, scene if stage in OF_ONE_SCENE else "", method or "", film or "")
     return canonical_json(_RECORDS[stage](place).model_dump(mode="json"))
 
 
@@ -107,7 +111,7 @@ def idle_variants(config: Config, scene: str) -> list[str]:
 def _extract(place: Place) -> SceneSource:
     config, dataset = place.config, place.dataset
     return SceneSource(
-        dataset=config.dataset_of(place.scene),
+        dataset=place.dataset_name,
         reader=dataset.reader,
         version=dataset.version,
         scene=place.scene,
@@ -205,7 +209,7 @@ def _format(place: Place) -> dict[str, Any]:
 def _film(place: Place) -> FilmJob:
     trajectories = place.config.render.trajectories
     if place.film not in trajectories:
-        raise ConfigError(no_such_film(place.config, place.scene, place.film))
+        raise ConfigError(no_such_film(place.config, f"dataset {place.dataset_name}", place.film))
     return FilmJob(trajectory=trajectories[place.film], **_format(place))
 
 
@@ -228,10 +232,10 @@ def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:
     return f"scene {scene} has no edit called {name!r}; there are: {known} (datasets.<name>.edits names its edits file)"
 
 
-def no_such_film(config: Config, scene: str, name: str) -> str:
-    """What to tell who asks for a film that there is none of; `config` as it holds for the scene."""
+def no_such_film(config: Config, whose: str, name: str) -> str:
+    """The message about an unknown film of a scene or dataset; `config` as it holds there."""
     known = ", ".join(config.render.trajectories)
-    return f"scene {scene} has no film called {name!r}; there are: {known} (add it to render.trajectories)"
+    return f"{whose} has no film called {name!r}; there are: {known} (add it to render.trajectories)"
 
 
 def _ghost_panel(place: Place) -> PanelJob:

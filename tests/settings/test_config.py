@@ -408,7 +408,7 @@ def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has():
     config = load({"datasets": {"a": {"scenes": ["a"], "overrides": aside}, "b": {"scenes": ["b"]}}})
     assert json.loads(stage_settings(config, "film", "a", "vanilla", "aside"))["trajectory"]["lateral"] == 1.0
     for scene, name in (("b", "aside"), ("a", "nowhere")):
-        with pytest.raises(ConfigError, match=f"scene {scene} has no film called '{name}'; there are: .*original"):
+        with pytest.raises(ConfigError, match=f"dataset {scene} has no film called '{name}'; there are: .*original"):
             stage_settings(config, "film", scene, "vanilla", name)
 
 

@@ -74,7 +74,7 @@ def test_depth_follows_the_overrides_of_dataset_and_method():
 )
 def test_a_report_expects_them_where_a_method_of_the_scene_takes_them(methods, more):
     made = plan(methods=methods, b=HELD)
-    expected = json.loads(made.report([]).settings)["expected"]
+    expected = json.loads(made.report([]).settings())["expected"]
     assert expected.keys() == {"a1", "a2", "b1"}
     for scene, stages in more.items():
         assert {name for name in expected[scene] if "/" not in name} == {*SCENE_STAGES, *stages}
@@ -130,7 +130,7 @@ def test_triangulated_points_are_an_input_of_free_space_where_there_are_any_and_
 
 def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
     made = plan(methods={"vanilla": {}}, b=REFINED)
-    expected = json.loads(made.report([]).settings)["expected"]
+    expected = json.loads(made.report([]).settings())["expected"]
     assert {name for name in expected["a1"] if "/" not in name} == set(SCENE_STAGES)
     assert {name for name in expected["b1"] if "/" not in name} == set(ALL_SCENE_STAGES)
     assert expected["b1"]["refine_poses"]["code"] == made.code("refine_poses")
@@ -195,9 +195,9 @@ def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
 )
 def test_a_report_waits_for_what_is_asked_for_with_it(targets, scenes, seen, wanted):
     report = plan().report(targets)
-    assert len(report.metrics) == scenes and report.wanted == wanted
-    assert len(report.pictures) == 2 * scenes * (len(PICTURES) if seen else len(HELD_OUT_PAIR))
-    assert bool(report.links) == seen
+    assert len(report.metrics()) == scenes and report.wanted == wanted
+    assert len(report.pictures()) == 2 * scenes * (len(PICTURES) if seen else len(HELD_OUT_PAIR))
+    assert bool(report.links()) == seen
 
 
 def test_a_report_asked_for_alone_is_of_what_is_there(tmp_path):
@@ -207,14 +207,14 @@ def test_a_report_asked_for_alone_is_of_what_is_there(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     report = made.report(["report"])
-    found = [*report.metrics, *report.links, *report.pictures]
+    found = [*report.metrics(), *report.links(), *report.pictures()]
     assert found == [str(tmp_path / name) for name in there]
-    assert {Path(link).name for link in made.report([]).links} >= {"original.mp4", "parts.mp4", "viewer.html"}
+    assert {Path(link).name for link in made.report([]).links()} >= {"original.mp4", "parts.mp4", "viewer.html"}
 
 
 def test_the_reference_is_the_first_method_that_stands_still():
     def reference(methods):
-        return json.loads(plan(methods=methods).report([]).settings)["reference"]
+        return json.loads(plan(methods=methods).report([]).settings())["reference"]
 
     assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}, "b": {}, "c": {}}) == "b"
     assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}}) is None
