@@ -42,7 +42,7 @@ TINY_TRAINING = {
 }
 
 
-_COSTS = re.compile(r"drivesplat: (\d+ jobs?, about |\d+ % of the work, |what was finished, )")
+_COSTS = re.compile(r"drivesplat: (\d+ jobs?, |(\d+ % of the work, )?\d+ of \d+ jobs, |what was finished, )")
 
 
 def complaints(output: str) -> set[str]:

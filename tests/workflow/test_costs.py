@@ -11,7 +11,7 @@ from helpers import REPOSITORY
 
 from drivesplat.io.storage import write_json
 from drivesplat.report.costs import costs_table
-from drivesplat.workflow.costs.measured import Job, read_costs
+from drivesplat.workflow.costs.measured import JobId, read_costs
 from drivesplat.workflow.costs.run_costs import COSTS, RunCosts
 from drivesplat.workflow.costs.table import LIMIT_SECONDS, costs_in_words, costs_record, scene_totals, write_costs
 from drivesplat.workflow.plan import Plan
@@ -40,18 +40,18 @@ def trained(results: Path, scene: str, method: str, seconds: float, **more: Any)
 @pytest.mark.parametrize(
     ("path", "job"),
     [
-        ("lpips_backbone.tsv", Job("lpips_backbone")),
-        ("demo_world/demo.tsv", Job("demo_world", film="demo")),
-        ("0103/extract.tsv", Job("extract", "0103")),
-        ("0103/metrics.tsv", Job("scene_metrics", "0103")),
-        ("0103/street/train.tsv", Job("train", "0103", "street")),
-        ("0103/street/film_lateral_2m.tsv", Job("film", "0103", "street", "lateral_2m")),
-        ("0103/street/film_parts.tsv", Job("film_parts", "0103", "street")),
-        ("0103/street/edit_v1.2_stop.tsv", Job("edit", "0103", "street", "v1.2_stop")),
+        ("lpips_backbone.tsv", JobId("lpips_backbone")),
+        ("demo_world/demo.tsv", JobId("demo_world", film="demo")),
+        ("0103/extract.tsv", JobId("extract", "0103")),
+        ("0103/metrics.tsv", JobId("scene_metrics", "0103")),
+        ("0103/street/train.tsv", JobId("train", "0103", "street")),
+        ("0103/street/film_lateral_2m.tsv", JobId("film", "0103", "street", "lateral_2m")),
+        ("0103/street/film_parts.tsv", JobId("film_parts", "0103", "street")),
+        ("0103/street/edit_v1.2_stop.tsv", JobId("edit", "0103", "street", "v1.2_stop")),
     ],
 )
 def test_a_benchmark_file_names_its_job(path, job):
-    assert Job.of(Path(path)) == job
+    assert JobId.of(Path(path)) == job
 
 
 def test_there_is_a_row_for_every_job_that_ran(tmp_path):
@@ -137,4 +137,4 @@ def test_costs_that_cannot_be_told_or_written_end_no_run(tmp_path, capsys):
     of_run.begin()
     of_run.end()
     said = capsys.readouterr().err
-    assert "what the run will take cannot be told" in said and "costs are not written" in said
+    assert "the run cannot be estimated" in said and "costs are not written" in said

@@ -1,7 +1,8 @@
-"""How far a run is: jobs that are done, trainings that say how far they are, and what is left of the rest."""
+"""Progress of a run: finished jobs, trainings that log their share, and the expected rest."""
 
 import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -12,21 +13,27 @@ from drivesplat.settings.config import load
 from drivesplat.training import monitor
 from drivesplat.workflow.costs.estimate import Machine, PlannedJob
 from drivesplat.workflow.costs.expected import Expectations
-from drivesplat.workflow.costs.measured import Cost, Job
-from drivesplat.workflow.costs.progress import Progress, Watch
+from drivesplat.workflow.costs.measured import Cost, JobId
+from drivesplat.workflow.costs.progress import RunProgress, Watch
 
 CONFIG = load(yaml.safe_load((REPOSITORY / "config.yaml").read_text()))
-MASKS, TRAIN, FILM = Job("masks", "0103"), Job("train", "0103", "street"), Job("film", "0103", "street", "original")
+MASKS, TRAIN, FILM = (
+    JobId("masks", "0103"),
+    JobId("train", "0103", "street"),
+    JobId("film", "0103", "street", "original"),
+)
 COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=15000), Cost(FILM, 100.0, "")]
 BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
 ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.workflow.job: street/train 0103 ends\n"
 TOLD = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
 
 
-def progress(folder: Path, finished: set[Job], began: float = 0.0) -> Progress:
+def progress(
+    folder: Path, finished: set[JobId], began: float = 0.0, costs: Sequence[Cost] = tuple(COSTS)
+) -> RunProgress:
     planned = [PlannedJob(job, 1, job is not MASKS) for job in (MASKS, TRAIN, FILM)]
     logs = {job: folder / f"{job.stage}.log" for job in (MASKS, TRAIN, FILM)}
-    return Progress(planned, logs, lambda: Expectations(CONFIG, COSTS), lambda: finished, Machine(1, 1), began)
+    return RunProgress(planned, logs, lambda: Expectations(CONFIG, costs), lambda: finished, Machine(1, 1), began)
 
 
 def test_trainings_weigh_what_they_take(tmp_path):
@@ -60,6 +67,15 @@ def test_a_job_that_says_nothing_is_taken_to_be_as_far_as_expected(tmp_path):
     assert looked.line(1000.0).startswith("90 % of the work")
     assert looked.line(1060.0) == "96 % of the work, 2 of 3 jobs, about 40 s left; at work: 0103 street film original"
     assert "about 0 s left" in looked.line(2000.0)
+
+
+def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
+    """A running training says how long it still takes."""
+    alone = progress(tmp_path, {MASKS}, costs=COSTS[:1])
+    assert alone.line(0.0) == "1 of 3 jobs, about 0 s and 2 jobs not measured yet left"
+    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("50 %, 18.8 it/s, 400 s left"))
+    line = alone.line(0.0)
+    assert line == "1 of 3 jobs, about 7 min and 1 jobs not measured yet left; at work: 0103 street train (50 %)"
 
 
 def test_a_job_that_has_ended_is_done_before_it_is_counted(tmp_path):
@@ -102,4 +118,7 @@ def test_a_watch_prints_and_outlives_what_goes_wrong(tmp_path, capsys, fails):
         time.sleep(0.02)
         said += capsys.readouterr().err
     watch.stop()
-    assert said.count("drivesplat: ") >= 2 and ("cannot be told" if fails else "0 % of the work") in said
+    assert (
+        said.count("drivesplat: ") >= 2
+        and ("the progress of the run is unknown" if fails else "0 % of the work") in said
+    )

@@ -273,7 +273,7 @@ def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
         path.write_text(EDITS)
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
     (line,) = complaints(done.stdout)
-    words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"there are: {CAR[:8]}")
+    words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"editable tracks: {CAR[:8]}")
     assert all(word in line for word in words), line
     assert not list((finished.folder / "results/0001/street/edits").glob("*typo*"))
 

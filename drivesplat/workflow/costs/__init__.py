@@ -1,1 +1,1 @@
-"""What runs have cost, what the next one will, and how far the present one is."""
+"""Measured costs of jobs, estimates of runs, and their progress."""

@@ -1,14 +1,14 @@
-"""What a run is expected to take, in time and on disk, before it starts."""
+"""The expected time and disk of a run before it starts, from what has been measured in its results folder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from drivesplat.workflow.costs.disk import DiskNeed, Leaves, disk_need
-from drivesplat.workflow.costs.expected import KNOWN_MACHINE, Expectations, Work, wall_seconds
-from drivesplat.workflow.costs.measured import Job
-from drivesplat.workflow.costs.usual import usual_bytes
+from drivesplat.workflow.costs.disk import DiskNeed, disk_need
+from drivesplat.workflow.costs.expected import Expectations, Work, wall_seconds
+from drivesplat.workflow.costs.measured import JobId
+
+NOT_MEASURED = "not measured yet"
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Machine:
 
 @dataclass(frozen=True)
 class PlannedJob:
-    """A job that is to run, the threads it takes, whether it takes a GPU, and the files that it makes."""
+    """A job that is to run, the threads it takes, whether it takes a GPU, and its declared outputs."""
 
-    job: Job
+    job: JobId
     threads: int
     on_gpu: bool
     outputs: tuple[str, ...] = ()
@@ -31,71 +31,75 @@ class PlannedJob:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The seconds that `jobs` take on a machine, by the clock on the wall; how many of them are `known`, and from how
-    many jobs that were `measured`; jobs and seconds of work by stage, the dearest first; and the disk they fill."""
+    """The expected wall time (s) of those of a run's `jobs` that are `known` from `measured` jobs; per stage the number
+    of jobs and the mean seconds of the known ones (None: not measured), the dearest first; and the disk they fill."""
 
     jobs: int
     seconds: float
     known: int
     measured: int
-    by_stage: dict[str, tuple[int, float]]
+    by_stage: dict[str, tuple[int, float | None]]
     machine: Machine
     disk: DiskNeed
 
 
 def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine: Machine, results: Path) -> Estimate:
-    """What is to be expected of `planned` jobs in a folder of results."""
+    """The estimate of `planned` jobs in a results folder."""
     expected = [expectations.of(one.job) for one in planned]
-    work = [Work(one.job, found.seconds, one.threads, one.on_gpu) for one, found in zip(planned, expected, strict=True)]
-    stages: dict[str, tuple[int, float]] = {}
-    for one in work:
-        jobs, seconds = stages.get(one.job.stage, (0, 0.0))
-        stages[one.job.stage] = jobs + 1, seconds + one.seconds
+    work = [
+        Work(one.job, found.seconds, one.threads, one.on_gpu)
+        for one, found in zip(planned, expected, strict=True)
+        if found.seconds is not None
+    ]
+    stages: dict[str, list[float]] = {one.job.stage: [] for one in planned}
+    for known in work:
+        stages[known.job.stage].append(known.seconds)
+    jobs = [one.job.stage for one in planned]
+    dearest = sorted(stages, key=lambda stage: -sum(stages[stage]))
     return Estimate(
-        jobs=len(work),
+        jobs=len(planned),
         seconds=wall_seconds(work, machine.cores, machine.gpus),
-        known=sum(bool(found.measured) for found in expected),
+        known=len(work),
         measured=len(frozenset().union(*(found.measured for found in expected))),
-        by_stage=dict(sorted(stages.items(), key=lambda item: -item[1][1])),
+        by_stage={s: (jobs.count(s), sum(stages[s]) / len(stages[s]) if stages[s] else None) for s in dearest},
         machine=machine,
-        disk=disk_need(
-            results,
-            [Leaves(one.job, one.outputs) for one in planned],
-            expectations.peers,
-            partial(usual_bytes, expectations.config),
-        ),
+        disk=disk_need(results, [(one.job, one.outputs) for one in planned], expectations.peers),
     )
 
 
 def in_one_line(found: Estimate) -> str:
-    """'27 jobs, about 12 min on 4 cores and 1 GPU (…), about 0.4 GB of disk (70.0 GB free)'."""
+    """'27 jobs, about 12 min on 4 cores (from 22 measured jobs; 3 not measured yet), about 0.4 GB of disk (…)'."""
     if not found.jobs:
         return "nothing is to be run"
+    jobs = f"{found.jobs} job{'s' * (found.jobs > 1)}"
+    return f"{jobs}, {_time(found)}, {_disk(found)}"
+
+
+def _time(found: Estimate) -> str:
+    if not found.known:
+        return f"time {NOT_MEASURED}"
     cores, gpus = found.machine.cores, found.machine.gpus
     where = f"{cores} core{'s' * (cores > 1)}" + (f" and {gpus} GPUs" if gpus > 1 else "")
-    disk = f"about {_spelled_bytes(found.disk.needed)} of disk ({found.disk.free / 1e9:.1f} GB free)"
-    warning = "; that is more than there is" if found.disk.needed > found.disk.free else ""
-    jobs = f"{found.jobs} job{'s' * (found.jobs > 1)}"
-    return f"{jobs}, about {spelled(found.seconds)} on {where} ({_basis(found)}), {disk}{warning}"
-
-
-def _basis(found: Estimate) -> str:
-    """How the time is known."""
-    if not found.known:
-        return "no such job measured here yet: rough"
     rest = found.jobs - found.known
-    return f"from {found.measured} measured job{'s' * (found.measured > 1)}" + (f"; {rest} rough" if rest else "")
+    missing = f"; {rest} {NOT_MEASURED}" if rest else ""
+    basis = f"from {found.measured} measured job{'s' * (found.measured > 1)}{missing}"
+    return f"about {spelled(found.seconds)} on {where} ({basis})"
+
+
+def _disk(found: Estimate) -> str:
+    disk, free = found.disk, f"{found.disk.free / 1e9:.1f} GB free"
+    if disk.unknown == found.jobs:
+        return f"disk {NOT_MEASURED} ({free})"
+    missing = f"; {disk.unknown} jobs {NOT_MEASURED}" if disk.unknown else ""
+    warning = "; that is more than there is" if disk.needed > disk.free else ""
+    return f"about {_spelled_bytes(disk.needed)} of disk ({free}{missing}){warning}"
 
 
 def in_full(found: Estimate) -> str:
     """The line, and a table of stages."""
     lines = [f"drivesplat: {in_one_line(found)}"]
-    lines += [f"  {stage:<16}{jobs:>5} x {seconds / jobs:>8.1f} s" for stage, (jobs, seconds) in found.by_stage.items()]
-    if found.known < found.jobs:
-        lines.append(f"  rough: as on {KNOWN_MACHINE},")
-        lines.append("         trainings by their iterations; on another machine it may be off by a factor of five")
-    if found.disk.rough:
-        lines.append(f"  disk: for {found.disk.rough} of the jobs what is usual, for want of other scenes' files")
+    for stage, (jobs, seconds) in found.by_stage.items():
+        lines.append(f"  {stage:<16}{jobs:>5} x {NOT_MEASURED if seconds is None else f'{seconds:>8.1f} s'}")
     return "\n".join(lines)
 
 

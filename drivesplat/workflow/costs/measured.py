@@ -1,4 +1,4 @@
-"""What every job that has run cost: from the benchmark files that Snakemake leaves, and what trainings say."""
+"""The measured cost of every job that has run, from Snakemake's benchmark files and the records of trainings."""
 
 import csv
 import json
@@ -16,9 +16,9 @@ RENAMED = {"metrics": "scene_metrics"}
 
 
 @dataclass(frozen=True)
-class Job:
-    """A job of the workflow: a stage, of a scene, of a method, with the name of its film or edit; empty where it is of
-    none. The film of a synthetic world's stage is its dataset."""
+class JobId:
+    """Which job of the workflow: stage, scene, method, and the name of its film or edit; empty where there is none. The
+    film of a synthetic world's job is its dataset."""
 
     stage: str
     scene: str = ""
@@ -26,7 +26,7 @@ class Job:
     film: str = ""
 
     @classmethod
-    def of(cls, benchmark: PurePath) -> "Job":
+    def of(cls, benchmark: PurePath) -> "JobId":
         """The job whose benchmark file this is, counted from the folder of benchmarks."""
         *place, name = benchmark.with_suffix("").parts
         if place == [WORLD]:
@@ -48,7 +48,7 @@ class Cost:
     """What a job cost. `seconds` of wall time are those of the whole job, or, of a training that was resumed or has no
     benchmark, those of the training loop (`seconds_from`); memory is the main memory's peak. None: not known."""
 
-    job: Job
+    job: JobId
     seconds: float
     seconds_from: str
     max_rss_mb: float | None = None
@@ -64,8 +64,8 @@ def read_costs(results: Path) -> tuple[list[Cost], list[str]]:
     missing or cannot be read: what it would tell is left out, or told by another."""
     costs, complaints = [], []
     folder = results / BENCHMARKS
-    files = {Job.of(file.relative_to(folder)): file for file in sorted(folder.rglob("*.tsv"))}
-    trained = {Job(TRAIN, *file.parent.parts[-2:]): file for file in sorted(results.glob("*/*/train.json"))}
+    files = {JobId.of(file.relative_to(folder)): file for file in sorted(folder.rglob("*.tsv"))}
+    trained = {JobId(TRAIN, *file.parent.parts[-2:]): file for file in sorted(results.glob("*/*/train.json"))}
     for job in sorted({*files, *trained}, key=lambda job: (job.scene, job.method, job.stage, job.film)):
         benchmark = _reading(_benchmark, files.get(job), complaints)
         summary = _reading(_summary, trained.get(job), complaints)
@@ -121,7 +121,7 @@ def _summary(path: Path) -> dict[str, Any]:
     }
 
 
-def _cost(job: Job, benchmark: dict[str, Any] | None, summary: dict[str, Any] | None) -> Cost | None:
+def _cost(job: JobId, benchmark: dict[str, Any] | None, summary: dict[str, Any] | None) -> Cost | None:
     """The benchmark of a training that was resumed has its last part alone, so that its own record counts."""
     told = {key: summary[key] for key in ("gpu_memory_gb", "device", "iterations")} if summary else {}
     if summary and (benchmark is None or summary["resumed"]):

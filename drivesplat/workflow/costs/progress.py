@@ -1,4 +1,4 @@
-"""How far a run is, and how long it goes on: a line now and then, while Snakemake counts jobs."""
+"""Progress and remaining time of a run: a line every half minute, beside Snakemake's count of jobs."""
 
 import re
 import sys
@@ -7,42 +7,43 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from drivesplat.workflow.costs.estimate import Machine, PlannedJob, spelled
+from drivesplat.workflow.costs.estimate import NOT_MEASURED, Machine, PlannedJob, spelled
 from drivesplat.workflow.costs.expected import Expectations, Work, wall_seconds
-from drivesplat.workflow.costs.measured import TRAIN, Job
+from drivesplat.workflow.costs.measured import TRAIN, JobId
 from drivesplat.workflow.job_logs import has_begun, is_cut_short
 
 EVERY_S = 30.0
-SHOWN = 4
-"""Jobs at work that are named at most."""
+MAX_NAMED = 4
+"""Running jobs that are named at most."""
 TAIL_BYTES = 4096
 _PROGRESS = re.compile(r"([\d.]+) %, [\d.]+ it/s, (\d+) s left")
 """How a training tells its log how far it is (`drivesplat.training.monitor`)."""
 
 
-class Progress:
-    """How far a run of `planned` jobs is, whose `logs` tell which are at work and how far trainings are.
+class RunProgress:
+    """The progress of a run of `planned` jobs; their `logs` tell which are at work and how far trainings are.
 
-    What is expected of the jobs that are left is asked anew every time: those of this run that are done tell.
+    Expected seconds are updated every time: finished jobs of this run are measured, too.
     """
 
     def __init__(
         self,
         planned: Sequence[PlannedJob],
-        logs: Mapping[Job, Path],
+        logs: Mapping[JobId, Path],
         expectations: Callable[[], Expectations],
-        finished: Callable[[], set[Job]],
+        finished: Callable[[], set[JobId]],
         machine: Machine,
         began: float,
     ):
         self._planned, self._logs, self._machine, self._began = planned, logs, machine, began
         self._expectations, self._finished = expectations, finished
-        self._since: dict[Job, float] = {}
+        self._since: dict[JobId, float] = {}
 
     def line(self, now: float) -> str:
-        """'37 % of the work, 12 of 40 jobs, about 9 min left; at work: 0103 street train (43 %)'."""
+        """'37 % of the work, 12 of 40 jobs, about 9 min left; at work: 0103 street train (43 %)'; without a share of
+        the work while the costs of some jobs are unknown."""
         expectations, finished = self._expectations(), self._finished()
-        done, left, at_work = 0.0, [], []
+        done, unknown, left, at_work = 0.0, 0, [], []
         for one in self._planned:
             seconds = expectations.of(one.job).seconds
             working = False if one.job in finished else self._is_at_work(one.job)
@@ -50,17 +51,22 @@ class Progress:
             if working:
                 part, remaining = self._of_running(one.job, seconds, now)
                 at_work.append(f"{one.job.name} ({part:.0f} %)" if part is not None else one.job.name)
-                seconds = max(seconds, remaining) if part is None else remaining / (1.0 - min(part, 99.0) / 100.0)
-            done += seconds - remaining
+                if part is not None and remaining is not None:
+                    seconds = remaining / (1.0 - min(part, 99.0) / 100.0)
+            if remaining is None:
+                unknown += 1
+                continue
+            done += max(0.0, (seconds or 0.0) - remaining)
             left.append(Work(one.job, remaining, one.threads, one.on_gpu))
         whole = done + sum(work.seconds for work in left)
-        share = 100.0 * done / whole if whole else 100.0
-        more = f" and {len(at_work) - SHOWN} more" if len(at_work) > SHOWN else ""
-        named = f"; at work: {', '.join(at_work[:SHOWN])}{more}" if at_work else ""
+        share = "" if unknown else f"{100.0 * done / whole if whole else 100.0:.0f} % of the work, "
         time_left = spelled(wall_seconds(left, self._machine.cores, self._machine.gpus))
-        return f"{share:.0f} % of the work, {len(finished)} of {len(self._planned)} jobs, about {time_left} left{named}"
+        more = f" and {len(at_work) - MAX_NAMED} more" if len(at_work) > MAX_NAMED else ""
+        named = f"; at work: {', '.join(at_work[:MAX_NAMED])}{more}" if at_work else ""
+        missing = f" and {unknown} jobs {NOT_MEASURED}" if unknown else ""
+        return f"{share}{len(finished)} of {len(self._planned)} jobs, about {time_left}{missing} left{named}"
 
-    def _is_at_work(self, job: Job) -> bool | None:
+    def _is_at_work(self, job: JobId) -> bool | None:
         """Whether a job is at work, as its log of this run says, and not over, though Snakemake may take seconds to
         count it; None where it has not begun."""
         log = self._logs.get(job)
@@ -70,13 +76,13 @@ class Progress:
             return None
         return is_cut_short(text) if has_begun(text) else None
 
-    def _of_running(self, job: Job, expected: float, now: float) -> tuple[float | None, float]:
-        """How far a job at work is, in percent, where it says so, and the seconds it still needs."""
+    def _of_running(self, job: JobId, expected: float | None, now: float) -> tuple[float | None, float | None]:
+        """The percentage of a running job where its log tells it, and the seconds it still needs where known."""
         elapsed = now - self._since.setdefault(job, now)
         told = _PROGRESS.findall(_tail(self._logs[job])) if job.stage == TRAIN else []
         if told:
             return float(told[-1][0]), float(told[-1][1])
-        return None, max(0.0, expected - elapsed)
+        return None, None if expected is None else max(0.0, expected - elapsed)
 
 
 def _tail(path: Path) -> str:
@@ -89,7 +95,7 @@ def _tail(path: Path) -> str:
 class Watch:
     """A thread that prints a run's progress every EVERY_S seconds until it is told to stop, or the process ends."""
 
-    def __init__(self, progress: Progress, every_s: float = EVERY_S):
+    def __init__(self, progress: RunProgress, every_s: float = EVERY_S):
         self._progress, self._every_s = progress, every_s
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._look, name="progress", daemon=True)
@@ -104,6 +110,6 @@ class Watch:
         while not self._ended.wait(self._every_s):
             try:
                 line = self._progress.line(time.time())
-            except Exception as error:  # a run must not end for what is told of it
-                line = f"how far the run is cannot be told ({type(error).__name__}: {error})"
+            except Exception as error:  # a failure to report progress must not end the run
+                line = f"the progress of the run is unknown ({type(error).__name__}: {error})"
             print(f"drivesplat: {line}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""What Snakemake's hooks say of costs: an estimate when a run starts, its progress, and costs.csv when it ends."""
+"""What Snakemake's hooks report of costs: an estimate when a run starts, its progress, costs.csv when it ends."""
 
 import os
 import sys
@@ -11,8 +11,8 @@ from drivesplat.errors import DriveSplatError
 from drivesplat.settings.overridden import without_effect
 from drivesplat.workflow.costs.estimate import Estimate, Machine, PlannedJob, estimate, in_full, in_one_line
 from drivesplat.workflow.costs.expected import Expectations
-from drivesplat.workflow.costs.measured import BENCHMARKS, Job, read_costs
-from drivesplat.workflow.costs.progress import Progress, Watch
+from drivesplat.workflow.costs.measured import BENCHMARKS, JobId, read_costs
+from drivesplat.workflow.costs.progress import RunProgress, Watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
 from drivesplat.workflow.plan import Plan
 
@@ -26,7 +26,7 @@ class RunCosts:
     def __init__(self, plan: Plan, workflow: Any, targets: Sequence[str]):
         self._plan, self._workflow, self._targets = plan, workflow, targets
         self._results = Path(plan.config.results_dir)
-        self._jobs: dict[Job, Any] = {}
+        self._jobs: dict[JobId, Any] = {}
         self._watch: Watch | None = None
 
     def tell_estimate(self) -> bool:
@@ -46,13 +46,13 @@ class RunCosts:
             if self._jobs:
                 _say(in_one_line(self.estimate()))
                 self._watch_jobs()
-        except Exception as error:  # a run must not end for what is told of it
-            _say(f"what the run will take cannot be told ({type(error).__name__}: {error})")
+        except Exception as error:  # a failed estimate must not end the run
+            _say(f"the run cannot be estimated ({type(error).__name__}: {error})")
 
     def _watch_jobs(self) -> None:
         logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
         args = self._planned, logs, self._expectations, self._finished, self._machine, time.time()
-        self._watch = Watch(Progress(*args))
+        self._watch = Watch(RunProgress(*args))
         self._watch.start()
 
     def estimate(self) -> Estimate:
@@ -77,11 +77,11 @@ class RunCosts:
             if total["scene"] in here and not total["under_90_minutes"]:
                 _say(f"scene {total['scene']}: {finding(total)}; {self._results / FILES[0]} says where it went")
 
-    def _needed(self) -> dict[Job, Any]:
+    def _needed(self) -> dict[JobId, Any]:
         """Snakemake's jobs that are to run, by what they are; those that only gather others are none."""
         jobs = (job for job in self._workflow.dag.needrun_jobs() if job.benchmark)
         folder = self._results / BENCHMARKS
-        return {Job.of(Path(os.path.relpath(job.benchmark, folder))): job for job in jobs}
+        return {JobId.of(Path(os.path.relpath(job.benchmark, folder))): job for job in jobs}
 
     @property
     def _planned(self) -> list[PlannedJob]:
@@ -98,11 +98,11 @@ class RunCosts:
     def _expectations(self) -> Expectations:
         return Expectations(self._plan.config, read_costs(self._results)[0])
 
-    def _finished(self) -> set[Job]:
+    def _finished(self) -> set[JobId]:
         return {name for name, job in self._jobs.items() if self._workflow.dag.finished(job)}
 
 
-def planned_job(name: Job, job: Any) -> PlannedJob:
+def planned_job(name: JobId, job: Any) -> PlannedJob:
     """One of Snakemake's jobs. It takes a GPU where it asks for one: on processors its rule asks for none."""
     return PlannedJob(name, int(job.threads), bool(job.resources.get("gpu")), tuple(map(str, job.output)))
 
