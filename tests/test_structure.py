@@ -8,7 +8,7 @@ from helpers import REPOSITORY
 
 LIBRARY = "drivesplat"
 MAX_PLACES, MAX_LOOSE_MODULES = 26, 2
-MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 8, 20
+MAX_PACKAGE_CHAIN, MAX_MODULE_CHAIN = 8, 18
 
 Graph = dict[str, set[str]]
 """What each module or package imports."""
@@ -16,7 +16,8 @@ Graph = dict[str, set[str]]
 
 def modules() -> dict[str, Path]:
     """The library's modules by dotted name; a package is named without `__init__`."""
-    paths = {path.relative_to(REPOSITORY).with_suffix(""): path for path in (REPOSITORY / LIBRARY).rglob("*.py")}
+    files = (path for path in (REPOSITORY / LIBRARY).rglob("*.py") if "__pycache__" not in path.parts)
+    paths = {path.relative_to(REPOSITORY).with_suffix(""): path for path in files}
     return {".".join(name.parts).removesuffix(".__init__"): path for name, path in paths.items()}
 
 
@@ -76,6 +77,25 @@ def test_modules_import_in_no_circle_and_in_short_chains():
 def test_packages_import_in_no_circle_and_in_short_chains():
     chain = longest_chain(package_graph(module_graph()))
     assert len(chain) <= MAX_PACKAGE_CHAIN, " > ".join(chain)
+
+
+def test_kernels_import_nothing_above_them():
+    below = {"kernels", "provenance", "io", "errors"}
+    assert {other for module, others in module_graph().items() if top(module) == "kernels" for other in others} <= {
+        module for module in modules() if top(module) in below
+    }
+
+
+def test_only_kernels_choose_between_triton_numba_and_torch():
+    """Callers use one function per operation: no import of a backend, no question which one is used."""
+    backends = ("drivesplat.kernels.triton.", "drivesplat.kernels.numba.")
+    wrong = {
+        module
+        for module, others in module_graph().items()
+        if top(module) != "kernels"
+        and (any(f"{o}.".startswith(backends) for o in others) or "usable_for" in modules()[module].read_text())
+    }
+    assert wrong == set()
 
 
 def test_imports_are_found_in_every_form():

@@ -40,6 +40,14 @@ def sh_basis(coefficients: int, directions: Float[Tensor, "*n 3"]) -> Float[Tens
     return _eval_sh_bases_fast(coefficients, directions)
 
 
+def compiled_kernels() -> Any:
+    """The module of gsplat's compiled CUDA kernels; None where they cannot be compiled. Raises what loading them
+    raises."""
+    from gsplat.cuda._backend import _C
+
+    return _C
+
+
 @contextmanager
 def cpu_strategies() -> Iterator[None]:
     """Within this context gsplat's strategies run on the CPU: torch replaces the two CUDA kernels that they call."""

@@ -66,13 +66,15 @@ def _require_gsplat() -> None:
     try:
         if torch.version.cuda and "gsplat.cuda._backend" not in sys.modules:
             import_module("gsplat.csrc")  # gsplat would compile kernels that it cannot load
-        from gsplat.cuda._backend import _C
+        from drivesplat.kernels.gsplat_private import compiled_kernels
+
+        kernels = compiled_kernels()
     except Exception as error:  # compiled code can fail to load in any way
         raise DeviceError(
             f"gsplat cannot be loaded ({type(error).__name__}: {error}); "
             f"`make doctor` says why, {REBUILD} reinstalls it for this torch and CUDA; or write device: cpu"
         ) from error
-    if _C is None:
+    if kernels is None:
         raise DeviceError(
             "gsplat is not compiled and there is no CUDA toolkit (nvcc) to compile it with; "
             f"{COMPILE}, `make doctor` says what that needs; or write device: cpu"

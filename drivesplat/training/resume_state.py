@@ -67,8 +67,9 @@ def restore_model(model: SplatModel, state: dict[str, torch.Tensor]) -> None:
     for name, value in state.items():
         owner_name, _, key = name.rpartition(".")
         owner = model.get_submodule(owner_name)
-        if key in owner._buffers:
-            owner._buffers[key].copy_(value)
+        buffers = dict(owner.named_buffers(recurse=False))
+        if key in buffers:
+            buffers[key].copy_(value)
             continue
         old = owner[key]
         owner[key] = torch.nn.Parameter(value.to(old.device), requires_grad=old.requires_grad)

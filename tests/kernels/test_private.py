@@ -1,0 +1,104 @@
+"""The private functions of torch and gsplat that the library calls: unchanged, and called in one module each."""
+
+import ast
+import inspect
+import re
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from gsplat import DefaultStrategy
+from gsplat.cuda import _torch_impl
+from gsplat.strategy import ops
+from helpers import REPOSITORY
+
+from drivesplat.kernels.relocation import relocation_in_torch
+
+LIBRARIES = ("torch", "gsplat", "numba", "triton")
+MODULES = {"drivesplat/kernels/torch_private.py", "drivesplat/kernels/gsplat_private.py"}
+TORCH = {
+    "_foreach_add_.Scalar": "(Tensor(a!)[] self, Scalar scalar) -> ()",
+    "_foreach_norm.Scalar": "(Tensor[] self, Scalar ord=2, ScalarType? dtype=None) -> Tensor[]",
+    "_fused_adam_.tensor_lr": "(Tensor(a!)[] self, Tensor(b!)[] grads, Tensor(c!)[] exp_avgs, "
+    "Tensor(d!)[] exp_avg_sqs, Tensor(e!)[] max_exp_avg_sqs, Tensor[] state_steps, *, Tensor lr, float beta1, "
+    "float beta2, float weight_decay, "
+    "float eps, bool amsgrad, bool maximize, Tensor? grad_scale=None, Tensor? found_inf=None) -> ()",
+}
+GSPLAT = [
+    (ops._update_param_with_optimizer, "param_fn optimizer_fn params optimizers names"),
+    (ops._multinomial_sample, "weights n replacement"),
+    (ops.compute_relocation, "opacities scales ratios binoms"),
+    (relocation_in_torch, "opacities scales ratios binoms"),
+    (ops.quat_scale_to_covar_preci, "quats scales compute_covar compute_preci triu"),
+    (_torch_impl._quat_scale_to_covar_preci, "quats scales compute_covar compute_preci triu"),
+    (_torch_impl._eval_sh_bases_fast, "basis_dim dirs"),
+    (DefaultStrategy._grow_gs, "self params optimizers state step"),
+]
+
+
+@pytest.mark.parametrize("name", TORCH)
+def test_torchs_private_operators_are_unchanged(name):
+    operator, overload = name.split(".")
+    found = str(getattr(getattr(torch.ops.aten, operator), overload)._schema)
+    assert found == f"aten::{name}{TORCH[name]}", "torch has changed it: adapt drivesplat/kernels/torch_private.py"
+    assert callable(getattr(torch, operator))
+
+
+def test_torch_counts_writes_to_a_tensor():
+    tensor = torch.zeros(2)
+    before = tensor._version
+    tensor.add_(1.0)
+    assert tensor._version > before, "torch has changed Tensor._version: adapt drivesplat/kernels/torch_private.py"
+
+
+@pytest.mark.skipif(torch.version.cuda is None, reason="torch was built without CUDA")
+@pytest.mark.parametrize("name", ["_cuda_endAllocateToPool", "_cuda_releasePool"])
+def test_torch_can_release_the_memory_pool_of_a_broken_capture(name):
+    assert hasattr(torch._C, name), f"torch has no _C.{name} any more: adapt drivesplat/kernels/torch_private.py"
+
+
+@pytest.mark.parametrize(("function", "parameters"), GSPLAT, ids=[function.__name__ for function, _ in GSPLAT])
+def test_gsplats_private_functions_are_unchanged(function: Callable, parameters: str):
+    found = " ".join(inspect.signature(function).parameters)
+    assert found == parameters, "gsplat has changed it: adapt drivesplat/kernels/gsplat_private.py"
+
+
+def test_gsplat_grows_gaussians_and_its_strategies_call_kernels_where_we_replace_them():
+    source = inspect.getsource(DefaultStrategy.step_post_backward)
+    assert "self._grow_gs(" in source, "gsplat does not call _grow_gs any more: HookedDefaultStrategy has no effect"
+    for caller, called in ((ops.relocate, "compute_relocation("), (ops.sample_add, "compute_relocation(")):
+        assert called in inspect.getsource(caller), f"cpu_strategies replaces {called} for {caller.__name__} in vain"
+
+
+def private_names(tree: ast.AST) -> Iterator[str]:
+    """Private names of LIBRARIES that a module imports, or reads from a name that it has imported from them."""
+    imported = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imported |= {(a.asname or a.name).partition(".")[0] for a in node.names if a.name.startswith(LIBRARIES)}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in LIBRARIES:
+            imported |= {alias.asname or alias.name for alias in node.names}
+            paths = (f"{node.module}.{alias.name}" for alias in node.names)
+            yield from (path for path in paths if is_private(path))
+    for node in ast.walk(tree):
+        name = ast.unparse(node) if isinstance(node, ast.Attribute) else ""
+        if re.fullmatch(r"[\w.]+", name) and name.partition(".")[0] in imported and is_private(name):
+            yield name
+        elif isinstance(node, ast.Attribute) and node.attr in ("_version", "_buffers", "_parameters", "_schema"):
+            yield ast.unparse(node)
+
+
+def is_private(path: str) -> bool:
+    return any(part.startswith("_") and not part.startswith("__") for part in path.split("."))
+
+
+def test_private_names_are_used_in_one_module_per_library():
+    files = [file for file in (REPOSITORY / "drivesplat").rglob("*.py") if "__pycache__" not in file.parts]
+    uses = {str(file.relative_to(REPOSITORY)): set(private_names(ast.parse(file.read_text()))) for file in files}
+    assert {file: names for file, names in uses.items() if names and file not in MODULES} == {}
+    assert all(uses[file] for file in MODULES)
+
+
+def test_private_names_are_found_in_every_form():
+    source = "import torch\nfrom gsplat.cuda import _x\nfrom gsplat import ops\ntorch._C.f\nops._y()\nops.z\na._version"
+    assert set(private_names(ast.parse(source))) == {"gsplat.cuda._x", "torch._C.f", "torch._C", "ops._y", "a._version"}
