@@ -8,7 +8,7 @@
 # make bench      what the benchmarks/ measure, against their bounds (two idle cores)
 # make quality    RECIPES=file: recipes trained with several seeds on one scene, and their table (docs/quality.md)
 # make speed      FILE=file: how fast a method trains, held to gsplat's example trainer, and how well (docs/speed.md)
-# make config     config.yaml and config.schema.json from the settings' definitions
+# make config     config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
 .PHONY: demo setup doctor test lint test-gpu test-slurm test-batch bench quality speed config
 
 BIN := .venv/bin
@@ -58,4 +58,4 @@ speed: setup
 	$(BIN)/python -m benchmarks.speed $(FILE) -- --cores $(CORES) $(SNAKEMAKE)
 
 config: setup
-	$(BIN)/python -m drivesplat.settings.config_document
+	$(BIN)/python -m drivesplat.settings.config_document $(FORCE)

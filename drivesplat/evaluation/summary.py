@@ -1,5 +1,6 @@
 """A metrics.json in sentences: `python -m drivesplat.evaluation.summary results/demo/metrics.json`."""
 
+import argparse
 import sys
 from pathlib import Path
 from typing import Any
@@ -77,9 +78,12 @@ def _moving_vehicles(group: dict[str, Any], gap: float | None) -> str:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser("python -m drivesplat.evaluation.summary", description=__doc__)
+    parser.add_argument("metrics", help="a scene's metrics.json")
+    path = parser.parse_args().metrics
     try:
-        metrics = read_json(sys.argv[1], rule="scene_metrics")
-        checked_digest(sys.argv[1], warn=False)
-        print("\n".join(sentences(metrics, sys.argv[1])))
+        metrics = read_json(path, rule="scene_metrics")
+        checked_digest(path, warn=False)
+        print("\n".join(sentences(metrics, path)))
     except DriveSplatError as error:
         sys.exit(f"drivesplat: {error}")

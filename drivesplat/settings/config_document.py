@@ -1,10 +1,11 @@
-"""config.yaml and config.schema.json, written from the settings records.
+"""Writes config.yaml and config.schema.json from the settings records; keeps a config.yaml that was changed."""
 
-python -m drivesplat.settings.config_document          writes both
-"""
-
+import argparse
+import difflib
 import json
+import sys
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,25 @@ def _bounds(field: FieldInfo) -> str:
     return ", ".join(found)
 
 
+def main(arguments: Sequence[str], folder: Path = ROOT) -> int:
+    """Writes both files into `folder`; returns the exit status, 1 where config.yaml has other content and is kept."""
+    parser = argparse.ArgumentParser("python -m drivesplat.settings.config_document", description=__doc__)
+    parser.add_argument("--force", action="store_true", help="overwrite config.yaml even if it differs")
+    force, path, text = parser.parse_args(arguments).force, folder / "config.yaml", config_yaml()
+    present = path.read_text(encoding="utf-8") if path.exists() else text
+    if present != text and not force:
+        lines = (value.splitlines(keepends=True) for value in (present, text))
+        sys.stdout.writelines(difflib.unified_diff(*lines, "config.yaml", "config.yaml as generated"))
+        print(
+            "drivesplat: config.yaml differs from the defaults, as above, and is kept; move your settings to a file of "
+            "your own (--configfile mine.yaml), or overwrite them with --force (make config FORCE=--force)",
+            file=sys.stderr,
+        )
+        return 1
+    path.write_text(text, encoding="utf-8")
+    (folder / "config.schema.json").write_text(config_schema(), encoding="utf-8")
+    return 0
+
+
 if __name__ == "__main__":
-    (ROOT / "config.yaml").write_text(config_yaml(), encoding="utf-8")
-    (ROOT / "config.schema.json").write_text(config_schema(), encoding="utf-8")
+    sys.exit(main(sys.argv[1:]))

@@ -4,9 +4,11 @@ What they run is compiled when it is first called, and kept (`drivesplat.kernels
 training, of each that is begun meanwhile, and of the first tests. The set-up has it behind it.
 """
 
+import argparse
 import logging
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +48,9 @@ def rehearse(folder: Path) -> None:
     unhidden(pixel, pixel, np.ones(1), np.ones((1, 2)), (height, width))
 
 
-def main() -> int:
+def main(arguments: Sequence[str] = ()) -> int:
     """Returns the exit status."""
+    argparse.ArgumentParser("python -m drivesplat.training.warm_up", description=__doc__).parse_args(arguments)
     logging.disable(logging.INFO)
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -59,4 +62,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

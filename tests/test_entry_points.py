@@ -1,0 +1,62 @@
+"""Every `python -m` command prints its help, and none overwrites what a user changed."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import REPOSITORY
+
+from drivesplat.settings.config_document import config_schema, config_yaml, main
+
+IS_COMMAND = re.compile(r'^if __name__ == "__main__":', re.MULTILINE)
+COMMANDS = sorted(
+    ".".join(path.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__main__")
+    for folder in ("drivesplat", "benchmarks")
+    for path in (REPOSITORY / folder).rglob("*.py")
+    if IS_COMMAND.search(path.read_text(encoding="utf-8"))
+)
+
+
+def test_the_commands_are_found():
+    assert {"drivesplat.settings.config_document", "drivesplat.machine.doctor", "benchmarks.speed"} <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
+def test_help_is_printed_and_nothing_else_happens(command, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(sys, "argv", [command, "--help"])
+    monkeypatch.chdir(tmp_path)
+    config = (REPOSITORY / "config.yaml").stat().st_mtime_ns
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(command, run_name="__main__", alter_sys=True)
+    told = capsys.readouterr().out
+    assert ended.value.code in (0, None) and told.startswith(f"usage: python -m {command} ")
+    assert (REPOSITORY / "config.yaml").stat().st_mtime_ns == config and not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def changed(tmp_path) -> Path:
+    """A folder with a config.yaml in which a user has changed one value."""
+    (tmp_path / "config.yaml").write_text(config_yaml().replace("results_dir: results", "results_dir: elsewhere"))
+    return tmp_path
+
+
+def test_a_changed_config_is_kept_and_the_difference_is_shown(changed, capsys):
+    before = (changed / "config.yaml").read_text()
+    assert main([], changed) == 1
+    told = capsys.readouterr()
+    assert "\n-results_dir: elsewhere\n+results_dir: results\n" in told.out and "--force" in told.err
+    assert (changed / "config.yaml").read_text() == before and not (changed / "config.schema.json").exists()
+
+
+def test_force_overwrites_a_changed_config(changed):
+    assert main(["--force"], changed) == 0
+    assert (changed / "config.yaml").read_text() == config_yaml()
+
+
+def test_absent_files_are_written(tmp_path):
+    assert main([], tmp_path) == 0 and main([], tmp_path) == 0
+    assert (tmp_path / "config.yaml").read_text() == config_yaml()
+    assert (tmp_path / "config.schema.json").read_text() == config_schema()
