@@ -1,4 +1,4 @@
-# What each thing in a method is worth: the method trained again without it.
+# The contribution of each component of a method: the method trained again without it.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/eval.json of the method and of all its variants, with every seed: methods
 # that the section `ablation` of the config names, trained and measured by the rules `train` and `evaluate`.
@@ -7,7 +7,7 @@
 
 rule ablation:
     """
-    Compares a method with what is left of it without each of its parts, losses and freedoms, over several random seeds.
+    Compares a method with variants that lack one of its parts, losses or degrees of freedom, over several random seeds.
     """
     input:
         evals=expand("<results>/{{scene}}/{method}/eval.json", method=plan.config.ablated),
@@ -17,7 +17,7 @@ rule ablation:
             caption="../report/ablation.rst",
             category="Scene {scene}",
             subcategory="figures",
-            labels={"what": "what each thing in a method is worth"},
+            labels={"what": "contribution of each component"},
         ),
         record="<results>/{scene}/ablation.json",
     log:

@@ -19,9 +19,9 @@ class VariantSettings(Settings):
     """Settings laid over the method's overrides, as a tree. Only `sky` and `train` may be set."""
 
     @model_validator(mode="after")
-    def _takes_something_out(self) -> "VariantSettings":
+    def _removes_something(self) -> "VariantSettings":
         if self.parts is None and not self.overrides:
-            raise ValueError("it takes nothing out: give it parts or overrides")
+            raise ValueError("it removes nothing: set parts or overrides")
         return self
 
 
@@ -56,14 +56,14 @@ class AblationSettings(Settings):
         without = tuple(name for name, variant in self.without.items() if variant is not None)
         return AblationJob(of=self.of, seeds=self.seeds, without=without)
 
-    def methods(self, whole: MethodSettings) -> dict[str, MethodSettings]:
-        """The methods to train, by name: `whole` and every variant, each with every seed."""
+    def methods(self, complete: MethodSettings) -> dict[str, MethodSettings]:
+        """The methods to train, by name: `complete` and every variant, each with every seed."""
         variants = {
-            self.job.variant(name): whole.varied(variant.parts, variant.overrides)
+            self.job.variant(name): complete.varied(variant.parts, variant.overrides)
             for name, variant in self.without.items()
             if variant is not None
         }
-        return with_seeds({self.of: whole, **variants}, self.seeds)
+        return with_seeds({self.of: complete, **variants}, self.seeds)
 
 
 class AblationJob(Settings):
@@ -82,13 +82,13 @@ class AblationJob(Settings):
         return with_seed(self.variant(without), seed)
 
     @property
-    def spelled(self) -> str:
+    def name_pattern(self) -> str:
         """The names of all methods, as one pattern with braces of the shell."""
-        stems = [self.of, *([self.variant(_either(self.without))] if self.without else [])]
-        return ", ".join(f"{stem}-seed{_either(self.seeds)}" for stem in stems)
+        stems = [self.of, *([self.variant(_alternatives(self.without))] if self.without else [])]
+        return ", ".join(f"{stem}-seed{_alternatives(self.seeds)}" for stem in stems)
 
 
-def _either(names: Sequence[Any]) -> str:
+def _alternatives(names: Sequence[Any]) -> str:
     """Names in braces of the shell; a single name without braces, which the shell would not expand."""
-    spelled = ",".join(map(str, names))
-    return f"{{{spelled}}}" if len(names) > 1 else spelled
+    alternatives = ",".join(map(str, names))
+    return f"{{{alternatives}}}" if len(names) > 1 else alternatives

@@ -26,13 +26,15 @@ VARIATION_OVERRIDES = ("sky", "train")
 """Settings that a variation of a method may override. Seeds are set separately."""
 
 
-def _each_once(seeds: tuple[int, ...]) -> tuple[int, ...]:
+def _no_duplicates(seeds: tuple[int, ...]) -> tuple[int, ...]:
     if len(set(seeds)) != len(seeds):
         raise ValueError("it names a seed twice")
     return seeds
 
 
-Seeds = Annotated[tuple[Annotated[int, Field(ge=0, lt=2**31)], ...], Field(min_length=1), AfterValidator(_each_once)]
+Seeds = Annotated[
+    tuple[Annotated[int, Field(ge=0, lt=2**31)], ...], Field(min_length=1), AfterValidator(_no_duplicates)
+]
 """Random seeds of compared trainings, without repetition."""
 
 

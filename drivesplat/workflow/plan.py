@@ -117,7 +117,7 @@ class Plan(Outputs):
                 f"ablation.of names the method {ablation.of!r}, which is not in the config; there are: {known}"
             )
         if len(path) > 1 and path[0] not in (*self.config.all_methods, "masks"):
-            more = f"; for the ablation: {ablation.job.spelled}" if self.config.ablated else ""
+            more = f"; for the ablation: {ablation.job.name_pattern}" if self.config.ablated else ""
             raise ConfigError(f"method {path[0]!r} is not in the config; there are: {known}{more}")
 
     def _refuse_idle_variants(self, scene: str) -> None:

@@ -154,7 +154,7 @@ def test_a_method_called_like_a_variant_is_refused(name):
 @pytest.mark.parametrize(
     ("section", "words"),
     [
-        ({"without": {"x": {}}}, ["ablation.without.x", "takes nothing out"]),
+        ({"without": {"x": {}}}, ["ablation.without.x", "removes nothing"]),
         ({"without": {"x": {"overrides": {"train": {"iteration": 3}}}}}, ["ablation.without.x", "train.iteration"]),
         ({"without": {"x": {"overrides": {"holdout": {"offset": 1}}}}}, ["ablation.without.x.overrides.holdout"]),
         ({"without": {"x": {"overrides": {"random_seed": 3}}}}, ["ablation.without.x.overrides.random_seed", "train"]),
@@ -236,7 +236,7 @@ def test_what_a_variant_takes_out_is_judged_by_what_holds_on_the_scene():
 )
 def test_names_of_methods_are_spelled_as_a_shell_expands_them(seeds, without, expected):
     job = AblationJob(of="it", seeds=seeds, without=without)
-    assert job.spelled == expected
+    assert job.name_pattern == expected
     command = ["bash", "-c", f"echo {expected.replace(', ', ' ')}"]
     expanded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
     assert sorted(expanded) == sorted(job.method(name, seed) for name in (None, *without) for seed in seeds)

@@ -307,7 +307,7 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
     [
-        ("drivesplat/evaluation/metrics.py", "LEAST_FRAME_PIXELS = 100", "LEAST_FRAME_PIXELS = 90",
+        ("drivesplat/evaluation/metrics.py", "MIN_FRAME_PIXELS = 100", "MIN_FRAME_PIXELS = 90",
          {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2, "remove_actor": 2}),
         ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
         ("drivesplat/preprocess/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.71",
