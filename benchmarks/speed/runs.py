@@ -33,7 +33,7 @@ from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training.clock import UNTIMED, Clock, StageClock
 from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
-from drivesplat.training.train import Workspace, train
+from drivesplat.training.train import TrainingFolders, train
 from drivesplat.workflow.gpus import hold_card
 
 Times = dict[str, Any]
@@ -142,9 +142,9 @@ def _continue(
     begun = prepare(inputs, task.train, device)
     continued = {"iterations": iterations, "sh_every": 0.0, "refine_start": 0.0, "refine_stop": 1.0}
     settings = begun.settings.model_copy(update={**continued, "coarse_to_fine": WHOLE_IMAGES})
-    workspace = Workspace(_profile_folder(task) / "resume", _profile_folder(task) / "tensorboard", "", task.label)
+    folders = TrainingFolders(_profile_folder(task) / "resume", _profile_folder(task) / "tensorboard", "", task.label)
     trained = begun.model if model is None else model
-    train(trained, begun.views, settings, task.seed, device, workspace, begun.surroundings, clock)
+    train(trained, begun.views, settings, task.seed, device, folders, begun.priors, clock)
     shutil.rmtree(_profile_folder(task))
 
 

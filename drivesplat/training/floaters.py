@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from drivesplat.model.part import Part
-from drivesplat.training.cells import Cells
+from drivesplat.training.sparse_grid import SparseGrid
 
 LARGEST_STEP = 15.0
 """Camera positions farther apart than this (metres) are not joined into a path."""
@@ -48,7 +48,7 @@ class EmptySpace:
     starts: Float[Tensor, "m 3"]
     ends: Float[Tensor, "m 3"]
     radius: float
-    free: Cells | None = None
+    free: SparseGrid | None = None
 
     @property
     def known(self) -> bool:
@@ -59,7 +59,7 @@ class EmptySpace:
         """Which points lie there."""
         segments = (self.starts, self.ends) if self.radius > 0 else (self.starts[:0], self.ends[:0])
         near = near_path(points, *segments, self.radius)
-        return near if self.free is None else near | self.free.find(points)[1]
+        return near if self.free is None else near | self.free.lookup(points)[1]
 
 
 @torch.no_grad()

@@ -16,8 +16,8 @@ from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.road import RoadSettings
-from drivesplat.training.cells import Cells
 from drivesplat.training.floaters import LARGEST_STEP
+from drivesplat.training.sparse_grid import SparseGrid
 
 CELL = 0.1
 """Edge in metres, seen from above, of the cells in which the road is a plane."""
@@ -31,7 +31,7 @@ class Road:
     `offsets` (k,) metres; and how much it counts, `weights` (k,) in [0, 1]. Centres within `reach` metres are its own.
     """
 
-    cells: Cells
+    cells: SparseGrid
     normals: Float[Tensor, "k 3"]
     offsets: Float[Tensor, " k"]
     weights: Float[Tensor, " k"]
@@ -53,7 +53,7 @@ def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
     """
     if len(road.weights) == 0:
         return gaussians.means.sum() * 0.0
-    place, on_it = road.cells.find(gaussians.means[:, :2])
+    place, on_it = road.cells.lookup(gaussians.means[:, :2])
     normals = road.normals[place]
     heights = (gaussians.means * normals).sum(dim=1) - road.offsets[place]
     on_it &= (heights.detach().abs() < road.reach) & (gaussians.opacities.detach() > 0.0)
@@ -89,7 +89,9 @@ def driven_road(ego_to_world: np.ndarray, settings: RoadSettings) -> Road:
     keys, nearest = (values[np.unique(keys[nearest], return_index=True)[1]] for values in (keys[nearest], nearest))
     weights = 1.0 - (aside[nearest] / settings.half_width) ** 2
     planes = (torch.from_numpy(values[nearest]).float() for values in (normals, offsets))
-    return Road(Cells.of(lower, CELL, shape, keys), *planes, torch.from_numpy(weights).float(), settings.reach)
+    return Road(
+        SparseGrid.from_numpy(lower, CELL, shape, keys), *planes, torch.from_numpy(weights).float(), settings.reach
+    )
 
 
 def _beside(

@@ -26,9 +26,9 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
-from drivesplat.training.first_exposure import first_gains
-from drivesplat.training.surfaces import Surroundings, surroundings_of
-from drivesplat.training.train import TrainingSummary, Workspace, train
+from drivesplat.training.exposure_init import initial_gains
+from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
+from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import Guides, TrainingView, load_views
 
 
@@ -135,7 +135,7 @@ class Prepared:
     model: SplatModel
     views: list[TrainingView]
     settings: TrainSettings
-    surroundings: Surroundings
+    priors: GeometryPriors
 
 
 def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
@@ -149,13 +149,13 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         inputs.actors,
         mean_sky_color(views),
         inputs.told_apart(job),
-        first_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
+        initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
         _times_by_camera(views) if job.train.camera_poses.corrected else {},
     )
     if not learns_from_sky_masks(job):
         views = [dataclasses.replace(view, sky=None) for view in views]
     model = build_model(init, job.parts, job.sky, settings)
-    return Prepared(model, views, settings, surroundings_of(inputs.record, inputs.free_space, settings))
+    return Prepared(model, views, settings, geometry_priors(inputs.record, inputs.free_space, settings))
 
 
 def run_training(
@@ -175,9 +175,9 @@ def run_training(
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
         )
-        workspace = Workspace(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
+        folders = TrainingFolders(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
         model, seed = begun.model, job.random_seed
-        summary = train(model, begun.views, begun.settings, seed, device, workspace, begun.surroundings)
+        summary = train(model, begun.views, begun.settings, seed, device, folders, begun.priors)
         content = {
             "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
             "job": job.model_dump_json(),

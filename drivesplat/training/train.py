@@ -17,8 +17,8 @@ from drivesplat.settings.train import TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
+from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor
-from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Workspace:
+class TrainingFolders:
     """Where a training keeps what outlives it.
 
     `resume` is a folder no rule declares; `fingerprint` is that of settings, code and inputs.
@@ -66,8 +66,8 @@ def train(
     settings: TrainSettings,
     seed: int,
     device: torch.device,
-    workspace: Workspace,
-    surroundings: Surroundings = NOTHING_KNOWN,
+    folders: TrainingFolders,
+    priors: GeometryPriors = NO_PRIORS,
     clock: Clock = UNTIMED,
 ) -> TrainingSummary:
     """Fits `model` in place, resuming where an earlier run of the same training was ended; `clock` times its stages.
@@ -76,9 +76,9 @@ def train(
     memory is exhausted. The last good checkpoint survives both.
     """
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
-        trainer = Trainer.begin(model.to(device), views, settings, seed, device, surroundings, clock)
-        run = Run.begin(trainer, workspace)
-        with Monitor(workspace.tensorboard, settings.iterations, trainer.step, workspace.label) as monitor:
+        trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock)
+        run = Run.begin(trainer, folders)
+        with Monitor(folders.tensorboard, settings.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
         return run.summary()
 
@@ -88,7 +88,7 @@ class Run:
     """A training and its place on disk: what was done before this process, and what outlives it."""
 
     trainer: Trainer
-    workspace: Workspace
+    folders: TrainingFolders
     seconds_before: float
     resumed_at: list[int]
     began: float
@@ -96,20 +96,20 @@ class Run:
     """When its state was last known on disk, or began (by `time.monotonic`, as `began`)."""
 
     @classmethod
-    def begin(cls, trainer: Trainer, workspace: Workspace) -> "Run":
-        """Takes up the workspace's resume state if this training wrote it; otherwise starts at 0."""
+    def begin(cls, trainer: Trainer, folders: TrainingFolders) -> "Run":
+        """Takes up the folders's resume state if this training wrote it; otherwise starts at 0."""
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(trainer.device)
-        saved = resume_state.resumable(workspace.state, workspace.fingerprint)
+        saved = resume_state.resumable(folders.state, folders.fingerprint)
         if saved is None:
-            shutil.rmtree(workspace.tensorboard, ignore_errors=True)
-            return cls(trainer, workspace, 0.0, [], now := time.monotonic(), now)
+            shutil.rmtree(folders.tensorboard, ignore_errors=True)
+            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now)
         resume_state.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
         log.info("resuming at iteration %d of %d", trainer.step, trainer.settings.iterations)
         now = time.monotonic()
-        return cls(trainer, workspace, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now)
+        return cls(trainer, folders, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now)
 
     @property
     def seconds(self) -> float:
@@ -118,7 +118,7 @@ class Run:
 
     def check(self) -> None:
         """Raises TrainingError where something was not finite, or no Gaussian is left."""
-        self.trainer.guard.check(str(self.workspace.state))
+        self.trainer.guard.check(str(self.folders.state))
         if not any(densifier.any_alive() for densifier in self.trainer.densifiers):
             raise TrainingError(
                 f"iteration {self.trainer.step + 1}: no Gaussian is left; "
@@ -130,13 +130,13 @@ class Run:
         self.check()
         t = self.trainer
         content = {
-            "fingerprint": self.workspace.fingerprint,
+            "fingerprint": self.folders.fingerprint,
             "step": t.step,
             "seconds": self.seconds,
             "resumed_at": self.resumed_at,
             "state": resume_state.state_of(t.model, t.optimizers, t.densifiers, t.device),
         }
-        checkpoint_file.save(self.workspace.state, content)
+        checkpoint_file.save(self.folders.state, content)
         self.saved = time.monotonic()
 
     @property
@@ -166,7 +166,7 @@ class Run:
 def _iterate(run: Run, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     path = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.images.views]))
-    empty = EmptySpace(*path, settings.floaters.radius, trainer.surroundings.free)
+    empty = EmptySpace(*path, settings.floaters.radius, trainer.priors.free)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):
             shown = (trainer.step + 1) % settings.image_every == 0

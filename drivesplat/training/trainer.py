@@ -13,10 +13,10 @@ from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.coarse_to_fine import TrainingImages
 from drivesplat.training.cuda_graph.iteration_graphs import GaussianCount, IterationGraphs, Terms, can_capture
 from drivesplat.training.densify import Densifier
+from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_terms
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import DeviceSchedule, ModelOptimizers, make_optimizers, set_learning_rates
-from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms
 from drivesplat.training.views import TrainingView
 
 
@@ -32,7 +32,7 @@ class Trainer:
     optimizers: ModelOptimizers
     densifiers: list[Densifier]
     guard: FiniteGuard
-    surroundings: Surroundings
+    priors: GeometryPriors
     clock: Clock
     graphs: IterationGraphs
     schedule: DeviceSchedule
@@ -46,11 +46,11 @@ class Trainer:
         settings: TrainSettings,
         seed: int,
         device: torch.device,
-        surroundings: Surroundings = NOTHING_KNOWN,
+        priors: GeometryPriors = NO_PRIORS,
         clock: Clock = UNTIMED,
     ) -> "Trainer":
         torch.manual_seed(seed)
-        optimizers, known = make_optimizers(model), surroundings.to(device)
+        optimizers, known = make_optimizers(model), priors.to(device)
         images, guard = TrainingImages(views, settings, seed), FiniteGuard(device)
         capture = clock is UNTIMED and can_capture(settings, images, device)
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
@@ -93,7 +93,7 @@ class Trainer:
             )
         with stage("loss"):
             terms = loss_terms(picture, view, self.model, self.settings)
-            terms |= surface_terms(picture, self.model, self.surroundings, self.settings)
+            terms |= geometry_terms(picture, self.model, self.priors, self.settings)
             loss = torch.stack(list(terms.values())).sum()
         if by_gradient:
             picture.info["means2d"].retain_grad()

@@ -1,7 +1,7 @@
-"""`python -m drivesplat.training.warm_up`: a training of next to nothing on the processors.
+"""`python -m drivesplat.training.warm_up`: a tiny training on the CPU that compiles and caches all CPU kernels.
 
-What they run is compiled when it is first called, and kept (`drivesplat.kernels.cache`): some 15 seconds of the first
-training, of each that is begun meanwhile, and of the first tests. The set-up has it behind it.
+Kernels are compiled on their first call and cached (`drivesplat.kernels.cache`), which takes some 15 seconds. The
+set-up runs this so that neither trainings nor tests have to.
 """
 
 import argparse
@@ -16,10 +16,12 @@ import torch
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.lidar.occlusion import unhidden
-from drivesplat.model.build import ModelInit, build_model
+from drivesplat.model.background import Background
+from drivesplat.model.sky import CubemapSky
+from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.train import Workspace, train
+from drivesplat.training.train import TrainingFolders, train
 from drivesplat.training.views import TrainingView
 
 ITERATIONS = 4
@@ -27,12 +29,11 @@ GAUSSIANS = 64
 SIZE = 48, 32
 
 
-def rehearse(folder: Path) -> None:
-    """Trains GAUSSIANS before a sky for ITERATIONS of one image, densification included; leaves its files in `folder`.
-    Nothing is learned, everything is compiled. Raises what a training raises."""
+def warm_up(folder: Path) -> None:
+    """Trains GAUSSIANS and a sky for ITERATIONS on one image, with densification; leaves its files in `folder`. Raises
+    what a training raises."""
     random = np.random.default_rng(0)
     points = random.uniform((-2.0, -1.0, 4.0), (2.0, 1.0, 8.0), (GAUSSIANS, 3))
-    record = {"points": points, "points_rgb": np.full((GAUSSIANS, 3), 128.0), "scene_scale": 5.0}
     settings = TrainSettings(
         iterations=ITERATIONS, cap_max=2 * GAUSSIANS, refine_start=0.0, refine_stop=1.0, sky_bce_weight=0.05
     )
@@ -41,9 +42,10 @@ def rehearse(folder: Path) -> None:
     pixels = torch.full((height, width, 3), 200, dtype=torch.uint8)
     sky = torch.zeros(height, width, dtype=torch.bool)
     view = TrainingView(View(intrinsics, torch.eye(4), width, height, time=0.0), pixels, sky)
-    model = build_model(ModelInit(record, [], np.full(3, 0.5)), ("background",), "cubemap", settings)
-    workspace = Workspace(folder / "resume", folder / "tensorboard", "", "rehearsal")
-    train(model, [view], settings, 0, torch.device("cpu"), workspace)
+    part = Background.from_points(points, np.full((GAUSSIANS, 3), 0.5), settings.gaussians, extent=5.0)
+    model = SplatModel([part], CubemapSky(settings.sky_resolution, torch.full((3,), 0.5), settings.lr_sky))
+    folders = TrainingFolders(folder / "resume", folder / "tensorboard", "", "warm-up")
+    train(model, [view], settings, 0, torch.device("cpu"), folders)
     pixel = np.zeros(1, dtype=np.int64)
     unhidden(pixel, pixel, np.ones(1), np.ones((1, 2)), (height, width))
 
@@ -54,7 +56,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     logging.disable(logging.INFO)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            rehearse(Path(folder))
+            warm_up(Path(folder))
     except DriveSplatError as error:
         print(f"drivesplat: {error}", file=sys.stderr)
         return 1

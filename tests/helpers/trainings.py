@@ -36,7 +36,7 @@ from drivesplat.training.run import (
     TrainingFiles,
     TrainingInputs,
 )
-from drivesplat.training.train import TrainingSummary, Workspace, train
+from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import LidarDepth, TrainingView
 from helpers import REPOSITORY
 from helpers.hand_made import actor_record, actors_of, motion_through, track_of
@@ -125,8 +125,8 @@ def settings_of(strategy: str = "mcmc", **changes: Any) -> TrainSettings:
     return TrainSettings(**{**common, **changes})
 
 
-def workspace_of(folder: Path, fingerprint: str) -> Workspace:
-    return Workspace(folder / "resume", folder / "tensorboard", fingerprint, "train")
+def folders_of(folder: Path, fingerprint: str) -> TrainingFolders:
+    return TrainingFolders(folder / "resume", folder / "tensorboard", fingerprint, "train")
 
 
 def trained(
@@ -141,7 +141,7 @@ def trained(
     """The model after `train`, and its summary."""
     model = untrained(settings) if model is None else model
     views = recorded_views(device=device) if views is None else views
-    return model, train(model, views, settings, seed, device, workspace_of(folder, fingerprint))
+    return model, train(model, views, settings, seed, device, folders_of(folder, fingerprint))
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from drivesplat.preprocess.free_space import Rays, camera_rays, free_space_recor
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.free_space import FreeSpaceJob, FreeSpaceSettings
-from drivesplat.training.cells import Cells
+from drivesplat.training.sparse_grid import SparseGrid
 
 SENSOR = np.array([0.0, 0.0, 1.8])
 GOING = Thing("vehicle.car", (4.0, 2.0, 1.6), (9.0, 0.0, 0.8), (6.0, 0.0))
@@ -355,7 +355,7 @@ def test_points_are_found_in_the_cells_they_lie_in(dimensions):
     shape, lower, edge = np.array([7, 4, 5][:dimensions]), np.array([-20.0, 30.0, 1.5][:dimensions]), 0.4
     keys = np.sort(random.choice(shape.prod(), shape.prod() // 3, replace=False))
     points = (lower + random.uniform(-0.5, 1.5, (2000, dimensions)) * shape * edge).astype(np.float32)
-    place, found = Cells.of(lower, edge, shape, keys).find(torch.from_numpy(points))
+    place, found = SparseGrid.from_numpy(lower, edge, shape, keys).lookup(torch.from_numpy(points))
     cells = np.floor((points - lower) / edge).astype(int)
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     expected = np.ravel_multi_index(tuple(np.where(inside[:, None], cells, 0).T), tuple(shape))
@@ -366,7 +366,7 @@ def test_points_are_found_in_the_cells_they_lie_in(dimensions):
 
 def test_no_cells_and_what_is_no_place_are_found_nowhere():
     points = torch.tensor([[0.1, 0.1], [float("nan"), 0.1], [float("inf"), 0.1]])
-    none = Cells.of(np.zeros(2), 1.0, np.array([1, 1]), np.empty(0, dtype=np.int64))
-    one = Cells.of(np.zeros(2), 1.0, np.array([1, 1]), np.zeros(1, dtype=np.int64))
-    assert none.find(points)[1].tolist() == [False] * 3
-    assert one.find(points)[1].tolist() == [True, False, False]
+    none = SparseGrid.from_numpy(np.zeros(2), 1.0, np.array([1, 1]), np.empty(0, dtype=np.int64))
+    one = SparseGrid.from_numpy(np.zeros(2), 1.0, np.array([1, 1]), np.zeros(1, dtype=np.int64))
+    assert none.lookup(points)[1].tolist() == [False] * 3
+    assert one.lookup(points)[1].tolist() == [True, False, False]

@@ -40,7 +40,7 @@ from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
-from drivesplat.training.first_exposure import first_gains, log_gains
+from drivesplat.training.exposure_init import initial_gains, log_gains
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
@@ -235,10 +235,10 @@ def rig(tmp_path_factory) -> TrainingInputs:
 def test_the_gains_of_the_demo_rig_are_estimated_before_the_training(rig):
     """Images are gamma encoded: a gain of light becomes its 2.2th root."""
     views = load_views(rig.record, Guides({}, {}, {}), CPU)
-    found = first_gains(rig.record, views, ["CAM_BACK"], "CAM_FRONT")
+    found = initial_gains(rig.record, views, ["CAM_BACK"], "CAM_FRONT")
     np.testing.assert_allclose(found["CAM_BACK"], np.power([1.4, 1.1, 0.75], 1 / 2.2), rtol=0.03)
     hidden = [dataclasses.replace(v, own_car=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]
-    np.testing.assert_array_equal(first_gains(rig.record, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
+    np.testing.assert_array_equal(initial_gains(rig.record, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
 
 
 def test_a_training_starts_from_the_estimated_gains_and_saves_them(rig, tmp_path):

@@ -315,7 +315,8 @@ def test_far_points_never_lie_under_the_ground():
 
 
 def test_far_points_leave_out_the_cells_that_are_covered():
-    """Cells are 8 x 8 pixels. Covered: the first, one in the middle, and the cut ones at the right and lower edges."""
+    """SparseGrid are 8 x 8 pixels. Covered: the first, one in the middle, and the cut ones at the right and lower
+    edges."""
     cells = [(0, 0), (3, 2), (7, 5)]
     rays = np.array([[(8 * x + 1.2 - 40.0) / 50.0, (8 * y + 1.7 - 30.0) / 50.0, 1.0] for x, y in cells])
     in_camera = 12.0 * rays

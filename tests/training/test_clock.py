@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.trainings import recorded_views, settings_of, untrained, workspace_of
+from helpers.trainings import folders_of, recorded_views, settings_of, untrained
 
 from drivesplat.training.clock import ITERATION, OTHER, UNTIMED, Clock, StageClock
 from drivesplat.training.train import train
@@ -67,7 +67,7 @@ def test_the_stages_of_a_training_are_timed_and_it_learns_the_same(tmp_path):
     def trained(folder: Path, clock: Clock) -> torch.nn.Module:
         settings = settings_of(iterations=12)
         model = untrained(settings, sky=True)
-        train(model, recorded_views(), settings, 3, CPU, workspace_of(folder, "f"), clock=clock)
+        train(model, recorded_views(), settings, 3, CPU, folders_of(folder, "f"), clock=clock)
         return model
 
     clock = StageClock(CPU, warm_up=2)

@@ -7,8 +7,8 @@ import torch
 from drivesplat.model.background import Background
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings
-from drivesplat.training.cells import Cells
 from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, camera_path, fade_floaters, near_path
+from drivesplat.training.sparse_grid import SparseGrid
 
 
 def distance_to_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
@@ -89,9 +89,11 @@ def test_a_faded_parameter_can_still_learn():
     assert part.params["opacities"] is before and before.requires_grad and before.is_leaf
 
 
-def free_cells() -> Cells:
+def free_cells() -> SparseGrid:
     """Two voxels of a grid of 0.5 m that begins at (-1, -1, -1): those at (0, 0, 0) and (3.5, 0, 0)."""
-    return Cells.of(np.full(3, -1.0), 0.5, np.array([10, 4, 4]), np.array([(2 * 4 + 2) * 4 + 2, (9 * 4 + 2) * 4 + 2]))
+    return SparseGrid.from_numpy(
+        np.full(3, -1.0), 0.5, np.array([10, 4, 4]), np.array([(2 * 4 + 2) * 4 + 2, (9 * 4 + 2) * 4 + 2])
+    )
 
 
 @pytest.mark.parametrize(("radius", "faded"), [(0.0, [0, 2]), (1.0, [0, 1, 2])])

@@ -17,10 +17,10 @@ from drivesplat.settings.train import McmcSettings, TrainSettings
 from drivesplat.training import strategies
 from drivesplat.training.cuda_graph.iteration_graphs import IterationGraphs
 from drivesplat.training.densify import Densifier, Optimizers
+from drivesplat.training.geometry_priors import NO_PRIORS, geometry_terms
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.road import driven_road, road_loss
-from drivesplat.training.surfaces import NOTHING_KNOWN, surface_terms
 
 
 def grown(preallocates: bool, steps: int, **changes: Any) -> tuple[SplatModel, Densifier, Optimizers, list[float]]:
@@ -139,7 +139,7 @@ def test_preallocated_rows_do_not_change_the_loss():
 def test_preallocated_rows_do_not_change_flatness():
     model, _, _, _ = grown(True, 4)
     part, settings = model.parts[0], TrainSettings(flatness_weight=1.0)
-    found = surface_terms(model.render(a_view()), model, NOTHING_KNOWN, settings)
+    found = geometry_terms(model.render(a_view()), model, NO_PRIORS, settings)
     expected = part.at(0.0)[torch.arange(part.row_count) < len(part)].scales.min(dim=1).values.mean()
     assert part.preallocated and float(found["flatness"].detach()) == pytest.approx(float(expected.detach()))
 

@@ -29,6 +29,7 @@ from helpers.trainings import (
     EndedError,
     EndingViews,
     files_in,
+    folders_of,
     guided_views,
     in_subprocess,
     inputs_in,
@@ -41,7 +42,6 @@ from helpers.trainings import (
     trained,
     untrained,
     untrained_street,
-    workspace_of,
 )
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -59,12 +59,12 @@ from drivesplat.settings.train import (
     TrainJob,
 )
 from drivesplat.training import resume_state
-from drivesplat.training.cells import Cells
+from drivesplat.training.geometry_priors import GeometryPriors
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.road import driven_road
 from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
-from drivesplat.training.surfaces import Surroundings
+from drivesplat.training.sparse_grid import SparseGrid
 from drivesplat.training.train import TrainingSummary, train
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import Guides, TrainingView, load_views, order
@@ -185,17 +185,17 @@ def test_actors_are_no_floaters(tmp_path):
     assert (still < 1e-3).any() and not (actors < 1e-3).any()
 
 
-def all_around(lower: float = -10.0, edge: float = 20.0) -> Cells:
+def all_around(lower: float = -10.0, edge: float = 20.0) -> SparseGrid:
     """A grid of one cell that holds everything."""
-    return Cells.of(np.full(3, lower), edge, np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64))
+    return SparseGrid.from_numpy(np.full(3, lower), edge, np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64))
 
 
 @pytest.mark.parametrize("free", [None, all_around()], ids=["unknown", "all free"])
 def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
     settings = settings_of(iterations=7, refine_start=1.0, floaters=FloaterSettings(every=7, radius=0))
     model = untrained_street(settings)
-    workspace = workspace_of(tmp_path, "of this training")
-    train(model, recorded_views(), settings, 0, CPU, workspace, Surroundings(free=free))
+    folders = folders_of(tmp_path, "of this training")
+    train(model, recorded_views(), settings, 0, CPU, folders, GeometryPriors(free=free))
     still, actors = (torch.sigmoid(part.params["opacities"].detach()) for part in model.parts)
     assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
 
@@ -205,8 +205,8 @@ def test_a_training_is_held_to_flatness_and_the_road():
     settings = settings_of(flatness_weight=0.2, road_weight=0.3)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, 2, 3], poses[:, 0, 3] = 4.5, [-1.0, 1.0]
-    surroundings = Surroundings(road=driven_road(poses, settings.road))
-    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, surroundings)
+    priors = GeometryPriors(road=driven_road(poses, settings.road))
+    trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU, priors)
     before = trainer.model.gaussians_at(0.0)
     terms, *_ = trainer.fit_one()
     torch.testing.assert_close(terms["flatness"], 0.2 * before.scales.amin(dim=1).mean())

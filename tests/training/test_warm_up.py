@@ -10,10 +10,10 @@ LEFT = """
 import importlib, pathlib, pkgutil, tempfile
 from numba.core.registry import CPUDispatcher
 from drivesplat.kernels import numba as package
-from drivesplat.training.warm_up import rehearse
+from drivesplat.training.warm_up import warm_up
 
 with tempfile.TemporaryDirectory() as folder:
-    rehearse(pathlib.Path(folder))
+    warm_up(pathlib.Path(folder))
 for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
     for name, kernel in vars(importlib.import_module(found.name)).items():
         if isinstance(kernel, CPUDispatcher) and kernel.stats.cache_path:  # without: kept with its callers
@@ -21,7 +21,7 @@ for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
 """
 
 
-def test_every_kernel_of_a_training_is_compiled_by_the_rehearsal():
+def test_the_warm_up_compiles_every_kernel_of_a_training():
     done = subprocess.run([sys.executable, "-c", LEFT], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     compiled = dict(line.rsplit(" ", 1) for line in done.stdout.splitlines())
     if not compiled:

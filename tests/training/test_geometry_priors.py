@@ -16,8 +16,8 @@ from drivesplat.scene.rigid import rigid
 from drivesplat.settings.road import RoadSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.floaters import LARGEST_STEP
+from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_priors, geometry_terms, thickness
 from drivesplat.training.road import CELL, ROUGHNESS, Road, driven_road, road_loss, road_of
-from drivesplat.training.surfaces import NOTHING_KNOWN, Surroundings, surface_terms, surroundings_of, thickness
 
 WIDE = RoadSettings(half_width=1.2, reach=0.3)
 
@@ -44,7 +44,7 @@ def round_at(means: torch.Tensor, size: float = 1e-4) -> Gaussians:
 
 def distance(road: Road, means: torch.Tensor) -> torch.Tensor:
     """How far points lie over the planes that a road has for them."""
-    place, found = road.cells.find(means[:, :2])
+    place, found = road.cells.lookup(means[:, :2])
     assert found.all()
     return (means * road.normals[place]).sum(dim=1) - road.offsets[place]
 
@@ -65,7 +65,7 @@ def test_it_is_as_wide_as_told_and_counts_less_the_farther_out(lie):
     random, poses = np.random.default_rng(1), straight(**lie)
     along, aside = random.uniform(0, 20, 4000), random.uniform(-2.0, 2.0, 4000)
     road = driven_road(poses, WIDE)
-    place, found = road.cells.find(on_road(poses, along, aside, np.zeros(4000))[:, :2])
+    place, found = road.cells.lookup(on_road(poses, along, aside, np.zeros(4000))[:, :2])
     width = np.abs(aside)
     assert found.numpy()[width < 1.2 - CELL].all() and not found.numpy()[width > 1.2 + CELL].any()
     off = np.abs(road.weights[place].numpy() - (1.0 - (width / 1.2) ** 2))[found.numpy()]
@@ -83,7 +83,7 @@ def test_along_a_bend_the_road_turns_evenly_from_pose_to_pose():
     between = 100.0 * np.stack([np.sin(angles[:-1] + 0.01), 0.0 * angles[1:], np.cos(angles[:-1] + 0.01) - 1.0], axis=1)
     road = driven_road(poses, WIDE)
     points = torch.from_numpy(between).float()
-    place, _ = road.cells.find(points[:, :2])
+    place, _ = road.cells.lookup(points[:, :2])
     assert distance(road, points).abs().max() < 6e-3, "the sagitta of 2 metres is 5 millimetres"
     np.testing.assert_allclose(road.normals[place, 0].numpy(), np.sin(angles[:-1] + 0.01), atol=1e-3)
 
@@ -93,10 +93,10 @@ def test_poses_far_apart_are_not_joined_and_a_lone_one_is_a_road():
     poses[3:, 0, 3] += 4.0 + LARGEST_STEP + 1.0
     road = driven_road(poses, WIDE)
     x = torch.tensor([0.5, 3.5, 4.0 + LARGEST_STEP / 2, 21.0])
-    _, found = road.cells.find(torch.stack([x, torch.zeros(4)], dim=1))
+    _, found = road.cells.lookup(torch.stack([x, torch.zeros(4)], dim=1))
     assert found.tolist() == [True, True, False, True]
     lone = driven_road(poses[:1], WIDE)
-    assert lone.cells.find(torch.tensor([[0.9, 0.0], [1.3, 0.0]]))[1].tolist() == [True, False]
+    assert lone.cells.lookup(torch.tensor([[0.9, 0.0], [1.3, 0.0]]))[1].tolist() == [True, False]
 
 
 def test_the_loss_is_the_pseudo_huber_norm_of_how_far_the_mass_lies_off():
@@ -110,7 +110,7 @@ def test_the_loss_is_the_pseudo_huber_norm_of_how_far_the_mass_lies_off():
     scales = torch.from_numpy(random.uniform(0.01, 0.3, (n, 3))).float()
     turns = Rotation.random(n, random_state=3)
     quats = torch.from_numpy(turns.as_quat()[:, [3, 0, 1, 2]] * random.uniform(0.5, 2.0, (n, 1))).float()
-    place, _ = road.cells.find(means[:, :2])
+    place, _ = road.cells.lookup(means[:, :2])
     normals, offsets = road.normals[place].double().numpy(), road.offsets[place].double().numpy()
     drawn = random.normal(size=(samples, n, 3)) * scales.numpy()
     mass = np.einsum("nij,snj->sni", turns.as_matrix(), drawn) + means.double().numpy()
@@ -178,7 +178,7 @@ def test_the_road_is_that_of_training_images_in_time_order():
     record = training_record_of(5, ego_to_world=poses, timestamps=np.array([0, 3, 6, 1, 4]), splits=splits)
     road = road_of(record, WIDE)
     points = torch.tensor([[1.0, 0.0], [4.0, 0.0], [7.5, 0.0], [12.0, 8.0], [10.0, 4.0]])
-    assert road.cells.find(points)[1].tolist() == [True, True, True, False, False]
+    assert road.cells.lookup(points)[1].tolist() == [True, True, True, False, False]
 
 
 # ---- the terms
@@ -199,14 +199,14 @@ def a_street() -> SplatModel:
     return SplatModel([still, moving], None)
 
 
-def known() -> Surroundings:
-    return Surroundings(road=driven_road(straight(), WIDE))
+def known() -> GeometryPriors:
+    return GeometryPriors(road=driven_road(straight(), WIDE))
 
 
 def test_terms_are_weighted_and_about_what_stands_still_alone():
     model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
-    terms = surface_terms(picture, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
+    terms = geometry_terms(picture, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
     still = model.parts[0].at(0.0)
     torch.testing.assert_close(terms["flatness"], 0.3 * still.scales.amin(dim=1).mean())
     torch.testing.assert_close(terms["road"], 0.2 * road_loss(still, known().road))
@@ -221,11 +221,11 @@ def test_without_their_weights_there_are_no_terms():
     model, record = a_street(), training_record_of(len(straight()), ego_to_world=straight())
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
     plain = TrainSettings()
-    assert surroundings_of(record, None, plain) == NOTHING_KNOWN
-    assert surface_terms(picture, model, surroundings_of(record, None, plain), plain) == {}
+    assert geometry_priors(record, None, plain) == NO_PRIORS
+    assert geometry_terms(picture, model, geometry_priors(record, None, plain), plain) == {}
     for changes, term in (({"flatness_weight": 0.1}, "flatness"), ({"road_weight": 0.1}, "road")):
         settings = TrainSettings(**changes)
-        assert surface_terms(picture, model, surroundings_of(record, None, settings), settings).keys() == {term}
+        assert geometry_terms(picture, model, geometry_priors(record, None, settings), settings).keys() == {term}
 
 
 def test_flatness_makes_the_shortest_axis_shorter_and_no_other():

@@ -1,0 +1,65 @@
+"""Geometry known beside the images, free space and road, and the loss terms of surfaces: flatness and road."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.part import active_fraction
+from drivesplat.model.splat_model import Picture, SplatModel
+from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.train import TrainSettings
+from drivesplat.training.road import Road, road_loss, road_of
+from drivesplat.training.sparse_grid import SparseGrid
+
+
+@dataclass(frozen=True)
+class GeometryPriors:
+    """Geometry of a scene known beside its images: `free` space that LiDAR rays crossed, and the `road`; each None
+    where it is unknown or not wanted."""
+
+    free: SparseGrid | None = None
+    road: Road | None = None
+
+    def to(self, device: torch.device) -> "GeometryPriors":
+        return GeometryPriors(*(None if prior is None else prior.to(device) for prior in (self.free, self.road)))
+
+
+NO_PRIORS = GeometryPriors()
+
+
+def geometry_priors(
+    record: TrainingRecord, free_space: dict[str, Any] | None, settings: TrainSettings
+) -> GeometryPriors:
+    """The priors that `settings` want, on the CPU, from the training record and the record of free space (None: not
+    made)."""
+    grid = {name: free_space[name] for name in ("lower", "shape", "keys")} if free_space else {}
+    return GeometryPriors(
+        SparseGrid.from_numpy(edge=free_space["voxel"], **grid) if free_space else None,
+        road_of(record, settings.road) if settings.road_weight else None,
+    )
+
+
+def geometry_terms(
+    picture: Picture, model: SplatModel, priors: GeometryPriors, settings: TrainSettings
+) -> dict[str, Float[Tensor, ""]]:
+    """The weighted loss terms of the surfaces of static parts."""
+    if not settings.flatness_weight and priors.road is None:
+        return {}
+    parts = [(part, rows) for part, rows in zip(model.parts, model.rows, strict=True) if not part.moves]
+    static = concatenate([picture.gaussians[rows] for _, rows in parts])
+    terms = {}
+    if settings.flatness_weight:
+        terms["flatness"] = settings.flatness_weight * thickness(static) / active_fraction([part for part, _ in parts])
+    if priors.road is not None:
+        terms["road"] = settings.road_weight * road_loss(static, priors.road)
+    return terms
+
+
+def thickness(gaussians: Gaussians) -> Float[Tensor, ""]:
+    """The mean smallest scale in metres, 0 for disc-shaped Gaussians: the regulariser of NeuSG (Chen et al. 2023,
+    arXiv 2312.00846) and PGSR (Chen et al. 2024, arXiv 2406.06521)."""
+    return gaussians.scales.min(dim=1).values.mean()
