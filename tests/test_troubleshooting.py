@@ -1,8 +1,9 @@
-"""docs/troubleshooting.md: the messages in its headings are those of the code, and its links lead somewhere."""
+"""docs/troubleshooting.md quotes messages of the code; links of README and docs/ lead to files and headings."""
 
 import ast
 import re
 import textwrap
+from pathlib import Path
 
 import pytest
 import yaml
@@ -52,12 +53,25 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
-@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)]+)\)", PAGE))))
-def test_links_lead_to_pages_and_their_headings(link):
+def links() -> list[tuple[str, str]]:
+    """Every link of README and docs/ that does not leave the repository, with the page that has it."""
+    pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+    found = {(str(page.relative_to(REPOSITORY)), link) for page in pages for link in _links(page)}
+    return sorted((page, link) for page, link in found if "://" not in link)
+
+
+def _links(page: Path) -> list[str]:
+    return re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(("page", "link"), links())
+def test_links_lead_to_files_and_their_headings(page, link):
     file, _, place = link.partition("#")
-    page = REPOSITORY / "docs" / file if file else REPOSITORY / "docs/troubleshooting.md"
-    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.M)
-    assert not place or place in {anchor(heading) for heading in headings}
+    target = (REPOSITORY / page).parent / file if file else REPOSITORY / page
+    assert target.exists()
+    if place:
+        headings = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.M)
+        assert place in {anchor(heading) for heading in headings}
 
 
 SETTINGS = re.findall(r"`(\w+: \{[^`]+)`|((?:^    \w+: \{.*\n)+)", PAGE, re.M)
