@@ -1,10 +1,10 @@
-"""The trajectory as cameras.json: with it, splat.ply is an asset that can be placed, played back and measured."""
+"""The recorded cameras as cameras.json, which places splat.ply in the world and in time."""
 
 from typing import Any
 
 import numpy as np
 
-from drivesplat.export.placement import placement
+from drivesplat.export.scene_header import scene_header
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.training_record import TrainingRecord
 
@@ -17,20 +17,20 @@ CONVENTIONS = {
     "the first pixel's centre (0.5, 0.5).",
     "transforms": "Matrices 4x4, row by row, applied to column vectors: world = camera_to_world camera.",
     "timestamp": "Microseconds of the dataset's clock; each image has its own, and its poses are those at that time.",
-    "sample_index": "The key frame an image belongs to: the index of its own, else of the nearest in time.",
-    "split": "What an image was used for: train, held out for interpolation or extrapolation, "
-    "or excluded for being near to one that is held out.",
+    "sample_index": "The index of the image's key frame; for other images that of the nearest key frame in time.",
+    "split": "The use of the image: train, held out for interpolation or extrapolation, "
+    "or excluded because a held-out image is near.",
 }
 
 
 def cameras_record(scene: Scene, record: TrainingRecord) -> dict[str, Any]:
     """The images of a scene as plain data in the order of `scene.frames`, of which `record` is the training record.
 
-    Poses and `origin` keep their float64; sizes and K are those at which images are trained.
+    Poses and `origin` have full float64 precision; sizes and K are those of the training images.
     """
     split_of = {int(i): split for split, images in record.splits.items() for i in images}
     return {
-        **placement(scene, SCHEMA, CONVENTIONS),
+        **scene_header(scene, SCHEMA, CONVENTIONS),
         "key_frame_timestamps": scene.key_frame_timestamps.tolist(),
         "images": [
             _image(frame, record.image_names[i], record.image_size(i), record.Ks[i], split_of[i])

@@ -1,6 +1,6 @@
-"""The groups of a model as PLYs of their own, with parts.json to say what each is and how it moves.
+"""The rigid groups of a model as one PLY each, with parts.json for their attributes and motions.
 
-With them a drive can be put together again at any time, or otherwise: without a vehicle, with it elsewhere.
+They allow other programs to compose the drive at any time, without a vehicle, or with a vehicle at another place.
 """
 
 import re
@@ -10,38 +10,38 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.export.names import distinct
-from drivesplat.export.placement import placement
 from drivesplat.export.sampled_motion import SampledMotion
+from drivesplat.export.scene_header import scene_header
 from drivesplat.export.splat_ply import note_of, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, digests, middle_timestamp
+from drivesplat.export.unique_names import unique_names
 from drivesplat.io.storage import write_json
 from drivesplat.scene.scene import Scene
 
 SCHEMA = 1
 CONVENTIONS = {
     "world": "Metres, z up, the axes of the dataset's global frame; files of frame 'world' are in these coordinates.",
-    "object": "Metres, x forward, y left, z up, the origin in the middle of the object's box; files of frame 'object' "
-    "are in these coordinates, and their spherical harmonics want directions in them.",
+    "object": "Metres, x forward, y left, z up, the origin at the centre of the object's box; files of frame 'object' "
+    "are in these coordinates, and so are the directions of their spherical harmonics.",
     "transforms": "Matrices 4x4, row by row, applied to column vectors: world = object_to_world object.",
     "seconds": "Since the first image of any camera, whose timestamp is first_image.",
     "timestamps": "Microseconds of the dataset's clock: first_image plus the seconds.",
-    "present": "From when to when the object is there, in seconds; at all other times it is absent.",
-    "samples": "Thirty a second, at every image of cameras.json and at the annotations, while the object is there.",
-    "colors": "Where colours vary with time they are those at colors_timestamp, the middle image's, "
-    "which is also the time of splat.ply.",
-    "size": "Length, width, height of the annotated box in metres; null, like category, where the scene "
-    "knows no such track.",
+    "present": "Intervals in seconds in which the object is present; at all other times it is absent.",
+    "samples": "Thirty a second, at every image of cameras.json and at the annotations, while the object is present.",
+    "colors": "Colours that vary with time are those at colors_timestamp, the time of the middle image, "
+    "which is also that of splat.ply.",
+    "size": "Length, width, height of the annotated box in metres; null, like category, if the scene "
+    "has no such track.",
 }
 
 
 def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Scene, provenance: dict[str, Any]) -> None:
-    """Writes every group as a PLY beside `path` and, once all are there, what they are to `path`.
+    """Writes every group as a PLY beside `path`, then their record to `path`.
 
-    PLYs of groups that an earlier call left there and this one does not write are removed; other files stay.
+    PLYs of groups of earlier calls that are not written again are removed; other files stay.
     """
     folder = Path(path).parent
-    files = {name: f"{stem}.ply" for name, stem in distinct(groups, _stem).items()}
+    files = {name: f"{stem}.ply" for name, stem in unique_names(groups, _stem).items()}
     for name, group in groups.items():
         note = {"scene": scene.name, "piece": name, "frame": _frame(group), **digests(provenance)}
         write_splat_ply(folder / files[name], group.gaussians, note)
@@ -52,7 +52,7 @@ def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Sce
 def _record(groups: Mapping[str, SampledGroup], files: Mapping[str, str], scene: Scene) -> dict[str, Any]:
     first_image = min(frame.timestamp for frame in scene.frames)
     return {
-        **placement(scene, SCHEMA, CONVENTIONS),
+        **scene_header(scene, SCHEMA, CONVENTIONS),
         "first_image": first_image,
         "colors_timestamp": middle_timestamp(scene),
         "parts": [
@@ -85,12 +85,12 @@ def _frame(group: SampledGroup) -> str:
 
 
 def _stem(name: str) -> str:
-    """A name as that of a file, on any system."""
+    """A name as a file name that is valid on every system."""
     return re.sub(r"[^A-Za-z0-9_-]", "_", name) or "_"
 
 
 def _remove_others(folder: Path, kept: set[str]) -> None:
-    """Removes PLYs of groups that are not among the names `kept`."""
+    """Removes PLYs of groups whose file names are not in `kept`."""
     for file in folder.glob("*.ply"):
         if file.name not in kept and "piece" in note_of(file):
             file.unlink()

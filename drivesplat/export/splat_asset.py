@@ -1,5 +1,5 @@
-"""The stage `export`: a trained model as splat.ply and, part by part, as PLYs of their own; cameras.json and parts.json
-have the trajectory it was recorded along and the motion of its objects."""
+"""The stage `export`: a trained model as splat.ply and as one PLY per rigid group, with the recorded cameras in
+cameras.json and the motions of objects in parts.json."""
 
 import logging
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SplatFiles:
-    """What the stage writes; the PLYs of the parts lie beside `parts`."""
+    """The outputs of the stage; the PLYs of groups are written beside `parts`."""
 
     splat: str | Path
     cameras: str | Path
@@ -32,10 +32,10 @@ class SplatFiles:
 def export_splat(
     files: SplatFiles, checkpoint: dict[str, Any], record: TrainingRecord, scene: Scene, provenance: dict[str, Any]
 ) -> None:
-    """Writes all Gaussians of a checkpoint's content: together as they stand when the middle image was taken, and part
-    by part; with the recorded cameras.
+    """Writes all Gaussians of a checkpoint (its content): together at the time of the middle image, and group by group;
+    and the recorded cameras.
 
-    The headers of PLYs have only the digests of `provenance`; all of it, in the JSON files, is too long for viewers.
+    PLY headers contain only the digests of `provenance`, since viewers limit their length; JSON files contain all.
     """
     model, _ = trained_model(checkpoint)
     gaussians = trained_gaussians(model, scene)

@@ -1,9 +1,9 @@
-"""Gaussians as splat.ply, in the layout that 3D Gaussian Splatting (Kerbl et al. 2023) saves and viewers read.
+"""Gaussians as splat.ply, in the layout of 3D Gaussian Splatting (Kerbl et al. 2023) that viewers read.
 
-One vertex a Gaussian, all float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (channel-major: every coefficient of
+One vertex per Gaussian, all float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (channel-major: every coefficient of
 red, then of green, then of blue), opacity as its logit, scale_0..2 as logarithms of metres, rot_0..3 as a unit
-quaternion w x y z. gsplat's exporter is not used: it leaves out the normals, without which SIBR reads every value
-three floats off, has no place for a note, and one bad opacity makes it drop every Gaussian.
+quaternion w x y z. gsplat's exporter is not used: it omits the normals, so that SIBR reads every value with an offset
+of three floats, supports no note, and drops every Gaussian if a single opacity is invalid.
 """
 
 import json
@@ -22,8 +22,7 @@ from drivesplat.io.storage import atomic_write, canonical_json, unreadable
 from drivesplat.model.gaussians import Gaussians
 
 _NOTE = "drivesplat "
-_LONGEST_HEADER = 10_000
-"""Bytes."""
+_MAX_HEADER_BYTES = 10_000
 _TINY = torch.finfo(torch.float32).tiny
 _ALMOST_ONE = 1.0 - 2.0**-24
 """The float32 before 1: the largest opacity with a finite logit."""
@@ -32,8 +31,8 @@ _ALMOST_ONE = 1.0 - 2.0**-24
 def write_splat_ply(path: str | Path, gaussians: Gaussians, note: dict[str, Any]) -> None:
     """Writes all of `gaussians`, with `note` as JSON in a comment of the header.
 
-    Opacities of 0 and 1 become the nearest that have a finite logit, quaternions become unit ones. Keep the note below
-    some 8 kB: antimatter15's viewer looks for the end of the header in the first 10.
+    Opacities are clamped to values with a finite logit, quaternions are normalised. The note should not exceed 8 kB:
+    antimatter15's viewer searches for the end of the header in the first 10 kB. Raises ResultError naming `path`.
     """
     # SIBR expects "element vertex" in the header's third line: the comment stands after it, as the element's own.
     element = PlyElement.describe(_vertices(gaussians), "vertex", comments=[_NOTE + canonical_json(note)])
@@ -42,9 +41,9 @@ def write_splat_ply(path: str | Path, gaussians: Gaussians, note: dict[str, Any]
 
 
 def note_of(path: str | Path) -> dict[str, Any]:
-    """The note of a file that `write_splat_ply` wrote; an empty one for any other."""
+    """The note in a file by `write_splat_ply`; empty for any other file."""
     with suppress(OSError, ValueError), open(path, "rb") as file:
-        header = file.read(_LONGEST_HEADER).partition(b"end_header")[0].decode("ascii", "replace")
+        header = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0].decode("ascii", "replace")
         for line in header.splitlines():
             if line.startswith(f"comment {_NOTE}"):
                 note = json.loads(line.removeprefix(f"comment {_NOTE}"))
@@ -53,9 +52,9 @@ def note_of(path: str | Path) -> dict[str, Any]:
 
 
 def read_splat_ply(path: str | Path) -> Gaussians:
-    """Reads what `write_splat_ply` or another program of the same convention wrote, on the CPU.
+    """Reads a file of this convention, by `write_splat_ply` or another program, on the CPU.
 
-    Raises ResultError naming the file where it is truncated, or lacks a property of the convention.
+    Raises ResultError naming the file if it is truncated, lacks a property, or contains NaN or Inf.
     """
     try:
         vertices = PlyData.read(str(path))["vertex"]
@@ -63,7 +62,7 @@ def read_splat_ply(path: str | Path) -> Gaussians:
         names = _property_names(coefficients)
         columns = {name: np.asarray(vertices[name], dtype=np.float32) for name in names if name[0] != "n"}
         if not all(np.isfinite(column).all() for column in columns.values()):
-            raise ValueError("it has values that are not finite")
+            raise ValueError("it contains NaN or Inf")
         return _gaussians(torch.from_numpy(np.stack(list(columns.values()), axis=1)), coefficients)
     except (OSError, PlyParseError, KeyError, ValueError, TypeError) as error:
         raise unreadable(
@@ -72,22 +71,22 @@ def read_splat_ply(path: str | Path) -> Gaussians:
 
 
 def _coefficients(names: list[str]) -> int:
-    """How many coefficients a channel there are beyond the first. Raises ValueError where they make no whole degree."""
+    """The number of coefficients per channel beyond the first. Raises ValueError if it matches no degree."""
     count = sum(name.startswith("f_rest_") for name in names)
     if count % 3 or math.isqrt(count // 3 + 1) ** 2 != count // 3 + 1:
-        raise ValueError(f"{count} f_rest properties make no degree of spherical harmonics")
+        raise ValueError(f"{count} f_rest properties match no degree of spherical harmonics")
     return count // 3
 
 
 def _property_names(coefficients: int) -> list[str]:
-    """The properties in order, for Gaussians with so many coefficients a channel beyond the first."""
+    """The properties in order, for this number of coefficients per channel beyond the first."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(3 * coefficients)]
     return [*names, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 
 def _vertices(gaussians: Gaussians) -> np.ndarray:
-    """The Gaussians (n,) as records of the convention."""
+    """The Gaussians as structured records (n,) of the convention."""
     count, coefficients = gaussians.shN.shape[:2]
     names = _property_names(coefficients)
     opacities = gaussians.opacities.double().clamp(_TINY, _ALMOST_ONE)
@@ -105,7 +104,7 @@ def _vertices(gaussians: Gaussians) -> np.ndarray:
 
 
 def _gaussians(values: Float[Tensor, "n columns"], coefficients: int) -> Gaussians:
-    """The Gaussians of the columns without normals."""
+    """The Gaussians from columns without normals."""
     means, sh0, rest, opacity, scales, quats = values.split([3, 3, 3 * coefficients, 1, 3, 4], dim=1)
     shN = rest.reshape(len(values), 3, coefficients).transpose(1, 2)
     return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacity[:, 0]), sh0[:, None], shN)

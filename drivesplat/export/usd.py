@@ -1,14 +1,14 @@
-"""Gaussians that move and the recording camera as scene.usdz: a drive that plays in programs with OpenUSD.
+"""Static and dynamic Gaussians and the recorded camera as scene.usdz, for programs with OpenUSD.
 
 The stage: metres, z up, the world of `Scene` with its origin in customLayerData, thirty time codes a second since the
-first image. Below /World lie
+first image. Its prims:
 
-- a prim for every group that stands still: /World/background
-- /World/actors/{track} for every object, its Gaussians in the object's frame, its transform and visibility over time
-- /World/camera as it was recorded
+- one for every static group, such as /World/background
+- /World/actors/{track} for every object: Gaussians in the object's frame, transform and visibility over time
+- /World/camera with the recorded path
 
-Colours do not change in time: they are those of the drive's middle image. The sky is not a Gaussian and is not in here,
-nor can the schema say that a model was trained antialiased.
+Colours are those of the drive's middle image at all times. The sky consists of no Gaussians and is not included; the
+schema has no attribute for antialiased training.
 """
 
 import tempfile
@@ -20,18 +20,18 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from drivesplat.errors import ResultError
-from drivesplat.export.names import distinct
 from drivesplat.export.trained_parts import SampledGroup
+from drivesplat.export.unique_names import unique_names
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_group, usd_matrix
 from drivesplat.io.storage import atomic_path
 
 APERTURE_WIDTH = 0.36
-"""A sensor 36 mm wide in the unit that UsdGeom.Camera has for lenses: a tenth of the scene's unit, here 10 cm."""
+"""A sensor width of 36 mm in the lens unit of UsdGeom.Camera: a tenth of the scene's unit, here 10 cm."""
 CLIPPING_RANGE = (0.1, 10_000.0)
 """Metres."""
 _ACTORS, _CAMERA = "/World/actors", "/World/camera"
 _OPENCV_TO_USD = np.diag([1.0, -1.0, -1.0, 1.0])
-"""A USD camera looks along -z with y up, an OpenCV camera along z with y down."""
+"""USD cameras look along -z with y up, OpenCV cameras along z with y down."""
 
 
 def splat_stage(
@@ -53,7 +53,7 @@ def splat_stage(
 def usd_camera(K: np.ndarray, size: tuple[int, int], camera_to_world: np.ndarray) -> Gf.Camera:
     """The camera of an image: `K` (3, 3) in continuous pixels at `size` (width, height), OpenCV pose (4, 4) in metres.
 
-    The frustum is that of K: with a principal point off the middle the aperture is off the lens's axis.
+    The frustum is that of K: a principal point off the image centre becomes an aperture offset.
     """
     width, height = size
     focal_length = APERTURE_WIDTH * K[0, 0] / width
@@ -69,9 +69,9 @@ def usd_camera(K: np.ndarray, size: tuple[int, int], camera_to_world: np.ndarray
 
 
 def write_usdz(path: str | Path, stage: Usd.Stage) -> None:
-    """Packs a stage without dependencies into one file, its root layer scene.usdc.
+    """Packs a stage without dependencies into one file with the root layer scene.usdc.
 
-    Raises ResultError naming the file where it cannot be written; nothing is left of it then.
+    Raises ResultError naming the file if it cannot be written; no partial file remains.
     """
     path = Path(path)
     with atomic_path(path) as aside, tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
@@ -90,19 +90,19 @@ def _unwritable(path: Path, why: str) -> ResultError:
 
 
 def _define_groups(stage: Usd.Stage, groups: Mapping[str, SampledGroup]) -> None:
-    still = [name for name, group in groups.items() if group.motion is None]
-    objects = [name for name in groups if name not in still]
+    static = [name for name, group in groups.items() if group.motion is None]
+    objects = [name for name in groups if name not in static]
     if objects:
         Usd.ModelAPI(UsdGeom.Xform.Define(stage, _ACTORS)).SetKind(Kind.Tokens.group)
     taken = [path.rpartition("/")[2] for path in (_ACTORS, _CAMERA)]
-    paths = {name: f"/World/{word}" for name, word in distinct(still, _identifier, taken).items()}
-    paths |= {name: f"{_ACTORS}/{word}" for name, word in distinct(objects, _identifier).items()}
+    paths = {name: f"/World/{word}" for name, word in unique_names(static, _identifier, taken).items()}
+    paths |= {name: f"{_ACTORS}/{word}" for name, word in unique_names(objects, _identifier).items()}
     for name, group in groups.items():
         define_group(stage, paths[name], name, group)
 
 
 def _identifier(name: str) -> str:
-    """A name as USD allows it. A leading digit, of which OpenUSD would make an underscore, gets one before it."""
+    """A name as a USD identifier; a leading digit gets an underscore before it instead of being replaced by one."""
     return Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
 
 

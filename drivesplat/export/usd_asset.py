@@ -1,4 +1,4 @@
-"""The stage `export_usd`: a trained model, what moves in it, and the camera that recorded it as scene.usdz."""
+"""The stage `export_usd`: a trained model with its moving objects and the recorded camera as scene.usdz."""
 
 import logging
 from pathlib import Path
@@ -23,10 +23,8 @@ log = logging.getLogger(__name__)
 def export_usd(
     path: str | Path, checkpoint: dict[str, Any], scene: Scene, job: UsdJob, provenance: dict[str, Any]
 ) -> None:
-    """Writes the `job.gaussians` of a checkpoint's content that cover most, and the recorded `job.eval_camera`.
-
-    Raises DatasetError where the scene does not hold that camera.
-    """
+    """Writes the `job.gaussians` Gaussians of a checkpoint (its content) with the largest coverage, and the recorded
+    `job.eval_camera`. Raises DatasetError if the scene lacks that camera."""
     model, _ = trained_model(checkpoint)
     cameras = recorded_cameras(scene, job.eval_camera)
     groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera))
@@ -38,10 +36,10 @@ def export_usd(
 
 
 def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]:
-    """A camera along its recorded path as USD's cameras, each with its time in seconds since the scene's first image.
+    """The USD cameras along a camera's recorded path, each with its time in seconds since the scene's first image.
 
-    Every image has its own pose; between them the path is that of the films, in steps so short that USD, which
-    interpolates matrices entry by entry, does not shear the camera. Raises DatasetError where there are no images.
+    Images have their own poses; between them the path is that of films, sampled densely enough for USD, which
+    interpolates matrices entry by entry. Raises DatasetError if the camera has no images.
     """
     frames = recorded_frames(scene, camera)
     recorded = recorded_timestamps(scene, camera)
@@ -54,5 +52,5 @@ def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]
 
 
 def recorded_timestamps(scene: Scene, camera: str) -> np.ndarray:
-    """When (microseconds) a camera's images were taken: (n,) int64, increasing."""
+    """The timestamps (n,) of a camera's images in microseconds: int64, increasing."""
     return np.array([frame.timestamp for frame in recorded_frames(scene, camera)], dtype=np.int64)

@@ -1,8 +1,8 @@
-"""Gaussians as a prim of OpenUSD's own schema for Gaussian splats, and an object's motion as the prim's over time.
+"""Gaussians as a prim of OpenUSD's schema for Gaussian splats, with an object's motion as transforms over time.
 
-The schema (usd-core 26.11) wants linear values: opacities in [0, 1], scales in metres, unit quaternions, and for every
-Gaussian its RGB coefficients of spherical harmonics in the order of 3D Gaussian Splatting. All of it is in the prim's
-local space: an object's Gaussians stay as they are in its frame, and the prim's transform moves them.
+The schema (usd-core 26.11) requires linear values: opacities in [0, 1], scales in metres, unit quaternions, and for
+every Gaussian its RGB coefficients of spherical harmonics in the order of 3D Gaussian Splatting, all in the local space
+of the prim: an object's Gaussians are constant in its frame, and the prim's transform moves them.
 """
 
 import numpy as np
@@ -17,14 +17,14 @@ from drivesplat.model.gaussians import Gaussians
 
 TIME_CODES_PER_SECOND = float(SAMPLES_PER_SECOND)
 EXTENT_SIGMAS = 3.0
-"""How far a Gaussian reaches for the extent, in its largest scale: the support that the schema gives the kernel."""
+"""The radius of a Gaussian in the extent, in units of its largest scale: the kernel's support in the schema."""
 
 
 def define_group(stage: Usd.Stage, prim_path: str, name: str, group: SampledGroup) -> None:
-    """A ParticleField3DGaussianSplat at `prim_path`; one that moves says which track it is, and of what class."""
+    """Defines a ParticleField3DGaussianSplat at `prim_path`; a moving one also has its track, class and size."""
     splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, prim_path)
     Usd.ModelAPI(splat).SetKind(Kind.Tokens.component)
-    _fill(splat, group.gaussians)
+    _set_gaussians(splat, group.gaussians)
     if group.motion is None:
         return
     about = {"track": name}
@@ -32,25 +32,25 @@ def define_group(stage: Usd.Stage, prim_path: str, name: str, group: SampledGrou
         about |= {"category": group.track.category, "size": Gf.Vec3d(*group.track.size)}
     splat.GetPrim().SetCustomDataByKey("drivesplat", about)
     splat.GetPrim().SetDisplayName(" ".join([about.get("category", "object"), name]))
-    _move(splat, group.motion)
-    _show(splat, group.motion)
+    _set_transforms(splat, group.motion)
+    _set_visibility(splat, group.motion)
 
 
 def usd_matrix(transform: np.ndarray) -> Gf.Matrix4d:
-    """A transform (4, 4) of column vectors as USD's, which multiplies row vectors."""
+    """A transform (4, 4) for column vectors as a USD matrix, which is for row vectors."""
     return Gf.Matrix4d(transform.T.tolist())
 
 
-def _fill(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussians) -> None:
+def _set_gaussians(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussians) -> None:
     quats = torch.nn.functional.normalize(gaussians.quats, dim=-1)
     splat.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.means)))
-    # the memory of Gf.Quatf is x, y, z, w
+    # the memory layout of Gf.Quatf is x, y, z, w
     splat.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(_numpy(quats.roll(-1, dims=-1))))
     splat.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.scales)))
     splat.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(_numpy(gaussians.opacities)))
     splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
     splat.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(_numpy(gaussians.sh.reshape(-1, 3))))
-    # how gsplat rendered them in training
+    # as gsplat renders in training
     splat.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
     splat.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)
     if len(gaussians):
@@ -58,30 +58,30 @@ def _fill(splat: UsdVol.ParticleField3DGaussianSplat, gaussians: Gaussians) -> N
 
 
 def _extent(gaussians: Gaussians) -> Float[Tensor, "2 3"]:
-    """The corners of a box around the Gaussians in their own frame; usd-core computes none for this schema."""
+    """The corners of a box around the Gaussians in their own frame, which usd-core does not compute for this schema."""
     reach = EXTENT_SIGMAS * gaussians.scales.amax(dim=-1, keepdim=True)
     return torch.stack([(gaussians.means - reach).amin(dim=0), (gaussians.means + reach).amax(dim=0)])
 
 
-def _move(xformable: UsdGeom.Xformable, motion: SampledMotion) -> None:
-    """Object to world over time; without a time as the motion stands still."""
+def _set_transforms(xformable: UsdGeom.Xformable, motion: SampledMotion) -> None:
+    """Object to world over time; the default value is the pose at the default time."""
     transform = xformable.AddTransformOp()
-    transform.Set(usd_matrix(motion.still_pose))
+    transform.Set(usd_matrix(motion.default_pose))
     for code, pose in zip(motion.seconds * TIME_CODES_PER_SECOND, motion.object_to_world, strict=True):
         transform.Set(usd_matrix(pose), float(code))
 
 
-def _show(imageable: UsdGeom.Imageable, motion: SampledMotion) -> None:
-    """Visible while the object is there. USD holds a token until the next sample, and the first also before it."""
-    visibility = imageable.CreateVisibilityAttr(_visible(motion.present_when_still))
-    visibility.Set(_visible(False), motion.spans[0][0] * TIME_CODES_PER_SECOND - 1.0)
+def _set_visibility(imageable: UsdGeom.Imageable, motion: SampledMotion) -> None:
+    """Visible while the object is present. USD holds a token until the next sample, and the first also before it."""
+    visibility = imageable.CreateVisibilityAttr(_visibility(motion.present_by_default))
+    visibility.Set(_visibility(False), motion.spans[0][0] * TIME_CODES_PER_SECOND - 1.0)
     for first, last in motion.spans:
-        visibility.Set(_visible(True), first * TIME_CODES_PER_SECOND)
-        visibility.Set(_visible(False), float(np.nextafter(last * TIME_CODES_PER_SECOND, np.inf)))
+        visibility.Set(_visibility(True), first * TIME_CODES_PER_SECOND)
+        visibility.Set(_visibility(False), float(np.nextafter(last * TIME_CODES_PER_SECOND, np.inf)))
 
 
-def _visible(is_there: bool) -> str:
-    return UsdGeom.Tokens.inherited if is_there else UsdGeom.Tokens.invisible
+def _visibility(present: bool) -> str:
+    return UsdGeom.Tokens.inherited if present else UsdGeom.Tokens.invisible
 
 
 def _numpy(values: Tensor) -> np.ndarray:

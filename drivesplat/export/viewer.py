@@ -1,11 +1,10 @@
 """The stage `export_viewer`: a trained model as viewer.html, one page that needs a browser and no network.
 
-The page is our own WebGL 2 in `viewer_page/`: it projects, cuts off and colours as gsplat does, spherical harmonics
-included, and shows the learned sky, without which a street's pictures lack what training has put into the sky. Nothing
-in it has an address, and its content security policy keeps the browser from fetching anything.
+The page uses the WebGL 2 code in `viewer_page/`, which projects, culls and colours as gsplat does, including spherical
+harmonics, and shows the learned sky. The page contains no addresses, and its content security policy prevents requests.
 
-The payload is base64 of what zlib deflated: little-endian arrays one after the other, each at a multiple of 4 bytes,
-listed in the JSON of #scene. Coefficients of spherical harmonics beyond the first are `sh_range` t |t| with t the
+The payload is base64 of zlib-compressed little-endian arrays, each at a multiple of 4 bytes, listed in the JSON of
+#scene. Coefficients of spherical harmonics beyond the first are `sh_range` t |t| with t the
 stored byte over 127, finest where most of them are: near zero.
 """
 
@@ -24,7 +23,8 @@ from torch import Tensor
 from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.export.viewer_page import filled_page
-from drivesplat.io.storage import atomic_write, canonical_json
+from drivesplat.io.html_page import json_in_html
+from drivesplat.io.storage import atomic_write
 from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
@@ -36,7 +36,7 @@ from drivesplat.settings.export import ViewerJob
 log = logging.getLogger(__name__)
 
 SKY_SIZE = 256
-"""Texels along an edge of the sky's cube map in the page."""
+"""Texels along an edge of the sky's cube map."""
 
 
 def export_viewer(
@@ -47,10 +47,11 @@ def export_viewer(
     method: str,
     provenance: dict[str, Any],
 ) -> None:
-    """Writes the page with the `job.gaussians` of a checkpoint's content that cover most, seen from `job.eval_camera`.
+    """Writes the page with the `job.gaussians` Gaussians of a checkpoint (its content) that have the largest coverage,
+    viewed from `job.eval_camera`.
 
-    The world stands as at the time of the drive's middle image, without objects that are absent then.
-    Raises DatasetError where the scene has no key frame of that camera.
+    Objects are shown at the time of the drive's middle image. Raises DatasetError if the scene has no key frame of that
+    camera.
     """
     start = scene.frames[scene.middle_key_frame(job.eval_camera)]
     model, _ = trained_model(checkpoint)
@@ -65,7 +66,7 @@ def export_viewer(
 def viewer_page(
     gaussians: Gaussians, sky: Sky | None, antialiased: bool, start: Frame, title: str, provenance: dict[str, Any]
 ) -> str:
-    """The page: equal inputs, equal text. Its first view is that of `start`; no sky is a black one."""
+    """The text of the page, deterministic. Its first view is that of `start`; without a sky the background is black."""
     arrays, sh_range = splat_arrays(gaussians)
     layout, payload = packed({**arrays, "sky": sky_faces(sky, SKY_SIZE)})
     scene = {
@@ -79,16 +80,16 @@ def viewer_page(
     }
     return filled_page(
         title=html.escape(title),
-        provenance=_json_in_html(provenance),
-        scene=_json_in_html(scene),
+        provenance=json_in_html(provenance),
+        scene=json_in_html(scene),
         payload=base64.b64encode(payload).decode(),
     )
 
 
 def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
-    """The Gaussians as the page stores them, and the largest coefficient of spherical harmonics beyond the first.
+    """The Gaussians in the page's encoding, and the largest coefficient of spherical harmonics beyond the first.
 
-    `means` (n, 3) float32 and `scales` (n, 3) float16 in metres, unit `quats` (n, 4) float16, `opacities` (n,) of 255,
+    `means` (n, 3) float32 and `scales` (n, 3) float16 in metres, unit `quats` (n, 4) float16, `opacities` (n,) uint8,
     `sh0` (n, 3) float16, `shN` (n, k - 1, 3) int8.
     """
     shN = gaussians.shN.float()
@@ -108,14 +109,14 @@ def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
 
 @torch.no_grad()
 def sky_faces(sky: Sky | None, size: int) -> np.ndarray:
-    """The sky (6, size, size, 3) uint8 as OpenGL's cube map in world directions: faces +x -x +y -y +z -z."""
+    """The sky (6, size, size, 3) uint8 as an OpenGL cube map in world directions: faces +x -x +y -y +z -z."""
     if sky is None:
         return np.zeros((6, size, size, 3), np.uint8)
     return torch.stack([to_uint8(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
 
 
 def cube_rays(size: int) -> Float[Tensor, "6 size size 3"]:
-    """Unit directions of a cube map's texels (face, t, s), by the table of section 8.13 of the OpenGL 4.5 spec."""
+    """Unit directions of a cube map's texels (face, t, s): OpenGL 4.5 specification, table of section 8.13."""
     line = (torch.arange(size) + 0.5) * (2.0 / size) - 1.0
     t, s = torch.meshgrid(line, line, indexing="ij")
     one = torch.ones_like(s)
@@ -134,15 +135,10 @@ def start_pose(frame: Frame) -> dict[str, Any]:
 
 
 def packed(arrays: dict[str, np.ndarray]) -> tuple[list[dict[str, Any]], bytes]:
-    """Where each array lies (bytes) with how many values, and all of them deflated."""
+    """The offset (bytes) and length (values) of each array, and all arrays compressed with zlib."""
     layout, content = [], bytearray()
     for name, array in arrays.items():
         content.extend(bytes(-len(content) % 4))
         layout.append({"name": name, "dtype": array.dtype.name, "offset": len(content), "length": array.size})
         content.extend(array.astype(array.dtype.newbyteorder("<")).tobytes())
     return layout, zlib.compress(bytes(content), level=9)
-
-
-def _json_in_html(value: Any) -> str:
-    """JSON that cannot end the element it stands in."""
-    return canonical_json(value).replace("<", "\\u003c")

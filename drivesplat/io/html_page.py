@@ -3,6 +3,9 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+from drivesplat.io.storage import canonical_json
 
 
 def filled_page(package: str, scripts: Sequence[str], **values: str) -> str:
@@ -14,6 +17,11 @@ def filled_page(package: str, scripts: Sequence[str], **values: str) -> str:
     folder = Path(package).parent
     filling = {**values, "scripts": "\n".join(_text(folder / name) for name in scripts)}
     return re.sub(r"\{\{(\w+)\}\}", lambda found: filling[found[1]], _text(folder / "page.html"))
+
+
+def json_in_html(value: Any) -> str:
+    """A value as JSON that cannot end the HTML element around it."""
+    return canonical_json(value).replace("<", "\\u003c")
 
 
 def _text(path: Path) -> str:

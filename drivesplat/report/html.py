@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from drivesplat.evaluation.comparison import GROUP_PLACES
-from drivesplat.io.storage import canonical_json
+from drivesplat.io.html_page import json_in_html
 from drivesplat.report.costs import costs_table
 from drivesplat.report.gaps import in_words
 from drivesplat.report.looks import Looks, address_of, apart_at, data_address, picture_of
@@ -38,7 +38,7 @@ def report_page(report: dict[str, Any], seen: Seen, costs: Sequence[dict[str, An
         scenes=_scenes(report, seen),
         protocol=_protocol(report),
         costs=costs_table(costs),
-        report=canonical_json(report).replace("<", "\\u003c"),
+        report=json_in_html(report),
     )
 
 

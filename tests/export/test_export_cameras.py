@@ -48,7 +48,7 @@ def matrix(row: dict) -> np.ndarray:
     return pose
 
 
-def test_poses_lead_back_to_the_datasets_global_frame(record, tiny_root):
+def test_poses_give_the_global_frame_of_the_dataset(record, tiny_root):
     """World plus origin is where the tables' chain of calibration and ego pose puts the camera."""
     ego_poses, sensors = table(tiny_root, "ego_pose"), table(tiny_root, "calibrated_sensor")
     rows = [row for row in table(tiny_root, "sample_data").values() if row["fileformat"] == "jpg"]
@@ -66,7 +66,7 @@ def test_poses_lead_back_to_the_datasets_global_frame(record, tiny_root):
         assert image["is_key_frame"] == row["is_key_frame"] and image["camera"] == "CAM_FRONT"
 
 
-def test_float64_and_microseconds_survive_the_file(tiny_scene, parser, tmp_path):
+def test_float64_and_microseconds_are_preserved(tiny_scene, parser, tmp_path):
     odd = dataclasses.replace(tiny_scene, origin=np.array([411.3039349319818, 1180.8903791765097, 0.1]))
     write_json(tmp_path / "cameras.json", cameras_record(odd, parser))
     again = json.loads((tmp_path / "cameras.json").read_text())
@@ -78,7 +78,7 @@ def test_float64_and_microseconds_survive_the_file(tiny_scene, parser, tmp_path)
         assert image["timestamp"] == frame.timestamp and image["sample_index"] == frame.sample_index
 
 
-def test_intrinsics_are_those_of_the_size_given(record, tiny_scene):
+def test_intrinsics_belong_to_the_size(record, tiny_scene):
     """A point is projected to the same place, relative to the image's size, as by the recorded intrinsics."""
     for image, frame in zip(record["images"], tiny_scene.frames, strict=True):
         assert (image["width"], image["height"]) == (48, 27)
@@ -90,7 +90,7 @@ def test_intrinsics_are_those_of_the_size_given(record, tiny_scene):
         np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_every_image_says_what_it_was_used_for(record):
+def test_every_image_has_its_split(record):
     split_of = {image["sample_index"]: image["split"] for image in record["images"] if image["is_key_frame"]}
     assert split_of == {
         **dict.fromkeys(range(10), "train"),
@@ -102,13 +102,13 @@ def test_every_image_says_what_it_was_used_for(record):
     assert {image["split"] for image in record["images"] if not image["is_key_frame"]} <= {"train", "excluded"}
 
 
-def test_the_record_names_what_it_is_of_and_every_convention_in_a_sentence(record, tiny_scene):
+def test_the_record_names_scene_and_conventions(record, tiny_scene):
     assert record["schema"] == 1 and record["scene"] == "0001" and record["dataset"] == "tiny"
     assert record["version"] == "v1.0-mini" and record["poses"] == tiny_scene.poses
     assert {"world", "global", "camera", "ego", "K", "timestamp", "split"} <= record["conventions"].keys()
     assert all(sentence.endswith(".") for sentence in record["conventions"].values())
 
 
-def test_the_machines_paths_stay_at_home(record, tiny_root):
+def test_the_record_contains_no_paths_of_the_machine(record, tiny_root):
     assert str(tiny_root) not in json.dumps(record)
     assert all("/" not in image["image"] for image in record["images"])

@@ -20,12 +20,12 @@ from helpers.hand_made_traffic import (
 )
 
 from drivesplat.export import splat_asset
-from drivesplat.export.names import distinct
 from drivesplat.export.parts_json import write_parts
-from drivesplat.export.sampled_motion import sampled
+from drivesplat.export.sampled_motion import sample_motion
 from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, trained_gaussians, trained_groups
+from drivesplat.export.unique_names import unique_names
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.motion import Motion
@@ -96,7 +96,7 @@ def test_every_group_has_a_file_and_an_entry(folder, record, parts):
     assert [(parts[name]["gaussians"], parts[name]["sh_degree"]) for name in parts] == [(3, 0), (12, 1), (12, 1)]
 
 
-def test_objects_are_in_their_own_frame_in_the_colours_of_the_middle_image(folder, parts):
+def test_objects_are_in_their_own_frame_with_the_colours_of_the_middle_image(folder, parts):
     for track_id in COURSES:
         found = read_splat_ply(folder / "parts" / parts[track_id]["file"])
         assert_same(found, own_gaussians(track_id, MIDDLE))
@@ -112,7 +112,7 @@ def test_poses_are_those_of_the_closed_form_at_every_sample(parts):
         np.testing.assert_allclose(motion["object_to_world"], expected, rtol=0, atol=1e-9)
 
 
-def test_samples_are_dense_while_an_object_is_there_and_none_elsewhere(parts):
+def test_samples_are_dense_while_an_object_is_present_and_absent_otherwise(parts):
     for track_id, course in COURSES.items():
         motion = parts[track_id]["motion"]
         seconds = np.array(motion["seconds"])
@@ -137,7 +137,7 @@ def test_every_image_and_every_annotation_has_a_sample(parts, scene):
         np.testing.assert_allclose(elapsed, motion["seconds"], rtol=0, atol=1e-9)
 
 
-def test_the_drive_can_be_put_together_again_at_any_image(folder, parts, scene):
+def test_the_groups_compose_the_drive_at_every_image(folder, parts, scene):
     """Files and poses of parts.json alone give what the model shows, in the colours of the middle image."""
     first, model = min(frame.timestamp for frame in scene.frames), street()
     for frame in scene.frames:
@@ -156,7 +156,7 @@ def test_the_drive_can_be_put_together_again_at_any_image(folder, parts, scene):
             assert_same(found, expected, atol=2e-5)
 
 
-def test_splat_ply_holds_all_that_is_there_at_the_middle_image(folder):
+def test_splat_ply_holds_all_groups_present_at_the_middle_image(folder):
     found = read_splat_ply(folder / "splat.ply")
     present = placed(own_gaussians(TURNING, MIDDLE), COURSES[TURNING].pose(MIDDLE))
     assert len(found) == len(STREET) + len(present), "the absent vehicle is not there, invisible or not"
@@ -165,14 +165,14 @@ def test_splat_ply_holds_all_that_is_there_at_the_middle_image(folder):
     assert not found.sh[:3, 1:].any()
 
 
-def test_the_scene_says_of_what_class_and_size_an_object_is_where_it_knows_it(parts):
-    known, unknown, still = (parts[name] for name in (TURNING, GONE_AT_TIMES, "background"))
+def test_class_and_size_of_an_object_come_from_the_scene(parts):
+    known, unknown, static = (parts[name] for name in (TURNING, GONE_AT_TIMES, "background"))
     assert (known["category"], known["size"]) == ("vehicle.car", [4.0, 2.0, 1.6])
     assert (unknown["category"], unknown["size"]) == (None, None)
-    assert (still["category"], still["size"], still["motion"]) == (None, None, None)
+    assert (static["category"], static["size"], static["motion"]) == (None, None, None)
 
 
-def test_the_record_says_where_it_is_from_and_what_it_means(record, scene, folder):
+def test_the_record_has_provenance_and_conventions(record, scene, folder):
     first = min(frame.timestamp for frame in scene.frames)
     assert (record["schema"], record["scene"], record["dataset"]) == (1, "0001", "tiny")
     assert record["origin"] == scene.origin.tolist() and record["provenance"] == PROVENANCE
@@ -190,7 +190,7 @@ def test_vanilla_is_one_group_equal_to_splat_ply(tmp_path, tiny_scene, monkeypat
     assert_same(read_splat_ply(tmp_path / "parts/background.ply"), read_splat_ply(tmp_path / "splat.ply"))
 
 
-def test_files_of_dropped_groups_are_removed_and_all_others_stay(tmp_path, scene, monkeypatch):
+def test_only_files_of_dropped_groups_are_removed(tmp_path, scene, monkeypatch):
     export_all(tmp_path, street(), scene, monkeypatch)
     folder = tmp_path / "parts"
     (folder / "mine.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment mine\nend_header\n")
@@ -203,7 +203,7 @@ def test_files_of_dropped_groups_are_removed_and_all_others_stay(tmp_path, scene
     assert {path.name for path in folder.iterdir()} == {"parts.json", "background.ply", *kept}
 
 
-def test_names_that_would_be_one_file_become_two(tmp_path, tiny_scene):
+def test_equal_file_names_are_made_unique(tmp_path, tiny_scene):
     names = ["car 7", "car/7", "Car_7", "../up", ""]
     groups = {name: SampledGroup(some_gaussians(i + 1, 0, i)) for i, name in enumerate(names)}
     write_parts(tmp_path / "parts/parts.json", groups, tiny_scene, PROVENANCE)
@@ -214,12 +214,12 @@ def test_names_that_would_be_one_file_become_two(tmp_path, tiny_scene):
     assert [path.name for path in tmp_path.iterdir()] == ["parts"]
 
 
-def test_a_name_made_distinct_does_not_take_anothers():
-    assert distinct(["a", "A", "a_2"], str) == {"a": "a", "A": "A_2", "a_2": "a_2_2"}
-    assert distinct(["camera", "b"], str, taken=["Camera"]) == {"camera": "camera_2", "b": "b"}
+def test_a_name_made_unique_does_not_collide_with_another():
+    assert unique_names(["a", "A", "a_2"], str) == {"a": "a", "A": "A_2", "a_2": "a_2_2"}
+    assert unique_names(["camera", "b"], str, taken=["Camera"]) == {"camera": "camera_2", "b": "b"}
 
 
-def test_what_is_not_finite_stays_behind_in_every_export(tiny_scene, monkeypatch, caplog):
+def test_gaussians_with_nan_are_dropped_in_every_export(tiny_scene, monkeypatch, caplog):
     def broken(track_id: str, time: float) -> Gaussians:
         own = own_gaussians(track_id, time)
         own.scales[4, 1] = torch.inf
@@ -235,10 +235,10 @@ def test_what_is_not_finite_stays_behind_in_every_export(tiny_scene, monkeypatch
     assert {name: len(group.gaussians) for name, group in groups.items()} == {
         "background": 3, TURNING: 10, GONE_AT_TIMES: 10,
     }  # fmt: skip
-    assert f"{TURNING}: 2 of 12 Gaussians are not finite and left out" in caplog.text
+    assert f"{TURNING}: 2 of 12 Gaussians contain NaN or Inf and are dropped" in caplog.text
 
 
-def test_a_faint_gaussian_that_stands_still_is_not_an_absent_object(tiny_scene):
+def test_a_transparent_static_gaussian_is_not_an_absent_object(tiny_scene):
     model = SplatModel([round_gaussians(STREET, opacities=[0.0, 0.5, 0.9])], None)
     assert len(trained_gaussians(model, tiny_scene)) == 3
 
@@ -248,7 +248,7 @@ def ahead(x: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("still", "x", "present"),
+    ("default_time", "x", "present"),
     [
         (0.2, 2.0, True),
         (1.4, 14.0, True),
@@ -258,17 +258,17 @@ def ahead(x: float) -> np.ndarray:
         (9.0, 80.0, False),
     ],
 )
-def test_an_object_that_is_absent_stands_where_it_was_last_or_will_be_next(still, x, present):
+def test_the_default_pose_of_an_absent_object_is_the_nearest_in_time(default_time, x, present):
     """There from 0 to 1.5 s at ten metres a second, and standing from 3 to 4 s: its motion is not continued beyond."""
     poses = np.stack([ahead(5.0), ahead(10.0), ahead(80.0)])
-    motion = sampled(Motion(np.array([0.5, 1.0, 3.5]), poses, ((0, 1), (2, 2)), 0.5), np.array([]), still)
-    assert motion.present_when_still == present
-    assert motion.still_pose[0, 3] == pytest.approx(x, abs=1e-9)
+    motion = sample_motion(Motion(np.array([0.5, 1.0, 3.5]), poses, ((0, 1), (2, 2)), 0.5), np.array([]), default_time)
+    assert motion.present_by_default == present
+    assert motion.default_pose[0, 3] == pytest.approx(x, abs=1e-9)
 
 
-def test_spans_that_overlap_are_one():
+def test_overlapping_spans_are_merged():
     """Annotations 0.6 s apart that are not consecutive: each reaches half a second."""
     poses = np.stack([ahead(0.0), ahead(1.0)])
-    motion = sampled(Motion(np.array([1.0, 1.6]), poses, ((0, 0), (1, 1)), 0.5), np.array([]), 0.0)
+    motion = sample_motion(Motion(np.array([1.0, 1.6]), poses, ((0, 0), (1, 1)), 0.5), np.array([]), 0.0)
     assert motion.spans == ((0.5, 2.1),)
     assert np.diff(motion.seconds).max() < 1 / 30 + 2e-6

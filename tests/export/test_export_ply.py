@@ -65,7 +65,7 @@ def unit(quats: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("sh_degree", "rest"), [(0, 0), (1, 9), (2, 24), (3, 45)])
-def test_properties_stand_in_the_order_of_the_convention_as_float32(tmp_path, sh_degree, rest):
+def test_properties_have_the_order_of_the_convention_and_float32(tmp_path, sh_degree, rest):
     write_splat_ply(tmp_path / "splat.ply", some_gaussians(sh_degree=sh_degree), {})
     data = PlyData.read(str(tmp_path / "splat.ply"))
     assert [element.name for element in data.elements] == ["vertex"] and not data.text and data.byte_order == "<"
@@ -76,7 +76,7 @@ def test_properties_stand_in_the_order_of_the_convention_as_float32(tmp_path, sh
     assert {p.val_dtype for p in data["vertex"].properties} == {"f4"}
 
 
-def test_the_header_is_one_that_viewers_with_simple_parsers_understand(tmp_path):
+def test_the_header_suits_viewers_with_simple_parsers(tmp_path):
     """SIBR takes the count from the third line; antimatter15's viewer looks at the first 10 kB."""
     write_splat_ply(tmp_path / "splat.ply", some_gaussians(7), {"scene": "ä"})
     content = (tmp_path / "splat.ply").read_bytes()
@@ -87,7 +87,7 @@ def test_the_header_is_one_that_viewers_with_simple_parsers_understand(tmp_path)
     assert len(content) == content.index(b"end_header\n") + len(b"end_header\n") + 7 * 62 * 4
 
 
-def test_the_note_returns_and_other_files_have_none(tmp_path):
+def test_the_note_is_read_back_and_other_files_have_none(tmp_path):
     note = {"scene": "ä", "origin": [1.0, 2.5]}
     write_splat_ply(tmp_path / "splat.ply", some_gaussians(2), note)
     assert note_of(tmp_path / "splat.ply") == note
@@ -97,7 +97,7 @@ def test_the_note_returns_and_other_files_have_none(tmp_path):
         assert note_of(tmp_path / "other.ply") == {}
 
 
-def test_values_are_those_before_the_activations(tmp_path):
+def test_values_precede_the_activations(tmp_path):
     shown = some_gaussians(sh_degree=2)
     write_splat_ply(tmp_path / "splat.ply", shown, {})
     vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
@@ -113,7 +113,7 @@ def test_values_are_those_before_the_activations(tmp_path):
     np.testing.assert_allclose(columns("rot_0", "rot_1", "rot_2", "rot_3"), unit(shown.quats), atol=1e-6)
 
 
-def test_coefficients_stand_channel_by_channel(tmp_path):
+def test_coefficients_are_stored_channel_by_channel(tmp_path):
     """Coefficient i of channel c is 100 c + i: f_rest has red's 1 to 15, then green's, then blue's."""
     sh = torch.arange(16.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])
     shown = dataclasses.replace(some_gaussians(2), sh0=sh[:1].repeat(2, 1, 1), shN=sh[1:].repeat(2, 1, 1))
@@ -126,7 +126,7 @@ def test_coefficients_stand_channel_by_channel(tmp_path):
 
 @pytest.mark.parametrize("count", [0, 1, 30])
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_gaussians_return(tmp_path, count, sh_degree):
+def test_gaussians_are_read_back(tmp_path, count, sh_degree):
     shown = some_gaussians(count, sh_degree)
     write_splat_ply(tmp_path / "splat.ply", shown, {})
     again = read_splat_ply(tmp_path / "splat.ply")
@@ -138,7 +138,7 @@ def test_gaussians_return(tmp_path, count, sh_degree):
 
 @pytest.mark.parametrize("opacity", [0.0, 1e-30, 1e-6, 1 - 1e-6, 1 - 2**-24, 1.0])
 @pytest.mark.parametrize("scale", [0.0, 1e-20, 1e4])
-def test_extreme_opacities_and_scales_return_from_finite_values(tmp_path, opacity, scale):
+def test_extreme_opacities_and_scales_are_stored_as_finite_values(tmp_path, opacity, scale):
     shown = some_gaussians(3)
     shown.opacities.fill_(opacity)
     shown.scales.fill_(scale)
@@ -150,7 +150,7 @@ def test_extreme_opacities_and_scales_return_from_finite_values(tmp_path, opacit
     torch.testing.assert_close(again.scales, shown.scales, rtol=1e-5, atol=1e-37)
 
 
-def test_what_returns_renders_the_same_image(tmp_path):
+def test_gaussians_read_back_render_the_same_image(tmp_path):
     shown = some_gaussians(200)
     write_splat_ply(tmp_path / "splat.ply", shown, {})
     K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
@@ -203,7 +203,7 @@ def test_a_ply_of_something_else_is_refused_naming_file_and_rule(tmp_path, eleme
 
 
 @pytest.mark.parametrize("content", [None, b"", b"not a ply", b"\x89PNG\r\n\x1a\n"])
-def test_no_ply_at_all_is_refused_naming_file_and_rule(tmp_path, content):
+def test_a_file_that_is_no_ply_is_refused_naming_file_and_rule(tmp_path, content):
     if content is not None:
         (tmp_path / "foreign.ply").write_bytes(content)
     with pytest.raises(ResultError, match=r"foreign\.ply.*'export'"):
@@ -243,7 +243,7 @@ def test_the_stage_exports_every_gaussian_of_the_checkpoint(tmp_path, tiny_scene
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_gaussians_that_are_not_finite_stay_behind(tiny_scene, name):
+def test_gaussians_with_nan_or_inf_are_dropped(tiny_scene, name):
     params = trained_params(10, sh_degree=1)
     params[name][4] = torch.nan
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1))

@@ -32,28 +32,28 @@ def places(gaussians: Gaussians) -> list[int]:
         pytest.param([[1, 1, 1]] * 4, [0.5] * 4, [0, 1], id="the first among equals"),
     ],
 )
-def test_those_stay_that_cover_most(scales, opacities, kept):
+def test_gaussians_with_the_largest_coverage_are_kept(scales, opacities, kept):
     assert places(thinned(gaussians_of([[float(s) for s in row] for row in scales], opacities), 2)) == kept
 
 
-def test_faint_giants_do_not_crowd_out_what_is_sharp():
+def test_large_faint_gaussians_do_not_displace_sharp_ones():
     """40 giants of 100 m and an opacity of 0.05 among 60 opaque Gaussians of 5 cm."""
     crowd = gaussians_of([[100.0] * 3] * 40 + [[0.05] * 3] * 60, [0.05] * 40 + [0.9] * 60)
     assert places(thinned(crowd, 60)) == list(range(40, 100))
 
 
-def test_an_opaque_giant_stays():
+def test_a_large_opaque_gaussian_is_kept():
     assert places(thinned(gaussians_of([[0.05] * 3] * 9 + [[5.0] * 3], [0.9] * 10), 1)) == [9]
 
 
 @pytest.mark.parametrize("count", [30, 31, 10_000])
-def test_enough_room_changes_nothing(count):
+def test_a_sufficient_budget_changes_nothing(count):
     shown = some_gaussians(30, 1, seed=0)
     for field in dataclasses.fields(Gaussians):
         assert torch.equal(getattr(thinned(shown, count), field.name), getattr(shown, field.name))
 
 
-def test_groups_share_the_budget_by_covered_area():
+def test_groups_share_the_budget_by_coverage():
     """Of several degrees of spherical harmonics, too, which stay as they are."""
     one, other = (gaussians_of([[1.0] * 3] * 3, opacities) for opacities in ([0.9, 0.1, 0.8], [0.2, 0.7, 0.3]))
     other = dataclasses.replace(other, shN=torch.zeros(3, 3, 3))

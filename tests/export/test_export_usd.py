@@ -82,7 +82,7 @@ def pixels_by_usd(camera: Gf.Camera, size: tuple[int, int], points: np.ndarray) 
     return (device[:, :2] * [1, -1] + 1) / 2 * size
 
 
-def test_the_stage_is_in_metres_with_z_up_and_says_where_it_is_from(stage, tiny_scene):
+def test_the_stage_is_in_metres_with_z_up_and_provenance(stage, tiny_scene):
     assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     assert stage.GetDefaultPrim().GetPath() == "/World"
     note = stage.GetRootLayer().customLayerData["drivesplat"]
@@ -91,7 +91,7 @@ def test_the_stage_is_in_metres_with_z_up_and_says_where_it_is_from(stage, tiny_
     assert note == {"scene": "0001", "dataset": "tiny", **digests}
 
 
-def test_the_gaussians_that_cover_most_are_there_in_linear_values(stage):
+def test_the_stage_has_the_gaussians_of_largest_coverage_in_linear_values(stage):
     splats = random_splats()
     areas = splats.scales.sort(dim=1).values[:, 1:].prod(dim=1)
     assert float(areas.max()) < 10 * float(areas.median())
@@ -105,7 +105,7 @@ def test_the_gaussians_that_cover_most_are_there_in_linear_values(stage):
     assert splat.GetSortingModeHintAttr().Get() == "zDepth"
 
 
-def test_orientations_are_unit_quaternions_that_turn_as_ours_do(stage):
+def test_orientations_are_unit_quaternions_of_the_same_rotation(stage):
     w, x, y, z = random_splats().quats.double().numpy().T
     turned = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).apply([1.0, 2.0, 3.0])
     by_position = {tuple(m): t for m, t in zip(random_splats().means.tolist(), turned, strict=True)}
@@ -116,7 +116,7 @@ def test_orientations_are_unit_quaternions_that_turn_as_ours_do(stage):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_coefficients_of_a_gaussian_stand_together(tmp_path, degree):
+def test_coefficients_of_a_gaussian_are_contiguous(tmp_path, degree):
     """Gaussian g's coefficient i in channel c is 1000 g + 10 i + c."""
     size = (degree + 1) ** 2
     g, i, c = torch.meshgrid(torch.arange(3.0), torch.arange(float(size)), torch.arange(3.0), indexing="ij")
@@ -130,7 +130,7 @@ def test_coefficients_of_a_gaussian_stand_together(tmp_path, degree):
     np.testing.assert_array_equal(splat.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(), expected)
 
 
-def test_the_extent_holds_three_sigmas_of_every_gaussian(stage):
+def test_the_extent_contains_three_sigmas_of_every_gaussian(stage):
     splat = splat_at(stage)
     low, high = np.array(splat.GetExtentAttr().Get())
     quats = np.array([[*q.GetImaginary(), q.GetReal()] for q in splat.GetOrientationsAttr().Get()])
@@ -141,7 +141,7 @@ def test_the_extent_holds_three_sigmas_of_every_gaussian(stage):
     assert (high - low < 30.0).all()
 
 
-def test_the_camera_is_where_and_when_it_recorded(stage, tiny_scene):
+def test_the_camera_has_the_recorded_poses_and_times(stage, tiny_scene):
     """Time codes are thirtieths of seconds since the first image; a world point falls on the pixel that K gives."""
     camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/camera"))
     assert stage.GetTimeCodesPerSecond() == 30.0
@@ -189,14 +189,14 @@ def pose_by_usd(stage: Usd.Stage, code: float) -> np.ndarray:
     return np.array(prim.ComputeLocalToWorldTransform(Usd.TimeCode(code))).T @ OPENCV_TO_USD
 
 
-def test_on_a_turning_path_the_camera_is_recorded_at_recorded_times(turning):
+def test_on_a_turning_path_recorded_times_have_recorded_poses(turning):
     stage = splat_stage({}, recorded_cameras(turning, "CAM_FRONT"), {})
     for frame in turning.frames:
         code = turning.seconds(frame.timestamp) * 30.0
         np.testing.assert_allclose(pose_by_usd(stage, code), frame.camera_to_world, atol=1e-7)
 
 
-def test_between_recorded_times_the_camera_stays_rigid_and_on_its_way(turning):
+def test_between_recorded_times_the_camera_stays_rigid_and_on_its_path(turning):
     """OpenUSD interpolates a matrix entry by entry: between poses that are far apart it shrinks and shears."""
     stage = splat_stage({}, recorded_cameras(turning, "CAM_FRONT"), {})
     last = max(turning.seconds(frame.timestamp) for frame in turning.frames)
@@ -208,7 +208,7 @@ def test_between_recorded_times_the_camera_stays_rigid_and_on_its_way(turning):
         np.testing.assert_allclose(pose[:3, 3], expected[:3, 3], atol=0.02)
 
 
-def test_the_camera_shown_is_the_one_asked_for(turning):
+def test_the_camera_is_the_requested_one(turning):
     """Images of another camera, elsewhere and between, are none of its path's."""
     other = tuple(
         dataclasses.replace(
@@ -222,7 +222,7 @@ def test_the_camera_shown_is_the_one_asked_for(turning):
     assert all(a.transform == b.transform for (_, a), (_, b) in zip(alone, among, strict=True))
 
 
-def test_oblong_pixels_and_an_axis_off_the_middle_are_those_of_K():
+def test_non_square_pixels_and_principal_point_are_those_of_K():
     K, size, camera_to_world = oblique_camera()
     in_camera = np.random.default_rng(0).uniform([-2, -1, 3], [2, 1, 9], (20, 3))
     points = in_camera @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
@@ -231,7 +231,7 @@ def test_oblong_pixels_and_an_axis_off_the_middle_are_those_of_K():
     np.testing.assert_allclose(found, projected[:, :2] / projected[:, 2:], atol=1e-3)
 
 
-def test_the_lens_is_one_of_a_sensor_36_mm_wide():
+def test_the_aperture_is_36_mm_wide():
     """UsdGeom.Camera's lengths are tenths of the scene's unit, which is a metre."""
     K, size, camera_to_world = oblique_camera()
     camera = usd_camera(K, size, camera_to_world)
@@ -240,7 +240,7 @@ def test_the_lens_is_one_of_a_sensor_36_mm_wide():
     assert camera.GetFieldOfView(Gf.Camera.FOVHorizontal) == pytest.approx(np.degrees(2 * np.arctan(160 / 310)))
 
 
-def test_the_package_is_one_binary_layer_without_the_machines_paths(package, stage):
+def test_the_package_is_one_binary_layer_without_paths_of_the_machine(package, stage):
     with zipfile.ZipFile(package) as archive:
         assert archive.namelist() == ["scene.usdc"]
         assert archive.read("scene.usdc").startswith(b"PXR-USDC")
@@ -257,14 +257,14 @@ def test_openusds_own_validators_find_nothing(stage):
 
 
 def test_a_scene_without_objects_has_no_actors(stage):
-    """Nor anything else but what stands still and the camera."""
+    """Nor any prim except static groups and the camera."""
     world = stage.GetPrimAtPath("/World")
     assert {prim.GetName() for prim in world.GetAllChildren()} == {"background", "camera"}
     background = UsdGeom.Xformable(stage.GetPrimAtPath("/World/background"))
     assert not background.GetOrderedXformOps() and not background.GetVisibilityAttr().IsAuthored()
 
 
-def test_a_package_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
+def test_an_unwritable_package_is_named_and_leaves_no_file(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ResultError, match=r"file/scene\.usdz: cannot be written"):
         write_usdz(tmp_path / "file/scene.usdz", splat_stage({}, [(0.0, Gf.Camera())], {}))
@@ -280,7 +280,7 @@ def little_room():
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def test_a_disk_that_is_full_is_told_and_the_package_before_stays(tmp_path, little_room):
+def test_a_full_disk_is_reported_and_the_previous_package_stays(tmp_path, little_room):
     (tmp_path / "scene.usdz").write_text("the one before")
     many = {"background": SampledGroup(random_splats(3000))}
     with pytest.raises(ResultError, match=r"scene\.usdz: cannot be written .*File too large.*; free space"):
@@ -290,7 +290,7 @@ def test_a_disk_that_is_full_is_told_and_the_package_before_stays(tmp_path, litt
 
 
 @pytest.mark.parametrize("raises", [True, False])
-def test_a_packer_that_fails_is_told_and_leaves_nothing(tmp_path, monkeypatch, raises):
+def test_a_failing_packer_is_reported_and_leaves_no_file(tmp_path, monkeypatch, raises):
     """OpenUSD raises its own error, or only returns False."""
     pack = UsdUtils.CreateNewUsdzPackage
     failing = (lambda layer, _: pack(layer, "/proc/nowhere/scene.usdz")) if raises else lambda *_: False
@@ -300,7 +300,7 @@ def test_a_packer_that_fails_is_told_and_leaves_nothing(tmp_path, monkeypatch, r
     assert not list(tmp_path.iterdir())
 
 
-def test_a_camera_that_the_scene_lacks_is_named(tmp_path, checkpoint, tiny_scene):
+def test_a_missing_camera_is_named(tmp_path, checkpoint, tiny_scene):
     job = UsdJob(eval_camera="CAM_BACK", gaussians=KEPT)
     with pytest.raises(DatasetError, match=r"scene 0001 .*CAM_BACK.*CAM_FRONT.*eval_camera"):
         export_usd(tmp_path / "scene.usdz", checkpoint, tiny_scene, job, PROVENANCE)

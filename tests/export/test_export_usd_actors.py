@@ -16,7 +16,7 @@ from pxr import Gf, Kind, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 from scipy.spatial.transform import Rotation
 
 from drivesplat.export import usd_asset
-from drivesplat.export.sampled_motion import sampled
+from drivesplat.export.sampled_motion import sample_motion
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.export.usd_asset import export_usd
@@ -118,7 +118,7 @@ def test_the_transform_is_one_matrix_that_stays_rigid_between_samples(stage, tra
 
 
 @pytest.mark.parametrize("track_id", COURSES)
-def test_an_object_is_seen_exactly_while_it_is_there(stage, track_id):
+def test_an_object_is_visible_exactly_while_it_is_present(stage, track_id):
     course = COURSES[track_id]
     for now in np.random.default_rng(1).uniform(-2.0, 7.0, 500):
         assert seen(stage, PATHS[track_id], now * 30.0) == course.is_there(now), now
@@ -139,7 +139,7 @@ def test_without_a_time_it_is_the_middle_image(stage):
     )
 
 
-def test_the_background_stands_still_and_is_always_seen(stage):
+def test_the_background_is_static_and_always_visible(stage):
     for code in (Usd.TimeCode.Default(), Usd.TimeCode(-100.0), Usd.TimeCode(60.0), Usd.TimeCode(1e6)):
         np.testing.assert_array_equal(matrix(stage, "/World/background", code), np.eye(4))
         assert seen(stage, "/World/background", code)
@@ -171,7 +171,7 @@ def test_the_extent_is_local_and_moves_with_the_object(stage):
         assert (np.array(bounds.GetMax()) - np.array(bounds.GetMin()) < 16.0).all()
 
 
-def test_an_object_says_which_track_it_is_and_of_what_class_and_size(stage):
+def test_an_object_has_its_track_class_and_size(stage):
     known, unknown = (stage.GetPrimAtPath(PATHS[name]) for name in (TURNING, GONE_AT_TIMES))
     about = {"track": TURNING, "category": "vehicle.car", "size": Gf.Vec3d(4.0, 2.0, 1.6)}
     assert known.GetCustomDataByKey("drivesplat") == about
@@ -199,7 +199,7 @@ def still(count: int) -> SampledGroup:
 
 
 def moving(count: int) -> SampledGroup:
-    motion = sampled(COURSES[TURNING].motion, np.array([]), 1.0)
+    motion = sample_motion(COURSES[TURNING].motion, np.array([]), 1.0)
     return SampledGroup(some_gaussians(count, 0, count), motion)
 
 
@@ -217,7 +217,7 @@ def test_every_group_is_a_prim(tmp_path):
     assert found == {"/World/background": 4, "/World/kerb_7_x": 2, "/World/empty": 0, "/World/actors/car": 3}
 
 
-def test_names_that_would_be_one_identifier_become_two():
+def test_equal_identifiers_are_made_unique():
     groups = {"a b": moving(1), "a/b": moving(2), "1b": moving(3), "2b": moving(4), "_1b": moving(5)}
     found = counts(splat_stage(groups, [(0.0, Gf.Camera())], {}))
     assert found == {
@@ -233,7 +233,7 @@ def test_group_names_do_not_collide_with_the_camera_or_the_actors():
     assert stage.GetPrimAtPath("/World/actors").GetTypeName() == "Xform"
 
 
-def test_an_object_may_be_called_like_the_camera():
+def test_an_object_may_have_the_name_of_the_camera():
     found = counts(splat_stage({"camera": moving(1), "background": moving(2)}, [(0.0, Gf.Camera())], {}))
     assert found == {"/World/actors/camera": 1, "/World/actors/background": 2}
 

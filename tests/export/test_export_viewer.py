@@ -112,14 +112,14 @@ def decoded(page: str) -> tuple[dict, dict[str, np.ndarray]]:
     return scene, arrays
 
 
-def test_the_page_has_no_address_that_a_browser_would_fetch(page):
+def test_the_page_has_no_address_to_request(page):
     assert "default-src 'none'" in page and "connect-src" not in page
     assert re.findall(r"""\b(?:src|href|srcset|action|data)\s*=\s*["']?([^"'\s>]+)""", page) == ["data:,"]
     assert not re.search(r"https?:|wss?:|@import|url\(|\bimport\b", page)
     assert not re.search(r"\b(fetch|importScripts|XMLHttpRequest|WebSocket|EventSource|sendBeacon|Worker)\b", page)
 
 
-def test_the_payload_holds_the_gaussians_that_cover_most(page):
+def test_the_payload_has_the_gaussians_of_largest_coverage(page):
     gaussians = splats()
     areas = gaussians.scales.sort(dim=1).values[:, 1:].prod(dim=1)
     covered = gaussians.opacities * areas.clamp(max=10.0 * float(areas.median()))
@@ -136,7 +136,7 @@ def test_the_payload_holds_the_gaussians_that_cover_most(page):
     np.testing.assert_allclose(scene["sh_range"] * root * abs(root), expected.sh[:, 1:], atol=scene["sh_range"] / 120)
 
 
-def test_objects_are_where_they_are_at_the_middle_image_and_only_if_they_are_there(tmp_path, tiny_scene, monkeypatch):
+def test_objects_present_at_the_middle_image_are_placed_there(tmp_path, tiny_scene, monkeypatch):
     """Two vehicles, of which one is absent then; beside a background without view dependence."""
     model = SplatModel([round_gaussians([[1.0, 2.0, 3.0]]), Traffic()], None)
     monkeypatch.setattr(viewer, "trained_model", lambda _: (model, None))
@@ -163,7 +163,7 @@ def test_the_start_is_the_middle_key_frame_of_the_evaluated_camera(page, tiny_sc
     assert (start["width"], start["height"]) == (frame.width, frame.height)
 
 
-def test_title_and_provenance_are_there_and_cannot_end_their_elements(page):
+def test_title_and_provenance_are_escaped(page):
     assert "<title>0001 · vanilla</title>" in page
     assert json.loads(element(page, "provenance")) == PROVENANCE
     assert "<b>" not in page
@@ -172,14 +172,14 @@ def test_title_and_provenance_are_there_and_cannot_end_their_elements(page):
     )
 
 
-def test_equal_inputs_make_an_equal_page_of_bounded_size(page):
+def test_the_page_is_deterministic_and_of_bounded_size(page):
     again = [viewer_page(splats(), a_sky(), True, oblique_frame(), "t", PROVENANCE) for _ in range(2)]
     assert again[0] == again[1]
     # 12 + 6 + 8 + 1 + 6 + 24 bytes a Gaussian and the sky, in base64 at worst; the rest of the page
     assert len(page) < 1.34 * (57 * KEPT + 6 * 256**2 * 3) + 40_000
 
 
-def test_arrays_begin_where_any_type_can_be_read():
+def test_arrays_are_aligned_for_every_type():
     layout, _ = packed({"a": np.zeros(3, np.uint8), "b": np.zeros(2, np.float32), "c": np.zeros(1, np.float16)})
     assert [entry["offset"] for entry in layout] == [0, 4, 12]
 
@@ -197,7 +197,7 @@ class DirectionSky(Sky):
         return {}
 
 
-def test_the_sky_is_where_opengl_looks_for_it():
+def test_the_sky_has_the_orientation_of_opengl():
     size, faces = 64, sky_faces(DirectionSky(), 64)
     rays = np.random.default_rng(0).normal(size=(200, 3))
     for x, y, z in rays / np.linalg.norm(rays, axis=1, keepdims=True):
@@ -225,7 +225,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 @in_a_browser
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_a_browser_shows_from_disk_what_the_model_renders(tmp_path, antialiased):
+def test_a_browser_renders_the_page_from_disk_as_the_model_does(tmp_path, antialiased):
     gaussians, sky, frame = splats(400, sh_degree=3), a_sky(), oblique_frame()
     if antialiased:  # small enough for it to matter
         gaussians = replace(gaussians, scales=0.2 * gaussians.scales)
@@ -260,7 +260,7 @@ def test_a_browser_shows_from_disk_what_the_model_renders(tmp_path, antialiased)
 
 
 @in_a_browser
-def test_a_request_and_an_error_of_the_page_would_be_noticed(tmp_path):
+def test_requests_and_errors_of_the_page_are_detected(tmp_path):
     page = viewer_page(splats(), None, False, oblique_frame(), "test", {})
     file = tmp_path / "viewer.html"
     file.write_text(page.replace('"use strict";', '"use strict"; fetch("https://example.org/x");', 1), encoding="utf-8")

@@ -2,7 +2,7 @@
 
 const HINT = "Drag: look · right drag: orbit · shift drag: pan · wheel or W A S D Q E: move · R: back to the start";
 
-// The arrays by name, from base64 of what zlib deflated: one after the other, little endian (as WebGL's machines are).
+// The arrays by name from zlib-compressed base64, one after the other in little-endian order (that of WebGL machines).
 async function unpacked(text, layout) {
   const packed = atob(text);
   const bytes = new Uint8Array(packed.length);
@@ -18,7 +18,7 @@ async function openPage() {
   const text = (id) => document.getElementById(id).textContent;
   const scene = JSON.parse(text("scene"));
   const arrays = await unpacked(text("payload"), scene.arrays);
-  document.getElementById("payload").remove(); // megabytes that nothing needs any more
+  document.getElementById("payload").remove(); // no longer needed, megabytes
   const canvas = document.querySelector("canvas");
   const draw = painter(canvas, scene, arrays);
   let [view, waiting] = [null, false];
@@ -37,7 +37,7 @@ async function openPage() {
     canvas.height = Math.max(1, Math.round(canvas.clientHeight * sharpness));
     redraw();
   };
-  canvas.addEventListener("webglcontextlost", () => tell("The graphics card was taken away: reload the page."));
+  canvas.addEventListener("webglcontextlost", () => tell("The browser lost access to the GPU: reload the page."));
   addEventListener("resize", fit);
   followInput(canvas, scene.start, (next) => { view = next; redraw(); });
   fit();

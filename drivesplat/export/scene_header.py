@@ -1,4 +1,4 @@
-"""What places an export in the world: the scene it is of, and how its coordinates are to be read."""
+"""The common header of exported JSON files: scene, coordinate conventions and origin."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,8 +8,8 @@ from drivesplat.scene.scene import Scene
 GLOBAL = "A position in the dataset's global frame is its world position plus origin."
 
 
-def placement(scene: Scene, schema: int, conventions: Mapping[str, str]) -> dict[str, Any]:
-    """How a record of `scene` begins; `origin` (3,) in metres keeps its float64."""
+def scene_header(scene: Scene, schema: int, conventions: Mapping[str, str]) -> dict[str, Any]:
+    """The first entries of a record of `scene`; `origin` (3,) in metres, with full float64 precision."""
     return {
         "schema": schema,
         "scene": scene.name,
