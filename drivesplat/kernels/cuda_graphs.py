@@ -90,6 +90,18 @@ def capture(
     return None
 
 
+def retry_without_graphs(work: Callable[[], T], drop_graphs: Callable[[], bool]) -> T:
+    """Runs `work`; where memory runs out, calls `drop_graphs` and runs it again. Raises torch's OutOfMemoryError where
+    `drop_graphs` returns False since there were no graphs, and where memory runs out again."""
+    try:
+        return work()
+    except torch.cuda.OutOfMemoryError:
+        if not drop_graphs():
+            raise
+    torch.cuda.empty_cache()
+    return work()
+
+
 def _first_line(error: Exception) -> str:
     """The first error's first line: an error during a capture makes the end of the capture fail as well."""
     return str(error.__context__ or error).splitlines()[0]

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from drivesplat.kernels import capacity, triton_support
-from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool
+from drivesplat.kernels.cuda_graphs import CudaGraph, capture, capture_stream, new_pool, retry_without_graphs
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -70,14 +70,14 @@ class GpuFrameRenderer:
     @torch.no_grad()
     def _retry_without_graph(self, render: Callable[[FrameInput], PendingFrame], wanted: FrameInput) -> PendingFrame:
         """Runs `render`; where memory runs out, again without a graph, and none is captured any more."""
-        try:
-            return render(wanted)
-        except torch.cuda.OutOfMemoryError:
-            if self._graph is None:
-                raise
+        return retry_without_graphs(partial(render, wanted), self._drop_graph)
+
+    def _drop_graph(self) -> bool:
+        """Stops capturing; returns False where there is no graph."""
+        if self._graph is None:
+            return False
         self._graph, self._captures = None, False
-        torch.cuda.empty_cache()
-        return render(wanted)
+        return True
 
     def _planned(self, wanted: FrameInput) -> PendingFrame:
         """A frame with planned capacities, by the entries that earlier frames needed."""

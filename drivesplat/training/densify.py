@@ -1,4 +1,4 @@
-"""The densification of a model's parts: each part its own gsplat strategy and state."""
+"""Densification of a model's parts, each with its own gsplat strategy and state."""
 
 import math
 from collections.abc import Callable
@@ -7,10 +7,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
+from torch.optim import Adam
 
 from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.optimizers import Optimizers
 
 
 class Densifier:
@@ -24,7 +24,7 @@ class Densifier:
         self._part = part
         self._by_gradient = settings.strategy == "default"
         self._cap = part.cap_max or settings.cap_max
-        self._few, self._few_until = few_at_first(self._cap, settings)
+        self._coarse_cap, self._coarse_until = coarse_cap(self._cap, settings)
         self._strategy = strategies.make_strategy(settings, part, self._cap, preallocates)
         self._on_cpu = cpu_strategies
         self._dead = 0.0 if self._by_gradient else settings.mcmc.min_opacity
@@ -36,36 +36,32 @@ class Densifier:
         """Whether Gaussians may be added, moved or removed after `step`."""
         return step % self._every == 0
 
-    def _room(self, step: int, coarse: bool) -> int:
-        """How many there may be after `step`, in which images were `coarse` or whole."""
-        return self._few if coarse and step < self._few_until else self._cap
-
     def any_alive(self) -> bool:
-        """Whether a Gaussian is left; one that MCMC would relocate for its opacity is not."""
+        """Whether a Gaussian is left whose opacity is above the threshold of relocation by MCMC."""
         opacities = self._part.params["opacities"]
         return bool(torch.sigmoid(opacities).gt(self._dead).any())
 
     def after_step(
-        self, step: int, optimizers: Optimizers, info: dict[str, Any], rows: slice, coarse: bool = False
+        self, step: int, optimizers: dict[str, Adam], info: dict[str, Any], rows: slice, coarse: bool = False
     ) -> None:
-        """Grows, prunes and moves Gaussians after the optimizers have stepped; `rows` of what was rendered, `coarse` or
-        whole, are theirs.
+        """Adds, removes and relocates Gaussians after a step of the optimizers. `rows` are those of the part in the
+        rendering; `coarse` says that the image was reduced.
 
-        Draws from torch's global generator, as gsplat does.
+        Uses torch's global random generator, as gsplat does.
         """
         params = self._part.params
         if len(self._part) == 0 or (self.due(step) and not self.any_alive()):
-            return  # nothing is left to grow from; the model's other parts may go on
-        self._strategy.cap_max = self._room(step, coarse)
+            return  # no Gaussian is left to grow from; other parts of the model may continue
+        self._strategy.cap_max = self._coarse_cap if coarse and step < self._coarse_until else self._cap
         if self._by_gradient:
-            info = _own(info, rows)
+            info = _info_of_rows(info, rows)
         extra = {} if self._by_gradient else {"lr": optimizers["means"].param_groups[0]["lr"]}
         with nullcontext() if params["means"].is_cuda else self._on_cpu():
             self._strategy.step_post_backward(params, optimizers, self.state, step, info, **extra)
         if step >= self._strategy.refine_stop_iter:
             self.end(optimizers)
 
-    def end(self, optimizers: Optimizers) -> None:
+    def end(self, optimizers: dict[str, Adam]) -> None:
         """Drops the preallocated rows that are left."""
         if self._part.preallocated:
             from drivesplat.training.cuda_graph.preallocation import release_rows
@@ -73,18 +69,18 @@ class Densifier:
             release_rows(self._part, optimizers)
 
 
-def few_at_first(cap: int, settings: TrainSettings) -> tuple[int, int]:
-    """How many of `cap` Gaussians there may be while images are reduced, and until which iteration: late enough for
-    them to grow to all of them before densification stops."""
+def coarse_cap(cap: int, settings: TrainSettings) -> tuple[int, int]:
+    """The cap while images are reduced, and the iteration at which it ends at the latest: early enough to grow to the
+    full `cap` before densification stops."""
     share, mcmc = settings.coarse_to_fine.share, settings.mcmc
     if settings.strategy != "mcmc" or share == 1.0 or mcmc.growth == 0.0:
         return cap, 0
-    times = math.ceil(-math.log(share) / math.log1p(mcmc.growth)) + 1
-    return max(1, int(share * cap)), int(settings.refine_stop * settings.iterations) - times * mcmc.refine_every
+    steps = math.ceil(-math.log(share) / math.log1p(mcmc.growth)) + 1
+    return max(1, int(share * cap)), int(settings.refine_stop * settings.iterations) - steps * mcmc.refine_every
 
 
-def _own(info: dict[str, Any], rows: slice) -> dict[str, Any]:
-    """What a rendering tells gsplat's DefaultStrategy about some of its Gaussians."""
+def _info_of_rows(info: dict[str, Any], rows: slice) -> dict[str, Any]:
+    """The `info` of a rendering for gsplat's DefaultStrategy, of some rows only."""
     means2d = info["means2d"]
     gradients = {name: getattr(means2d, name, None) for name in ("grad", "absgrad")}
     own = {name: values[:, rows] for name, values in gradients.items() if values is not None}

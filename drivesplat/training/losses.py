@@ -1,4 +1,4 @@
-"""The terms of the training loss, each named, so that each can be logged and blamed."""
+"""The terms of the training loss, by name, for logs and error messages."""
 
 import torch
 import torch.nn.functional as F
@@ -13,16 +13,16 @@ from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.views import LidarDepth, TrainingView
 
-WORST = 0.05
-"""The share of depths that the loss leaves out."""
+IGNORED_DEPTHS = 0.05
+"""Fraction of the depths that the loss ignores: those with the largest errors."""
 
 
 def loss_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The weighted terms whose sum is minimised; what is absent from the picture is not regularised either, since
-    nothing in it could hold against that. Of what the own car's body hides nothing is asked."""
-    shown = picture.gaussians
+    """The weighted terms whose sum is minimised. Gaussians that are absent at the view's time are not regularised,
+    since the image could not counteract. Pixels of the ego vehicle have no effect."""
+    gaussians = picture.gaussians
     alpha = picture.alpha if view.own_car is None else picture.alpha.masked_fill(view.own_car, 1.0)
     moving = view.moving if settings.dynamic_weight > 0 else None
     difference = color_difference(picture.image, view.pixels, view.own_car, moving)
@@ -34,8 +34,8 @@ def loss_terms(
         terms["dynamic"] = settings.dynamic_weight * difference.moving_l1
     regularizers = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
     if any(regularizers.values()):
-        means, share = mean_opacity_and_scale(shown.opacities, shown.scales), active_fraction(model.parts)
-        terms |= {name: w * mean / share for (name, w), mean in zip(regularizers.items(), means, strict=True) if w}
+        means, active = mean_opacity_and_scale(gaussians.opacities, gaussians.scales), active_fraction(model.parts)
+        terms |= {name: w * mean / active for (name, w), mean in zip(regularizers.items(), means, strict=True) if w}
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
@@ -46,16 +46,16 @@ def loss_terms(
     if logits is not None:
         terms["semantic"] = settings.semantic_weight * class_cross_entropy(logits, view.classes)
     for name, learned in (("exposure", model.exposure), ("camera_poses", model.camera_poses)):
-        paid = learned.penalty(view.view.camera) if learned is not None else None
-        if paid is not None:
-            terms[name] = paid
-    return {**terms, **_moving_terms(picture, view, model, settings)}
+        penalty = learned.penalty(view.view.camera) if learned is not None else None
+        if penalty is not None:
+            terms[name] = penalty
+    return {**terms, **_dynamic_terms(picture, view, model, settings)}
 
 
-def _moving_terms(
+def _dynamic_terms(
     picture: Picture, view: TrainingView, model: SplatModel, settings: TrainSettings
 ) -> dict[str, Float[Tensor, ""]]:
-    """The terms about parts that move, their colours aside; none for a model without."""
+    """The terms of dynamic parts, colours excepted; none for a model without such parts."""
     terms = {name: term for part in model.parts for name, term in part.penalties().items()}
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
@@ -70,27 +70,27 @@ def sky_cross_entropy(alpha: Float[Tensor, "h w"], sky: Bool[Tensor, "h w"]) -> 
 
 
 def class_cross_entropy(logits: Float[Tensor, "h w c"], classes: UInt8[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """Mean over the labelled pixels of -log of the softmax of the class that is there (Street Gaussians, section 3.3);
-    0 where no pixel is labelled."""
+    """Mean cross entropy over the labelled pixels (Street Gaussians, section 3.3); 0 where no pixel is labelled."""
     flat = classes.reshape(-1).long()
     total = F.cross_entropy(logits.reshape(len(flat), -1), flat, ignore_index=UNLABELLED, reduction="sum")
     return total / (flat != UNLABELLED).sum().clamp(min=1)
 
 
 def depth_loss(depth: Float[Tensor, "h w"], lidar: LidarDepth) -> Float[Tensor, ""]:
-    """Mean absolute difference in metres where LiDAR measured, the worst 5 % left out (Street Gaussians, section 3.3):
-    returns from behind an edge, or from what the image does not see."""
+    """Mean absolute difference to the LiDAR depths in metres, without the largest 5 % (Street Gaussians, section 3.3):
+    these are returns from behind an edge, or of surfaces that the image does not show."""
     errors = (depth.reshape(-1).index_select(0, lidar.pixels) - lidar.depth).abs()
-    kept = max(1, int(len(errors) * (1.0 - WORST)))
+    kept = max(1, int(len(errors) * (1.0 - IGNORED_DEPTHS)))
     return torch.topk(errors, kept, largest=False, sorted=False).values.mean()
 
 
 def entropy(alpha: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """Mean of -o ln o - (1 - o) ln (1 - o): least where everything is there or not there."""
+    """Mean of -o ln o - (1 - o) ln (1 - o): smallest for opacities near 0 or 1."""
     o = alpha.clamp(1e-4, 1.0 - 1e-4)
     return -(o * torch.log(o) + (1.0 - o) * torch.log1p(-o)).mean()
 
 
 def sky_alpha_loss(alpha: Float[Tensor, "h w"], sky: Tensor) -> Float[Tensor, ""]:
-    """Mean over the image of -log(1 - alpha) on sky pixels: the half of the cross entropy that empties the sky."""
+    """Mean over the image of -log(1 - alpha) on sky pixels: the part of the cross entropy that removes Gaussians from
+    the sky."""
     return (-torch.log((1.0 - alpha).clamp(min=1e-4)) * sky).mean()

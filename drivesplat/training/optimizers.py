@@ -14,13 +14,12 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.train import TrainSettings
 
 DECAY = 0.01
-"""Positions, and what is learned of cameras, learn at the end at this fraction of their initial rate."""
+"""Final learning rate of positions and cameras, as a fraction of the initial rate."""
 
 
 class Adam(torch.optim.Adam):
-    """torch.optim.Adam, fused, of one parameter, for `ModelOptimizers`: its fields and the format of its state, had
-    without torch's compiler. Torch's own methods read that when they are first called, which takes a second or more,
-    and no training compiles."""
+    """torch.optim.Adam, fused, of one parameter, for `ModelOptimizers`: the same fields and format of state. Its own
+    methods avoid torch's, whose first call imports torch's compiler, which takes a second or more."""
 
     def __init__(self, parameter: nn.Parameter, rate: float):
         super().__init__([parameter], lr=rate, eps=1e-15, fused=True)
@@ -34,8 +33,8 @@ class Adam(torch.optim.Adam):
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         self.param_groups.append({**self.defaults, **param_group})
 
-    def started(self) -> dict[str, Tensor]:
-        """What is known of the parameter, which begins with nothing."""
+    def initialized(self) -> dict[str, Tensor]:
+        """The state of the parameter, created on first use."""
         parameter = self.parameter
         state = self.state[parameter]
         if not state:
@@ -54,8 +53,8 @@ Optimizers = dict[str, Adam]
 
 @dataclass
 class ModelOptimizers:
-    """`parts[i]` belongs to the Gaussians of part i of the model, `shared[i]` to what they share, `beside_parts`, by
-    name, to what the model learns beside them: its sky, its cameras' exposure and poses."""
+    """The optimizers of a model: `parts[i]` for the Gaussians of part i, `shared[i]` for its shared parameters,
+    `beside_parts`, by name, for sky, exposure and camera poses."""
 
     parts: list[Optimizers]
     shared: list[Optimizers]
@@ -70,18 +69,18 @@ class ModelOptimizers:
 
     @torch.no_grad()
     def step(self, rates: Mapping[str, Tensor] | None = None) -> None:
-        """A step of every optimizer with a gradient, which is dropped; at the `rates` that the device knows, by name,
-        where they are told.
+        """Steps every optimizer that has a gradient and drops the gradient; with the `rates` in device memory, by name,
+        where given.
 
-        What torch.optim.Adam does with `fused`, whose state this is; but all steps are counted at once. A step of each
-        by itself takes Python longer than the GPU.
+        The same as torch.optim.Adam with `fused`, but all step counters are incremented at once: separate steps take
+        Python longer than the GPU.
         """
         ready: list[tuple[nn.Parameter, dict[str, Tensor], float | Tensor, dict[str, Any]]] = []
         for name, optimizer in self.all():
             parameter, (group,) = optimizer.parameter, optimizer.param_groups
             if parameter.grad is not None:
                 rate = group["lr"] if rates is None else rates[name]
-                ready.append((parameter, optimizer.started(), rate, group))
+                ready.append((parameter, optimizer.initialized(), rate, group))
         if ready:
             torch_private.increment([state["step"] for _, state, _, _ in ready])
         for parameter, state, rate, group in ready:
@@ -131,15 +130,15 @@ def _adams(params: nn.ParameterDict, rates: dict[str, float]) -> Optimizers:
 
 
 def set_learning_rates(model: SplatModel, optimizers: ModelOptimizers, step: int, settings: TrainSettings) -> None:
-    """Sets the learning rates of `step`: those of positions and of cameras decay exponentially, exposures' being 0
-    until they start; the rest stay."""
+    """Sets the learning rates of `step`. Those of positions and cameras decay exponentially, and that of exposures is 0
+    until they start; the others are constant."""
     done = step / settings.iterations
-    left = DECAY**done
+    decay = DECAY**done
     for part, group in zip(model.parts, optimizers.parts, strict=True):
         if "means" in group:
-            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * left
+            group["means"].param_groups[0]["lr"] = part.learning_rates()["means"] * decay
     begins = {"exposure": settings.exposure.start, "camera_poses": 0.0}
     for name, start in begins.items():
         for camera, optimizer in optimizers.beside_parts.get(name, {}).items():
             rate = model.beside_parts[name].learning_rates()[camera] if done >= start else 0.0
-            optimizer.param_groups[0]["lr"] = rate * left
+            optimizer.param_groups[0]["lr"] = rate * decay

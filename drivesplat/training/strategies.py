@@ -1,4 +1,4 @@
-"""gsplat's densification strategies as this workflow runs them: capped, resetting, and on the CPU."""
+"""gsplat's densification strategies with a cap, opacity resets, and preallocated rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,26 +8,26 @@ import torch
 from gsplat import MCMCStrategy
 from gsplat.strategy import ops
 from torch import Tensor
+from torch.optim import Adam
 
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import HookedDefaultStrategy
 from drivesplat.model.part import Part
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.cuda_graph.preallocation import activate, release_rows, reserve_rows
-from drivesplat.training.optimizers import Optimizers
 
 
 class CappedDefaultStrategy(HookedDefaultStrategy):
-    """gsplat's DefaultStrategy with at most `cap_max` Gaussians: where more want to grow, the largest gradients do.
+    """gsplat's DefaultStrategy with at most `cap_max` Gaussians: beyond, only those with the largest gradients grow.
 
-    It resets opacities every `reset_every` iterations, as 3DGS does; gsplat 1.5.3 never comes to it, since
-    its condition `step % reset_every == 0 & step > 0` reads as `... == (0 & step) > 0`.
+    Resets opacities every `reset_every` iterations, as 3DGS does; gsplat 1.5.3 never does, since its condition
+    `step % reset_every == 0 & step > 0` means `... == (0 & step) > 0`.
     """
 
     cap_max: int = 1_500_000
 
     def step_post_backward(
-        self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
+        self, params: Any, optimizers: dict[str, Adam], state: dict[str, Any], step: int, info: dict[str, Any]
     ) -> None:
         super().step_post_backward(params, optimizers, state, step, info, packed=False)
         if 0 < step < self.refine_stop_iter and step % self.reset_every == 0:
@@ -36,11 +36,11 @@ class CappedDefaultStrategy(HookedDefaultStrategy):
     @torch.no_grad()
     def before_growth(self, state: dict[str, Any]) -> None:
         gradients = state["grad2d"] / state["count"].clamp_min(1)
-        room = max(0, self.cap_max - len(gradients))
-        wanting = torch.nonzero(gradients > self.grow_grad2d)[:, 0]
-        if len(wanting) > room:
-            weakest_first = wanting[torch.argsort(gradients[wanting])]
-            state["grad2d"][weakest_first[: len(wanting) - room]] = 0.0
+        allowed = max(0, self.cap_max - len(gradients))
+        growing = torch.nonzero(gradients > self.grow_grad2d)[:, 0]
+        if len(growing) > allowed:
+            smallest_first = growing[torch.argsort(gradients[growing])]
+            state["grad2d"][smallest_first[: len(growing) - allowed]] = 0.0
 
 
 @dataclass
@@ -55,7 +55,13 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
 
     @torch.no_grad()
     def step_post_backward(
-        self, params: Any, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any], lr: float
+        self,
+        params: Any,
+        optimizers: dict[str, Adam],
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        lr: float,
     ) -> None:
         if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
             state["binoms"] = state["binoms"].to(params["means"].device)
@@ -64,7 +70,7 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
         explore(params, lr * self.noise_lr)
 
     @torch.no_grad()
-    def relocate_dead(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
+    def relocate_dead(self, params: Any, optimizers: dict[str, Adam], binoms: Tensor) -> int:
         dead = torch.sigmoid(params["opacities"]) <= self.min_opacity
         dead[len(self.part) :] = False
         count = int(dead.sum())
@@ -73,7 +79,7 @@ class PreallocatingMcmcStrategy(MCMCStrategy):
         return count
 
     @torch.no_grad()
-    def add_new(self, params: Any, optimizers: Optimizers, binoms: Tensor) -> int:
+    def add_new(self, params: Any, optimizers: dict[str, Adam], binoms: Tensor) -> int:
         count = len(self.part)
         more = max(0, min(self.cap_max, int((1.0 + self.growth) * count)) - count)
         if more > self.part.preallocated:

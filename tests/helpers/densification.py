@@ -13,7 +13,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
-from drivesplat.training.densify import Densifier, Optimizers
+from drivesplat.training.densify import Densifier
+from drivesplat.training.optimizers import Optimizers
 
 ALL = slice(None)
 """The rows of a lone part."""

@@ -19,7 +19,7 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.train import DefaultSettings, McmcSettings
-from drivesplat.training.densify import Densifier, few_at_first
+from drivesplat.training.densify import Densifier, coarse_cap
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.trainer import Trainer
 
@@ -134,14 +134,14 @@ def test_mcmc_grows_by_the_share_it_is_told():
     assert counts == [100, 100, 125, 125, 156, 156, 170, 170]
 
 
-def test_there_are_few_at_first_in_time_to_become_all():
+def test_there_are_coarse_cap_in_time_to_become_all():
     """A third more needs six times a twentieth, and another for what is rounded away."""
     coarse = CoarseToFineSettings(share=0.75)
     told = {"coarse_to_fine": coarse, "refine_stop": 0.8, "mcmc": McmcSettings(refine_every=20)}
-    assert few_at_first(1000, settings_of("mcmc", **told)) == (750, 800 - 7 * 20)
+    assert coarse_cap(1000, settings_of("mcmc", **told)) == (750, 800 - 7 * 20)
     for left_alone in ({"mcmc": McmcSettings(growth=0.0)}, {"coarse_to_fine": CoarseToFineSettings(share=1.0)}):
-        assert few_at_first(1000, settings_of("mcmc", **{**told, **left_alone})) == (1000, 0)
-    assert few_at_first(1000, settings_of("default", **told)) == (1000, 0)
+        assert coarse_cap(1000, settings_of("mcmc", **{**told, **left_alone})) == (1000, 0)
+    assert coarse_cap(1000, settings_of("default", **told)) == (1000, 0)
 
 
 def test_while_images_are_reduced_there_is_room_for_fewer():

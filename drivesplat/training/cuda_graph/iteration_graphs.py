@@ -14,7 +14,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from drivesplat.kernels import capacity
+from drivesplat.kernels import capacity, cuda_graphs
 from drivesplat.kernels.cuda_graphs import CudaGraph, MemoryPool, capture, graphs_supported, new_pool
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages
@@ -77,15 +77,15 @@ class IterationGraphs:
 
     def retry_without_graphs(self, work: Callable[[], T]) -> T:
         """Runs `work`; where memory runs out, again without graphs, which are then no longer `enabled`."""
-        try:
-            return work()
-        except torch.cuda.OutOfMemoryError:
-            if not self._graphs:
-                raise
+        return cuda_graphs.retry_without_graphs(work, self._drop_all)
+
+    def _drop_all(self) -> bool:
+        """Disables graphs; returns False where there are none."""
+        if not self._graphs:
+            return False
         log.warning("no GPU memory is left for CUDA graphs: training takes longer without them; lower train.cap_max")
         self._disable()
-        torch.cuda.empty_cache()
-        return work()
+        return True
 
     def check(self) -> None:
         """Drops the graphs whose lists overflowed, to be captured with more capacity. Waits for the device."""

@@ -8,18 +8,18 @@ gradient, and is moved neither by Adam nor by the noise of MCMC.
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.optim import Adam
 
 from drivesplat.kernels import gsplat_private
 from drivesplat.kernels.relocation import relocation
 from drivesplat.model.part import Part
-from drivesplat.training.optimizers import Optimizers
 
 INACTIVE = -1000.0
 """Log scale and opacity logit whose exponential and sigmoid are exactly 0 in single precision."""
 
 
 @torch.no_grad()
-def reserve_rows(part: Part, optimizers: Optimizers, rows: int) -> None:
+def reserve_rows(part: Part, optimizers: dict[str, Adam], rows: int) -> None:
     """Adds preallocated rows up to `rows` rows in all."""
     more, active = rows - part.row_count, len(part)
 
@@ -37,7 +37,7 @@ def reserve_rows(part: Part, optimizers: Optimizers, rows: int) -> None:
 
 
 @torch.no_grad()
-def release_rows(part: Part, optimizers: Optimizers) -> None:
+def release_rows(part: Part, optimizers: dict[str, Adam]) -> None:
     """Drops all preallocated rows."""
     active = len(part)
 
