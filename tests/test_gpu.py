@@ -1,4 +1,4 @@
-"""What needs a GPU: gsplat against the reference, trainings on the card, and a card that is full."""
+"""Tests that need a GPU: gsplat compared with the reference, trainings, films, CUDA graphs, and exhausted memory."""
 
 import math
 import re
@@ -119,7 +119,7 @@ def test_gpu_tensors_are_rendered_by_gsplat(monkeypatch):
     assert {"means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"} <= info.keys()
 
 
-def test_nothing_in_view_is_zeros_and_finite_gradients():
+def test_without_a_gaussian_in_view_images_are_zero_and_gradients_finite():
     scene = {name: value.to(GPU, torch.float32) for name, value in random_scene(50).items()}
     scene["means"][:, 2] = -5.0
     for name in INPUTS:
@@ -131,7 +131,7 @@ def test_nothing_in_view_is_zeros_and_finite_gradients():
 
 
 @pytest.mark.parametrize("with_depth", [False, True])
-def test_no_gaussians_at_all_show_nothing(with_depth):
+def test_an_empty_set_of_gaussians_gives_an_empty_image(with_depth):
     scene = {name: tensor.to(GPU).float() for name, tensor in random_scene(count=5).items()}
     none = [scene[name][:0] for name in INPUTS]
     rendering = rasterize(*none, scene["viewmats"], scene["Ks"], WIDTH, HEIGHT, sh_degree=3, with_depth=with_depth)
@@ -139,8 +139,8 @@ def test_no_gaussians_at_all_show_nothing(with_depth):
     assert not rendering.image.any() and not rendering.alpha.any() and (rendering.depth is not None) == with_depth
 
 
-def test_a_films_frame_and_a_removal_are_those_of_the_cpu():
-    """The card shows what the CPU shows, and where no removed Gaussian reaches both of its pictures are equal."""
+def test_film_frames_and_removals_agree_with_the_cpu():
+    """Frames equal those of the CPU; pixels that no removed Gaussian reaches are equal before and after the removal."""
     scene = random_scene()
     background = Background(
         {
@@ -168,8 +168,8 @@ def test_a_films_frame_and_a_removal_are_those_of_the_cpu():
     assert not torch.equal(before.image, after.image)
 
 
-def test_actors_are_on_the_card_where_they_are_on_the_cpu():
-    """Places, colours and presence of two cars, of which one comes later; what a view sees of them by themselves."""
+def test_actors_agree_with_the_cpu():
+    """Positions, colors and presence of two cars, one of which appears later, and the alpha of the objects alone."""
     model = untrained_street(settings_of())
     with torch.no_grad():
         for value in (value for value in model.parameters() if value.requires_grad):
@@ -189,7 +189,7 @@ def test_actors_are_on_the_card_where_they_are_on_the_cpu():
     assert float(alone.max()) > 0.1 and float((alone - alone_on_cpu).abs().quantile(0.99)) < 1e-3
 
 
-def test_relocation_is_gsplats():
+def test_relocation_in_torch_agrees_with_gsplat():
     generator = torch.Generator().manual_seed(0)
     ratios = torch.arange(1, 21).repeat(50)
     opacities = torch.rand(len(ratios), generator=generator) * 0.97 + 0.02
@@ -212,25 +212,25 @@ def gpu_views() -> list:
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory) -> dict[str, float]:
-    """By strategy, the PSNR of a training that nothing disturbed."""
+    """By strategy, the PSNR of a training without interruption."""
     folder = tmp_path_factory.mktemp("uninterrupted")
     models = {s: trained(folder / s, gpu_settings(s), gpu_views(), device=GPU)[0] for s in ("mcmc", "default")}
     return {strategy: mean_psnr(model, gpu_views()) for strategy, model in models.items()}
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
-def test_a_training_comes_nearer_to_its_images(uninterrupted, strategy):
+def test_a_training_increases_psnr(uninterrupted, strategy):
     before = mean_psnr(untrained(gpu_settings(strategy)).to(GPU), gpu_views())
     assert uninterrupted[strategy] > before + 3.0
 
 
-def test_absolute_gradients_densify_too(tmp_path):
+def test_absolute_gradients_densify(tmp_path):
     settings = gpu_settings("default", default=DefaultSettings(absgrad=True, grow_grad2d=1e-3, refine_every=5))
     _, summary = trained(tmp_path, settings, gpu_views(), device=GPU)
     assert 90 < summary.gaussians <= 140
 
 
-def test_a_summary_tells_the_card_and_its_peak_memory(tmp_path):
+def test_a_summary_names_the_gpu_and_its_peak_memory(tmp_path):
     _, summary = trained(tmp_path, gpu_settings("mcmc", iterations=5), gpu_views(), device=GPU)
     assert summary.device == torch.cuda.get_device_name()
     assert 0.0 < summary.peak_gpu_memory_gb <= torch.cuda.max_memory_reserved() / 1e9
@@ -248,7 +248,7 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(uninterrupted, strategy
 
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
 def test_a_training_of_actors_learns_and_resumes(strategy, tmp_path):
-    """With all terms of the loss, and corrections of tracks."""
+    """With all loss terms, and corrections of tracks."""
     settings = gpu_settings(strategy, **ALL_TERMS)
     before = mean_psnr(untrained_street(settings).to(GPU), guided_views(GPU))
     whole, _ = trained(tmp_path / "whole", settings, guided_views(GPU), device=GPU, model=untrained_street(settings))
@@ -264,7 +264,7 @@ def test_a_training_of_actors_learns_and_resumes(strategy, tmp_path):
 
 
 def train_until_killed(folder: str) -> None:
-    """For a subprocess: a training on the GPU that ends itself as `kill -9` would."""
+    """For a subprocess: a training on the GPU that kills itself with SIGKILL."""
     trained(Path(folder), gpu_settings("mcmc"), EndingViews(gpu_views(), 120, kill=True), device=GPU)
 
 
@@ -278,9 +278,9 @@ def test_a_killed_training_ends_as_an_uninterrupted_one(uninterrupted, tmp_path)
 
 
 def print_what_stops(folder: str, strategy: str, fault: str) -> None:
-    """For a subprocess: prints the sentence in which a training that goes wrong ends.
+    """For a subprocess: prints the message with which a failing training ends.
 
-    Where the library does not foresee it, a kernel's assertion takes the whole process's use of the GPU with it.
+    An unexpected assertion in a kernel makes the GPU unusable for the whole process.
     """
     gaussians = GaussianSettings(sh_degree=1, lr_sh0=1e30) if fault == "not finite" else GaussianSettings(sh_degree=1)
     settings = gpu_settings(strategy, gaussians=gaussians, refine_start=0.0, log_every=50, checkpoint_every=1000)
@@ -298,14 +298,14 @@ def print_what_stops(folder: str, strategy: str, fault: str) -> None:
 @pytest.mark.parametrize(
     ("fault", "said"), [("not finite", r"^iteration 2: .*ssim.* not finite"), ("none left", r"no Gaussian is left")]
 )
-def test_a_training_that_goes_wrong_ends_in_a_sentence(tmp_path, strategy, fault, said):
+def test_a_failing_training_ends_with_a_message(tmp_path, strategy, fault, said):
     process = in_subprocess(print_what_stops, str(tmp_path), strategy, fault)
     output, errors = process.communicate(timeout=120)
     assert re.search(said, output), output + errors[-3000:]
 
 
 def print_out_of_memory(folder: str, gaussians: str, gigabytes: str) -> None:
-    """For a subprocess: a training on a card that seems to have only so much memory."""
+    """For a subprocess: a training on a GPU whose memory is limited to `gigabytes`."""
     count = int(gaussians)
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=generator) * torch.tensor([6.0, 3.0, 3.0]) + torch.tensor([-3.0, -1.5, 3.0])
@@ -327,7 +327,7 @@ def print_out_of_memory(folder: str, gaussians: str, gigabytes: str) -> None:
     ("gaussians", "gigabytes"),
     [pytest.param(400_000, 0.35, id="while training"), pytest.param(400_000, 0.05, id="before the first iteration")],
 )
-def test_a_full_card_is_told_with_its_gaussians_and_what_lowers_the_need(tmp_path, gaussians, gigabytes):
+def test_exhausted_memory_is_reported_with_the_number_of_gaussians_and_a_remedy(tmp_path, gaussians, gigabytes):
     process = in_subprocess(print_out_of_memory, str(tmp_path), str(gaussians), str(gigabytes))
     output, errors = process.communicate(timeout=120)
     assert output.startswith("DeviceError "), output + errors[-3000:]
@@ -335,7 +335,7 @@ def test_a_full_card_is_told_with_its_gaussians_and_what_lowers_the_need(tmp_pat
     assert re.search(r"peak \d+\.\d GB", output) and "train.cap_max" in output
 
 
-def test_too_little_free_memory_is_refused_naming_both_numbers():
+def test_too_little_free_memory_is_refused_with_both_numbers():
     free, total = (size / 1e9 for size in torch.cuda.mem_get_info())
     asked = min(1000.0, math.ceil(total) + 1.0)
     with pytest.raises(DeviceError) as error:
@@ -346,7 +346,7 @@ def test_too_little_free_memory_is_refused_naming_both_numbers():
     assert f"asks for {asked:g}" in message
 
 
-def test_a_card_that_suffices_is_taken():
+def test_a_gpu_with_enough_memory_is_chosen():
     assert choose_device(DeviceSettings(min_free_gb=0.1)) == GPU
 
 
@@ -355,7 +355,7 @@ Film = tuple[SplatModel, list[View], list[np.ndarray]]
 
 @pytest.fixture
 def street_film() -> Film:
-    """A model with cars and a sky, views of it by a lens that zooms, and what these show, one by one."""
+    """A model with cars and a sky, views of it with a changing focal length, and their frames rendered one by one."""
     model = untrained_street(settings_of()).to(GPU)
     model.sky = CubemapSky(4, torch.full((3,), 0.5), 1e-2).to(GPU)
     model.sky.params["texels"].data.normal_(generator=torch.Generator(GPU).manual_seed(0))
@@ -382,8 +382,8 @@ def assert_frames(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
         np.testing.assert_allclose(frame.astype(int), alone, atol=1)
 
 
-def test_frames_in_a_row_are_those_by_themselves(street_film, captures, monkeypatch):
-    """Captured once; also with other Gaussians and another size between them, and for two films by turns."""
+def test_the_frames_of_a_film_equal_single_frames(street_film, captures, monkeypatch):
+    """With one capture; also with other Gaussians and another size in between, and for two films alternately."""
     model, views, expected = street_film
     timeline = model.parts[1].timeline
     known = dict(timeline._cache)

@@ -1,7 +1,7 @@
-"""Functions compiled by numba, cached on disk for as long as nothing changes that may be compiled into them.
+"""Functions compiled by numba, cached on disk until any code that may be compiled into them changes.
 
-numba itself looks at the time of a function's own file alone, and would keep what it compiled from an imported constant
-or callee for ever.
+numba's own cache checks the time of a function's file only: it does not notice a changed constant or callee that the
+file imports.
 """
 
 import os
@@ -19,63 +19,61 @@ from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_write
 from drivesplat.provenance.code_digest import code_digest
 
-KEPT_S = 14 * 24 * 3600
-"""How long (seconds) what is compiled is kept unused: another run may still be at it."""
-
-
+MAX_UNUSED_S = 14 * 24 * 3600
+"""Seconds after which unused compiled code is removed; another run may use an older version until then."""
 OPTIONS = {"nogil": True, "error_model": "numpy"}
 callee = numba.njit(**OPTIONS)
-"""Compiles a function that kernels alone call: it is kept with them."""
+"""Compiles a function that only kernels call; it is cached with them."""
 
 
 def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Callable[..., Any]:
-    """Compiles a function (or makes a decorator that does) to run without the GIL.
+    """Compiles a function, or returns a decorator that does, to run without the GIL.
 
-    What has been compiled is kept in NUMBA_CACHE_DIR, or beside this file, or in the user's cache. Where none of these
-    can be written, each process compiles anew.
+    The cache is in NUMBA_CACHE_DIR, in the package's __pycache__, or in the user's cache folder. Where none of these is
+    writable, each process compiles again.
     """
     if function is None:
         return lambda f: kernel(f, fastmath=fastmath)
     options = {**OPTIONS, "fastmath": fastmath}
-    given = numba.config.CACHE_DIR
+    configured = numba.config.CACHE_DIR
     try:
-        source = _kept_source(Path(function.__code__.co_filename), given)
+        source = _cached_source(Path(function.__code__.co_filename), configured)
         function.__code__ = function.__code__.replace(co_filename=str(source))
         numba.config.CACHE_DIR = str(source.parent)
         return numba.njit(cache=True, **options)(function)
-    except (OSError, RuntimeError, ResultError):  # from here, and from numba
+    except (OSError, RuntimeError, ResultError):  # no folder is writable
         return numba.njit(**options)(function)
     finally:
-        numba.config.CACHE_DIR = given
+        numba.config.CACHE_DIR = configured
 
 
 @cache
-def _kept_source(file: Path, given: str) -> Path:
-    """A copy of `file` in the folder for what is compiled from it. numba files what it compiles under the path of the
-    source: under this one, every checkout with the same code finds it. Raises ResultError where it cannot be written.
-    """
-    kept = _cache_folder(file, given) / file.name
-    if not kept.exists():
-        with atomic_write(kept) as copy:
+def _cached_source(file: Path, configured: str) -> Path:
+    """A copy of `file` in its cache folder. numba names cache entries by the path of the source: with this path every
+    checkout of the same code shares them. Raises ResultError where the copy cannot be written."""
+    source = _cache_folder(file, configured) / file.name
+    if not source.exists():
+        with atomic_write(source) as copy:
             copy.write(file.read_bytes())
-    os.utime(kept.parent)
-    return kept
+    os.utime(source.parent)
+    return source
 
 
-def _cache_folder(file: Path, given: str) -> Path:
-    """The folder for what is compiled from `file` and the code it imports, below the first that can be written of
-    `given`, the package's __pycache__, and the user's cache. What went unused there for weeks is removed."""
-    beside, users = Path(__file__).parents[1] / "__pycache__", Path.home() / ".cache" / "drivesplat"
-    parent = Path(given) if given else next((folder for folder in (beside, users) if _writable(folder)), beside)
+def _cache_folder(file: Path, configured: str) -> Path:
+    """The folder for code compiled from `file` and from what it imports, in the `configured` folder, or else in the
+    first writable one of the package's __pycache__ and the user's cache. Removes folders that have long been unused."""
+    package, user = Path(__file__).parents[1] / "__pycache__", Path.home() / ".cache" / "drivesplat"
+    writable = (folder for folder in (package, user) if _writable(folder))
+    parent = Path(configured) if configured else next(writable, package)
     folder = parent / f"kernels-{file.stem}-{code_digest(file)[:16]}"
     for other in parent.glob(f"kernels-{file.stem}-*"):
         with suppress(OSError):
-            if other != folder and time.time() - other.stat().st_mtime > KEPT_S:
+            if other != folder and time.time() - other.stat().st_mtime > MAX_UNUSED_S:
                 shutil.rmtree(other)
     return folder
 
 
 def _writable(folder: Path) -> bool:
-    """Whether a file can be made in a folder, or in the one that it would be made in."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    return os.access(there, os.W_OK | os.X_OK)
+    """Whether files can be created in a folder, which need not exist yet."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    return os.access(existing, os.W_OK | os.X_OK)

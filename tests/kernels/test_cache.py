@@ -1,4 +1,4 @@
-"""Compiled functions: what is kept on disk goes when anything compiled into it changes."""
+"""The cache of compiled functions is invalidated by every change of code that is compiled into them."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ SHOW = "from drivesplat.caller import total\nprint(total(10.0))\nprint(sum(total
 
 
 def small_package(root: Path) -> Path:
-    """A package of this one's name with nothing but kernels in it: its digests see what a kernel imports."""
+    """A package of the library's name with kernels only: code digests follow the imports of a kernel."""
     package = root / "drivesplat"
     used = ("kernels/cache", "provenance/code_digest", "provenance/syntax_digest", "io/storage", "errors")
     for name in used:
@@ -32,10 +32,9 @@ def small_package(root: Path) -> Path:
 
 
 def show(root: Path, **environment: str) -> tuple[float, int]:
-    """The kernel's value in a fresh process, and how often it was found on disk.
+    """The kernel's value in a new process, and its number of cache hits.
 
-    The process leaves no bytecode behind: Python would take it for that of a file of the same size which a test writes
-    in the same second.
+    The process writes no bytecode, which Python would also use for another source of the same size and second.
     """
     known = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     env = {**known, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1", **environment}
@@ -44,7 +43,7 @@ def show(root: Path, **environment: str) -> tuple[float, int]:
     return float(value), int(hits)
 
 
-def test_what_was_compiled_is_kept_until_an_imported_constant_changes(tmp_path):
+def test_compiled_code_is_cached_until_an_imported_constant_changes(tmp_path):
     package = small_package(tmp_path)
     (package / "callee.py").write_text(CALLEE.format(scale=2.0))
     assert show(tmp_path) == (22.0, 0)
@@ -53,8 +52,8 @@ def test_what_was_compiled_is_kept_until_an_imported_constant_changes(tmp_path):
     assert show(tmp_path) == (33.0, 0), "numba alone would have kept 22"
 
 
-def test_checkouts_of_the_same_code_share_what_they_compile(tmp_path):
-    """And a comment, or the time of a file, makes no other code."""
+def test_checkouts_of_the_same_code_share_the_cache(tmp_path):
+    """Comments and file times do not change the code."""
     caches, roots = str(tmp_path / "cache"), [tmp_path / name for name in ("one", "another")]
     for root in roots:
         root.mkdir()
@@ -67,7 +66,7 @@ def test_checkouts_of_the_same_code_share_what_they_compile(tmp_path):
     assert show(roots[0], NUMBA_CACHE_DIR=caches) == (22.0, 1)
 
 
-def test_what_earlier_code_left_goes_after_two_weeks_and_not_before(tmp_path):
+def test_the_cache_of_earlier_code_is_removed_after_two_weeks_unused(tmp_path):
     package = small_package(tmp_path)
     (package / "callee.py").write_text(CALLEE.format(scale=2.0))
     show(tmp_path)
@@ -82,7 +81,7 @@ def test_what_earlier_code_left_goes_after_two_weeks_and_not_before(tmp_path):
     assert list((package / "__pycache__").glob("kernels-caller-*")) == [folders[1]]
 
 
-def test_where_the_installation_cannot_be_written_the_users_cache_is_used_just_as_carefully(tmp_path):
+def test_the_users_cache_replaces_a_read_only_installation(tmp_path):
     package = small_package(tmp_path)
     (package / "callee.py").write_text(CALLEE.format(scale=2.0))
     (package / "__pycache__").write_text("a file, so that nothing can be written below it")
@@ -95,7 +94,7 @@ def test_where_the_installation_cannot_be_written_the_users_cache_is_used_just_a
     assert len(list((home / ".cache" / "drivesplat").glob("kernels-caller-*"))) == 2
 
 
-def test_a_folder_that_is_named_for_the_cache_is_used(tmp_path):
+def test_the_folder_in_numba_cache_dir_is_used(tmp_path):
     package = small_package(tmp_path)
     (package / "callee.py").write_text(CALLEE.format(scale=2.0))
     elsewhere = tmp_path / "cache"

@@ -20,7 +20,7 @@ from drivesplat.kernels.numba import tiles
 from drivesplat.rasterization import Rendering, rasterize
 
 AGREEMENT = 1e-5
-"""Greatest error allowed in float64, over the tensor's greatest value."""
+"""Maximum error in float64, relative to the tensor's maximum."""
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
 
@@ -30,7 +30,7 @@ def render(scene: Scene, backend: str = "cpu", **options) -> Rendering:
 
 
 def with_harmonics(scene: Scene, seed: int, degree: int) -> Scene:
-    """The scene with coefficients that make some colours negative, which are shown as 0."""
+    """The scene with coefficients for which some colors are negative, and rendered as 0."""
     shape = (len(scene.means), (degree + 1) ** 2, 3)
     return replace(scene, colors=0.5 * torch.from_numpy(np.random.default_rng(seed).normal(size=shape)))
 
@@ -55,7 +55,7 @@ def seen_and_gradients(scene: Scene, backend: str, **options) -> dict[str, torch
 
 
 def disagreements(scene: Scene, bound: float = AGREEMENT, **options) -> dict[str, float]:
-    """What differs from the reference by more than `bound`, and by how much."""
+    """The results that differ from the reference by more than `bound`, and their errors."""
     expected = seen_and_gradients(scene, "reference", **options)
     found = seen_and_gradients(scene, "cpu", **options)
     errors = {}
@@ -121,8 +121,8 @@ def test_extreme_gaussians_agree(antialiased):
     assert not disagreements(scene, antialiased=antialiased, with_depth=True)
 
 
-def test_of_equal_depths_the_first_is_in_front():
-    """As gsplat's stable sort has it; the reference's sort is not stable, so it gets depths a hair apart."""
+def test_equal_depths_keep_their_order():
+    """As in gsplat's stable sort. The reference's sort is not stable, so its depths differ slightly."""
     scene = random_scene(31, n=60, width=30, height=30)
     scene.viewmats = torch.eye(4, dtype=torch.float64)[None]
     scene.means[:, 2] = 4.0
@@ -131,8 +131,8 @@ def test_of_equal_depths_the_first_is_in_front():
     torch.testing.assert_close(found, render(scene, "reference").image, rtol=0.0, atol=1e-8)
 
 
-def test_rays_that_end_agree():
-    """Opaque Gaussians in many layers: most lists are left before their end."""
+def test_rays_that_end_early_agree():
+    """With opaque Gaussians in many layers most lists are not processed to their end."""
     scene = random_scene(32, n=400, width=33, height=20)
     scene.opacities[:] = torch.linspace(0.6, 1.0, 400)
     assert not disagreements(scene, with_depth=True)
@@ -144,7 +144,7 @@ def test_skew_and_off_centre_intrinsics_agree():
     assert not disagreements(scene)
 
 
-def test_images_in_several_windows_of_tiles_are_the_same(monkeypatch):
+def test_the_number_of_windows_does_not_change_an_image(monkeypatch):
     scene = random_scene(34, n=80, width=70, height=40)
     whole = seen_and_gradients(scene, "cpu")
     monkeypatch.setattr(tiles, "MAX_ENTRIES", 40)
@@ -163,7 +163,7 @@ def _projected(scene: Scene) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("n", [0, 1])
-def test_no_gaussian_in_view_is_zeros_and_zero_gradients(n):
+def test_without_a_gaussian_in_view_image_and_gradients_are_zero(n):
     scene = random_scene(35, n=1, width=20, height=18, cameras=2)
     scene.means[:, 2] = -5.0
     scene = replace(scene, **{name: getattr(scene, name)[:n] for name in INPUTS[:-1]})
@@ -174,7 +174,7 @@ def test_no_gaussian_in_view_is_zeros_and_zero_gradients(n):
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_float32_agrees_but_for_gaussians_at_the_cut_off(antialiased):
+def test_float32_agrees_except_for_gaussians_at_the_cut_off(antialiased):
     scene = with_harmonics(random_scene(36, n=300, width=64, height=48, cameras=2), 36, degree=3)
     expected = seen_and_gradients(scene, "reference", sh_degree=3, antialiased=antialiased)
     found = seen_and_gradients(scene.float(), "cpu", sh_degree=3, antialiased=antialiased)
@@ -185,8 +185,8 @@ def test_float32_agrees_but_for_gaussians_at_the_cut_off(antialiased):
             assert float(error.quantile(0.99)) < 1e-4 and float(error.max()) < 1e-2, name
 
 
-def test_a_black_colour_can_brighten():
-    """Its harmonics come to exactly 0, the end of the range in which gradients pass."""
+def test_a_black_color_has_a_gradient():
+    """Its harmonics are exactly 0, the limit of the range with gradients."""
     scene = random_scene(37, n=10, width=20, height=20)
     scene.colors = torch.full((10, 1, 3), -1.0, dtype=torch.float64) * np.sqrt(np.pi)
     gradient = seen_and_gradients(scene, "cpu", sh_degree=0)["gradient of colors"]
@@ -211,14 +211,14 @@ def test_gradients_are_those_of_finite_differences(antialiased):
     assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
-def test_more_coefficients_than_there_are_is_an_error_and_no_stray_read():
+def test_too_few_coefficients_for_the_degree_are_an_error():
     scene = with_harmonics(random_scene(38, n=5, width=8, height=8), 0, degree=1)
     with pytest.raises(ValueError, match=r"degree 2 from 4 coefficients"):
         render(scene, sh_degree=2)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_the_same_bits_come_back_every_time_and_from_any_number_of_threads(count):
+def test_results_are_bitwise_equal_for_every_run_and_number_of_threads(count):
     scene = with_harmonics(random_scene(39, n=5000, width=90, height=70), 39, degree=2).float()
     scene.scales = scene.scales * 0.3
     with threads(1):
@@ -229,7 +229,7 @@ def test_the_same_bits_come_back_every_time_and_from_any_number_of_threads(count
             assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
-def test_info_says_what_the_references_says():
+def test_info_equals_the_references():
     scene = random_scene(41, n=40, width=32, height=24, cameras=2)
     expected, found = (render(scene, backend, antialiased=True).info for backend in ("reference", "cpu"))
     assert found.keys() == expected.keys()
@@ -241,7 +241,7 @@ def test_info_says_what_the_references_says():
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
-def test_info_feeds_gsplats_default_strategy(absgrad):
+def test_gsplats_default_strategy_reads_info(absgrad):
     scene = random_scene(12, n=20, width=32, height=24).float()
     scene.means[3, 2] = -4.0
     params = {name: torch.nn.Parameter(getattr(scene, name)) for name in INPUTS[:4]}
@@ -260,7 +260,7 @@ def test_info_feeds_gsplats_default_strategy(absgrad):
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_absolute_gradients_are_sums_over_pixels_of_absolute_gradients(antialiased):
+def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients(antialiased):
     scene = random_scene(42, n=6, width=20, height=18, cameras=2)
     scene.means.requires_grad_()
 
@@ -278,7 +278,7 @@ def test_absolute_gradients_are_sums_over_pixels_of_absolute_gradients(antialias
     torch.testing.assert_close(found.info["means2d"].absgrad, expected)
 
 
-def test_it_renders_from_several_threads_at_once():
+def test_several_threads_can_render_at_the_same_time():
     scene = with_harmonics(random_scene(43, n=500, width=64, height=48), 43, degree=1)
     expected = seen_and_gradients(scene, "cpu", sh_degree=1)
     found: list[dict[str, torch.Tensor]] = []
@@ -302,7 +302,7 @@ def _image_in_child(scene: Scene, connection) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
-def test_it_renders_in_a_process_forked_after_it_has_rendered():
+def test_a_process_forked_after_rendering_can_render():
     scene = random_scene(44, n=500, width=64, height=48)
     with threads(2):
         expected = render(scene).image.numpy()
@@ -318,8 +318,8 @@ def test_it_renders_in_a_process_forked_after_it_has_rendered():
         child.join()
 
 
-def test_it_works_where_numba_cannot_write_its_cache():
-    """A read-only installation and home: compiled anew in each process."""
+def test_kernels_compile_where_numba_cannot_write_its_cache():
+    """With a read-only installation and home each process compiles again."""
     script = """
 import numpy as np
 from numba.core import caching

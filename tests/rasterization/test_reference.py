@@ -86,7 +86,7 @@ def _projected(scene: Scene, g: int, view: np.ndarray, k: np.ndarray, at: np.nda
 
 
 @pytest.mark.parametrize(("depth", "sigma", "opacity"), [(4.0, 0.5, 0.7), (2.0, 0.05, 0.9), (10.0, 3.0, 0.3)])
-def test_one_gaussian_has_the_closed_forms_profile(depth, sigma, opacity):
+def test_one_gaussian_has_the_profile_of_the_closed_form(depth, sigma, opacity):
     scene = on_axis([depth], [opacity], sigma)
     rendering = scene.render(with_depth=True)
     variance = (20.0 * sigma / depth) ** 2 + DILATION
@@ -99,7 +99,7 @@ def test_one_gaussian_has_the_closed_forms_profile(depth, sigma, opacity):
 
 
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
-def test_two_gaussians_composite_front_to_back_whatever_their_order(order):
+def test_two_gaussians_composite_front_to_back_in_any_order(order):
     scene = on_axis([3.0, 6.0], [0.6, 0.8])
     for name in ("means", "opacities", "colors"):
         setattr(scene, name, getattr(scene, name)[order])
@@ -111,29 +111,29 @@ def test_two_gaussians_composite_front_to_back_whatever_their_order(order):
 
 
 @pytest.mark.parametrize(("opacity", "seen"), [(0.999 / 255.0, 0.0), (1.001 / 255.0, 1.001 / 255.0)])
-def test_what_adds_less_than_one_grey_level_is_dropped(opacity, seen):
+def test_contributions_below_one_grey_level_are_dropped(opacity, seen):
     assert float(middle(on_axis([4.0], [opacity]).render().alpha)) == pytest.approx(seen)
 
 
-def test_no_gaussian_hides_more_than_999_in_a_thousand():
+def test_the_alpha_of_a_gaussian_is_at_most_0_999():
     rendering = on_axis([4.0, 5.0], [1.0, 0.5]).render()
     assert float(middle(rendering.image)[0]) == pytest.approx(0.999)
     assert float(middle(rendering.image)[1]) == pytest.approx(0.001 * 0.5)
 
 
-def test_a_ray_ends_before_its_transmittance_falls_to_a_ten_thousandth():
+def test_a_ray_ends_before_its_transmittance_reaches_1e_4():
     rendering = on_axis([3.0, 4.0, 5.0], [0.97, 0.97, 0.97]).render()
     expected = torch.tensor([0.97, 0.03 * 0.97, 0.0], dtype=torch.float64)
     torch.testing.assert_close(middle(rendering.image), expected)
     assert float(middle(rendering.alpha)) == pytest.approx(1.0 - 0.03**2)
 
 
-def test_behind_an_ended_ray_even_a_faint_gaussian_is_not_seen():
+def test_gaussians_behind_the_end_of_a_ray_have_no_effect():
     rendering = on_axis([3.0, 4.0, 5.0], [0.98, 0.999, 0.01]).render()
     assert middle(rendering.image).tolist() == pytest.approx([0.98, 0.0, 0.0])
 
 
-def test_depth_is_expected_depth_and_zero_where_nothing_is():
+def test_depth_is_expected_depth_and_zero_without_gaussians():
     rendering = on_axis([4.0], [0.7], sigma=0.1).render(with_depth=True)
     seen = rendering.alpha > 0
     assert seen.any() and not seen.all()
@@ -141,18 +141,18 @@ def test_depth_is_expected_depth_and_zero_where_nothing_is():
     assert (rendering.depth[~seen] == 0).all()
 
 
-def test_without_with_depth_there_is_none():
+def test_depth_is_none_unless_requested():
     assert on_axis([4.0], [0.7]).render().depth is None
 
 
-def test_antialiasing_dims_by_the_area_the_dilation_adds():
+def test_antialiasing_scales_opacity_by_the_area_that_the_dilation_adds():
     sigma, depth, opacity = 0.05, 4.0, 0.9
     rendering = on_axis([depth], [opacity], sigma).render(antialiased=True)
     variance = (20.0 * sigma / depth) ** 2
     assert float(middle(rendering.alpha)) == pytest.approx(opacity * variance / (variance + DILATION), rel=1e-9)
 
 
-def test_spherical_harmonics_of_degree_0_are_a_colour_from_everywhere():
+def test_spherical_harmonics_of_degree_0_are_the_same_color_from_all_directions():
     scene = on_axis([4.0], [0.7])
     scene.colors = torch.tensor([[[0.4, -0.3, 1.2]]], dtype=torch.float64)
     rendering = scene.render(sh_degree=0)
@@ -177,14 +177,14 @@ def test_spherical_harmonics_of_degree_1_follow_the_viewing_direction():
     torch.testing.assert_close(color, torch.from_numpy(0.5 + basis @ coefficients).expand_as(color))
 
 
-def test_coefficients_beyond_the_degree_asked_for_do_not_show():
+def test_coefficients_above_the_requested_degree_have_no_effect():
     scene = on_axis([4.0], [0.7])
     scene.colors = torch.full((1, 16, 3), 0.3, dtype=torch.float64)
     rendering = scene.render(sh_degree=0)
     assert (middle(rendering.image) / middle(rendering.alpha)).tolist() == pytest.approx([0.5 + SH_C0 * 0.3] * 3)
 
 
-def test_a_negative_colour_is_black():
+def test_a_negative_color_is_rendered_black():
     scene = on_axis([4.0], [0.7])
     scene.colors = torch.tensor([[[-5.0, 0.2, -1.7]]], dtype=torch.float64)
     rendering = scene.render(sh_degree=0)
@@ -196,7 +196,7 @@ def test_a_negative_colour_is_black():
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("width", "height"), [(37, 21), (16, 32), (5, 3), (49, 17)])
-def test_the_image_knows_nothing_of_tiles(width, height, antialiased):
+def test_an_image_does_not_depend_on_its_tiles(width, height, antialiased):
     scene = random_scene(seed=width, n=60, width=width, height=height)
     rendering = scene.render(antialiased=antialiased, with_depth=True)
     image, alpha, depth = naive(scene, 0, antialiased)
@@ -206,7 +206,7 @@ def test_the_image_knows_nothing_of_tiles(width, height, antialiased):
     np.testing.assert_allclose(rendering.depth[0, ..., 0].numpy(), depth, rtol=1e-9, atol=1e-11)
 
 
-def test_several_cameras_see_what_each_sees_alone():
+def test_several_cameras_render_as_each_alone():
     scene = random_scene(seed=5, n=40, width=24, height=20, cameras=3)
     rendering = scene.render(with_depth=True)
     for camera in range(3):
@@ -254,7 +254,7 @@ def test_gradients_are_those_of_finite_differences(antialiased):
         pytest.param([0.0, 0.0, 0.0], id="in the camera"),
     ],
 )
-def test_nothing_in_view_is_zeros_and_finite_gradients(place, antialiased):
+def test_without_a_gaussian_in_view_images_are_zero_and_gradients_finite(place, antialiased):
     scene = on_axis([4.0], [0.9], sigma=0.2)
     scene.means = torch.tensor([place], dtype=torch.float64)
     inputs = [getattr(scene, name).requires_grad_() for name in ("means", "quats", "scales", "opacities", "colors")]
@@ -266,7 +266,7 @@ def test_nothing_in_view_is_zeros_and_finite_gradients(place, antialiased):
         assert value.grad is None or (value.grad == 0).all()
 
 
-def test_a_gaussian_out_of_view_does_not_spoil_the_gradients_of_others():
+def test_a_gaussian_out_of_view_leaves_the_gradients_of_others_finite():
     scene = on_axis([4.0, 5.0], [0.9, 0.9], sigma=0.2)
     scene.means[1] = torch.tensor([1.0, 0.0, 0.0])
     inputs = [getattr(scene, name).requires_grad_() for name in ("means", "quats", "scales", "opacities", "colors")]
@@ -288,7 +288,7 @@ def test_a_needle_seen_edge_on_has_finite_gradients_when_antialiased():
         assert torch.isfinite(value.grad).all()
 
 
-def test_no_gaussians_at_all_are_an_empty_image():
+def test_an_empty_set_of_gaussians_gives_an_empty_image():
     scene = on_axis([], [])
     scene.means = scene.means.reshape(0, 3)
     rendering = scene.render(with_depth=True)
@@ -296,7 +296,7 @@ def test_no_gaussians_at_all_are_an_empty_image():
     assert (rendering.image == 0).all() and (rendering.alpha == 0).all() and (rendering.depth == 0).all()
 
 
-def test_info_feeds_gsplats_default_strategy():
+def test_gsplats_default_strategy_reads_info():
     scene = random_scene(seed=12, n=20, width=32, height=24).float()
     scene.means[3, 2] = -4.0
     params = {name: torch.nn.Parameter(getattr(scene, name)) for name in ("means", "quats", "scales", "opacities")}

@@ -1,1 +1,1 @@
-"""Compiled for the CPU: what a GPU does by kernels of torch or gsplat. Imported where a CPU works: it needs numba."""
+"""Kernels for the CPU, compiled by numba; imported only where a CPU computes."""
