@@ -8,10 +8,11 @@
 
 rule extract:
     """
-    Reads the dataset's tables once and checks them: cameras, LiDAR sweeps and object tracks in one world frame,
-    every image with the ego pose of its own timestamp.
+    Reads a scene's rows of the dataset's tables and checks them: cameras, LiDAR sweeps and object tracks in one world
+    frame, every image with the ego pose of its own timestamp.
     """
     input:
+        root=ancient(plan.table_of_scenes),
         tables=plan.tables,
     output:
         scene="<results>/{scene}/scene.json",

@@ -11,7 +11,8 @@ from drivesplat.settings.extract import SceneSource
 
 with job(snakemake) as current:
     tables = current.input.tables
-    scene = extract_scene(current.settings(SceneSource), Path(tables[0]).parents[1])
+    root, of_scene = Path(current.input.root).parents[1], Path(tables[0]) if len(tables) == 1 else None
+    scene = extract_scene(current.settings(SceneSource), root, of_scene)
     current.record_dataset(
         images=(frame.image_path for frame in scene.frames), sweeps=(sweep.path for sweep in scene.sweeps)
     )

@@ -19,13 +19,14 @@ MOST_NAMED = 10
 """Of images that are left out, so many are named one by one."""
 
 
-def extract_scene(source: SceneSource, root: Path) -> Scene:
-    """The scene, read and checked, its images decoded once. `root` holds the folder of tables. What a reader of the
-    figures has to know of the drive is told as warnings.
+def extract_scene(source: SceneSource, root: Path, scene_tables: Path | None = None) -> Scene:
+    """The scene, read and checked, its images decoded once. `root` holds the folder of tables, `scene_tables` what the
+    scene needs of them (None: it is looked for). What a reader of the figures has to know of the drive is logged as
+    warnings.
 
     Raises DatasetError naming the token and path of what is wrong.
     """
-    scene = reader(source.reader).read(root, source)
+    scene = reader(source.reader).read(root, source, scene_tables)
     with ThreadPoolExecutor() as pool:
         faults = list(pool.map(image_fault, scene.frames))
     bad = [(frame, fault) for frame, fault in zip(scene.frames, faults, strict=True) if fault]

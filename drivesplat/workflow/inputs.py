@@ -1,10 +1,10 @@
 """The files that rules read, as functions of wildcards: which ones depends on the config."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-from drivesplat.readers.datasets import layout
+from drivesplat.errors import DriveSplatError
+from drivesplat.readers.datasets import index, layout
 from drivesplat.readers.truth import TRUTH_FILE
 from drivesplat.scene.scene import REFINED
 from drivesplat.settings.config import Config, for_scene
@@ -12,28 +12,55 @@ from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.workflow.stages import refines_poses, training_inputs
 
 
+def unwritable_results(config: Config, error: OSError) -> DriveSplatError:
+    """What to tell where the results folder cannot be written."""
+    return DriveSplatError(
+        f"{config.results_dir}/: cannot be written ({error.strerror or error}); "
+        "fix its permissions, or give this run another folder (results_dir)"
+    )
+
+
 class Inputs:
     """The inputs of a config's rules."""
 
     def __init__(self, config: Config):
         self.config = config
-        self._tables: dict[str, list[str]] = {}
+        self._roots: dict[str, str] = {}
+        self._folders: dict[str, Path] = {}
 
     def tables(self, wildcards: Any) -> list[str]:
-        """The dataset files that decide a scene's scene.json."""
+        """The files that decide a scene's scene.json: all tables of a synthetic world; of a recorded dataset the rows
+        that the scene needs, which planning extracts, so that touched tables rerun nothing."""
         name = self.config.dataset_of(wildcards.scene)
-        if name not in self._tables:
-            self._tables[name] = self._tables_of(name)
-        return self._tables[name]
-
-    def _tables_of(self, name: str) -> list[str]:
         dataset = self.config.datasets[name]
-        files = layout(dataset.reader)
         if dataset.world:
-            return [f"{dataset.world_root}/{dataset.version}/{table}.json" for table in files.TABLES]
-        return [
-            str(file) for file in files.table_files(files.find_root(dataset.dataroot, dataset.version), dataset.version)
-        ]
+            return self.world_tables(name)
+        return [str(index(dataset.reader).scene_file(self._scene_tables(name), wildcards.scene))]
+
+    def table_of_scenes(self, wildcards: Any) -> str:
+        """A table of a scene's dataset, below whose root the recordings are: where it has moved to, all is remade."""
+        name = self.config.dataset_of(wildcards.scene)
+        return f"{self._root(name)}/{self.config.datasets[name].version}/scene.json"
+
+    def _root(self, name: str) -> str:
+        if name not in self._roots:
+            dataset = self.config.datasets[name]
+            find_root = layout(dataset.reader).find_root
+            found = dataset.world_root if dataset.world else find_root(dataset.dataroot, dataset.version)
+            self._roots[name] = str(found)
+        return self._roots[name]
+
+    def _scene_tables(self, name: str) -> Path:
+        """The folder with the rows of each scene of a recorded dataset, brought up to date once."""
+        if name not in self._folders:
+            dataset, folder = self.config.datasets[name], Path(self.config.results_dir) / ".tables" / name
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise unwritable_results(self.config, error) from error
+            index(dataset.reader).index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder)
+            self._folders[name] = folder
+        return self._folders[name]
 
     @property
     def worlds(self) -> dict[str, str]:
@@ -42,7 +69,8 @@ class Inputs:
 
     def world_tables(self, dataset: str) -> list[str]:
         """The files that a synthetic world consists of, as far as rules know them."""
-        return self.tables(SimpleNamespace(scene=self.worlds[dataset]))
+        world = self.config.datasets[dataset]
+        return [f"{world.world_root}/{world.version}/{table}.json" for table in layout(world.reader).TABLES]
 
     def truth_file(self, dataset: str) -> str:
         """Where the truth of a synthetic world is stated."""

@@ -188,10 +188,7 @@ class Plan(Outputs):
             folder.mkdir(parents=True, exist_ok=True)
             self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
         except OSError as error:
-            raise DriveSplatError(
-                f"{folder}/: cannot be written ({error.strerror or error}); "
-                "fix its permissions, or give this run another folder (results_dir)"
-            ) from error
+            raise unwritable_results(self.config, error) from error
         try:
             fcntl.flock(self._held_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

@@ -5,8 +5,10 @@ record, never the key frame's. The tables' quaternions are w, x, y, z; box sizes
 """
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import checked_intrinsics, checked_pose, checked_size, require_increasing
 from drivesplat.readers.nuscenes.object_classes import object_class
+from drivesplat.readers.nuscenes.scene_tables import damaged, read_scene_tables, scene_file, write_scene_tables
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
 from drivesplat.scene.sensors import Camera, Lidar
@@ -28,19 +31,17 @@ AZIMUTH_STEPS = 1085
 46.08 microseconds, so that revolutions differ by one or two firings."""
 
 
-def read(root: Path, source: SceneSource) -> Scene:
-    """The scene that `source` names, its dataset's name aside; `root` holds the folder of tables.
+def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> Scene:
+    """The scene that `source` names, its dataset's name aside; `root` holds the folder of tables, `scene_tables` those
+    rows of them that the scene needs (None: they are looked for).
 
     `source.sweeps` adds the images between key frames, `source.lidar_sweeps` the LiDAR sweeps there. `source.frames` =
     (first, last + 1) keeps some key frames, which are then counted from 0, and what lies between them. Image files are
     not opened. Raises DatasetError naming the offending token.
     """
     version, name, cameras, frames = source.version, source.scene, source.cameras, source.frames
-    tables = _load(root, version)
-    record = next((s for s in tables.scene if s["name"] == f"scene-{name}"), None)
-    if record is None:
-        there = ", ".join(s["name"].removeprefix("scene-") for s in tables.scene)
-        raise DatasetError(f"scene {name} is not in nuScenes {version} at {root}; there are: {there}")
+    tables = _load(root, source, scene_tables)
+    record = tables.scene[0]
     samples = _samples(tables, record)
     if frames and frames[1] > len(samples):
         raise DatasetError(f"scene {name}: the frame range {frames} ends beyond its {len(samples)} key frames")
@@ -78,15 +79,30 @@ def _camera(frame: Frame) -> Camera:
     return Camera(frame.camera, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5))
 
 
-def _load(root: Path, version: str) -> Any:
+def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
+    """nuscenes-devkit's view of the tables, reduced to one scene."""
     from nuscenes.nuscenes import NuScenes
 
-    try:
-        return NuScenes(version, str(root), verbose=False)
-    except (AssertionError, KeyError, ValueError, OSError) as error:
-        raise DatasetError(
-            f"nuScenes {version} in {root} cannot be read ({type(error).__name__}: {error}); unpack it again"
-        ) from error
+    with TemporaryDirectory() as folder:
+        if scene_tables is None:
+            write_scene_tables(root, source.version, [source.scene], Path(folder))
+            scene_tables = scene_file(Path(folder), source.scene)
+        tables = read_scene_tables(scene_tables)
+        names = [row["name"].removeprefix("scene-") for row in tables["scene"]]
+        if source.scene not in names:
+            there = ", ".join(names)
+            raise DatasetError(
+                f"scene {source.scene} is not in nuScenes {source.version} at {root}; there are: {there}"
+            )
+        try:
+            (Path(folder) / source.version).mkdir()
+            for row in tables["map"]:
+                row["filename"] = str(root.absolute() / row["filename"])
+            for table, rows in tables.items():
+                (Path(folder) / source.version / f"{table}.json").write_text(json.dumps(rows), encoding="utf-8")
+            return NuScenes(source.version, folder, verbose=False)
+        except (AssertionError, IndexError, KeyError, ValueError, OSError) as error:
+            raise damaged(root, source.version, error) from error
 
 
 def _samples(tables: Any, scene: dict) -> list[dict]:

@@ -1,0 +1,184 @@
+"""What a scene needs of nuScenes' tables: all of it, nothing of other scenes, found in bounded memory."""
+
+import json
+import os
+import tracemalloc
+from pathlib import Path
+
+import pytest
+from helpers.tiny_world import World, write_world
+from nuscenes.nuscenes import NuScenes
+
+from drivesplat.errors import DatasetError, ResultError
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.readers.nuscenes import scene_tables
+from drivesplat.readers.nuscenes.scene_tables import index_tables, read_scene_tables, rows, scene_file
+from drivesplat.settings.extract import SceneSource
+
+VERSION, SCENES = "v1.0-mini", ("0001", "0002", "0003")
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    return write_world(tmp_path / "nuscenes", World(scenes=SCENES))
+
+
+def edit(root: Path, table: str, token: str, **changes) -> None:
+    path = root / VERSION / f"{table}.json"
+    content = json.loads(path.read_text())
+    next(row for row in content if row["token"] == token).update(changes)
+    path.write_text(json.dumps(content))
+
+
+def expected_tokens(root: Path, scene: str) -> dict[str, set[str]]:
+    """The tokens of a scene's rows, by nuscenes-devkit's own links."""
+    tables = NuScenes(VERSION, str(root), verbose=False)
+    row = next(row for row in tables.scene if row["name"] == f"scene-{scene}")
+    samples, data = set(), set()
+    token = row["first_sample_token"]
+    while token:
+        samples.add(token)
+        token = tables.get("sample", token)["next"]
+    for sample in samples:
+        for first in tables.get("sample", sample)["data"].values():
+            while first and first not in data:
+                data.add(first)
+                first = tables.get("sample_data", first)["next"]
+    boxes = {token for sample in samples for token in tables.get("sample", sample)["anns"]}
+    records = [tables.get("sample_data", token) for token in data]
+    return {
+        "scene": {row["token"]},
+        "sample": samples,
+        "sample_data": data,
+        "sample_annotation": boxes,
+        "ego_pose": {record["ego_pose_token"] for record in records},
+        "calibrated_sensor": {record["calibrated_sensor_token"] for record in records},
+        "instance": {tables.get("sample_annotation", token)["instance_token"] for token in boxes},
+        "log": {row["log_token"]},
+        "map": {row["token"] for row in tables.map},
+        **{table: {row["token"] for row in getattr(tables, table)} for table in scene_tables._SHARED},
+    }
+
+
+@pytest.mark.parametrize("buffer", [1, 500, 2**26])
+def test_a_scene_gets_its_own_rows_and_no_others(root, tmp_path, buffer, monkeypatch):
+    monkeypatch.setattr(scene_tables, "_BUFFER", buffer)
+    index_tables(root, VERSION, SCENES, tmp_path / "rows")
+    for scene in SCENES:
+        found = read_scene_tables(scene_file(tmp_path / "rows", scene))
+        assert {table: {row["token"] for row in of} for table, of in found.items()} == expected_tokens(root, scene)
+        assert all(len({row["token"] for row in of}) == len(of) for of in found.values())
+
+
+def test_rows_are_as_in_the_tables_and_in_their_order(root, tmp_path):
+    index_tables(root, VERSION, ["0002"], tmp_path)
+    for table, found in read_scene_tables(scene_file(tmp_path, "0002")).items():
+        whole = json.loads((root / VERSION / f"{table}.json").read_text())
+        tokens = {row["token"] for row in found}
+        assert table == "map" or found == [row for row in whole if row["token"] in tokens]
+
+
+def test_a_scene_read_from_its_rows_is_the_one_read_from_the_tables(root, tmp_path):
+    index_tables(root, VERSION, SCENES, tmp_path)
+    for name in SCENES:
+        source = SceneSource(
+            dataset="tiny", reader="nuscenes", version=VERSION, scene=name, frames=None, cameras=("CAM_FRONT",),
+            sweeps=True, lidar_sweeps=True, on_missing="stop",
+        )  # fmt: skip
+        assert repr(extract_scene(source, root, scene_file(tmp_path, name))) == repr(extract_scene(source, root))
+
+
+def times_of_change(folder: Path) -> dict[str, int]:
+    return {scene: scene_file(folder, scene).stat().st_ino for scene in SCENES}
+
+
+def test_touched_and_newly_spelled_tables_rewrite_no_scene(root, tmp_path):
+    index_tables(root, VERSION, SCENES, tmp_path)
+    before = times_of_change(tmp_path)
+    for table in (root / VERSION).iterdir():
+        os.utime(table, (2e9, 2e9))
+    index_tables(root, VERSION, SCENES, tmp_path)
+    assert times_of_change(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("table", "token", "changes"),
+    [
+        ("sample_annotation", "0002 annotation 0 4", {"size": [1.0, 2.0, 3.0]}),
+        ("ego_pose", "0002 CAM_FRONT 2", {"translation": [1.0, 2.0, 3.0]}),
+        ("sample_data", "0002 LIDAR_TOP 2", {"width": 7}),
+        ("sample", "0002 sample 3", {"timestamp": 7}),
+    ],
+)
+def test_a_changed_row_rewrites_its_own_scene_alone(root, tmp_path, table, token, changes):
+    index_tables(root, VERSION, SCENES, tmp_path)
+    before = times_of_change(tmp_path)
+    edit(root, table, token, **changes)
+    index_tables(root, VERSION, SCENES, tmp_path)
+    after = times_of_change(tmp_path)
+    assert [scene for scene in SCENES if after[scene] != before[scene]] == ["0002"]
+    (changed,) = (row for row in read_scene_tables(scene_file(tmp_path, "0002"))[table] if row["token"] == token)
+    assert {key: changed[key] for key in changes} == changes
+
+
+def test_tables_that_have_not_changed_are_not_read_again(root, tmp_path, monkeypatch):
+    index_tables(root, VERSION, SCENES, tmp_path)
+    monkeypatch.setattr(scene_tables, "rows", lambda table: pytest.fail(f"{table} is read"))
+    index_tables(root, VERSION, SCENES, tmp_path)
+
+
+@pytest.mark.parametrize("lost", ["0003.jsonl", scene_tables.INDEX])
+def test_a_lost_file_is_made_again(root, tmp_path, lost):
+    index_tables(root, VERSION, SCENES, tmp_path)
+    content = scene_file(tmp_path, "0003").read_bytes()
+    (tmp_path / lost).unlink()
+    index_tables(root, VERSION, SCENES, tmp_path)
+    assert scene_file(tmp_path, "0003").read_bytes() == content and (tmp_path / lost).is_file()
+
+
+def test_a_damaged_file_is_refused_naming_it(root, tmp_path):
+    index_tables(root, VERSION, SCENES, tmp_path)
+    file = scene_file(tmp_path, "0001")
+    for content in (file.read_bytes()[:-9], b"[]\n", b'{"other": {}}\n', b"\xff"):
+        file.write_bytes(content)
+        with pytest.raises(DatasetError, match=r"0001\.jsonl is damaged.*delete it and rerun"):
+            read_scene_tables(file)
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '[{"token": "a"}', '[{"token": "a"}, {"tok', "[{}]", "nothing"])
+def test_a_damaged_table_is_refused_naming_the_dataset(root, tmp_path, content):
+    (root / VERSION / "sample_data.json").write_text(content)
+    with pytest.raises(DatasetError, match=rf"{root} cannot be read.*unpack it again"):
+        index_tables(root, VERSION, SCENES, tmp_path / "rows")
+
+
+def test_a_folder_that_cannot_be_written_is_refused_naming_it(root, tmp_path):
+    (tmp_path / "rows").write_text("no folder")
+    with pytest.raises(ResultError, match="rows"):
+        index_tables(root, VERSION, SCENES, tmp_path / "rows")
+
+
+ROWS = [{"token": "ä}]", "text": 'a "quoted"  ], [ text', "nested": [[1.5, -2], {"a": {}}]}, {}, {"token": "b" * 50}]
+
+
+@pytest.mark.parametrize("chunk", [7, 64, 2**22])
+@pytest.mark.parametrize("indent", [None, 0, 4])
+@pytest.mark.parametrize("content", [ROWS, [], ROWS * 3])
+def test_rows_are_those_that_json_reads_whatever_is_read_at_once(tmp_path, monkeypatch, chunk, indent, content):
+    monkeypatch.setattr(scene_tables, "_CHUNK", chunk)
+    (tmp_path / "table.json").write_text(" \n" + json.dumps(content, indent=indent, ensure_ascii=False) + "\n")
+    found = list(rows(tmp_path / "table.json"))
+    assert [row for _, row in found] == content
+    assert [json.loads(text) for text, _ in found] == content and not any("\n" in text for text, _ in found)
+
+
+def test_a_large_table_is_read_in_little_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(scene_tables, "_CHUNK", 2**14)
+    row = {"token": "0" * 32, "translation": [1.0, 2.0, 3.0]}
+    (tmp_path / "table.json").write_text(json.dumps([row] * 30_000))
+    tracemalloc.start()
+    try:
+        assert sum(1 for _ in rows(tmp_path / "table.json")) == 30_000
+        assert tracemalloc.get_traced_memory()[1] < 400_000, "the table has 2.3 MB"
+    finally:
+        tracemalloc.stop()
