@@ -23,7 +23,7 @@ rule extract:
     conda:
         "../envs/drivesplat.yaml"
     resources:
-        mem_mb=8000,
+        mem_mb=2000,
         runtime=30,
     params:
         settings=plan.settings("extract"),

@@ -18,6 +18,7 @@ from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
 from drivesplat.workflow.gpus import any_card
+from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import (

@@ -1,8 +1,10 @@
 """The whole DAG on a tiny world, as users run it."""
 
+import json
 import math
 import subprocess
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -302,6 +304,22 @@ def test_touched_files_and_a_fresh_checkout_rerun_nothing(finished):
             path.unlink()
             path.write_bytes(content)
     assert finished.planned() == {}
+
+
+def test_changed_tables_rerun_the_scenes_whose_rows_they_change(finished):
+    def planned_with(table: str, change: Callable[[list[dict]], None]) -> dict[str, int]:
+        path = finished.folder / f"data/v1.0-mini/{table}.json"
+        before = path.read_bytes()
+        rows = json.loads(before)
+        change(rows)
+        path.write_text(json.dumps(rows))
+        try:
+            return finished.planned()
+        finally:
+            path.write_bytes(before)
+
+    assert planned_with("sample", lambda rows: rows.append({**rows[0], "token": "x", "scene_token": "other"})) == {}
+    assert planned_with("sample_annotation", lambda rows: rows[3].update(size=[1.0, 2.0, 3.0])) == EVERYTHING
 
 
 @pytest.mark.parametrize(
