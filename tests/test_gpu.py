@@ -35,7 +35,7 @@ from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
 from drivesplat.io.prefetch import in_advance
 from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture_stream
-from drivesplat.kernels.relocation import relocation_in_torch
+from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
@@ -189,14 +189,14 @@ def test_actors_agree_with_the_cpu():
     assert float(alone.max()) > 0.1 and float((alone - alone_on_cpu).abs().quantile(0.99)) < 1e-3
 
 
-def test_relocation_in_torch_agrees_with_gsplat():
+def test_relocation_agrees_with_gsplat():
     generator = torch.Generator().manual_seed(0)
     ratios = torch.arange(1, 21).repeat(50)
     opacities = torch.rand(len(ratios), generator=generator) * 0.97 + 0.02
     scales = torch.rand(len(ratios), 3, generator=generator) + 0.05
     binoms = MCMCStrategy().initialize_state()["binoms"]
     expected = compute_relocation(opacities.to(GPU), scales.to(GPU), ratios.to(GPU), binoms.to(GPU))
-    found = relocation_in_torch(opacities, scales, ratios, binoms)
+    found = relocation(opacities, scales, ratios, binoms)
     for ours, gsplats in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, gsplats.cpu(), rtol=1e-3, atol=1e-6)
 

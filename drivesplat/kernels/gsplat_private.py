@@ -15,7 +15,7 @@ from gsplat.strategy import ops
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from drivesplat.kernels.relocation import relocation_in_torch
+from drivesplat.kernels.relocation import relocation
 
 
 def update_parameters(
@@ -52,7 +52,7 @@ def compiled_kernels() -> Any:
 def cpu_strategies() -> Iterator[None]:
     """Within this context gsplat's strategies run on the CPU: torch replaces the two CUDA kernels that they call."""
     with (
-        patch.object(ops, "compute_relocation", relocation_in_torch),
+        patch.object(ops, "compute_relocation", relocation),
         patch.object(ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
     ):
         yield

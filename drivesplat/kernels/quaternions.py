@@ -1,4 +1,4 @@
-"""Rotations as quaternions w, x, y, z, in few operations: a training pays for every one of them at every iteration."""
+"""Rotations as quaternions w, x, y, z, in few tensor operations, which every training iteration runs."""
 
 from functools import cache
 

@@ -13,22 +13,13 @@ def relocation(
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
     """Opacity (in [0, 1]) and scale (metres) with which `ratios` copies in one place look like the one Gaussian before.
 
-    `binoms[i, k]` is the binomial coefficient. Runs gsplat's kernel on a GPU and torch elsewhere.
+    `binoms[i, k]` is the binomial coefficient. The arguments are those of gsplat's `compute_relocation`, which runs on
+    a GPU; elsewhere torch runs.
     """
-    if not opacities.is_cuda:
-        return relocation_in_torch(opacities, scales, ratios, binoms)
-    from gsplat.relocation import compute_relocation
+    if opacities.is_cuda:
+        from gsplat.relocation import compute_relocation
 
-    return compute_relocation(opacities, scales, ratios, binoms)
-
-
-def relocation_in_torch(
-    opacities: Float[Tensor, " n"],
-    scales: Float[Tensor, "n 3"],
-    ratios: Int[Tensor, " n"],
-    binoms: Float[Tensor, "n_max n_max"],
-) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """The same in torch; takes the arguments of gsplat's `compute_relocation`."""
+        return compute_relocation(opacities, scales, ratios, binoms)
     n_max = len(binoms)
     ratios = ratios.clamp(1, n_max).long()
     new_opacities = 1.0 - (1.0 - opacities) ** (1.0 / ratios)

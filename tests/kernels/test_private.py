@@ -12,7 +12,7 @@ from gsplat.cuda import _torch_impl
 from gsplat.strategy import ops
 from helpers import REPOSITORY
 
-from drivesplat.kernels.relocation import relocation_in_torch
+from drivesplat.kernels.relocation import relocation
 
 LIBRARIES = ("torch", "gsplat", "numba", "triton")
 MODULES = {"drivesplat/kernels/torch_private.py", "drivesplat/kernels/gsplat_private.py"}
@@ -28,7 +28,7 @@ GSPLAT = [
     (ops._update_param_with_optimizer, "param_fn optimizer_fn params optimizers names"),
     (ops._multinomial_sample, "weights n replacement"),
     (ops.compute_relocation, "opacities scales ratios binoms"),
-    (relocation_in_torch, "opacities scales ratios binoms"),
+    (relocation, "opacities scales ratios binoms"),
     (ops.quat_scale_to_covar_preci, "quats scales compute_covar compute_preci triu"),
     (_torch_impl._quat_scale_to_covar_preci, "quats scales compute_covar compute_preci triu"),
     (_torch_impl._eval_sh_bases_fast, "basis_dim dirs"),

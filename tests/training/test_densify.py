@@ -13,7 +13,7 @@ from helpers.hand_made import actors_of, motion_through, round_gaussians, track_
 
 from drivesplat.kernels.exploration import explore
 from drivesplat.kernels.gsplat_private import cpu_strategies
-from drivesplat.kernels.relocation import relocation, relocation_in_torch
+from drivesplat.kernels.relocation import relocation
 from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.actors import ActorSettings
@@ -84,7 +84,7 @@ def test_every_gaussian_is_relocated_by_its_own_ratio():
 def test_gsplats_own_functions_are_restored_after_cpu_strategies():
     before = ops.compute_relocation, ops.quat_scale_to_covar_preci
     with pytest.raises(ZeroDivisionError), cpu_strategies():
-        assert ops.compute_relocation is relocation_in_torch
+        assert ops.compute_relocation is relocation
         raise ZeroDivisionError
     assert (ops.compute_relocation, ops.quat_scale_to_covar_preci) == before
 

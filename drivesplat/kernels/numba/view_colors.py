@@ -133,7 +133,7 @@ def _basis_backward(degree, x, y, z, v):
 @callee
 @no_type_check
 def _color(basis, used, coefficients):
-    """Red, green and blue before they are held above 0."""
+    """Red, green and blue before they are limited to 0 or more."""
     red, green, blue = 0.5, 0.5, 0.5
     for k in range(used):
         red += basis[k] * coefficients[k, 0]

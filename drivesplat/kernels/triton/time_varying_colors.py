@@ -50,11 +50,11 @@ def _colors(
     sh0, shN, series, rotations, owner, colors, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i, k, valid, whose, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
+    i, k, valid, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
     for channel in tl.static_range(3):
         own = tl.zeros((BLOCK, PADDED), tl.float32)
         for term in tl.static_range(TERMS):
-            weight = tl.load(series + whose * TERMS + term, mask=valid, other=0.0)[:, None]
+            weight = tl.load(series + object_ * TERMS + term, mask=valid, other=0.0)[:, None]
             row = (i * TERMS + term)[:, None]
             of_first = tl.load(sh0 + row * 3 + channel + 0 * k[None, :], mask=first, other=0.0)
             of_others = tl.load(shN + (row * (K - 1) + k[None, :] - 1) * 3 + channel, mask=others, other=0.0)
@@ -69,12 +69,12 @@ def _colors_backward(
     v_colors, series, rotations, owner, v_sh0, v_shN, count,
     TERMS: tl.constexpr, K: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i, k, valid, whose, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
+    i, k, valid, object_, first, others, rotation = _harmonics(rotations, owner, count, K, PADDED, BLOCK)
     for channel in tl.static_range(3):
         given = tl.load(v_colors + (i[:, None] * K + k[None, :]) * 3 + channel, mask=first | others, other=0.0)
         own = tl.sum(rotation * given[:, :, None], axis=1)
         for term in tl.static_range(TERMS):
-            value = tl.load(series + whose * TERMS + term, mask=valid, other=0.0)[:, None] * own
+            value = tl.load(series + object_ * TERMS + term, mask=valid, other=0.0)[:, None] * own
             row = (i * TERMS + term)[:, None]
             tl.store(v_sh0 + row * 3 + channel + 0 * k[None, :], value, mask=first)
             tl.store(v_shN + (row * (K - 1) + k[None, :] - 1) * 3 + channel, value, mask=others)
@@ -88,9 +88,9 @@ def _harmonics(rotations, owner, count, K: tl.constexpr, PADDED: tl.constexpr, B
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     k = tl.arange(0, PADDED)
     valid = i < count
-    whose = tl.load(owner + i, mask=valid, other=0)
+    object_ = tl.load(owner + i, mask=valid, other=0)
     first = valid[:, None] & (k == 0)[None, :]
     others = valid[:, None] & ((k > 0) & (k < K))[None, :]
-    at = (whose[:, None, None] * K + k[None, :, None]) * K + k[None, None, :]
+    at = (object_[:, None, None] * K + k[None, :, None]) * K + k[None, None, :]
     known = valid[:, None, None] & (k < K)[None, :, None] & (k < K)[None, None, :]
-    return i, k, valid, whose, first, others, tl.load(rotations + at, mask=known, other=0.0)
+    return i, k, valid, object_, first, others, tl.load(rotations + at, mask=known, other=0.0)
