@@ -332,7 +332,7 @@ def test_changed_tables_rerun_the_scenes_whose_rows_they_change(finished):
          {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ("drivesplat/preprocess/sky_mask.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
         ("drivesplat/training/floaters.py", "LARGEST_STEP = 15.0", "LARGEST_STEP = 14.0", TRAINING_AND_AFTER),
-        ("drivesplat/settings/train.py", "Optimisation steps", "Steps of the optimisation", {}),
+        ("drivesplat/settings/train.py", "Number of optimisation", "The number of optimisation", {}),
         ("drivesplat/scene/object_class.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
         ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
         ("drivesplat/io/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
