@@ -7,7 +7,7 @@
 
 rule edit:
     """
-    Films an edit with the recorded drive beside it, and states where everything then is, frame by frame: labels of
+    Renders an edited drive beside the recorded one as a film, and writes the poses and boxes of every frame: labels of
     images that were never recorded.
     """
     input:

@@ -7,8 +7,8 @@
 
 rule export:
     """
-    The Gaussians as splat viewers read them (3DGS's PLY), together and a file for the background and every object, with
-    every camera of the drive and how the objects move.
+    Exports the Gaussians in 3DGS's PLY format, in one file and in one per part (background and each object), with the
+    recorded cameras and the motion of the objects.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
@@ -36,8 +36,8 @@ rule export:
 
 rule export_usd:
     """
-    The Gaussians in OpenUSD's Gaussian splat schema, objects moving, with the recording camera: the drive as Omniverse
-    and Isaac Sim play it.
+    Exports the Gaussians in OpenUSD's Gaussian splat schema, with moving objects and the recording camera, for Omniverse
+    and Isaac Sim.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
@@ -62,7 +62,7 @@ rule export_usd:
 
 rule export_viewer:
     """
-    One page that shows the splat under a mouse, without network; thinned to what a browser carries well.
+    Exports one HTML page that shows the splat interactively and offline, with a limited number of Gaussians.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",

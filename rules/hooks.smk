@@ -7,7 +7,7 @@
 
 rule costs:
     """
-    Nothing by itself: costs.csv and costs.json are written when any run ends, and this one's table is printed.
+    Runs no job; every run writes costs.csv and costs.json at its end, and this target prints them.
     """
     input:
         [],
@@ -15,7 +15,7 @@ rule costs:
 
 rule estimate:
     """
-    Nothing: what the targets beside it, else everything, would take in time and disk is printed, and the run ends there.
+    Prints the time and disk that the other targets (by default all) would take, and runs nothing.
     """
     input:
         [] if wanted else rules.all.input,

@@ -9,8 +9,8 @@
 
 rule tracks:
     """
-    Lists every annotated object that can move, with its class, speed and time in sight, and shows the movers with the
-    ids by which settings name them.
+    Lists every annotated object that can move, with class, speed and visible time, and draws the moving ones with the
+    ids that settings use.
     """
     input:
         scene=plan.scene,
@@ -43,7 +43,7 @@ rule tracks:
 
 rule film:
     """
-    Drives the recorded path again, or one beside it, at the speed of the drive, and films what the model shows.
+    Renders a film along the recorded path or one beside it, at the speed of the drive.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
@@ -78,7 +78,7 @@ rule film:
 
 rule film_parts:
     """
-    The recorded drive three times side by side: everything, what stands still, and what moves.
+    Renders the recorded drive three times side by side: all parts, the static ones and the dynamic ones.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
@@ -115,8 +115,8 @@ rule film_parts:
 
 rule ghost_panel:
     """
-    Ground truth, render, error and ghosts of the moving vehicle that fills most pixels: what a static world makes of
-    what moves.
+    Draws ground truth, rendering, error and ghosts of the moving vehicle with the most pixels: how a static model fails
+    on dynamic objects.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",
@@ -153,8 +153,8 @@ rule ghost_panel:
 
 rule remove_actor:
     """
-    Takes that vehicle out of the model, by its own Gaussians where the method knows them, else by its box, and reports
-    what that leaves: holes, edges, ghosts.
+    Removes that vehicle from the model, by its own Gaussians if the method has them, otherwise by its box, and reports
+    the remaining holes, edges and ghosts.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.pt",

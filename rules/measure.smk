@@ -7,8 +7,8 @@
 
 rule lpips_backbone:
     """
-    Fetches LPIPS's AlexNet backbone once, or takes the file that lies there; where neither works LPIPS is null with
-    the reason, and the run goes on.
+    Downloads LPIPS's AlexNet backbone once, or uses the present file; if neither works, LPIPS is null with the reason
+    and the run continues.
     """
     input:
         file=plan.backbone_file,
@@ -29,9 +29,9 @@ rule lpips_backbone:
 
 rule evaluate:
     """
-    Renders the held-out images of the evaluated camera and measures PSNR, SSIM and LPIPS over static and moving pixels;
-    on a synthetic world also the view from the side and the street without the car ahead, against the truth. One
-    held-out image is kept as it was recorded and as it is rendered.
+    Renders the held-out images of the evaluated camera and measures PSNR, SSIM and LPIPS over static and dynamic pixels;
+    on a synthetic world also a lateral view and the removal of the leading car, compared with the ground truth. Writes
+    one held-out image as recorded and as rendered.
     """
     input:
         scene=plan.scene,
@@ -66,7 +66,7 @@ rule evaluate:
 
 rule scene_metrics:
     """
-    Puts all methods of a scene side by side.
+    Combines the measurements of all methods of a scene.
     """
     input:
         evals=expand("<results>/{{scene}}/{method}/eval.json", method=plan.config.methods),

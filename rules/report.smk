@@ -7,8 +7,8 @@
 
 rule gap_report:
     """
-    A row per scene and method, means with intervals, the gap as a plot, and a page to look at. Results of other
-    settings or code than the config's are left out and named.
+    Writes a table with a row per scene and method, means with confidence intervals, a plot of the gap, and an HTML page.
+    Results of other settings or code are left out and named.
     """
     input:
         metrics=across_scenes.metrics,

@@ -34,8 +34,8 @@ rule extract:
 
 rule own_car:
     """
-    Says where each camera sees the recording car's own body: by the outlines that the user gave, or where images stay
-    as they are while the car drives.
+    Finds the pixels of the ego vehicle in each camera: from the user's outlines, or as the pixels that do not change
+    while the vehicle drives.
     """
     input:
         scene="<results>/{scene}/scene.json",
@@ -59,9 +59,9 @@ rule own_car:
 
 rule refine_poses:
     """
-    Corrects the poses by what the images show: features triangulated between key frames, bundle adjustment with the
-    given poses as priors. Keeps the given ones, with a warning, where images cannot improve them. Or makes them from
-    images and LiDAR alone, and fails where these do not tell.
+    Refines poses from images: triangulated features between key frames, bundle adjustment with the given poses as
+    priors. Keeps the given poses, with a warning, if images cannot improve them. Can also estimate poses from images and
+    LiDAR alone, and fails if these do not determine them.
     """
     input:
         scene="<results>/{scene}/scene.json",
@@ -89,8 +89,8 @@ rule refine_poses:
 
 rule lidar_seed:
     """
-    Starts the Gaussians where LiDAR of the training sweeps found something that stands still, coloured from
-    training images, with random far points along pixels that LiDAR does not reach.
+    Makes seed points from static LiDAR returns of the training sweeps, coloured from training images, and random far
+    points along pixels that LiDAR does not reach.
     """
     input:
         scene=plan.scene,
@@ -118,7 +118,7 @@ rule lidar_seed:
 
 rule parser:
     """
-    Packs cameras, splits and seed into the dict that users of gsplat's example trainer will recognise.
+    Combines cameras, splits and seed into the dictionary of gsplat's example trainer.
     """
     input:
         scene=plan.scene,
@@ -143,7 +143,7 @@ rule parser:
 
 rule masks:
     """
-    Labels every pixel of every image: static, parked, moving, left out (from the annotated boxes), and sky.
+    Labels every pixel of every image as static, parked, moving or ignored (from the annotated boxes), and as sky.
     """
     input:
         scene=plan.scene,
@@ -168,8 +168,8 @@ rule masks:
 
 rule actors:
     """
-    Gathers LiDAR of every vehicle that moves and is seen in that vehicle's own frame, coloured from training images,
-    with random points in its box where LiDAR is thin.
+    Collects LiDAR points of every visible moving vehicle in the vehicle's own frame, coloured from training images, with
+    random points in its box where LiDAR is sparse.
     """
     input:
         scene=plan.scene,
@@ -194,7 +194,8 @@ rule actors:
 
 rule lidar_depth:
     """
-    Projects the LiDAR sweep nearest in time into every training image, what moves carried along to the image's moment.
+    Projects the nearest LiDAR sweep into every training image, with moving points transformed by their tracks to the
+    time of the image.
     """
     input:
         scene=plan.scene,
@@ -219,8 +220,8 @@ rule lidar_depth:
 
 rule free_space:
     """
-    Follows every LiDAR ray of the training key frames from sensor to return, and every ray from a training image to a
-    triangulated point: the voxels that rays passed, and near which none ended, are empty.
+    Finds empty voxels: crossed by LiDAR rays of training key frames or by rays from training images to triangulated
+    points, with no end of a ray near them.
     """
     input:
         scene=plan.scene,

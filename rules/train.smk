@@ -1,14 +1,14 @@
 # The training of one method on one scene.
 #
 # REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.pkl, lidar_depth.pkl and free_space.pkl
-# where the method has actors, is held to LiDAR's depth, and keeps Gaussians out of space proven empty.
+# if the method has actors, is supervised with LiDAR depth, and keeps Gaussians out of empty space.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.pt and train.json; tensorboard/ beside them. While it runs,
 # resume/ holds what a killed training goes on from; no rule declares it, so that Snakemake leaves it alone.
 
 
 rule train:
     """
-    Fits Gaussians to the training images; resumes where a run of the same settings, code and inputs was ended.
+    Fits Gaussians to the training images; resumes an interrupted training of the same settings, code and inputs.
     """
     input:
         parser="<results>/{scene}/parser.pkl",

@@ -1,4 +1,4 @@
-"""Where a result comes from: settings, code and inputs of every stage behind it, carried from stage to stage."""
+"""Provenance of results: settings, code and inputs of every stage behind a result, passed from stage to stage."""
 
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
@@ -16,8 +16,8 @@ def provenance(
 ) -> dict[str, Any]:
     """The provenance of a result of `stage`, given those of the results it was made from.
 
-    `inputs` are digests of files that no stage made (tables, a user's points file), by name. Raises ResultError where
-    two results behind it were made by the same stage in different ways.
+    `inputs` are digests of files that no stage made (tables, a user's points file), by name. Raises ResultError if two
+    of them contain the same stage with different settings or code.
     """
     merged = combine(upstream)
     merged["stages"][stage] = {"settings": settings, "code": code}
@@ -26,7 +26,7 @@ def provenance(
 
 
 def combine(records: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """Several provenances as one. Raises ResultError naming the stage and the difference where they contradict."""
+    """Several provenances as one. Raises ResultError naming the stage and the difference if they contradict."""
     stages: dict[str, Any] = {}
     inputs: dict[str, str] = {}
     for record in records:
@@ -43,7 +43,7 @@ def combine(records: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def sealed(stages: dict[str, Any], inputs: dict[str, str]) -> dict[str, Any]:
-    """The record with the digests that `metrics.json` promises."""
+    """The record with the digests that `metrics.json` specifies."""
     return {
         "settings_sha256": sha256_text(canonical_json({name: stage["settings"] for name, stage in stages.items()})),
         "code_sha256": sha256_text(canonical_json({name: stage["code"] for name, stage in stages.items()})),

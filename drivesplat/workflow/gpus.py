@@ -1,4 +1,4 @@
-"""How many GPUs there are, and which job has which: one job a card, whoever starts them. Without importing torch."""
+"""Visible GPUs, counted without importing torch, and locks that give each job a GPU of its own."""
 
 import fcntl
 import logging
@@ -16,13 +16,13 @@ from drivesplat.errors import DeviceError
 log = logging.getLogger(__name__)
 
 VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
-"""What a user or a scheduler says with which cards are to be used; the first that is set counts."""
+"""Environment variables with which a user or scheduler selects GPUs; the first one that is set counts."""
 PATIENCE_S = 1.0
-"""Seconds between two looks for a free card."""
+"""Seconds between two attempts to lock a GPU."""
 
 
 def visible_cards() -> int:
-    """How many GPUs this process may use, of any maker; never under 1, so that GPU rules can be scheduled on a CPU."""
+    """The number of GPUs of any maker that this process may use; at least 1, so that a CPU can run GPU rules."""
     return max(1, len(_visible()[1]))
 
 
@@ -32,8 +32,8 @@ def any_card() -> bool:
 
 
 def hold_card(jobs_per_card: int) -> BinaryIO | None:
-    """Takes a card that fewer than `jobs_per_card` jobs of this user hold on this machine, and hides all others from
-    this process; to be called before anything looks for a GPU.
+    """Locks a GPU that fewer than `jobs_per_card` jobs of this user hold on this machine, and hides all others from
+    this process; call it before any library looks for a GPU.
 
     Returns the file whose kernel lock says so: the card is held until it is closed, at the latest until the process
     ends, however it ends. None where there is nothing to hold: no card, or a single one, given by a scheduler, of which
@@ -61,8 +61,8 @@ def hold_card(jobs_per_card: int) -> BinaryIO | None:
 
 
 def _free_card(cards: dict[str, str], jobs_per_card: int) -> tuple[str, BinaryIO | None, list[str]]:
-    """A card of the fewest jobs, and the lock on a place on it; or no lock, and the processes that hold all places.
-    `cards` are their identities by name."""
+    """The GPU with the fewest jobs and a lock on it; or no lock, and the processes that hold all locks. `cards` are
+    identities by name."""
     holders = []
     for place in range(jobs_per_card):
         for card, identity in cards.items():
@@ -74,7 +74,7 @@ def _free_card(cards: dict[str, str], jobs_per_card: int) -> tuple[str, BinaryIO
 
 
 def _visible() -> tuple[str, list[str]]:
-    """The variable that says which cards are to be used, and their names in it."""
+    """The environment variable that selects GPUs, and the names in it."""
     for variable in VARIABLES:
         if variable in os.environ:
             names = (name.strip() for name in os.environ[variable].split(","))
@@ -86,8 +86,8 @@ def _visible() -> tuple[str, list[str]]:
 
 
 def _identities(cards: Sequence[str]) -> list[str]:
-    """What each card is called whichever others can be seen: numbers count those that can, and a scheduler may show
-    every job its card as number 0. The number, where nvidia-smi cannot tell."""
+    """Names of GPUs that do not depend on which are visible (a scheduler may show every job its GPU as number 0): their
+    UUIDs, or their numbers if nvidia-smi is not available."""
     if all(not card.isdigit() for card in cards):
         return list(cards)
     command = ("nvidia-smi", "--query-gpu=index,uuid", "--format=csv,noheader")
@@ -99,7 +99,7 @@ def _identities(cards: Sequence[str]) -> list[str]:
 
 
 def _lock_folder() -> Path:
-    """This user's locks on this machine, whose cards they are."""
+    """The folder of this user's locks on this machine."""
     return Path(tempfile.gettempdir()) / f"drivesplat-cards-{os.getuid()}"
 
 

@@ -1,4 +1,4 @@
-"""The files that rules read, as functions of wildcards: which ones depends on the config."""
+"""Input functions of rules: the files to read depend on the config."""
 
 from pathlib import Path
 from typing import Any
@@ -68,30 +68,30 @@ class Inputs:
         return {name: dataset.scenes[0] for name, dataset in self.config.datasets.items() if dataset.world}
 
     def world_tables(self, dataset: str) -> list[str]:
-        """The files that a synthetic world consists of, as far as rules know them."""
+        """The declared files of a synthetic world."""
         world = self.config.datasets[dataset]
         return [f"{world.world_root}/{world.version}/{table}.json" for table in layout(world.reader).TABLES]
 
     def truth_file(self, dataset: str) -> str:
-        """Where the truth of a synthetic world is stated."""
+        """The ground-truth file of a synthetic world."""
         return f"{self.config.datasets[dataset].world_root}/{TRUTH_FILE}"
 
     def truth(self, wildcards: Any) -> list[str]:
-        """The truth of a scene: recorded drives have none."""
+        """The ground truth of a scene; none for recorded drives."""
         name = self.config.dataset_of(wildcards.scene)
         return [self.truth_file(name)] if name in self.worlds else []
 
     def scene(self, wildcards: Any) -> str:
-        """The record of a scene that all stages take: with refined poses, where they are wanted."""
+        """The scene record that all stages read: with refined poses if they are enabled."""
         name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
 
     def triangulated_seeds(self, wildcards: Any) -> list[str]:
-        """The points that the refinement of poses triangulated, where they are to be seeds."""
+        """The points triangulated by pose refinement, if they are used as seeds."""
         return self._triangulated(wildcards, for_scene(self.config, wildcards.scene).lidar_seed.triangulated)
 
     def triangulated_ends(self, wildcards: Any) -> list[str]:
-        """The same points, where rays to them are to prove space empty."""
+        """The same points, if rays to them are used to find empty space."""
         return self._triangulated(wildcards, for_scene(self.config, wildcards.scene).free_space.triangulated)
 
     def _triangulated(self, wildcards: Any, wanted: bool) -> list[str]:
@@ -99,20 +99,20 @@ class Inputs:
         return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.pkl"] if made else []
 
     def points_file(self, wildcards: Any) -> list[str]:
-        """The user's extra seed points, where given."""
+        """The user's extra seed points, if given."""
         path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
         return [str(Path(path).expanduser())] if path else []
 
     def actors(self, wildcards: Any) -> list[str]:
-        """What the actors of a training are made of, where its method has any."""
+        """The seeds of actors, if the method trains actors."""
         return self._training_input("actors", wildcards)
 
     def lidar_depth(self, wildcards: Any) -> list[str]:
-        """LiDAR's depth in the training images, where a training is held to it."""
+        """LiDAR depth in the training images, if the training is supervised with it."""
         return self._training_input("lidar_depth", wildcards)
 
     def free_space(self, wildcards: Any) -> list[str]:
-        """The space that LiDAR's rays prove empty, where a training keeps Gaussians out of it."""
+        """The space that LiDAR rays crossed, if the training keeps Gaussians out of it."""
         return self._training_input("free_space", wildcards)
 
     def _training_input(self, stage: str, wildcards: Any) -> list[str]:
@@ -120,9 +120,9 @@ class Inputs:
         return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.pkl"] if stage in taken else []
 
     def lpips_record(self, _: Any) -> list[str]:
-        """The record of LPIPS's backbone, where LPIPS is wanted."""
+        """The record of LPIPS's backbone, if LPIPS is enabled."""
         return [BACKBONE_RECORD] if self.config.lpips.enabled else []
 
     def backbone_file(self, _: Any) -> list[str]:
-        """The backbone itself, where it is there already: its arrival reruns what lacked it."""
+        """The backbone itself if it is present: adding it reruns the measurements that lacked it."""
         return [BACKBONE] if Path(BACKBONE).is_file() else []

@@ -28,14 +28,14 @@ from drivesplat.workflow.gpus import hold_card
 S = TypeVar("S", bound=Settings)
 
 REFUSED_BY_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-"""What is wrong with the disk and not with the workflow."""
+"""Errors of the disk, not of the workflow."""
 
-if hasattr(sys.modules["__main__"], "snakemake"):  # in a rule's script, which imports this before all else
-    gc.disable()  # until the job begins: what is imported stays, and looking for waste in it takes half a second
+if hasattr(sys.modules["__main__"], "snakemake"):  # in a rule's script, which imports this first
+    gc.disable()  # until the job begins: imported objects stay, and collecting garbage among them takes 0.5 s
 
 
 class Job:
-    """What a rule's script may know: its files, its settings and its digest of code; never the whole config."""
+    """The files, settings and code digest of a rule, for its script; never the whole config."""
 
     def __init__(self, snakemake: Any):
         self.input = snakemake.input
@@ -53,7 +53,7 @@ class Job:
 
     @property
     def stage(self) -> str:
-        """The name under which results remember this stage; a method's stages carry its name."""
+        """The name of this stage in provenance records, prefixed by the method if it has one."""
         method = getattr(self.wildcards, "method", None)
         return f"{method}/{self._rule}" if method else self._rule
 
@@ -107,10 +107,10 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
     Inputs are compared with what their rules wrote, unless the script does that itself (`check_inputs`); `dataset` are
     the kinds of the dataset's files that the script reads ('images', 'sweeps').
 
-    A DriveSplatError is told as its sentence, a disk that takes no more as what it says; anything else is a bug, told
-    with the place of its traceback in the log.
+    A DriveSplatError is reported by its message, a full or read-only disk by the file; anything else is a bug, reported
+    with the log that has its traceback.
     """
-    gc.freeze()  # nor is it looked through again; when the script ends, that is what most of the time goes to
+    gc.freeze()  # imports are never collected, which would take most of the time when a script ends
     gc.enable()
     log_path = Path(snakemake.log[0])
     _log_into(log_path)
@@ -158,5 +158,5 @@ def _log_into(path: Path) -> None:
 
 
 def _log_thread(failed: threading.ExceptHookArgs) -> None:
-    """What a thread fails with is the log's; who waits for the thread tells the user."""
+    """Logs the failure of a thread; the caller that waits for it reports it to the user."""
     logging.getLogger(__name__).info("a thread fails: %s: %s", failed.exc_type.__name__, failed.exc_value)

@@ -1,4 +1,4 @@
-"""What the Snakefile needs to know before anything runs: settings and code digests for its rules, and early refusals.
+"""What the Snakefile needs before anything runs: settings and code digests of rules, and checks of the targets.
 
 Everything here is cheap to import and to compute; it runs once in the main process and once in every job.
 """
@@ -38,7 +38,7 @@ def let_scripts_import(folder: str) -> None:
 
 
 class Plan(Outputs):
-    """The validated config as the rules ask for it; `basedir` is the Snakefile's folder."""
+    """The interface of the rules to the validated config; `basedir` is the Snakefile's folder."""
 
     def __init__(self, values: Mapping[str, Any], basedir: str):
         super().__init__(load(values), Path(basedir) / SCRIPTS)
@@ -63,7 +63,8 @@ class Plan(Outputs):
         return canonical_json(download_job(self.config).model_dump(mode="json"))
 
     def device(self, wildcards: Any) -> str:
-        """Where a scene's jobs run. A resource of the rules, not a param: moving to another machine reruns nothing."""
+        """The device settings of a scene's jobs as canonical JSON. A resource of the rules, not a param: moving to
+        another machine reruns nothing."""
         return self._device(wildcards.scene)[0]
 
     def _device(self, scene: str) -> tuple[str, int]:
@@ -78,27 +79,27 @@ class Plan(Outputs):
         return self._devices[name]
 
     def cards(self, wildcards: Any) -> int:
-        """How many GPUs a scene's trainings and renderings take each: one, or none where they run on the CPU; by what
-        can be told on this machine, whose GPUs are those of the jobs."""
+        """The number of GPUs that each training or rendering of a scene takes: 1, or 0 on the CPU. Looks at the GPUs of
+        this machine, where the jobs run."""
         return self._device(wildcards.scene)[1]
 
     def threads(self, on_gpu: int) -> Callable[[Any], int]:
-        """The threads of such a job, `on_gpu` where it has one. On the CPU half of the processors: two jobs beside one
-        another are done sooner than one after the other on all of them."""
+        """The threads of such a job: `on_gpu` with a GPU, otherwise half of the processors, since two jobs side by side
+        finish sooner than one after the other on all processors."""
         on_cpu = max(1, len(os.sched_getaffinity(0)) // 2)
         return lambda wildcards: on_gpu if self.cards(wildcards) else on_cpu
 
     def known(self, names: Any) -> str:
-        """A wildcard constraint that admits these names only."""
+        """A wildcard constraint that matches only these names."""
         return "|".join(re.escape(name) for name in names) or "(?!)"
 
     def report(self, targets: list[str]) -> ReportPlan:
-        """What the rule of the report across scenes asks, where `targets` are wanted."""
+        """The plan of the report across scenes for these `targets`."""
         return ReportPlan(self, targets)
 
     def refuse_unknown(self, targets: list[str]) -> None:
-        """Raises ConfigError, listing what there is, where a target names a scene, method or film it does not know, or
-        an ablation that would train one thing twice."""
+        """Raises ConfigError with the known names if a target names an unknown scene, method or film, or an ablation
+        that would train one variant twice."""
         for target in targets:
             scene, *rest = self._inside_results(target)
             if not rest:
@@ -111,7 +112,7 @@ class Plan(Outputs):
                 self._refuse_unknown_film(scene, rest[0], rest[1:])
 
     def _refuse_unknown_method(self, path: list[str]) -> None:
-        """Raises ConfigError where `path` below a scene's folder is about a method that there is none of."""
+        """Raises ConfigError if `path` below a scene's folder names an unknown method."""
         ablation, known = self.config.ablation, ", ".join(self.config.methods)
         if path[0] in ABLATION_FILES and not self.config.ablated:
             raise ConfigError(
@@ -122,7 +123,7 @@ class Plan(Outputs):
             raise ConfigError(f"method {path[0]!r} is not in the config; there are: {known}{more}")
 
     def _refuse_idle_variants(self, scene: str) -> None:
-        """Raises ConfigError where a variant of the ablation would be the whole method, trained again."""
+        """Raises ConfigError if a variant of the ablation has the settings of the whole method."""
         idle = idle_variants(self.config, scene)
         if idle:
             drop = ", ".join(f"{name}: null" for name in idle)
@@ -132,7 +133,7 @@ class Plan(Outputs):
             )
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
-        """Raises ConfigError where `path` below a method's folder is a film or an edit that there is none of."""
+        """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
         edit = Path(path[-1]).stem if len(path) == 2 and path[0] == "edits" else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         if (edit is not None or film == PARTS_FILM) and method not in self.methods_with_actors:
@@ -146,12 +147,12 @@ class Plan(Outputs):
             raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
 
     def refuse_download(self, targets: list[str]) -> None:
-        """Raises ConfigError where nuScenes mini is asked for and may not be fetched."""
+        """Raises ConfigError if nuScenes mini is a target and may not be downloaded."""
         if DOWNLOAD in targets:
             require_permission(download_job(self.config))
 
     def refuse_absent_data(self, targets: list[str]) -> None:
-        """Raises DatasetError where the dataset of a scene that is asked for is not where the config says."""
+        """Raises DatasetError if the dataset of a target's scene is not at the configured path."""
         needing = [target for target in targets if target != DOWNLOAD]
         for scene in self._scenes_of(needing) if needing or not targets else ():
             tables = self.tables(SimpleNamespace(scene=scene))
@@ -159,15 +160,14 @@ class Plan(Outputs):
                 refuse_foreign_data(Path(tables[0]).parents[1])
 
     def _scenes_of(self, targets: list[str]) -> list[str]:
-        """The scenes that targets need; those of the batch where a target does not say."""
+        """The scenes that targets need; those of the batch if a target names none."""
         scenes = [self._scene_of(target) for target in targets]
         if not scenes or any(scene is not None and scene not in self.config.scenes for scene in scenes):
             return self.report(targets).scenes
         return [scene for scene in scenes if scene is not None]
 
     def _scene_of(self, target: str) -> str | None:
-        """The scene whose file a target is: empty for a rule's name, None for a file that is no scene's result, of
-        which Snakemake knows whether it can be made."""
+        """The scene of a target: empty for a rule's name, None for a file outside the results of scenes."""
         for dataset, scene in self.worlds.items():
             made = (*self.world_tables(dataset), self.truth_file(dataset))
             if os.path.normpath(target) in map(os.path.normpath, made):
@@ -175,7 +175,7 @@ class Plan(Outputs):
         return self._inside_results(target)[0] or (None if os.sep in target else "")
 
     def _inside_results(self, target: str) -> list[str]:
-        """The parts of a target's path below the results folder; an empty one where it lies elsewhere."""
+        """The parts of a target's path below the results folder; one empty part if it is elsewhere."""
         path, results = (Path(os.path.normpath(name)) for name in (target, self.config.results_dir))
         return list(path.relative_to(results).parts) or [""] if path.is_relative_to(results) else [""]
 

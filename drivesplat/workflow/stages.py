@@ -1,4 +1,4 @@
-"""What each stage of a scene, a method or a film gets of the config: the one param that Snakemake compares.
+"""The settings that each stage of a scene, a method or a film gets: the param that Snakemake compares.
 
 A stage is a rule; its record holds everything that decides its result, its inputs aside.
 """
@@ -35,9 +35,9 @@ SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_me
 METHOD_STAGES = ("train", "evaluate")
 """The stages behind every metrics.json, of a scene and of each of its methods."""
 ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
-"""And that behind those of scenes whose poses are refined."""
+"""The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
-"""The one of them that no eval.json comes from."""
+"""The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = ("demo_world", "extract", "edit", "ghost_panel", "remove_actor")
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
@@ -46,8 +46,8 @@ TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 
 @dataclass(frozen=True)
 class Place:
-    """What a job is about; `config` as it holds there. A stage of a scene has no method, one of a method no film: the
-    name of a trajectory or of an edit. `scene` is empty for stages that are not among OF_ONE_SCENE."""
+    """The dataset, scene, method and film (trajectory or edit) of a job, empty where it has none, and the config that
+    applies to it. `scene` is also empty for stages that are not in OF_ONE_SCENE."""
 
     config: Config
     dataset_name: str
@@ -61,7 +61,7 @@ class Place:
 
     @property
     def subject(self) -> SubjectSettings:
-        """The vehicle that the user named for the scene."""
+        """The vehicle that the user selected for the scene."""
         return self.config.subjects.get(self.scene, SubjectSettings())
 
 
@@ -78,7 +78,7 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
 
 
 def refines_poses(config: Config, scene: str) -> bool:
-    """Whether a scene's poses are refined before anything else is made of it."""
+    """Whether a scene's poses are refined before all other stages."""
     enabled, world = for_scene(config, scene).refine_poses.enabled, config.datasets[config.dataset_of(scene)].world
     return (world is None or world.pose_noise) if enabled == "auto" else enabled
 
@@ -89,7 +89,7 @@ def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
-    """Which of TRAINING_INPUTS a method's training on a scene takes."""
+    """The stages of TRAINING_INPUTS that a method's training on a scene reads."""
     train = for_scene(config, scene, method).train
     taken = {
         "actors": "actors" in config.all_methods[method].parts,
@@ -100,7 +100,7 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
 
 
 def idle_variants(config: Config, scene: str) -> list[str]:
-    """The variants of the ablation that are trained on a scene just as the whole method is."""
+    """The variants of the ablation that have the training settings of the whole method on a scene."""
     job = config.ablation.job
     whole, *others = (
         stage_settings(config, "train", scene, job.method(without, job.seeds[0])) for without in (None, *job.without)
@@ -214,7 +214,7 @@ def _film(place: Place) -> FilmJob:
 
 
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
-    """The edits of a scene by their names, none where it has no edits file. Raises ConfigError where that is wrong."""
+    """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
     path = config.datasets[config.dataset_of(scene)].edits.get(scene)
     return read_edits(Path(path).expanduser()) if path else {}
 
@@ -227,7 +227,7 @@ def _edit(place: Place) -> EditJob:
 
 
 def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:
-    """What to tell who asks for an edit that there is none of."""
+    """The message about an unknown edit of a scene."""
     known = ", ".join(edits) or "none"
     return f"scene {scene} has no edit called {name!r}; there are: {known} (datasets.<name>.edits names its edits file)"
 
