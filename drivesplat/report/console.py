@@ -1,16 +1,16 @@
-"""A report for the console."""
+"""The report as text for the console."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from drivesplat.report.gaps import in_words
+from drivesplat.report.gaps import summary_sentences
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 SHOWN = ("static", "vehicle", "moving_vehicle", "gap_db")
 
 
 def console_table(report: dict[str, Any]) -> str:
-    """Both groups, a line per scene and method, the means, then what the gap comes to, what is missing and why."""
+    """A line per scene and method with both groups of held-out frames, means, summary sentences and missing scenes."""
     header = ["scene", "method"]
     for group in HELD_OUT_GROUPS:
         header += [f"{group[:6]}. static", "vehicle", "moving", "gap dB"]
@@ -23,7 +23,7 @@ def console_table(report: dict[str, Any]) -> str:
     notes = [f"{item['scene']}: left out ({item['why']})" for item in report["left_out"]]
     notes += [f"{item['scene']}: {item['why']}" for item in report["missing"]]
     title = "PSNR on held-out frames" + (" (partial: see below)" if report["partial"] else "")
-    return "\n".join([title, *table, *in_words(report), *notes])
+    return "\n".join([title, *table, *summary_sentences(report), *notes])
 
 
 def _cells(figures: Mapping[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""What scenes cost, on the page of the report."""
+"""The costs of scenes on the page of the report."""
 
 from collections.abc import Sequence
 from html import escape
@@ -8,19 +8,18 @@ HEADS = ("total, min", "trainings, min", "peak memory, GB", "on the GPU, GB", "u
 
 
 def costs_table(totals: Sequence[dict[str, Any]]) -> str:
-    """A line per scene of what its jobs took, one after another; empty where nothing is known."""
+    """A table with the summed costs of the jobs of each scene; empty without data."""
     if not totals:
         return ""
     methods = list(dict.fromkeys(method for total in totals for method in total["seconds_by_method"]))
-    heads = ["its own stages, min", *(f"{method}, min" for method in methods), *HEADS]
+    heads = ["stages of the scene, min", *(f"{method}, min" for method in methods), *HEADS]
     lines = "".join(f"<tr>{_line(total, methods)}</tr>" for total in totals)
     return (
-        '<h2>What it cost</h2><div class="card wide"><table><thead><tr><th class="name">scene</th>'
+        '<h2>Costs</h2><div class="card wide"><table><thead><tr><th class="name">scene</th>'
         + "".join(f"<th>{escape(head)}</th>" for head in heads)
         + f"</tr></thead><tbody>{lines}</tbody></table></div>"
-        '<p class="soft">Of jobs one after another, films and exports included, when this page was made; '
-        "side by side they take less. The variants of an ablation are left out. Every job stands in "
-        "costs.csv.</p>"
+        '<p class="soft">Sums over jobs, films and exports included, at the time of this page; jobs that run in '
+        "parallel take less. Variants of an ablation are not included. costs.csv lists every job.</p>"
     )
 
 

@@ -1,4 +1,4 @@
-"""The report as files: a page, a record and a table."""
+"""The report as files: HTML page, JSON record and CSV table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from drivesplat.io.storage import atomic_write, write_json
 from drivesplat.report.console import console_table
 from drivesplat.report.gaps import gap_report, write_csv
 from drivesplat.report.html import report_page
-from drivesplat.report.looks import looks_of
+from drivesplat.report.media import collect_media
 from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
@@ -17,7 +17,7 @@ from drivesplat.workflow.costs.table import scene_totals
 
 @dataclass(frozen=True)
 class ReportFiles:
-    """Where a report is written, in the folder of all results, and where the `logs` of their jobs lie."""
+    """The paths of a report in the results folder, and the folder of the jobs' `logs`."""
 
     page: Path
     record: Path
@@ -28,19 +28,18 @@ class ReportFiles:
 def write_report(
     files: ReportFiles, job: ReportJob, metrics: Sequence[str], pictures: Sequence[str], links: Sequence[str]
 ) -> None:
-    """Writes the report of these metrics.json, with these pictures in its page and links to these files, and prints its
-    table."""
+    """Writes the report of these metrics.json files, with these images and links in its page, and prints its table."""
     report = gap_report(list(metrics), job, files.logs)
-    seen = looks_of([*pictures, *links], files.page.parent)
+    media = collect_media([*pictures, *links], files.page.parent)
     write_json(files.record, report)
     write_csv(files.table, report)
     with atomic_write(files.page) as page:
-        page.write(report_page(report, seen, _costs(files.page.parent, job)).encode())
+        page.write(report_page(report, media, _costs(files.page.parent, job)).encode())
     print(console_table(report), flush=True)
 
 
 def _costs(results: Path, job: ReportJob) -> list[dict[str, Any]]:
-    """What the configured scenes have cost so far."""
+    """The costs of the configured scenes so far."""
     stages = [name for stages in job.expected.values() for name in stages]
     methods = dict.fromkeys(name.partition("/")[0] for name in stages if "/" in name)
     totals = {total["scene"]: total for total in scene_totals(read_costs(results)[0], list(methods))}

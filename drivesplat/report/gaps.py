@@ -1,7 +1,7 @@
-"""The gap between static and moving pixels, a row per scene and method, and what that comes to over scenes.
+"""The PSNR gap between static and moving pixels per scene and method, and its means over scenes.
 
-Means of gaps, and the fraction of them that a method closes, are over scenes in which vehicles move: where none does
-`gap_db` is that of parked vehicles, which no method has to close.
+Means of gaps and closed fractions are over scenes with moving vehicles; in other scenes `gap_db` is that of parked
+vehicles, which no method has to close.
 """
 
 from pathlib import Path
@@ -25,9 +25,9 @@ REGIONS = ("static", "vehicle", "moving_vehicle")
 def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
     """The content of gap_report.json from the metrics.json files of measured scenes.
 
-    A result made of other settings or code than `job` expects, or measured under another protocol than the first, is
-    left out and named under `left_out`. `missing` names the configured scenes without a result, and why, as far as the
-    jobs' `logs` tell. `partial`: whether there are any of either.
+    Results of other settings or code than `job` expects, or of another protocol than the first, are listed under
+    `left_out`. `missing` lists the configured scenes without a result, with the reason from the jobs' `logs`.
+    `partial`: whether either is not empty.
     """
     rows: list[dict[str, Any]] = []
     left_out: list[dict[str, str]] = []
@@ -60,7 +60,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
         "reference": job.reference,
         "rows": rows,
         "means": _means(rows, job.random_seed),
-        "gap_closed": _closed(rows, job.reference, job.random_seed),
+        "gap_closed": _gaps_closed(rows, job.reference, job.random_seed),
         "left_out": left_out,
         "missing": missing,
         "protocols": protocols,
@@ -68,7 +68,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
 
 
 def write_csv(path: str | Path, report: dict[str, Any]) -> None:
-    """The rows of a report as a table; empty cells where a figure is null."""
+    """Writes the rows of a report as a table; null figures are empty cells."""
     storage.write_csv(path, COLUMNS, ({column: row[column] for column in COLUMNS} for row in report["rows"]))
 
 
@@ -97,9 +97,8 @@ _COMPARABLE = ("cameras", "eval_camera", "width", "height", "sweeps", "holdout",
 
 
 def _comparable(record: dict[str, Any]) -> dict[str, Any]:
-    """What of a protocol has to be the same for figures to stand side by side. A scene whose refinement was refused
-    keeps its poses (`protocol.poses` says so) and stands beside those that have refined ones; one whose poses were made
-    from images alone does not."""
+    """The entries of a protocol that must be equal for figures to be comparable. A scene that kept its poses because
+    refinement was rejected (see `protocol.poses`) is comparable with refined ones, one with poses from images not."""
     own = {key: record["protocol"][key] for key in _COMPARABLE}
     refined = "refine_poses" in record["provenance"]["stages"] and own["poses"] != "images"
     return own | ({"poses": "refined"} if refined else {})
@@ -118,12 +117,12 @@ def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
 
 
 def _means(rows: list[dict[str, Any]], random_seed: int) -> list[dict[str, Any]]:
-    """The means of every figure over scenes, by method; null figures do not count."""
+    """The means of every figure over scenes, by method; null figures are ignored."""
     return [
         {
             "method": method,
             "figures": {
-                column: mean_over_scenes([_counted(row, column) for row in own.values()], random_seed)
+                column: mean_over_scenes([_figure(row, column) for row in own.values()], random_seed)
                 for column in COLUMNS[3:]
             },
         }
@@ -131,15 +130,15 @@ def _means(rows: list[dict[str, Any]], random_seed: int) -> list[dict[str, Any]]
     ]
 
 
-def _closed(rows: list[dict[str, Any]], reference: str | None, random_seed: int) -> list[dict[str, Any]]:
-    """What part of the reference's gap every other method closes, by group of held-out frames."""
+def _gaps_closed(rows: list[dict[str, Any]], reference: str | None, random_seed: int) -> list[dict[str, Any]]:
+    """The fraction of the reference's gap that every other method closes, by group of held-out frames."""
     methods = _by_method(rows)
     given = methods.pop(reference, {}) if reference else {}
     found = []
     for method, own in methods.items():
         both = [scene for scene in own if scene in given]
         gaps = {
-            group: [[counted_gap(of[scene], group) for scene in both] for of in (given, own)]
+            group: [[moving_gap(of[scene], group) for scene in both] for of in (given, own)]
             for group in HELD_OUT_GROUPS
         }
         closed = {group: gap_closed(*pair, random_seed) for group, pair in gaps.items()}
@@ -156,19 +155,19 @@ def _by_method(rows: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]
     return methods
 
 
-def counted_gap(row: dict[str, Any], group: str) -> float | None:
-    """The gap of a row to vehicles that move; None where none does."""
+def moving_gap(row: dict[str, Any], group: str) -> float | None:
+    """The gap of a row to moving vehicles; None without them."""
     return None if row[f"{group}_moving_vehicle"] is None else row[f"{group}_gap_db"]
 
 
-def _counted(row: dict[str, Any], column: str) -> int | float | None:
-    """What of a row counts in a mean."""
+def _figure(row: dict[str, Any], column: str) -> int | float | None:
+    """The figure of a row that enters a mean."""
     group, _, name = column.partition("_")
-    return counted_gap(row, group) if name == "gap_db" else row[column]
+    return moving_gap(row, group) if name == "gap_db" else row[column]
 
 
-def in_words(report: dict[str, Any]) -> list[str]:
-    """What the report comes to: a sentence per method and group of held-out frames in which vehicles move."""
+def summary_sentences(report: dict[str, Any]) -> list[str]:
+    """A sentence per method and group of held-out frames with moving vehicles."""
     lines = []
     closed = {item["method"]: item for item in report["gap_closed"]}
     for mean in report["means"]:
@@ -178,16 +177,16 @@ def in_words(report: dict[str, Any]) -> list[str]:
                 continue
             scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
             width = _with_interval(gap, gap["mean"], "{:.1f}")
-            line = f"{mean['method']}, {GROUP_PLACES[group]}: a gap of {width} dB, {scenes}"
+            line = f"{mean['method']}, {GROUP_PLACES[group]}: gap {width} dB, {scenes}"
             part = closed.get(mean["method"], {}).get(group)
             if part:
                 share = _with_interval(part, part["fraction"], "{:.0%}")
-                line += f"; it closes {share} of that of {report['reference']}"
+                line += f"; it closes {share} of the gap of {report['reference']}"
             lines.append(line)
     return lines
 
 
-def _with_interval(found: dict[str, Any], value: float, spelling: str) -> str:
+def _with_interval(found: dict[str, Any], value: float, fmt: str) -> str:
     if found["low"] is None or found["high"] is None:
-        return spelling.format(value)
-    return f"{spelling} ({spelling} to {spelling})".format(value, found["low"], found["high"])
+        return fmt.format(value)
+    return f"{fmt} ({fmt} to {fmt})".format(value, found["low"], found["high"])

@@ -1,4 +1,4 @@
-"""gap_report.html: one page that needs a browser and no network. Pictures are in it, films and viewers are linked."""
+"""gap_report.html: a page with embedded images, which needs no network, and links to films and viewers."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -8,34 +8,31 @@ from typing import Any
 from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io.html_page import json_in_html
 from drivesplat.report.costs import costs_table
-from drivesplat.report.gaps import in_words
-from drivesplat.report.looks import Looks, address_of, apart_at, data_address, picture_of
+from drivesplat.report.gaps import summary_sentences
+from drivesplat.report.media import MethodMedia, data_url, difference_position, image_data_url, read_image
 from drivesplat.report.page import filled_page
 from drivesplat.report.plot import gap_plot
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 
-Seen = Mapping[tuple[str, str], Looks]
+MediaByMethod = Mapping[tuple[str, str], MethodMedia]
 COLUMNS = {
     "static": ("static", "{:.1f}"), "vehicle": ("vehicle", "{:.1f}"), "moving_vehicle": ("moving", "{:.1f}"),
     "gap_db": ("gap", "{:.1f}"), "lpips": ("LPIPS", "{:.3f}"),
 }  # fmt: skip
-"""Of a group of held-out frames: a row's figures, their names on the page, and how they are spelled."""
+"""Of a group of held-out frames: the keys of figures, their column titles and formats."""
 COSTS = {"gaussians": ("Gaussians", "{:,.0f}"), "train_seconds": ("training, s", "{:,.0f}")}
 NOTHING = "Nothing has been measured yet."
 
 
-def report_page(report: dict[str, Any], seen: Seen, costs: Sequence[dict[str, Any]] = ()) -> str:
-    """The page of a report, with what is to be `seen` of scenes and methods, and what scenes cost, their totals; links
-    count from the report's folder.
-
-    Raises ResultError where a picture cannot be read.
-    """
+def report_page(report: dict[str, Any], media: MediaByMethod, costs: Sequence[dict[str, Any]] = ()) -> str:
+    """The page of a report with the `media` by scene and method and the total costs of scenes; links are relative to
+    the report's folder. Raises ResultError if an image cannot be read."""
     return filled_page(
         introduction=_introduction(report),
-        plot=_in_card(gap_plot(report), "plot"),
+        plot=_card(gap_plot(report), "plot"),
         table=_table(report),
         absent=_absent(report),
-        scenes=_scenes(report, seen),
+        scenes=_scenes(report, media),
         protocol=_protocol(report),
         costs=costs_table(costs),
         report=json_in_html(report),
@@ -46,15 +43,15 @@ def _introduction(report: dict[str, Any]) -> str:
     measured = len(dict.fromkeys(row["scene"] for row in report["rows"]))
     configured = measured + len(report["left_out"]) + len(report["missing"])
     state = f"{measured} of {configured} configured scenes"
-    mark = f'<p class="partial">Partial: {state}; the others are named below.</p>' if report["partial"] else ""
-    sentences = "".join(f"<li>{escape(line)}</li>" for line in in_words(report))
+    mark = f'<p class="partial">Partial: {state}; the others are listed below.</p>' if report["partial"] else ""
+    sentences = "".join(f"<li>{escape(line)}</li>" for line in summary_sentences(report))
     return (
-        '<p class="soft">PSNR in dB on held-out images: pixels of what stands still against pixels of vehicles that '
-        f"move. {'' if report['partial'] else f'All {state}.'}</p>{mark}<ul>{sentences or f'<li>{NOTHING}</li>'}</ul>"
+        '<p class="soft">PSNR in dB on held-out images: static pixels compared with pixels of moving vehicles. '
+        f"{'' if report['partial'] else f'All {state}.'}</p>{mark}<ul>{sentences or f'<li>{NOTHING}</li>'}</ul>"
     )
 
 
-def _in_card(content: str, kind: str) -> str:
+def _card(content: str, kind: str) -> str:
     return f'<div class="card {kind}">{content}</div>' if content else ""
 
 
@@ -65,8 +62,8 @@ def _table(report: dict[str, Any]) -> str:
     fields += list(COSTS.items())
     span = f'<th class="group" colspan="{len(COLUMNS)}">'
     groups = "".join(f"{span}{GROUP_PLACES[group]}</th>" for group in HELD_OUT_GROUPS)
-    heads = [_head(i, name, "name") for i, name in enumerate(names)]
-    heads += [_head(i, how[0], _border(key)) for i, (key, how) in enumerate(fields, start=len(names))]
+    heads = [_column_title(i, name, "name") for i, name in enumerate(names)]
+    heads += [_column_title(i, how[0], _border(key)) for i, (key, how) in enumerate(fields, start=len(names))]
     lines = [
         "".join(_cell(row[name], "{}", "name") for name in names)
         + "".join(_cell(row[key], how[1], _border(key)) for key, how in fields)
@@ -82,9 +79,9 @@ def _table(report: dict[str, Any]) -> str:
         '<div class="card wide"><table class="sortable"><thead>'
         f'<tr><th class="name" colspan="2"></th>{groups}<th class="group" colspan="{len(COSTS)}"></th></tr>'
         f"<tr>{''.join(heads)}</tr></thead><tbody>{body}</tbody><tfoot>{foot}</tfoot></table></div>"
-        '<p class="soft">A mean is over the scenes that have the figure; that of the gap over those in which vehicles '
-        "move: where none does, a row's gap is that of parked ones. Below it the 95 % interval of the mean, from "
-        "scenes drawn anew (percentile bootstrap). A dash: no such pixels, or not measured.</p>"
+        '<p class="soft">Means are over the scenes that have the figure; means of the gap are over scenes with moving '
+        "vehicles (elsewhere the gap of a row is that of parked vehicles), with their 95 % confidence intervals "
+        "(percentile bootstrap over scenes). A dash: no such pixels, or not measured.</p>"
     )
 
 
@@ -92,26 +89,26 @@ def _border(key: str) -> str:
     return "first" if key.endswith("_static") or key == "gaussians" else ""
 
 
-def _head(column: int, name: str, kind: str) -> str:
+def _column_title(column: int, name: str, kind: str) -> str:
     return f'<th class="{kind}" data-column="{column}"><button type="button">{escape(name)}</button></th>'
 
 
-def _cell(value: Any, spelling: str, kind: str) -> str:
+def _cell(value: Any, fmt: str, kind: str) -> str:
     sorted_by = "" if value is None else escape(str(value))
-    return f'<td class="{kind}" data-value="{sorted_by}">{_spelled(value, spelling)}</td>'
+    return f'<td class="{kind}" data-value="{sorted_by}">{_formatted(value, fmt)}</td>'
 
 
-def _mean_cell(found: dict[str, Any] | None, spelling: str, kind: str) -> str:
+def _mean_cell(found: dict[str, Any] | None, fmt: str, kind: str) -> str:
     if found is None:
         return f'<td class="{kind}">–</td>'
     interval = ""
     if found["low"] is not None and found["high"] is not None:
-        interval = f'<span class="soft">{spelling.format(found["low"])} to {spelling.format(found["high"])}</span>'
-    return f'<td class="{kind}">{spelling.format(found["mean"])}{interval}</td>'
+        interval = f'<span class="soft">{fmt.format(found["low"])} to {fmt.format(found["high"])}</span>'
+    return f'<td class="{kind}">{fmt.format(found["mean"])}{interval}</td>'
 
 
-def _spelled(value: Any, spelling: str) -> str:
-    return "–" if value is None else escape(spelling.format(value))
+def _formatted(value: Any, fmt: str) -> str:
+    return "–" if value is None else escape(fmt.format(value))
 
 
 def _absent(report: dict[str, Any]) -> str:
@@ -121,40 +118,40 @@ def _absent(report: dict[str, Any]) -> str:
     return f'<h2>Not in the table</h2><div class="card"><ul>{listed}</ul></div>' if lines else ""
 
 
-def _scenes(report: dict[str, Any], seen: Seen) -> str:
+def _scenes(report: dict[str, Any], media: MediaByMethod) -> str:
     scenes: dict[str, list[dict[str, Any]]] = {}
     for row in report["rows"]:
         scenes.setdefault(row["scene"], []).append(row)
-    return "".join(_scene(scene, rows, seen) for scene, rows in scenes.items()) or f"<p>{NOTHING}</p>"
+    return "".join(_scene(scene, rows, media) for scene, rows in scenes.items()) or f"<p>{NOTHING}</p>"
 
 
-def _scene(scene: str, rows: Sequence[dict[str, Any]], seen: Seen) -> str:
-    looks = "".join(_method(row, seen.get((scene, row["method"]), Looks())) for row in rows)
+def _scene(scene: str, rows: Sequence[dict[str, Any]], media: MediaByMethod) -> str:
+    methods = "".join(_method(row, media.get((scene, row["method"]), MethodMedia())) for row in rows)
     title = f'{escape(scene)} <span class="soft">{escape(rows[0]["dataset"])}</span>'
-    inside = f'<h3>{title}</h3><div class="looks">{looks}</div>'
+    inside = f'<h3>{title}</h3><div class="looks">{methods}</div>'
     return f'<section class="card" id="scene-{escape(scene)}">{inside}</section>'
 
 
-def _method(row: dict[str, Any], looks: Looks) -> str:
-    pictures = looks.pictures
+def _method(row: dict[str, Any], media: MethodMedia) -> str:
+    images = media.images
     shown = []
-    if "recorded" in pictures and "rendered" in pictures:
+    if "recorded" in images and "rendered" in images:
         what = f"{row['method']}: {_where(row['shown'])}"
-        shown.append(_compared(pictures["recorded"], pictures["rendered"], "recorded", row["method"], what))
-    if "with_car" in pictures and "without_car" in pictures:
-        sides = ("with the vehicle", "without")
-        what = f"{row['method']}: a vehicle taken out of the model"
-        shown.append(_compared(pictures["with_car"], pictures["without_car"], *sides, what))
-    if "panel" in pictures:
+        shown.append(_comparison(images["recorded"], images["rendered"], "recorded", row["method"], what))
+    if "with_car" in images and "without_car" in images:
+        sides = ("with vehicle", "without vehicle")
+        what = f"{row['method']}: with and without a vehicle"
+        shown.append(_comparison(images["with_car"], images["without_car"], *sides, what))
+    if "panel" in images:
         shown.append(
-            f'<figure><img class="panel" alt="ghost panel" src="{data_address(pictures["panel"])}">'
-            f"<figcaption>{escape(row['method'])}: what moves, recorded, rendered, and where they differ</figcaption>"
+            f'<figure><img class="panel" alt="ghost panel" src="{image_data_url(images["panel"])}">'
+            f"<figcaption>{escape(row['method'])}: recorded and rendered moving vehicle, error, ghosts</figcaption>"
             "</figure>"
         )
-    links = "".join(f'<a href="{escape(link)}">{escape(_link_name(link))}</a>' for link in looks.links)
+    links = "".join(f'<a href="{escape(link)}">{escape(_link_name(link))}</a>' for link in media.links)
     figures = [
-        f"{GROUP_PLACES[g]}: static {_spelled(row[f'{g}_static'], '{:.1f}')}, moving "
-        f"{_spelled(row[f'{g}_moving_vehicle'], '{:.1f}')} dB"
+        f"{GROUP_PLACES[g]}: static {_formatted(row[f'{g}_static'], '{:.1f}')}, moving "
+        f"{_formatted(row[f'{g}_moving_vehicle'], '{:.1f}')} dB"
         for g in HELD_OUT_GROUPS
     ]
     return (
@@ -167,26 +164,26 @@ def _where(shown: dict[str, Any] | None) -> str:
     if shown is None:
         return "an image"
     if shown["group"] == "train":
-        return f"key frame {shown['key_frame']}, which was trained on"
+        return f"key frame {shown['key_frame']}, a training image"
     return f"key frame {shown['key_frame']}, held out {GROUP_PLACES[shown['group']]}"
 
 
-def _compared(below: Path, above: Path, left: str, right: str, what: str) -> str:
-    """Two pictures of one view with a slider between them, which begins where they differ."""
-    pictures = picture_of(below), picture_of(above)
-    begins, (under, over) = f"{100 * apart_at(*pictures):.1f}", map(address_of, pictures)
+def _comparison(below: Path, above: Path, left: str, right: str, what: str) -> str:
+    """Two images of one view with a slider between them, which starts where they differ."""
+    images = read_image(below), read_image(above)
+    start, (under, over) = f"{100 * difference_position(*images):.1f}", map(data_url, images)
     return (
         f'<figure><div class="compare"><img alt="{escape(left)}" src="{under}">'
         f'<img class="over" alt="{escape(right)}" src="{over}">'
         f'<span class="side left">{escape(left)}</span><span class="side right">{escape(right)}</span>'
-        f'<input type="range" min="0" max="100" step="0.1" value="{begins}" '
+        f'<input type="range" min="0" max="100" step="0.1" value="{start}" '
         f'aria-label="{escape(left)} or {escape(right)}">'
         f"</div><figcaption>{escape(what)}</figcaption></figure>"
     )
 
 
 def _link_name(link: str) -> str:
-    """What a file is called on the page: 'original.mp4', 'edits/remove.mp4'."""
+    """The name of a file on the page: 'original.mp4', 'edits/remove.mp4'."""
     return "/".join(PurePosixPath(link).parts[2:])
 
 

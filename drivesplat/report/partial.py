@@ -1,4 +1,4 @@
-"""The report of a run that failed: the rule that writes it waits for all scenes, and so never ran."""
+"""The report of a failed run, whose rule for the report did not run."""
 
 import sys
 from pathlib import Path
@@ -11,14 +11,14 @@ from drivesplat.workflow.report_plan import REPORT_FILES, REPORT_RULES
 
 
 def write_partial_report(plan: Plan) -> None:
-    """Writes the report of what there is, which names what there is not; the rule replaces it once nothing fails. Says
-    on the console where it lies, or why there is none."""
-    there, results = plan.report([*REPORT_RULES]), Path(plan.config.results_dir)
+    """Writes a report of the finished scenes that names the missing ones; the rule replaces it in a later run. Prints
+    its path, or why it cannot be written."""
+    inputs, results = plan.report([*REPORT_RULES]), Path(plan.config.results_dir)
     page, record, table = (results / name for name in REPORT_FILES)
-    files, job = ReportFiles(page, record, table, results / "logs"), ReportJob.model_validate_json(there.settings())
+    files, job = ReportFiles(page, record, table, results / "logs"), ReportJob.model_validate_json(inputs.settings())
     try:
-        write_report(files, job, there.metrics(), there.pictures(), there.links())
+        write_report(files, job, inputs.metrics(), inputs.pictures(), inputs.links())
     except (DriveSplatError, OSError) as error:
-        print(f"drivesplat: there is no report of what was finished: {error}", file=sys.stderr, flush=True)
+        print(f"drivesplat: the report of the finished scenes cannot be written: {error}", file=sys.stderr, flush=True)
         return
-    print(f"drivesplat: what was finished, and what was not, and why: {page}", file=sys.stderr, flush=True)
+    print(f"drivesplat: report of finished and missing scenes: {page}", file=sys.stderr, flush=True)

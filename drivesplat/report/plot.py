@@ -1,4 +1,4 @@
-"""The gap by method, as a picture for the page."""
+"""The gap by method as a plot for the page."""
 
 import io
 from typing import Any
@@ -9,16 +9,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drivesplat.evaluation.comparison import GROUP_PLACES
-from drivesplat.report.gaps import counted_gap
+from drivesplat.report.gaps import moving_gap
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Told apart by colour-blind people, too (Okabe and Ito 2008)."""
+"""A palette for colour-blind readers (Okabe and Ito 2008)."""
 _STYLE = {"svg.fonttype": "none", "svg.hashsalt": "drivesplat", "font.family": "sans-serif", "font.size": 10}
 
 
 def gap_plot(report: dict[str, Any]) -> str:
-    """The gap in dB as an SVG: for each group of held-out frames in which vehicles move a dot for every scene, by
-    method, and the mean with its interval. Empty where there is no gap to draw."""
+    """The gap in dB as an SVG: for each group of held-out frames with moving vehicles a dot per scene and method, and
+    the mean with its interval. Empty without a gap."""
     drawn = [g for g in GROUP_PLACES if any(mean["figures"][f"{g}_gap_db"] for mean in report["means"])]
     if not drawn:
         return ""
@@ -38,10 +38,10 @@ def _draw(axes: Axes, report: dict[str, Any], group: str) -> None:
     methods = [mean["method"] for mean in report["means"]]
     for at, mean in enumerate(report["means"]):
         color = COLORS[at % len(COLORS)]
-        gaps = [counted_gap(row, group) for row in report["rows"] if row["method"] == mean["method"]]
-        there = sorted(gap for gap in gaps if gap is not None)
-        beside = 0.28 * np.linspace(-1.0, 1.0, len(there)) if len(there) > 1 else np.zeros(len(there))
-        axes.plot(at + beside, there, "o", color=color, alpha=0.45, markersize=5)
+        gaps = [moving_gap(row, group) for row in report["rows"] if row["method"] == mean["method"]]
+        known = sorted(gap for gap in gaps if gap is not None)
+        offsets = 0.28 * np.linspace(-1.0, 1.0, len(known)) if len(known) > 1 else np.zeros(len(known))
+        axes.plot(at + offsets, known, "o", color=color, alpha=0.45, markersize=5)
         found = mean["figures"][f"{group}_gap_db"]
         if found:
             axes.plot([at - 0.36, at + 0.36], [found["mean"]] * 2, color=color, linewidth=2.5)

@@ -42,12 +42,12 @@ TINY_TRAINING = {
 }
 
 
-_COSTS = re.compile(r"drivesplat: (\d+ jobs?, |(\d+ % of the work, )?\d+ of \d+ jobs, |what was finished, )")
+_COSTS = re.compile(r"drivesplat: (\d+ jobs?, |(\d+ % of the work, )?\d+ of \d+ jobs, |report of finished )")
 
 
 def complaints(output: str) -> set[str]:
     """The workflow's own lines in a run's output, but for those that say what it costs, how far it is, and where the
-    report of what was finished lies."""
+    report of the finished scenes is."""
     return {line for line in output.splitlines() if line.startswith("drivesplat: ") and not _COSTS.match(line)}
 
 

@@ -11,7 +11,7 @@ import pytest
 from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, stages, told
 
 from drivesplat.report.console import console_table
-from drivesplat.report.gaps import gap_report, in_words, write_csv
+from drivesplat.report.gaps import gap_report, summary_sentences, write_csv
 
 VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
 VANILLA_B = method(group(26.0, None, 22.0, lpips=0.1), group(23.0), gaussians=3000, seconds=80.0)
@@ -30,7 +30,7 @@ def write(tmp_path):
     return write_metrics
 
 
-def test_a_row_holds_both_groups_figures_of_a_scene_and_method(write):
+def test_a_row_has_the_figures_of_both_groups(write):
     report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061"), NO_LOGS)
     assert report["rows"] == [
         {
@@ -75,7 +75,7 @@ def test_every_scene_and_method_has_a_row_in_order(write):
     ]  # fmt: skip
 
 
-def test_means_are_over_scenes_by_method_and_ignore_null(write):
+def test_means_are_over_scenes_per_method_and_ignore_null(write):
     paths = [
         write(metrics("0061", {"vanilla": VANILLA_A, "street": VANILLA_B})),
         write(metrics("0103", {"vanilla": VANILLA_B, "street": VANILLA_B})),
@@ -118,7 +118,7 @@ def test_a_result_of_other_code_is_left_out_and_named_with_the_stage(write):
     assert "vanilla/train: other code" in left_out(report, "0061")
 
 
-def test_a_result_without_a_configured_method_is_left_out_and_says_so(write):
+def test_a_result_without_a_configured_method_is_left_out_with_the_reason(write):
     report = gap_report(
         [write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061", methods=("vanilla", "street")), NO_LOGS
     )
@@ -157,7 +157,7 @@ def test_a_result_of_another_protocol_is_left_out_and_named_with_the_difference(
     assert key in left_out(report, "0103") and "0061" in left_out(report, "0103")
 
 
-def test_what_differs_from_scene_to_scene_by_nature_is_no_other_protocol(write):
+def test_values_that_depend_on_the_scene_do_not_change_the_protocol(write):
     held_out = {"interpolation": [4, 12], "extrapolation": [36, 37]}
     other = metrics("0103", {"vanilla": VANILLA_A}, held_out_frames=held_out, train_images=30, lidar_missing=2)
     report = gap_report(
@@ -167,7 +167,7 @@ def test_what_differs_from_scene_to_scene_by_nature_is_no_other_protocol(write):
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_scene_that_kept_its_poses_stands_beside_those_with_refined_ones(write, order):
+def test_a_scene_that_kept_its_poses_is_comparable_with_refined_ones(write, order):
     """All were to be refined, and one was refused: that is the scene's nature, not another protocol."""
     made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
     results = {"0061": ("refined", made), "0103": ("nuscenes", made)}
@@ -177,7 +177,7 @@ def test_a_scene_that_kept_its_poses_stands_beside_those_with_refined_ones(write
     assert {row["scene"] for row in report["rows"]} == {"0061", "0103"} and report["left_out"] == []
 
 
-def test_a_scene_whose_poses_come_from_images_alone_does_not(write):
+def test_a_scene_with_poses_from_images_is_not_comparable(write):
     made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
     paths = [
         write(metrics(scene, {"vanilla": VANILLA_A}, made, poses=poses))
@@ -187,7 +187,7 @@ def test_a_scene_whose_poses_come_from_images_alone_does_not(write):
     assert "poses" in left_out(report, "0103")
 
 
-def test_a_scene_that_was_never_to_be_refined_does_not(write):
+def test_a_scene_without_refinement_is_not_comparable(write):
     made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
     paths = [write(metrics("0061", {"vanilla": VANILLA_A}, made, poses="refined")),
              write(metrics("0103", {"vanilla": VANILLA_A}))]  # fmt: skip
@@ -196,7 +196,7 @@ def test_a_scene_that_was_never_to_be_refined_does_not(write):
     assert left_out["scene"] == "0103" and "poses" in left_out["why"]
 
 
-def test_a_stale_result_sets_no_protocol_for_the_others(write):
+def test_a_stale_result_does_not_set_the_protocol(write):
     stale = metrics("0061", {"vanilla": VANILLA_A}, stages(iterations=7000), width=320)
     paths = [write(stale), write(metrics("0103", {"vanilla": VANILLA_A}))]
     report = gap_report(paths, expecting("0061", "0103"), NO_LOGS)
@@ -240,7 +240,7 @@ def test_configured_scenes_without_a_result_are_listed(write):
     assert all(item["why"] for item in report["missing"])
 
 
-def test_a_report_of_nothing_still_comes_out(tmp_path):
+def test_a_report_without_results_is_written(tmp_path):
     report = gap_report([], expecting("0061"), NO_LOGS)
     assert report["rows"] == report["means"] == [] and [item["scene"] for item in report["missing"]] == ["0061"]
     write_csv(tmp_path / "gap_report.csv", report)
@@ -280,7 +280,7 @@ def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
     assert report == before
 
 
-def test_the_console_table_can_be_read(report):
+def test_the_console_table(report):
     lines = console_table(report).splitlines()
     header = next(i for i, line in enumerate(lines) if "scene" in line and "method" in line)
     table = lines[header : header + 4]
@@ -314,7 +314,7 @@ def many(write, gaps: dict[str, tuple[float, float | None]], nothing_moves: tupl
     return gap_report(paths, expecting(*gaps, methods=("vanilla", "street")), NO_LOGS)
 
 
-def test_a_mean_has_an_interval_of_scenes_drawn_anew(write):
+def test_a_mean_has_a_bootstrap_interval_over_scenes(write):
     """For scenes as different as these the interval is near the normal one: 1.96 standard errors to either side."""
     gaps = {f"{i:04}": (5.0 + 0.5 * i, 1.0) for i in range(10)}
     vanilla, street = (mean["figures"]["interpolation_gap_db"] for mean in many(write, gaps)["means"])
@@ -330,7 +330,7 @@ def test_one_scene_has_no_interval(write):
     assert mean["figures"]["interpolation_gap_db"] == {"mean": 7.0, "low": None, "high": None, "scenes": 1}
 
 
-def test_a_method_closes_a_fraction_of_the_references_gap_where_vehicles_move(write):
+def test_the_closed_fraction_is_over_scenes_with_moving_vehicles(write):
     gaps = {"0061": (8.0, 2.0), "0103": (4.0, 2.0), "0553": (1.0, 1.0), "0655": (9.0, None)}
     report = many(write, gaps, nothing_moves=("0553",))
     (street,) = report["gap_closed"]
@@ -339,15 +339,15 @@ def test_a_method_closes_a_fraction_of_the_references_gap_where_vehicles_move(wr
     assert street["interpolation"]["scenes"] == 2
     assert street["interpolation"]["low"] == pytest.approx(0.5)
     assert street["interpolation"]["high"] == pytest.approx(0.75)
-    (line,) = [line for line in in_words(report) if line.startswith("street, between")]
-    assert "2.0 (2.0 to 2.0) dB, 2 scenes" in line and "67% (50% to 75%) of that of vanilla" in line
+    (line,) = [line for line in summary_sentences(report) if line.startswith("street, between")]
+    assert "2.0 (2.0 to 2.0) dB, 2 scenes" in line and "67% (50% to 75%) of the gap of vanilla" in line
 
 
-def test_a_gap_that_is_not_there_cannot_be_closed(write):
+def test_a_reference_without_a_gap_has_no_closed_fraction(write):
     assert many(write, {"0061": (-1.0, 2.0), "0103": (0.5, 2.0)})["gap_closed"] == []
 
 
-def test_without_a_reference_nothing_is_closed(write):
+def test_without_a_reference_there_is_no_closed_fraction(write):
     path = write(metrics("0061", {"vanilla": VANILLA_A}))
     assert gap_report([path], told({"0061": stages()}, reference=None), NO_LOGS)["gap_closed"] == []
 
@@ -372,12 +372,12 @@ BEGINS, ENDS = (f"INFO drivesplat.workflow.job: extract 0103 {word}" for word in
         ({"extract": (BEGINS, ENDS)}, "not measured"),
         ({"extract": (BEGINS, "ERROR drivesplat.workflow.job: extract 0103: image n015.jpg is broken")},
          "extract: image n015.jpg is broken"),
-        ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS,)}, "vanilla/train was ended in the middle"),
+        ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS,)}, "vanilla/train was interrupted"),
         ({"extract": (BEGINS, ENDS), "vanilla/train": (BEGINS, f"{ERROR}vanilla/train 0103: no memory")},
          "vanilla/train: no memory"),
     ],
 )  # fmt: skip
-def test_a_missing_scene_says_what_its_logs_say(tmp_path, write, logs, why):
+def test_a_missing_scene_has_the_reason_from_its_logs(tmp_path, write, logs, why):
     for name, lines in logs.items():
         log(tmp_path / "logs", name, *lines)
     report = gap_report([write(metrics("0061", {"vanilla": VANILLA_A}))], expecting("0061", "0103"), tmp_path / "logs")

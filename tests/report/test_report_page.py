@@ -16,7 +16,7 @@ from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_json
 from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import report_page
-from drivesplat.report.looks import WIDEST, apart_at, data_address, looks_of, picture_of
+from drivesplat.report.media import MAX_WIDTH, collect_media, difference_position, image_data_url, read_image
 from drivesplat.report.plot import gap_plot
 from drivesplat.scene.images import write_png
 from drivesplat.settings.report import PICTURES
@@ -59,16 +59,16 @@ def made(results: Path) -> dict[str, Any]:
 
 def page_of(results: Path) -> str:
     files = [file for scene in GAPS for file in sorted((results / scene).rglob("*.*")) if file.parent.name in METHODS]
-    return report_page(made(results), looks_of(files, results))
+    return report_page(made(results), collect_media(files, results))
 
 
-def test_a_page_needs_nothing_from_elsewhere(results):
+def test_a_page_requests_nothing(results):
     page = page_of(results)
     assert "default-src 'none'" in page and "<script src" not in page and '<link rel="stylesheet' not in page
     addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert len(addresses) > 20
     assert {address.partition(":")[0] for address in addresses if ":" in address} == {"data"}
-    assert set(re.findall(r"https?://[^\s\"<]*", page)) <= NAMESPACES, "addresses that name, and are not fetched"
+    assert set(re.findall(r"https?://[^\s\"<]*", page)) <= NAMESPACES, "namespaces are not requested"
 
 
 NAMESPACES = {
@@ -77,7 +77,7 @@ NAMESPACES = {
 }  # fmt: skip
 
 
-def test_a_page_names_what_is_not_in_the_table_and_why(results):
+def test_a_page_lists_missing_scenes_with_reasons(results):
     page = page_of(results)
     assert "Partial: 4 of 5 configured scenes" in page
     assert "<b>1100</b>: street/train: &lt;b&gt;no memory&lt;/b&gt; &amp; more" in page
@@ -85,7 +85,7 @@ def test_a_page_names_what_is_not_in_the_table_and_why(results):
     assert "Partial" not in report_page(whole, {}) and "Not in the table" not in report_page(whole, {})
 
 
-def test_a_page_has_the_pictures_and_links_of_its_methods(results):
+def test_a_page_has_the_images_and_links_of_its_methods(results):
     page = page_of(results)
     assert page.count("data:image/jpeg") == len(GAPS) * len(METHODS) * len(PICTURES)
     assert 'href="0061/vanilla/original.mp4"' in page and "key frame 12, held out between training frames" in page
@@ -93,64 +93,64 @@ def test_a_page_has_the_pictures_and_links_of_its_methods(results):
     assert "data:image/jpeg" not in bare and ".mp4" not in bare and 'id="scene-0061"' in bare
 
 
-def test_a_page_is_the_same_when_it_is_made_again(results):
+def test_a_page_is_deterministic(results):
     assert page_of(results) == page_of(results)
 
 
-def test_a_report_of_nothing_is_a_page(tmp_path):
+def test_a_report_without_results_has_a_page(tmp_path):
     page = report_page(gap_report([], expecting("0061"), NO_LOGS), {})
     assert "Nothing has been measured yet" in page and "<b>0061</b>: not measured" in page and "<svg" not in page
 
 
-def test_pictures_are_reduced_to_what_a_page_can_bear(tmp_path):
+def test_large_images_are_reduced(tmp_path):
     paint(tmp_path / "wide.png", 100, (2000, 500))
     paint(tmp_path / "small.png", 100, (160, 90))
     sizes = []
     for name in ("wide", "small"):
-        address = data_address(tmp_path / f"{name}.png")
+        address = image_data_url(tmp_path / f"{name}.png")
         picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
         sizes.append(picture.size)
         np.testing.assert_allclose(np.asarray(picture)[5, 5], [100, 200, 155], atol=4)
-    assert sizes == [(WIDEST, WIDEST // 4), (160, 90)]
+    assert sizes == [(MAX_WIDTH, MAX_WIDTH // 4), (160, 90)]
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture"])
-def test_a_broken_picture_is_named(tmp_path, content):
+def test_a_broken_image_is_named(tmp_path, content):
     (tmp_path / "broken.png").write_bytes(content)
-    with pytest.raises(ResultError, match=r"broken\.png is no readable picture"):
-        data_address(tmp_path / "broken.png")
+    with pytest.raises(ResultError, match=r"broken\.png is not a readable image"):
+        image_data_url(tmp_path / "broken.png")
 
 
-def test_a_slider_begins_where_its_pictures_differ(tmp_path):
+def test_a_slider_starts_where_its_images_differ(tmp_path):
     with_car, without = np.full((60, 200, 3), 90, dtype=np.uint8), np.full((60, 200, 3), 90, dtype=np.uint8)
     with_car[20:40, 30:50] = 200
     for name, pixels in (("with", with_car), ("without", without)):
         write_png(tmp_path / f"{name}.png", pixels)
-    shown, gone = (picture_of(tmp_path / f"{name}.png") for name in ("with", "without"))
-    assert apart_at(shown, gone) == pytest.approx(0.2, abs=0.01)
-    assert apart_at(shown, shown) == 0.5
+    shown, gone = (read_image(tmp_path / f"{name}.png") for name in ("with", "without"))
+    assert difference_position(shown, gone) == pytest.approx(0.2, abs=0.01)
+    assert difference_position(shown, shown) == 0.5
 
 
-def test_what_there_is_to_see_is_sorted_by_scene_and_method(tmp_path):
+def test_media_are_collected_by_scene_and_method(tmp_path):
     names = ("0061/street/edits/remove.mp4", "0061/street/ghost_panel.png", "0103/vanilla/viewer.html")
-    looks = looks_of([tmp_path / name for name in names], tmp_path)
-    assert set(looks) == {("0061", "street"), ("0103", "vanilla")}
-    assert looks["0061", "street"].pictures == {"panel": tmp_path / "0061/street/ghost_panel.png"}
-    assert looks["0061", "street"].links == ["0061/street/edits/remove.mp4"]
-    assert looks["0103", "vanilla"].links == ["0103/vanilla/viewer.html"]
+    media = collect_media([tmp_path / name for name in names], tmp_path)
+    assert set(media) == {("0061", "street"), ("0103", "vanilla")}
+    assert media["0061", "street"].images == {"panel": tmp_path / "0061/street/ghost_panel.png"}
+    assert media["0061", "street"].links == ["0061/street/edits/remove.mp4"]
+    assert media["0103", "vanilla"].links == ["0103/vanilla/viewer.html"]
 
 
-def test_the_plot_has_a_dot_for_every_scene_in_which_vehicles_move(results):
+def test_the_plot_has_a_dot_for_every_scene_with_moving_vehicles(results):
     drawing = gap_plot(made(results))
     assert drawing.startswith("<svg") and "between training frames" in drawing
-    assert "beyond the last training frame" not in drawing, "nothing moves there"
+    assert "beyond the last training frame" not in drawing, "no vehicle moves there"
     assert all(f">{name}<" in drawing for name in METHODS)
     dots = [re.findall(rf"<use [^>]*fill: {color}", drawing) for color in ("#0072b2", "#d55e00")]
     assert [len(of_method) for of_method in dots] == [3, 3]
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
-def test_a_browser_sorts_and_slides_and_fetches_nothing(results, tmp_path):
+def test_in_a_browser_sorting_and_sliders_work_without_requests(results, tmp_path):
     file = tmp_path / "gap_report.html"
     file.write_text(page_of(results), encoding="utf-8")
     cells = "[...document.querySelectorAll('tbody tr')].map((row) => row.cells[5].dataset.value)"
@@ -163,7 +163,7 @@ def test_a_browser_sorts_and_slides_and_fetches_nothing(results, tmp_path):
             tab.run(f"{head}.querySelector('button').click()")
             there = sorted((gap for gap in gaps if gap is not None), reverse=reverse)
             found = [float(value) if value else None for value in tab.run(cells)]
-            assert found == [*there, None, None], "those without a figure come last"
+            assert found == [*there, None, None], "empty cells come last"
             assert tab.run(f"{head}.getAttribute('aria-sort')") == order
         slide = "s = document.querySelector('.compare input'), s.value = 20, s.dispatchEvent(new Event('input'))"
         over = "getComputedStyle(document.querySelector('.compare .over')).clipPath"

@@ -1,4 +1,4 @@
-// Sliders: what lies over the other picture begins where the slider is.
+// Sliders: the upper image starts at the slider.
 for (const compare of document.querySelectorAll(".compare")) {
     const slider = compare.querySelector("input");
     const move = () => compare.style.setProperty("--at", `${slider.value}%`);
@@ -6,7 +6,7 @@ for (const compare of document.querySelectorAll(".compare")) {
     move();
 }
 
-// Sorting: a click on a column's name, again for the other way round. Cells without a figure come last, both ways.
+// Sorting: a click on a column title sorts, a second one reverses. Empty cells always come last.
 for (const table of document.querySelectorAll("table.sortable")) {
     const body = table.tBodies[0];
     const heads = [...table.querySelectorAll("th[data-column]")];
