@@ -1,13 +1,13 @@
 # make demo       set-up, then the whole workflow on a synthetic drive: no dataset, no GPU, minutes
-# make setup      .venv with everything, gsplat compiled where there is an NVIDIA GPU (idempotent; docs/installation.md)
-# make doctor     what works on this machine, what does not, and what to do about it
+# make setup      .venv with all packages; compiles gsplat where there is an NVIDIA GPU (idempotent; docs/installation.md)
+# make doctor     check the machine and suggest remedies
 # make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
-# make test-gpu   what needs a GPU: the rasterizers agree, trainings resume
-# make test-slurm a scene through a real SLURM, started on this machine for it (root on Debian; docs/cluster.md)
+# make test-gpu   tests that need a GPU: the rasterizers agree, trainings resume
+# make test-slurm one scene through a real SLURM, started on this machine for the test (root on Debian; docs/cluster.md)
 # make test-batch ten synthetic drives, one of them broken, as a batch (two cores: a quarter of an hour)
-# make bench      what the benchmarks/ measure, against their bounds (two idle cores)
-# make quality    RECIPES=file: recipes trained with several seeds on one scene, and their table (docs/quality.md)
-# make speed      FILE=file: how fast a method trains, held to gsplat's example trainer, and how well (docs/speed.md)
+# make bench      the measurements of benchmarks/ against their bounds (two idle cores)
+# make quality    RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
+# make speed      FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
 # make config     config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
 .PHONY: demo setup doctor test lint test-gpu test-slurm test-batch bench quality speed config
 
