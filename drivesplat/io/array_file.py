@@ -1,0 +1,139 @@
+"""Files of arrays and plain data: uncompressed .npz archives, which numpy opens with `allow_pickle=False`.
+
+Every array is a member named by its place in the content ('actors/0/points'). The member 'content' is the rest as JSON
+(UTF-8 bytes): {"$array": name} stands for an array, {"$tuple": [...]} for a tuple, {"$items": [[key, value], ...]} for a
+mapping whose keys are not text.
+"""
+
+import json
+import math
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from drivesplat.io.storage import atomic_write, unreadable
+
+CONTENT = "content"
+MAX_DIMENSIONS = 8
+
+
+def write_arrays(
+    path: str | Path,
+    content: dict[str, Any],
+    kind: type = np.ndarray,
+    to_array: Callable[[Any], np.ndarray] = lambda array: array,
+) -> None:
+    """Writes plain containers, scalars and arrays, atomically; `kind` is the class of arrays in `content`.
+
+    Raises TypeError for anything else, ResultError naming `path` where the disk is full.
+    """
+    arrays: dict[str, np.ndarray] = {}
+
+    def packed(value: Any, name: str) -> Any:
+        if isinstance(value, kind):
+            if name in arrays or name == CONTENT:
+                raise ValueError(f"two arrays are called {name}")
+            arrays[name] = to_array(value)
+            return {"$array": name}
+        if type(value) in (list, tuple):
+            items = [packed(item, f"{name}/{i}") for i, item in enumerate(value)]
+            return items if type(value) is list else {"$tuple": items}
+        if type(value) is dict:
+            items = {key: packed(item, f"{name}/{key}" if name else str(key)) for key, item in value.items()}
+            simple = all(type(key) is str and not key.startswith("$") for key in items)
+            return items if simple else {"$items": [list(item) for item in items.items()]}
+        if value is None or type(value) in (bool, int, float, str):
+            return value
+        raise TypeError(f"{type(value).__name__} is not plain data")
+
+    plain = json.dumps(packed(content, ""), separators=(",", ":"), allow_nan=False).encode()
+    if any(array.dtype.kind not in "biuf" for array in arrays.values()):
+        raise TypeError("an array of anything but numbers is not plain data")
+    members = {CONTENT: np.frombuffer(plain, dtype=np.uint8), **arrays}
+    with atomic_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in members.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, version=(1, 0), allow_pickle=False)
+
+
+def read_arrays(
+    path: str | Path, rule: str, from_array: Callable[[np.ndarray], Any] = lambda array: array
+) -> dict[str, Any]:
+    """Reads what `write_arrays` wrote; `from_array` makes the arrays of the content.
+
+    Raises ResultError naming `path` and `rule` where the file is truncated, damaged, foreign or forged: every byte of
+    content is covered by a checksum, and no array is larger than the file.
+    """
+    try:
+        with open(path, "rb") as file:
+            arrays = _members(file)
+        content = _unpacked(json.loads(arrays.pop(CONTENT).tobytes()), arrays, from_array)
+        if arrays:
+            raise ValueError(f"nothing refers to {', '.join(arrays)}")
+        if not isinstance(content, dict):
+            raise ValueError("it holds no record")
+        return content
+    except FileNotFoundError as error:
+        raise unreadable(path, rule, f"cannot be read ({error.strerror})") from error
+    except Exception as error:  # zip, numpy and JSON each fail in their own ways
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise unreadable(path, rule, f"not a file of arrays of this workflow ({reason})") from error
+
+
+def _unpacked(plain: Any, arrays: dict[str, np.ndarray], from_array: Callable[[np.ndarray], Any]) -> Any:
+    """The content, whose arrays are taken out of `arrays`."""
+    if isinstance(plain, list):
+        return [_unpacked(item, arrays, from_array) for item in plain]
+    if not isinstance(plain, dict):
+        return plain
+    match plain:
+        case {"$array": name}:
+            return from_array(arrays.pop(name))
+        case {"$tuple": items}:
+            return tuple(_unpacked(items, arrays, from_array))
+        case {"$items": items}:
+            return {key: _unpacked(item, arrays, from_array) for key, item in items}
+    return {key: _unpacked(item, arrays, from_array) for key, item in plain.items()}
+
+
+def _members(file: BinaryIO) -> dict[str, np.ndarray]:
+    """All arrays of an archive, by name."""
+    with zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+    if sum(member.file_size for member in members) > os.fstat(file.fileno()).st_size:
+        raise ValueError("its members are larger than the file")
+    arrays = {}
+    for member in members:
+        if member.compress_type != zipfile.ZIP_STORED or member.compress_size != member.file_size:
+            raise ValueError(f"{member.filename} is compressed")
+        file.seek(member.header_offset)
+        lengths = struct.unpack("<26xHH", file.read(30))
+        start = member.header_offset + 30 + sum(lengths)
+        arrays[member.filename.removesuffix(".npy")] = _array(file, start, member)
+    return arrays
+
+
+def _array(file: BinaryIO, start: int, member: zipfile.ZipInfo) -> np.ndarray:
+    """The array that a member holds, which begins at `start`."""
+    file.seek(start)
+    version = np.lib.format.read_magic(file)
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    header = file.tell() - start
+    if version != (1, 0) or dtype.kind not in "biuf" or len(shape) > MAX_DIMENSIONS or min(shape, default=0) < 0:
+        raise ValueError(f"{member.filename} is no array of numbers")
+    if header + math.prod(shape) * dtype.itemsize != member.file_size:
+        raise ValueError(f"{member.filename} has another size than its header says")
+    flat = np.empty(math.prod(shape), dtype)
+    file.seek(start)
+    checksum = zlib.crc32(file.read(header))
+    if flat.size and file.readinto(flat.view(np.uint8)) != flat.nbytes:
+        raise ValueError(f"{member.filename} is cut short")
+    if zlib.crc32(flat, checksum) != member.CRC:
+        raise ValueError(f"{member.filename} is damaged")
+    return flat.reshape(shape, order="F" if fortran else "C")
