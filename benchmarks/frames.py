@@ -1,6 +1,6 @@
 """How many frames of a trained scene are rendered in a second, and how long its film takes.
 
-    python -m benchmarks.frames results/0103/street/checkpoint.pt results/0103/scene.json --width 1600 --height 900
+    python -m benchmarks.frames results/0103/street/checkpoint.npz results/0103/scene.json --width 1600 --height 900
 
 The recorded path at 30 frames a second, twice: rendered to bytes in main memory, frame by frame, by themselves; then
 as the rule `film` does it, encoded, and read again. The first tenth of the frames is not counted among those a second.

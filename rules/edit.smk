@@ -1,6 +1,6 @@
 # A drive that was never driven: cars gone, moved, slower, larger, the camera's car elsewhere.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt of a method with actors, scene.json; the scene's edits file,
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz of a method with actors, scene.json; the scene's edits file,
 # named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not.
 # OUTPUTS: <results>/{scene}/{method}/edits/{edit}.mp4, {edit}.png and {edit}.json; {edit}/ with frames, where wanted.
 
@@ -11,7 +11,7 @@ rule edit:
     images that were never recorded.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
     output:
         film=report(

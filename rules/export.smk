@@ -1,6 +1,6 @@
 # What leaves the workflow: the splat for other programs, with the trajectory it was recorded along.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, scene.json, parser.pkl.
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl.
 # OUTPUTS: <results>/{scene}/{method}/splat.ply, cameras.json, parts/parts.json (and the PLYs beside it); scene.usdz;
 # viewer.html.
 
@@ -11,7 +11,7 @@ rule export:
     recorded cameras and the motion of the objects.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
     output:
@@ -40,7 +40,7 @@ rule export_usd:
     and Isaac Sim.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
     output:
         usd="<results>/{scene}/{method}/scene.usdz",
@@ -65,7 +65,7 @@ rule export_viewer:
     Exports one HTML page that shows the splat interactively and offline, with a limited number of Gaussians.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
     output:
         viewer="<results>/{scene}/{method}/viewer.html",

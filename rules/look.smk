@@ -1,6 +1,6 @@
 # A trained method as a person sees it: films, the ghosts of what moved, the drive without a car.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, scene.json, parser.pkl, masks/.
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl, masks/.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
 # ghost_panel.png and .json;
@@ -46,7 +46,7 @@ rule film:
     Renders a film along the recorded path or one beside it, at the speed of the drive.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
     output:
         film=report(
@@ -81,7 +81,7 @@ rule film_parts:
     Renders the recorded drive three times side by side: all parts, the static ones and the dynamic ones.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
     output:
         film=report(
@@ -119,7 +119,7 @@ rule ghost_panel:
     on dynamic objects.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
@@ -157,7 +157,7 @@ rule remove_actor:
     the remaining holes, edges and ghosts.
     """
     input:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",

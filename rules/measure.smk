@@ -1,6 +1,6 @@
 # What a trained method is worth on the images it has not seen.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.pt, parser.pkl, masks/.
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl, masks/.
 # OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;
 # <results>/{scene}/metrics.json; resources/lpips/backbone.json.
 
@@ -36,7 +36,7 @@ rule evaluate:
     input:
         scene=plan.scene,
         truth=plan.truth,
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",

@@ -2,8 +2,8 @@
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
-# where poses are refined, scene_refined.json, poses.json and triangulated.pkl; where a method asks for them, actors.pkl,
-# lidar_depth.pkl and free_space.pkl. The scene of all rules after these (plan.scene) is the refined one where there is one.
+# where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
+# lidar_depth.npz and free_space.npz. The scene of all rules after these (plan.scene) is the refined one where there is one.
 
 
 rule extract:
@@ -69,7 +69,7 @@ rule refine_poses:
     output:
         scene="<results>/{scene}/scene_refined.json",
         poses="<results>/{scene}/poses.json",
-        points="<results>/{scene}/triangulated.pkl",
+        points="<results>/{scene}/triangulated.npz",
     log:
         "<logs>/{scene}/refine_poses.log",
     benchmark:
@@ -175,7 +175,7 @@ rule actors:
         scene=plan.scene,
         own_car="<results>/{scene}/own_car.json",
     output:
-        actors="<results>/{scene}/actors.pkl",
+        actors="<results>/{scene}/actors.npz",
     log:
         "<logs>/{scene}/actors.log",
     benchmark:
@@ -201,7 +201,7 @@ rule lidar_depth:
         scene=plan.scene,
         own_car="<results>/{scene}/own_car.json",
     output:
-        depth="<results>/{scene}/lidar_depth.pkl",
+        depth="<results>/{scene}/lidar_depth.npz",
     log:
         "<logs>/{scene}/lidar_depth.log",
     benchmark:
@@ -227,7 +227,7 @@ rule free_space:
         scene=plan.scene,
         triangulated=plan.triangulated_ends,
     output:
-        free_space="<results>/{scene}/free_space.pkl",
+        free_space="<results>/{scene}/free_space.npz",
     log:
         "<logs>/{scene}/free_space.log",
     benchmark:

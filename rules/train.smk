@@ -1,8 +1,8 @@
 # The training of one method on one scene.
 #
-# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.pkl, lidar_depth.pkl and free_space.pkl
+# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.npz, lidar_depth.npz and free_space.npz
 # if the method has actors, is supervised with LiDAR depth, and keeps Gaussians out of empty space.
-# OUTPUTS: <results>/{scene}/{method}/checkpoint.pt and train.json; tensorboard/ beside them. While it runs,
+# OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While it runs,
 # resume/ holds what a killed training goes on from; no rule declares it, so that Snakemake leaves it alone.
 
 
@@ -17,7 +17,7 @@ rule train:
         lidar_depth=plan.lidar_depth,
         free_space=plan.free_space,
     output:
-        checkpoint="<results>/{scene}/{method}/checkpoint.pt",
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",
     log:
         "<logs>/{scene}/{method}/train.log",

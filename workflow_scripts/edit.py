@@ -1,4 +1,4 @@
-"""checkpoint.pt with its actors in other roles, into a film, a still and labels."""
+"""checkpoint.npz with its actors in other roles, into a film, a still and labels."""
 
 from pathlib import Path
 

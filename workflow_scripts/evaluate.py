@@ -1,4 +1,4 @@
-"""checkpoint.pt against held-out images, and against truth where there is any, into eval.json and a pair of images."""
+"""checkpoint.npz against held-out images, and against truth where there is any, into eval.json and a pair of images."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""checkpoint.pt as splat.ply, in the convention of splat viewers, its parts likewise, cameras.json and parts.json."""
+"""checkpoint.npz as splat.ply, in the convention of splat viewers, its parts likewise, cameras.json and parts.json."""
 
 from drivesplat.workflow.job import job
 from drivesplat.export.splat_asset import SplatFiles, export_splat

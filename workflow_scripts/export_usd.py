@@ -1,4 +1,4 @@
-"""checkpoint.pt as scene.usdz: Gaussians in OpenUSD's schema, what moves among them, and the recording camera."""
+"""checkpoint.npz as scene.usdz: Gaussians in OpenUSD's schema, what moves among them, and the recording camera."""
 
 from drivesplat.workflow.job import job
 from drivesplat.export.usd_asset import export_usd

@@ -1,4 +1,4 @@
-"""checkpoint.pt as viewer.html: one page that shows the splat under a mouse."""
+"""checkpoint.npz as viewer.html: one page that shows the splat under a mouse."""
 
 from drivesplat.workflow.job import job
 from drivesplat.export.viewer import export_viewer

@@ -1,4 +1,4 @@
-"""checkpoint.pt along a trajectory, into an MP4 and the record of its cameras."""
+"""checkpoint.npz along a trajectory, into an MP4 and the record of its cameras."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""checkpoint.pt taken apart along the recorded path, into parts.mp4 and the record of its cameras."""
+"""checkpoint.npz taken apart along the recorded path, into parts.mp4 and the record of its cameras."""
 
 from pathlib import Path
 

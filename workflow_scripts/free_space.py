@@ -1,7 +1,9 @@
-"""scene.json, and triangulated.pkl where poses are refined, into free_space.pkl."""
+"""scene.json, and triangulated.npz where poses are refined, into free_space.npz."""
+
+import dataclasses
 
 from drivesplat.workflow.job import job
-from drivesplat.io.plain_pickle import write_plain_pickle
+from drivesplat.lidar.free_space_record import write_free_space
 from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.scene.scene import read_scene
@@ -11,4 +13,5 @@ with job(snakemake, dataset=("sweeps",)) as current:
     scene = read_scene(current.input.scene)
     triangulated = read_triangulated(current.input.triangulated[0]) if current.input.triangulated else None
     record = free_space_record(scene, current.settings(FreeSpaceJob), triangulated)
-    write_plain_pickle(current.output.free_space, {**record, "provenance": current.provenance(scene.provenance)})
+    provenance = current.provenance(scene.provenance)
+    write_free_space(current.output.free_space, dataclasses.replace(record, provenance=provenance))

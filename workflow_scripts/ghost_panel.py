@@ -1,4 +1,4 @@
-"""checkpoint.pt before a moving vehicle, into ghost_panel.png and ghost_panel.json."""
+"""checkpoint.npz before a moving vehicle, into ghost_panel.png and ghost_panel.json."""
 
 from drivesplat.workflow.job import job
 from drivesplat.inspection.drawing import draw_panel

@@ -1,7 +1,7 @@
-"""scene.json and own_car.json into lidar_depth.pkl."""
+"""scene.json and own_car.json into lidar_depth.npz."""
 
 from drivesplat.workflow.job import job
-from drivesplat.io.plain_pickle import write_plain_pickle
+from drivesplat.lidar.depth_record import LidarDepthRecord, write_lidar_depth
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene
@@ -11,4 +11,4 @@ with job(snakemake, dataset=("sweeps",)) as current:
     scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
     images = lidar_depths(scene, current.settings(LidarDepthJob), own_car)
     provenance = current.provenance(scene.provenance, upstream)
-    write_plain_pickle(current.output.depth, {"images": images, "provenance": provenance})
+    write_lidar_depth(current.output.depth, LidarDepthRecord(images, provenance))

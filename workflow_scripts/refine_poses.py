@@ -1,11 +1,11 @@
-"""scene.json and own_car.json into scene_refined.json, poses.json and triangulated.pkl."""
+"""scene.json and own_car.json into scene_refined.json, poses.json and triangulated.npz."""
 
 import dataclasses
 
 from drivesplat.workflow.job import job
-from drivesplat.io.plain_pickle import write_plain_pickle
 from drivesplat.io.storage import write_json
 from drivesplat.poses.refinement import refined_or_kept
+from drivesplat.poses.triangulated import write_triangulated
 from drivesplat.scene.ego_mask import read_own_car
 from drivesplat.scene.scene import read_scene, write_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
@@ -15,5 +15,5 @@ with job(snakemake, dataset=("images", "sweeps")) as current:
     refinement = refined_or_kept(scene, current.settings(RefinePosesJob), own_car, current.threads)
     provenance = current.provenance(scene.provenance, upstream)
     write_json(current.output.poses, {**refinement.record, "provenance": provenance})
-    write_plain_pickle(current.output.points, {**refinement.points, "provenance": provenance})
+    write_triangulated(current.output.points, dataclasses.replace(refinement.points, provenance=provenance))
     write_scene(current.output.scene, dataclasses.replace(refinement.scene, provenance=provenance))

@@ -1,4 +1,4 @@
-"""checkpoint.pt with and without a vehicle, into with_car.png, without_car.png, removal.png and removal.json."""
+"""checkpoint.npz with and without a vehicle, into with_car.png, without_car.png, removal.png and removal.json."""
 
 from drivesplat.workflow.job import job
 from drivesplat.inspection.drawing import draw_removal

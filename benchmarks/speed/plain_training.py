@@ -35,7 +35,7 @@ from drivesplat.kernels.gsplat_private import cpu_strategies
 from drivesplat.rasterization import rasterize
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 
-CHECKPOINT = "ckpt.pt"
+CHECKPOINT = "ckpt.npz"
 
 
 @dataclass(frozen=True)

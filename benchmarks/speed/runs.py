@@ -106,7 +106,7 @@ def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
 
 def training_files(task: Task) -> TrainingFiles:
     """The output files of a training of ours."""
-    return TrainingFiles(task.folder / "checkpoint.pt", task.folder / "train.json")
+    return TrainingFiles(task.folder / "checkpoint.npz", task.folder / "train.json")
 
 
 def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:

@@ -50,7 +50,7 @@ def render_edit(
     `job.frames`, the frames of the edited one.
 
     Returns the content of the edit's JSON without provenance: cameras of the edited drive at the size of the frames,
-    and the poses of all objects. `checkpoint` is the content of checkpoint.pt. Raises ConfigError if the edit does not
+    and the poses of all objects. `checkpoint` is the content of checkpoint.npz. Raises ConfigError if the edit does not
     fit the scene or the model has no actors; DatasetError, DeviceError and ResultError as `render_film` does.
     """
     model, device = open_model(checkpoint, device_settings)
@@ -96,7 +96,7 @@ def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[Recorde
             continue
         if track is None:
             raise ResultError(
-                f"{where}: scene.json has no track {name}, which checkpoint.pt contains; delete checkpoint.pt and rerun"
+                f"{where}: scene.json has no track {name}, which checkpoint.npz contains; delete that file and rerun"
             )
         actors.append(RecordedActor(track.id, track.category, track.size, group.motion))
     if not actors:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.evaluation.metrics import MIN_REGION_PIXELS
-from drivesplat.lidar.depth import Depths
+from drivesplat.lidar.depth_record import PixelDepths
 
 
 class DepthErrors:
@@ -14,10 +14,10 @@ class DepthErrors:
     def __init__(self) -> None:
         self._errors: list[np.ndarray] = []
 
-    def add(self, rendered: np.ndarray, known: Depths) -> None:
+    def add(self, rendered: np.ndarray, known: PixelDepths) -> None:
         """Adds a rendered depth image (h, w) in metres and its LiDAR depth."""
-        found = rendered[known["rows"], known["columns"]].astype(np.float64)
-        self._errors.append(np.abs(found - known["depth"]) / known["depth"])
+        found = rendered[known.rows, known.columns].astype(np.float64)
+        self._errors.append(np.abs(found - known.depth) / known.depth)
 
     def summary(self) -> dict[str, Any]:
         """`depth`: the median of |rendered - LiDAR| / LiDAR over all `pixels` of the group with LiDAR depth, None if

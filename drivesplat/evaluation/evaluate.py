@@ -19,7 +19,8 @@ from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.sample_pair import SamplePair, render_sample_pair
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.io.prefetch import ahead
-from drivesplat.lidar.depth import Depths, clouds_of, depths_in
+from drivesplat.lidar.depth import clouds_of, depths_in
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
@@ -39,7 +40,7 @@ VEHICLE_FINDING_DB = 18.0
 
 @dataclass(frozen=True)
 class EvaluationInputs:
-    """The inputs of an evaluation: the contents of checkpoint.pt, train.json, masks.json and LPIPS's backbone.json
+    """The inputs of an evaluation: the contents of checkpoint.npz, train.json, masks.json and LPIPS's backbone.json
     (None if LPIPS is disabled), the recording, and the path `truth` of a synthetic world's truth.json (None for a
     recorded drive)."""
 
@@ -141,7 +142,7 @@ def findings(group: dict[str, Any]) -> dict[str, bool | None]:
     }
 
 
-def held_out_depths(recording: Recording, camera: str, job: LidarDepthJob) -> dict[int, Depths]:
+def held_out_depths(recording: Recording, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
     """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
     missing."""
     scene = recording.scene
@@ -157,7 +158,7 @@ def evaluate_groups(
     camera: str,
     lpips_map: LpipsMap | None,
     device: torch.device,
-    depths: Mapping[int, Depths] = MappingProxyType({}),
+    depths: Mapping[int, PixelDepths] = MappingProxyType({}),
 ) -> dict[str, dict[str, Any]]:
     """The metrics of every held-out group by region. With LiDAR `depths` of images, by index, also `depth`; with
     several cameras also `overlap` and `no_overlap`, the static pixels that other cameras see as well, and the rest."""
@@ -170,7 +171,7 @@ def _group_metrics(
     recording: Recording,
     lpips_map: LpipsMap | None,
     device: torch.device,
-    depths: Mapping[int, Depths],
+    depths: Mapping[int, PixelDepths],
     images: list[int],
 ) -> dict[str, Any]:
     """The metrics of a held-out group of `images`."""

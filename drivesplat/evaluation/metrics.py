@@ -118,7 +118,7 @@ class RegionMetrics:
         """
         if not np.isfinite(image).all():
             raise ResultError(
-                "the rendering of a held-out image contains NaN or Inf; delete its checkpoint.pt and rerun"
+                "the rendering of a held-out image contains NaN or Inf; delete its checkpoint.npz and rerun"
             )
         image, truth = image.clip(0.0, 1.0).astype(np.float64), truth.astype(np.float64)
         maps = [((image - truth) ** 2).mean(axis=2), ssim_map(image, truth)]

@@ -73,7 +73,7 @@ class RenderedView:
         with explain_out_of_memory(lambda: len(gaussians)):
             picture = self.drive.model.render(self.camera, gaussians=gaussians)
         if not bool(torch.isfinite(picture.image).all()):
-            raise ResultError("the rendering contains NaN or Inf; delete checkpoint.pt and rerun")
+            raise ResultError("the rendering contains NaN or Inf; delete checkpoint.npz and rerun")
         return picture
 
 

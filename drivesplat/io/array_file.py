@@ -1,8 +1,8 @@
 """Files of arrays and plain data: uncompressed .npz archives, which numpy opens with `allow_pickle=False`.
 
-Every array is a member named by its place in the content ('actors/0/points'). The member 'content' is the rest as JSON
-(UTF-8 bytes): {"$array": name} stands for an array, {"$tuple": [...]} for a tuple, {"$items": [[key, value], ...]} for a
-mapping whose keys are not text.
+Every array is a member named by its place in the content ('actors/0/points'). The member 'content' is the rest as UTF-8
+JSON: {"$array": name} stands for an array, {"$tuple": [...]} for a tuple, {"$items": [[key, value], ...]} for a mapping
+whose keys are not text.
 """
 
 import json
@@ -44,7 +44,7 @@ def write_arrays(
         if type(value) in (list, tuple):
             items = [packed(item, f"{name}/{i}") for i, item in enumerate(value)]
             return items if type(value) is list else {"$tuple": items}
-        if type(value) is dict:
+        if isinstance(value, dict):
             items = {key: packed(item, f"{name}/{key}" if name else str(key)) for key, item in value.items()}
             simple = all(type(key) is str and not key.startswith("$") for key in items)
             return items if simple else {"$items": [list(item) for item in items.items()]}

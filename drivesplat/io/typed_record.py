@@ -13,13 +13,14 @@ R = TypeVar("R")
 def typed_record(kind: type[R], values: Any) -> R:
     """The dataclass `kind` with the `values` (by name) of its fields; further values are ignored.
 
-    Raises ValueError where a field without a default is missing or a value has another type, dtype or shape than the
-    field's annotation. A dimension has one size in all arrays of the record. Elements of containers are not checked.
+    Raises ValueError where a field without a default value is missing, or a value has another type, dtype or shape than
+    the field's annotation. A dimension has one size in all arrays of the record. Elements of containers are not
+    checked.
     """
     if not isinstance(values, dict):
         raise ValueError(f"it holds a {type(values).__name__}, no record")
     fields, hints = dataclasses.fields(kind), typing.get_type_hints(kind)
-    lacking = [field.name for field in fields if field.name not in values and _required(field)]
+    lacking = [field.name for field in fields if field.default is dataclasses.MISSING and field.name not in values]
     if lacking:
         raise ValueError(f"it lacks {', '.join(lacking)}")
     known = {field.name: values[field.name] for field in fields if field.name in values}
@@ -28,10 +29,6 @@ def typed_record(kind: type[R], values: Any) -> R:
             if not isinstance(value, _classes(hints[name])):
                 raise ValueError(f"{name} is {_described(value)}, not {getattr(hints[name], '__name__', hints[name])}")
     return kind(**known)
-
-
-def _required(field: dataclasses.Field) -> bool:
-    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
 def _classes(hint: Any) -> tuple[type, ...]:

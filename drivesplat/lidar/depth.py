@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivesplat.lidar.coloring import visible
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.lidar.movers import Mover, movers
 from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.lidar.sweeps import returns_of
@@ -14,9 +15,6 @@ from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import Group
 from drivesplat.settings.lidar_depth import LidarDepthJob
-
-Depths = dict[str, np.ndarray]
-"""`rows` and `columns` (m,) int32 of pixels, `depth` (m,) float32 metres."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def nearest_cloud(clouds: list[Cloud], timestamp: int, interval: float) -> Cloud
     return nearest if nearest and abs(nearest.timestamp - timestamp) < interval else None
 
 
-def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body: np.ndarray) -> Depths:
+def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body: np.ndarray) -> PixelDepths:
     """The returns of a cloud that a frame sees, the nearest of a pixel. What is absent by then is left out, and so is
     what lies behind the own car's `body` (h, w) bool."""
     size, seconds = target_size(frame, job.images), scene.seconds(frame.timestamp)
@@ -86,10 +84,10 @@ def box_depths(scene: Scene, frame: Frame, size: tuple[int, int], track_ids: set
     return nearest
 
 
-def nearest_per_pixel(found: np.ndarray) -> Depths:
+def nearest_per_pixel(found: np.ndarray) -> PixelDepths:
     """Rows, columns and depths (n, 3), of every pixel the nearest, row by row."""
     found = found[np.lexsort(found.T[::-1])]
     first = np.ones(len(found), dtype=bool)
     first[1:] = (np.diff(found[:, :2], axis=0) != 0).any(axis=1)
     rows, columns, depth = found[first].T
-    return {"rows": rows.astype(np.int32), "columns": columns.astype(np.int32), "depth": depth.astype(np.float32)}
+    return PixelDepths(rows.astype(np.int32), columns.astype(np.int32), depth.astype(np.float32))

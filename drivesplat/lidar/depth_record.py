@@ -1,28 +1,52 @@
-"""What lidar_depth.pkl holds: the depth that LiDAR gives some pixels of every training image.
-
-    images      one for each of the scene's frames, in their order; empty arrays where it is no training image
-        rows, columns    (m,) int32: the pixels, at the size at which images are trained; none twice
-        depth            (m,) float32: metres along the camera's axis
-    provenance
+"""The depth that LiDAR gives some pixels of every training image, as lidar_depth.npz holds it.
 
 The stage `lidar_depth` makes it (`drivesplat.preprocess.lidar_depth`).
 """
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from drivesplat.io.plain_pickle import read_plain_pickle
-from drivesplat.io.storage import unreadable
+import numpy as np
+from jaxtyping import Float, Int
+
+from drivesplat.io.array_file import read_arrays, write_arrays
+from drivesplat.io.storage import Provenance, unreadable
+from drivesplat.io.typed_record import typed_record
+
+RULE = "lidar_depth"
 
 
-def read_lidar_depth(path: str | Path) -> dict[str, Any]:
-    """Reads lidar_depth.pkl. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
-    content = read_plain_pickle(path, rule="lidar_depth")
+@dataclass(frozen=True)
+class PixelDepths:
+    """Depth of m pixels of an image, none twice: `depth` in metres along the camera's axis at `rows` and `columns`."""
+
+    rows: Int[np.ndarray, " m"]
+    columns: Int[np.ndarray, " m"]
+    depth: Float[np.ndarray, " m"]
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+
+@dataclass(frozen=True)
+class LidarDepthRecord:
+    """The content of lidar_depth.npz: one of `images` for each of the scene's frames, in their order, at the size of
+    training; without pixels where the frame is no training image."""
+
+    images: list[PixelDepths]
+    provenance: Provenance = field(default_factory=dict)
+
+
+def write_lidar_depth(path: str | Path, record: LidarDepthRecord) -> None:
+    """Writes lidar_depth.npz."""
+    write_arrays(path, {**vars(record), "images": [vars(image) for image in record.images]})
+
+
+def read_lidar_depth(path: str | Path) -> LidarDepthRecord:
+    """Reads lidar_depth.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    content = read_arrays(path, RULE)
     try:
-        if not content.keys() >= {"images", "provenance"}:
-            raise ValueError("it lacks the keys of one")
-        if any(not image.keys() >= {"rows", "columns", "depth"} for image in content["images"]):
-            raise ValueError("an image in it lacks keys")
-    except (AttributeError, TypeError, ValueError) as error:
-        raise unreadable(path, "lidar_depth", f"not a record of depths ({error})") from error
-    return content
+        images = [typed_record(PixelDepths, image) for image in content["images"]]
+        return typed_record(LidarDepthRecord, {**content, "images": images})
+    except (KeyError, TypeError, ValueError) as error:
+        raise unreadable(path, RULE, f"not a record of depths ({error})") from error

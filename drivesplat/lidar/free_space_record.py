@@ -1,34 +1,48 @@
-"""What free_space.pkl holds: the voxels that rays prove empty.
-
-    lower       (3,) float64: the grid's lower corner in world metres
-    voxel       edge of a voxel in metres
-    shape       (3,) int64: how many voxels the grid has along x, y and z
-    keys        (k,) int64, ascending: the empty voxels; voxel i, j, k of the grid is (i ny + j) nz + k
-    provenance
+"""The voxels that rays prove empty, as free_space.npz holds them.
 
 The stage `free_space` makes it (`drivesplat.preprocess.free_space`).
 """
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int64
 
-from drivesplat.io.plain_pickle import read_plain_pickle
-from drivesplat.io.storage import unreadable
+from drivesplat.io.array_file import read_arrays, write_arrays
+from drivesplat.io.storage import Provenance, unreadable
+from drivesplat.io.typed_record import typed_record
+
+RULE = "free_space"
 
 
-def read_free_space(path: str | Path) -> dict[str, Any]:
-    """Reads free_space.pkl. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
-    content = read_plain_pickle(path, rule="free_space")
+@dataclass(frozen=True)
+class FreeSpace:
+    """Empty voxels of a grid whose lower corner is `lower` in world metres.
+
+    `voxel` is a voxel's edge in metres, `shape` their number along x, y and z; `keys`, ascending, are the empty ones:
+    voxel (i, j, k) of the grid is (i ny + j) nz + k.
+    """
+
+    lower: Float[np.ndarray, "3"]
+    shape: Int64[np.ndarray, "3"]
+    voxel: float
+    keys: Int64[np.ndarray, " k"]
+    provenance: Provenance = field(default_factory=dict)
+
+
+def write_free_space(path: str | Path, record: FreeSpace) -> None:
+    """Writes free_space.npz."""
+    write_arrays(path, vars(record))
+
+
+def read_free_space(path: str | Path) -> FreeSpace:
+    """Reads free_space.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    content = read_arrays(path, RULE)
     try:
-        if not content.keys() >= {"lower", "voxel", "shape", "keys", "provenance"}:
-            raise ValueError("it lacks the keys of one")
-        if not (content["lower"].shape == content["shape"].shape == (3,) and content["voxel"] > 0):
-            raise ValueError("it describes no grid")
-        keys = content["keys"]
-        if keys.dtype != np.int64 or keys.ndim != 1 or (np.diff(keys) <= 0).any():
-            raise ValueError("its voxels are in no order")
-    except (AttributeError, TypeError, ValueError) as error:
-        raise unreadable(path, "free_space", f"not a record of free space ({error})") from error
-    return content
+        record = typed_record(FreeSpace, content)
+        if not record.voxel > 0 or (np.diff(record.keys) <= 0).any():
+            raise ValueError("its voxels are not in order")
+        return record
+    except (TypeError, ValueError) as error:
+        raise unreadable(path, RULE, f"not a record of free space ({error})") from error

@@ -15,7 +15,7 @@ from drivesplat.model.part import Part, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
-from drivesplat.scene.actor_record import motion_of
+from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import PartName, SkyKind, TrainSettings
 
@@ -35,7 +35,7 @@ class ModelInit:
     corrected, the times of its training images in seconds."""
 
     record: TrainingRecord
-    actors: list[dict[str, Any]]
+    actors: list[ActorRecord]
     sky_color: np.ndarray
     classes: int = 0
     exposed: dict[str, np.ndarray] = field(default_factory=dict)
@@ -105,26 +105,25 @@ def _restore_background(params: dict[str, torch.Tensor], definition: dict[str, A
 
 
 def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
-    actors = [actor for actor in init.actors if len(actor["points"])]
+    actors = [actor for actor in init.actors if len(actor.points)]
     if not actors:
         return None
-    tracks = [ActorTrack(actor["id"], actor["size"], motion_of(actor)) for actor in actors]
+    tracks = [ActorTrack(actor.id, actor.size, actor.motion) for actor in actors]
     limits = [actor_cap(actor, settings) for actor in actors]
-    counts = [len(actor["points"]) for actor in actors]
+    counts = [len(actor.points) for actor in actors]
     shares = split_cap(list(map(min, counts, limits)), settings.actors.cap_max)
     kept = [random_subset(count, share) for count, share in zip(counts, shares, strict=True)]
-    points, colors = (
-        [actor[key][chosen] for actor, chosen in zip(actors, kept, strict=True)] for key in ("points", "points_rgb")
-    )
+    chosen = list(zip(actors, kept, strict=True))
+    points, colors = [actor.points[rows] for actor, rows in chosen], [actor.points_rgb[rows] for actor, rows in chosen]
     capped = settings.actors.model_copy(update={"cap_max": min(settings.actors.cap_max, sum(limits))})
     return Actors.from_points(tracks, points, [c / 255.0 for c in colors], capped, settings.gaussians, init.classes)
 
 
-def actor_cap(actor: dict[str, Any], settings: TrainSettings) -> int:
+def actor_cap(actor: ActorRecord, settings: TrainSettings) -> int:
     """The maximum number of Gaussians for the training pixels in an actor's box."""
     if not settings.pixels_per_gaussian:
         return settings.actors.cap_max
-    return max(settings.actors.least, int(actor["pixels"] / settings.pixels_per_gaussian))
+    return max(settings.actors.least, int(actor.pixels / settings.pixels_per_gaussian))
 
 
 def split_cap(wanted: Sequence[int], cap: int) -> list[int]:

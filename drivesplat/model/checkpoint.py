@@ -1,4 +1,4 @@
-"""Reading checkpoint.pt and opening the trained model in it."""
+"""Reading checkpoint.npz and opening the trained model in it."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from drivesplat.settings.train import TrainJob
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Reads `checkpoint.pt`. Raises ResultError for any other file, and for anything but tensors and plain data in
+    """Reads `checkpoint.npz`. Raises ResultError for any other file, and for anything but tensors and plain data in
     it."""
     content = checkpoint_file.load(Path(path), rule="train")
     if not {"model", "job", "parts", "provenance"} <= content.keys():
@@ -36,7 +36,7 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
 
     Rendering a camera 1.5 m above the origin that looks along the world's x axis, 2 s after the first image:
 
-    >>> model, device = open_model(read_checkpoint("results/0103/street/checkpoint.pt"), DeviceSettings(kind="cpu"))
+    >>> model, device = open_model(read_checkpoint("results/0103/street/checkpoint.npz"), DeviceSettings(kind="cpu"))
     >>> K = torch.tensor([[320.0, 0.0, 320.0], [0.0, 320.0, 180.0], [0.0, 0.0, 1.0]], device=device)
     >>> pose = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]], device=device)
     >>> picture = model.render(View(K, pose, 640, 360, time=2.0), with_depth=True)

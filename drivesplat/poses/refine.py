@@ -30,7 +30,7 @@ from drivesplat.poses.from_images import placed_by_images
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.refinement_record import Refinement, verdict
 from drivesplat.poses.rig import RigImages, from_pycolmap
-from drivesplat.poses.triangulated import no_points, triangulated_record
+from drivesplat.poses.triangulated import no_points, triangulated_points
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
@@ -84,7 +84,7 @@ def refined_by_matches(
     if fault is not None:
         log.warning("scene %s: poses stay as they are: %s", scene.name, fault)
         return Refinement(scene, record, no_points())
-    return Refinement(corrected(scene, corrections), record, triangulated_record(images.indices, seen))
+    return Refinement(corrected(scene, corrections), record, triangulated_points(images.indices, seen))
 
 
 def made_by_matches(
@@ -105,7 +105,7 @@ def made_by_matches(
         corrections = corrections.continued(images.scene.key_frame_interval)
     record = {**verdict(scene, job, None), "placement": placement.record, **described}
     made = corrected(images.scene, corrections, poses="images")
-    return Refinement(made, record, triangulated_record(images.indices, seen))
+    return Refinement(made, record, triangulated_points(images.indices, seen))
 
 
 def _adjusted(

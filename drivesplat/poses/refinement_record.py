@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 
@@ -13,11 +12,11 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Refinement:
-    """`scene`: with refined poses, or as it was; `record`: the content of poses.json; `points`: of triangulated.pkl."""
+    """`scene`: with refined poses, or as it was; `record`: the content of poses.json; `points`: of triangulated.npz."""
 
     scene: Scene
     record: dict[str, Any]
-    points: dict[str, np.ndarray]
+    points: TriangulatedPoints
 
 
 def verdict(scene: Scene, job: RefinePosesJob, fault: str | None) -> dict[str, Any]:

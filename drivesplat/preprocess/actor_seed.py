@@ -8,7 +8,6 @@ training images in whose pixels the actor is seen. Held-out images and sweeps co
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from drivesplat.io.prefetch import ahead
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.movers import Mover, movers
 from drivesplat.lidar.sweeps import training_returns
+from drivesplat.scene.actor_record import ActorRecord, ActorRecords
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.object_class import ObjectClass
@@ -32,8 +32,8 @@ UNSEEN = 127
 """Grey of an actor that no pixel shows."""
 
 
-def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
-    """The record of `drivesplat.scene.actor_record`, provenance aside. A mover that no training image sees is left
+def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) -> ActorRecords:
+    """The actors of a scene, without provenance. A mover that no training image sees is left
     out."""
     sweeps = training_returns(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
@@ -50,8 +50,8 @@ def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) ->
         log.info("%d tracks that move are left out, no training image sees them: %s", len(unseen), ", ".join(unseen))
     actors = [seed.record() for seed in seeds if seed.seen]
     for actor in actors:
-        log.info("%s: %d points, %d of them LiDAR's", actor["id"], len(actor["points"]), actor["lidar_points"])
-    return {"actors": actors}
+        log.info("%s: %d points, %d of them LiDAR's", actor.id, len(actor.points), actor.lidar_points)
+    return ActorRecords(actors)
 
 
 def may_be_actor(track: Track, settings: ActorSeedSettings) -> bool:
@@ -142,21 +142,17 @@ class Seed:
         self._distances[index[better]] = distances[better]
         self._colors[index[better]] = sight.pixels[rows[better], columns[better]]
 
-    def record(self) -> dict[str, Any]:
-        """The actor as `drivesplat.scene.actor_record` describes it. Points that no image shows have the others' mean
-        colour."""
-        track, motion, shown = self.mover.track, self.mover.motion, np.isfinite(self._distances)
+    def record(self) -> ActorRecord:
+        """The actor. Points that no image shows have the others' mean colour."""
+        track, shown = self.mover.track, np.isfinite(self._distances)
         mean = self._colors[shown].mean(axis=0).round() if shown.any() else UNSEEN
-        return {
-            "id": track.id,
-            "category": track.category,
-            "size": track.size,
-            "times": motion.times,
-            "object_to_world": motion.object_to_world,
-            "runs": [list(run) for run in motion.runs],
-            "reach": motion.reach,
-            "points": self._points.astype(np.float32),
-            "points_rgb": np.where(shown[:, None], self._colors, mean).astype(np.uint8),
-            "lidar_points": self._lidar,
-            "pixels": self.pixels,
-        }
+        return ActorRecord(
+            id=track.id,
+            category=track.category,
+            size=track.size,
+            motion=self.mover.motion,
+            points=self._points.astype(np.float32),
+            points_rgb=np.where(shown[:, None], self._colors, mean).astype(np.uint8),
+            lidar_points=self._lidar,
+            pixels=self.pixels,
+        )

@@ -17,15 +17,15 @@ again. Held-out sweeps contribute nothing.
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from drivesplat.errors import ConfigError
+from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.lidar.movers import movers
 from drivesplat.lidar.sweeps import training_returns
 from drivesplat.lidar.traversal import OCCUPIED, count_passing, empty_voxels
-from drivesplat.poses.triangulated import seen_in
+from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.free_space import FreeSpaceJob, FreeSpaceSettings
@@ -55,14 +55,11 @@ class Rays:
 _PLACES = ("origins", "ends")
 
 
-def free_space_record(
-    scene: Scene, job: FreeSpaceJob, triangulated: dict[str, np.ndarray] | None = None
-) -> dict[str, Any]:
-    """The record of `drivesplat.lidar.free_space_record`, provenance aside, from the LiDAR of a scene, and from the
-    content of its triangulated.pkl where it has one."""
+def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: TriangulatedPoints | None = None) -> FreeSpace:
+    """The free space of a scene, without provenance, from its LiDAR and, where they are given, triangulated points."""
     rays = Rays.joined([lidar_rays(scene, job), *([camera_rays(scene, job, triangulated)] if triangulated else [])])
     record = proven_empty(rays, job.free_space)
-    log.info("%d rays prove %.0f cubic metres empty", len(rays.ends), len(record["keys"]) * record["voxel"] ** 3)
+    log.info("%d rays prove %.0f cubic metres empty", len(rays.ends), len(record.keys) * record.voxel**3)
     return record
 
 
@@ -78,18 +75,18 @@ def lidar_rays(scene: Scene, job: FreeSpaceJob) -> Rays:
     return Rays.joined(found)
 
 
-def camera_rays(scene: Scene, job: FreeSpaceJob, triangulated: dict[str, np.ndarray]) -> Rays:
+def camera_rays(scene: Scene, job: FreeSpaceJob, triangulated: TriangulatedPoints) -> Rays:
     """The rays from the training images to the triangulated points that they see, if enough of them see a point. All
     stand still: features on what moves are left out before anything is triangulated."""
     training = training_images(scene, job.holdout)
-    counts = np.isin(triangulated["seen_by"], training) & seen_in(triangulated, training)[triangulated["seen_point"]]
+    counts = np.isin(triangulated.seen_by, training) & triangulated.seen_in(training)[triangulated.seen_point]
     centres = np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames])
-    ends = triangulated["points"][triangulated["seen_point"][counts]]
-    return Rays(centres[triangulated["seen_by"][counts]], ends, np.ones(len(ends), dtype=bool))
+    ends = triangulated.points[triangulated.seen_point[counts]]
+    return Rays(centres[triangulated.seen_by[counts]], ends, np.ones(len(ends), dtype=bool))
 
 
-def proven_empty(rays: Rays, settings: FreeSpaceSettings) -> dict[str, Any]:
-    """What rays of any kind prove empty: the record of `drivesplat.lidar.free_space_record`, provenance aside.
+def proven_empty(rays: Rays, settings: FreeSpaceSettings) -> FreeSpace:
+    """What rays of any kind prove empty.
 
     Raises ConfigError where the grid would be too large.
     """
@@ -106,7 +103,7 @@ def proven_empty(rays: Rays, settings: FreeSpaceSettings) -> dict[str, Any]:
     occupied = cells[((cells >= 0) & (cells < shape)).all(axis=1)].astype(np.int64)
     counts[tuple(occupied.T)] = OCCUPIED
     keys = empty_voxels(counts, settings.min_rays)
-    return {"lower": lower, "shape": shape, "voxel": settings.voxel, "keys": keys}
+    return FreeSpace(lower, shape, settings.voxel, keys)
 
 
 def proving(rays: Rays, settings: FreeSpaceSettings) -> tuple[np.ndarray, np.ndarray]:

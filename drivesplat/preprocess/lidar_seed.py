@@ -9,7 +9,6 @@ neither position (of LiDAR) nor colour, and a point that no training image sees 
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from plyfile import PlyParseError
@@ -19,7 +18,7 @@ from drivesplat.io.point_cloud import PointCloud, read_positions
 from drivesplat.io.prefetch import ahead
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
 from drivesplat.lidar.sweeps import outside_boxes, thin, without_own_car
-from drivesplat.poses.triangulated import mean_over_views, seen_in
+from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.preprocess.far_points import far_points, uncovered
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
@@ -36,10 +35,10 @@ log = logging.getLogger(__name__)
 
 
 def seed_points(
-    scene: Scene, job: SeedJob, own_car: OwnCar = NOWHERE, triangulated: dict[str, Any] | None = None
+    scene: Scene, job: SeedJob, own_car: OwnCar = NOWHERE, triangulated: TriangulatedPoints | None = None
 ) -> PointCloud:
     """The seed of a scene, to which the own car's body lends nothing; `triangulated` is the content of its
-    triangulated.pkl. Its note counts points by source, missing sweeps, and names the points file.
+    triangulated.npz. Its note counts points by source, missing sweeps, and names the points file.
 
     Raises DatasetError where a LiDAR file is missing (unless told to go on) or nothing is left to start from.
     """
@@ -126,13 +125,13 @@ def extra_points(scene: Scene, path: str | None) -> np.ndarray:
         raise DatasetError(f"lidar_seed.points_file {path} is no readable PLY of points ({error})") from error
 
 
-def triangulated_points(scene: Scene, job: SeedJob, record: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def triangulated_points(scene: Scene, job: SeedJob, record: TriangulatedPoints) -> tuple[np.ndarray, np.ndarray]:
     """The triangulated points (n, 3) that enough training images see, in world coordinates, and the times (n,) at which
     they do, on average."""
     training = training_images(scene, job.holdout)
     times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
-    chosen = seen_in(record, training)
-    return record["points"][chosen], mean_over_views(record, training, times)[chosen]
+    chosen = record.seen_in(training)
+    return record.points[chosen], record.mean_over_views(training, times)[chosen]
 
 
 def color_views(

@@ -86,7 +86,7 @@ def render_film(
     """Writes the MP4 `path`; returns the content of the record of its cameras without provenance: that of the shot, the
     `offset` from the recorded path in metres and degrees, `render_seconds` and `bytes`.
 
-    `checkpoint` is the content of checkpoint.pt. Raises DatasetError where the scene lacks the camera, DeviceError,
+    `checkpoint` is the content of checkpoint.npz. Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or a rendering contains NaN or Inf.
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))

@@ -20,7 +20,7 @@ from drivesplat.rendering.captured_frames import FrameInput, GpuFrameRenderer, P
 from drivesplat.rendering.color_bytes import to_uint8
 
 T = TypeVar("T")
-NOT_FINITE = "a frame of a film contains NaN or Inf; delete its checkpoint.pt and rerun"
+NOT_FINITE = "a frame of a film contains NaN or Inf; delete its checkpoint.npz and rerun"
 
 
 def film_frames(model: SplatModel, inputs: Iterable[FrameInput]) -> Iterator[np.ndarray]:

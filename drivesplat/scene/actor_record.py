@@ -1,47 +1,69 @@
-"""What actors.pkl holds: the vehicles that move, how they move, and where their Gaussians start.
-
-    actors           by id; of each
-        id, category     as annotated
-        size             (3,) float64: length, width, height in metres
-        times            (k,) float64: seconds since the scene's first image
-        object_to_world  (k, 4, 4) float64 at `times`
-        runs, reach      the further fields of `drivesplat.scene.motion.Motion`; runs as [first, last]
-        points           (p, 3) float32 in the object's frame, metres
-        points_rgb       (p, 3) uint8
-        lidar_points     how many of the points are LiDAR's: the first so many
-        pixels           how many pixels of training images, at the size of training, are its own
-    provenance
+"""The objects that become actors, as actors.npz holds them: how they move and where their Gaussians start.
 
 The stage `actors` makes it (`drivesplat.preprocess.actor_seed`).
 """
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drivesplat.io.plain_pickle import read_plain_pickle
-from drivesplat.io.storage import unreadable
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from drivesplat.io.array_file import read_arrays, write_arrays
+from drivesplat.io.storage import Provenance, unreadable
+from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.motion import Motion
 
-_KEYS = {
-    "id", "category", "size", "times", "object_to_world", "runs", "reach",
-    "points", "points_rgb", "lidar_points", "pixels",
-}  # fmt: skip
+RULE = "actors"
 
 
-def read_actors(path: str | Path) -> dict[str, Any]:
-    """Reads actors.pkl. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
-    content = read_plain_pickle(path, rule="actors")
+@dataclass(frozen=True)
+class ActorRecord:
+    """An actor of p seed points: `id` and `category` as annotated, `size` (length, width, height in metres), `motion`
+    in seconds since the scene's first image, `points` in the object's frame (metres) with their colours.
+
+    The first `lidar_points` of the points are LiDAR returns; `pixels` of training images, at the size of training,
+    show the actor.
+    """
+
+    id: str
+    category: str
+    size: Float[np.ndarray, "3"]
+    motion: Motion
+    points: Float[np.ndarray, "p 3"]
+    points_rgb: UInt8[np.ndarray, "p 3"]
+    lidar_points: int
+    pixels: int
+
+    def to_plain(self) -> dict[str, Any]:
+        """As plain data and arrays."""
+        return {**vars(self), "motion": self.motion.to_plain()}
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> "ActorRecord":
+        """The inverse of `to_plain`. Raises AttributeError, KeyError, TypeError or ValueError where `plain` is none."""
+        return typed_record(cls, {**plain, "motion": Motion.from_plain(plain["motion"])})
+
+
+@dataclass(frozen=True)
+class ActorRecords:
+    """The content of actors.npz; `actors` by id."""
+
+    actors: list[ActorRecord]
+    provenance: Provenance = field(default_factory=dict)
+
+
+def write_actors(path: str | Path, record: ActorRecords) -> None:
+    """Writes actors.npz."""
+    write_arrays(path, {**vars(record), "actors": [actor.to_plain() for actor in record.actors]})
+
+
+def read_actors(path: str | Path) -> ActorRecords:
+    """Reads actors.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    content = read_arrays(path, RULE)
     try:
-        if not content.keys() >= {"actors", "provenance"}:
-            raise ValueError("it lacks the keys of one")
-        if any(not actor.keys() >= _KEYS for actor in content["actors"]):
-            raise ValueError("an actor in it lacks keys")
-    except (AttributeError, TypeError, ValueError) as error:
-        raise unreadable(path, "actors", f"not a record of actors ({error})") from error
-    return content
-
-
-def motion_of(actor: dict[str, Any]) -> Motion:
-    """The motion of an actor of the record."""
-    runs = tuple((first, last) for first, last in actor["runs"])
-    return Motion(actor["times"], actor["object_to_world"], runs, actor["reach"])
+        actors = [ActorRecord.from_plain(actor) for actor in content["actors"]]
+        return typed_record(ActorRecords, {**content, "actors": actors})
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise unreadable(path, RULE, f"not a record of actors ({error})") from error

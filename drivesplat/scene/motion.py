@@ -7,11 +7,14 @@ the box centre; world metres.
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import runs
 
@@ -26,11 +29,11 @@ class Motion:
     positions are.
     """
 
-    times: np.ndarray
-    object_to_world: np.ndarray
+    times: Float[np.ndarray, " k"]
+    object_to_world: Float[np.ndarray, "k 4 4"]
     runs: tuple[tuple[int, int], ...]
     reach: float
-    turns: np.ndarray | None = None
+    turns: Float[np.ndarray, " k"] | None = None
 
     @classmethod
     def of_track(cls, scene: Scene, track: Track) -> "Motion":
@@ -38,6 +41,17 @@ class Motion:
         times = np.array([scene.seconds(timestamp) for timestamp in track.timestamps])
         reach = scene.key_frame_interval * 0.5e-6
         return cls(times, track.object_to_world, tuple(runs(track.sample_indices)), reach)
+
+    def to_plain(self) -> dict[str, Any]:
+        """As plain data and arrays; corrections of the heading are left out."""
+        runs = [list(run) for run in self.runs]
+        return {"times": self.times, "object_to_world": self.object_to_world, "runs": runs, "reach": self.reach}
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> "Motion":
+        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError where `plain` is none."""
+        runs = tuple((first, last) for first, last in plain["runs"])
+        return typed_record(cls, {**plain, "runs": runs})
 
     @property
     def span(self) -> tuple[float, float]:

@@ -1,12 +1,12 @@
 """Geometry known beside the images, free space and road, and the loss terms of surfaces: flatness and road."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import Picture, SplatModel
@@ -31,14 +31,13 @@ class GeometryPriors:
 NO_PRIORS = GeometryPriors()
 
 
-def geometry_priors(
-    record: TrainingRecord, free_space: dict[str, Any] | None, settings: TrainSettings
-) -> GeometryPriors:
+def geometry_priors(record: TrainingRecord, free_space: FreeSpace | None, settings: TrainSettings) -> GeometryPriors:
     """The priors that `settings` want, on the CPU, from the training record and the record of free space (None: not
     made)."""
-    grid = {name: free_space[name] for name in ("lower", "shape", "keys")} if free_space else {}
     return GeometryPriors(
-        SparseGrid.from_numpy(edge=free_space["voxel"], **grid) if free_space else None,
+        SparseGrid.from_numpy(free_space.lower, free_space.voxel, free_space.shape, free_space.keys)
+        if free_space
+        else None,
         road_of(record, settings.road) if settings.road_weight else None,
     )
 

@@ -1,4 +1,4 @@
-"""A training from a training record to its files: checkpoint.pt and train.json."""
+"""A training from a training record to its files: checkpoint.npz and train.json."""
 
 import dataclasses
 import os
@@ -14,12 +14,12 @@ import torch
 from drivesplat.io import checkpoint_file
 from drivesplat.io.prefetch import ahead
 from drivesplat.io.storage import canonical_json, read_record, sha256_text, write_json
-from drivesplat.lidar.depth_record import read_lidar_depth
-from drivesplat.lidar.free_space_record import read_free_space
+from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
+from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.machine.device import choose_device, explain_out_of_memory
 from drivesplat.model.build import ModelInit, build_model, definitions, gaussian_cap
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.actor_record import read_actors
+from drivesplat.scene.actor_record import ActorRecord, read_actors
 from drivesplat.scene.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
@@ -34,19 +34,19 @@ from drivesplat.training.views import Guides, TrainingView, load_views
 
 @dataclass(frozen=True)
 class TrainingInputs:
-    """What a training reads: the records of parser.pkl, of actors.pkl and of lidar_depth.pkl (empty where the method
+    """What a training reads: the records of parser.pkl, of actors.npz and of lidar_depth.npz (empty where the method
     has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), the
     cameras that see the own car, `sky_known` (where no sky was found, it is not known of any pixel that it is none),
-    and the record of free_space.pkl (None where the method has no use for it)."""
+    and the record of free_space.npz (None where the method has no use for it)."""
 
     record: TrainingRecord
     masks: Path
-    actors: list[dict[str, Any]]
-    lidar_depth: list[dict[str, np.ndarray]]
+    actors: list[ActorRecord]
+    lidar_depth: list[PixelDepths]
     classes: int = 0
     seeing_own_car: frozenset[str] = frozenset()
     sky_known: bool = True
-    free_space: dict[str, Any] | None = None
+    free_space: FreeSpace | None = None
 
     def guides(self, job: TrainJob) -> Guides:
         """What `job` wants to know of the training images."""
@@ -94,8 +94,8 @@ class TrainingInputs:
 def read_inputs(
     parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str], free_space: Sequence[str]
 ) -> tuple[TrainingInputs, list[dict[str, Any]]]:
-    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.pkl, lidar_depth.pkl and
-    free_space.pkl, with the provenances of these files."""
+    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.npz, lidar_depth.npz and
+    free_space.npz, with the provenances of these files."""
     folder = Path(masks).parent
     record, made = read_training_record(parser), read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
@@ -104,15 +104,15 @@ def read_inputs(
     inputs = TrainingInputs(
         record,
         folder,
-        [actor for it in moving for actor in it["actors"]],
-        [image for it in depths for image in it["images"]],
+        [actor for it in moving for actor in it.actors],
+        [image for it in depths for image in it.images],
         made["semantic_classes"],
         frozenset(made["own_car"]),
         made["sky_known"],
         next(iter(spaces), None),
     )
-    records = [made, *moving, *depths, *spaces]
-    return inputs, [record.provenance, *(it["provenance"] for it in records)]
+    upstream = [record.provenance, made["provenance"], *(it.provenance for it in (*moving, *depths, *spaces))]
+    return inputs, upstream
 
 
 @dataclass(frozen=True)

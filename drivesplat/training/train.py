@@ -39,7 +39,7 @@ class TrainingFolders:
 
     @property
     def state(self) -> Path:
-        return self.resume / "state.pt"
+        return self.resume / "state.npz"
 
 
 @dataclass(frozen=True)

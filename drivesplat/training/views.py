@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from drivesplat.io.prefetch import ahead
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.view import View, view_of
 from drivesplat.scene.images import read_image
 from drivesplat.scene.training_record import TrainingRecord
@@ -50,7 +51,7 @@ class Guides:
 
     sky: Mapping[int, np.ndarray]
     moving: Mapping[int, np.ndarray]
-    lidar: Mapping[int, dict[str, np.ndarray]]
+    lidar: Mapping[int, PixelDepths]
     classes: Mapping[int, np.ndarray] = field(default_factory=dict)
     own_car: Mapping[int, np.ndarray] = field(default_factory=dict)
 
@@ -84,10 +85,8 @@ def _shared(mask: np.ndarray, known: dict[bytes, Tensor], device: torch.device) 
     return known[key]
 
 
-def _lidar_depth(
-    record: dict[str, np.ndarray], width: int, body: np.ndarray | None, device: torch.device
-) -> LidarDepth | None:
-    rows, columns, depth = (record[key] for key in ("rows", "columns", "depth"))
+def _lidar_depth(record: PixelDepths, width: int, body: np.ndarray | None, device: torch.device) -> LidarDepth | None:
+    rows, columns, depth = record.rows, record.columns, record.depth
     if body is not None:
         seen = ~body[rows, columns]
         rows, columns, depth = rows[seen], columns[seen], depth[seen]

@@ -96,7 +96,7 @@ class Inputs:
 
     def _triangulated(self, wildcards: Any, wanted: bool) -> list[str]:
         made = wanted and refines_poses(self.config, wildcards.scene)
-        return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.pkl"] if made else []
+        return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.npz"] if made else []
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, if given."""

@@ -50,9 +50,9 @@ def test_frames_are_counted_after_the_first_and_the_film_with_all_it_takes(scene
 
 def test_the_command_measures_a_trained_scene(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "read_scene", lambda path: scene)
-    torch.save(checkpoint_of(street_model()), tmp_path / "checkpoint.pt")
+    torch.save(checkpoint_of(street_model()), tmp_path / "checkpoint.npz")
     threads, began = torch.get_num_threads(), time.monotonic()
-    words = [str(tmp_path / "checkpoint.pt"), "scene.json", "--width", "32", "--height", "18", "--fps", "4"]
+    words = [str(tmp_path / "checkpoint.npz"), "scene.json", "--width", "32", "--height", "18", "--fps", "4"]
     try:
         assert command.main([*words, "--threads", "1"]) == 0
     finally:

@@ -22,7 +22,7 @@ STARTED = """\
 Building DAG of jobs...
 [Sat Nov 21 20:30:16 2026]
 rule train:
-    output: out/plain/0061/b-seed1/checkpoint.pt
+    output: out/plain/0061/b-seed1/checkpoint.npz
 drivesplat: waits for a GPU: jobs hold all there are (1; processes 7)
 """
 REFUSED = "Using profile profiles/default.\ndrivesplat: dataset nuscenes: there is no folder nowhere\n"

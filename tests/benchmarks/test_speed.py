@@ -63,7 +63,7 @@ def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path)
         run.plan.actors(at), run.plan.lidar_depth(at), run.plan.free_space(at)
     ]  # fmt: skip
     assert {Path(path).name for path in targets_of(run)} == {
-        "scene_refined.json", "parser.pkl", "masks.json", "actors.pkl", "lidar_depth.pkl"
+        "scene_refined.json", "parser.pkl", "masks.json", "actors.npz", "lidar_depth.npz"
     }  # fmt: skip
 
 
@@ -316,9 +316,9 @@ def test_what_is_timed_is_what_the_rule_trains(measured, tmp_path, monkeypatch):
     file = read_speed_file("tiny.yaml", {})
     out = Path("results/speed/tiny")
     _, task = tasks_of(file, plan_run(file, out, Path()), out)
-    timed = read_checkpoint(task.folder / "checkpoint.pt")
+    timed = read_checkpoint(task.folder / "checkpoint.npz")
     inputs, _ = read_inputs(task.files.parser, task.files.masks, (), (), ())
-    files = TrainingFiles(tmp_path / "again/checkpoint.pt", tmp_path / "again/train.json")
+    files = TrainingFiles(tmp_path / "again/checkpoint.npz", tmp_path / "again/train.json")
     run_training(inputs, task.train, task.device, files, timed["provenance"], "again")
     again = read_checkpoint(files.checkpoint)
     assert again["job"] == timed["job"] and all(

@@ -224,7 +224,7 @@ def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(record
     assert (summary.gaussians, summary.peak_gpu_memory_gb, summary.ssim) == (64, None, "torch")
     assert len(splats["means"]) == 64, "60, 63 after 100 iterations, 64 after 200"
     assert summary.seconds > 0
-    kept = load(tmp_path / "out/ckpt.pt", rule="train")
+    kept = load(tmp_path / "out/ckpt.npz", rule="train")
     assert kept["step"] == 220 and torch.equal(kept["splats"]["means"], splats["means"])
     after = as_model(kept["splats"], record)
     assert after.sky is None and off(after, record) < 0.7 * off(before, record)
@@ -237,7 +237,7 @@ def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(record, tmp_path):
     before = torch.cuda.memory_reserved() / 1e9  # by other tests' recordings, whose memory torch does not give back
     summary = fit(splats, images_of(record), scene_scale(record), recipe, tmp_path)
     assert summary.gaussians == 63 and 0 < summary.peak_gpu_memory_gb < before + 1
-    assert all(torch.isfinite(value).all() for value in load(tmp_path / "ckpt.pt", rule="train")["splats"].values())
+    assert all(torch.isfinite(value).all() for value in load(tmp_path / "ckpt.npz", rule="train")["splats"].values())
 
 
 def off(model, record: TrainingRecord) -> float:

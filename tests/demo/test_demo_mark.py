@@ -79,7 +79,7 @@ def demo(root: Path, **settings) -> dict:
 
 
 @pytest.mark.parametrize(
-    "target", ["results/demo/metrics.json", "results/demo/vanilla/checkpoint.pt", "{}/v1.0-mini/log.json"]
+    "target", ["results/demo/metrics.json", "results/demo/vanilla/checkpoint.npz", "{}/v1.0-mini/log.json"]
 )
 def test_planning_refuses_a_world_in_a_recorded_datasets_folder_before_any_job(recorded, target):
     before = content(recorded)

@@ -167,7 +167,7 @@ def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has(target, 
     "target",
     [
         "results/a/vanilla/aside.mp4", "results/b/vanilla/original.cameras.json", "results/b/vanilla/cameras.json",
-        "results/b/vanilla/ghost_panel.png", "results/b/vanilla/checkpoint.pt", "results/b/masks/masks.json",
+        "results/b/vanilla/ghost_panel.png", "results/b/vanilla/checkpoint.npz", "results/b/masks/masks.json",
         "results/b/metrics.json", "results/b/vanilla/tensorboard/nowhere.mp4", "elsewhere/b/vanilla/nowhere.mp4",
         "films",
     ],

@@ -338,7 +338,7 @@ def test_actors_missing_in_the_scene_are_refused(scene, model, tmp_path):
     """Otherwise they would silently be missing in the film."""
     other = replace(scene, tracks=tuple(track for track in scene.tracks if track.id != TURNING))
     message = refusal(other, model, tmp_path, {"remove": {"track": AHEAD}}, kind=ResultError)
-    assert TURNING in message and "checkpoint.pt" in message
+    assert TURNING in message and "checkpoint.npz" in message
 
 
 def test_a_still_avoids_collision_frames_unless_there_is_no_other():

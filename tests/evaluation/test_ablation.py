@@ -463,8 +463,8 @@ def test_asking_for_it_plans_exactly_the_trainings_of_all_variants_with_all_seed
         copy.write_config()
     assert sorted(trainings) == sorted(names())
     for name, files in trainings.items():
-        assert ("results/0001/actors.pkl" in files) == ("without-actors" not in name), name
-        assert ("results/0001/lidar_depth.pkl" in files) == ("without-depth" not in name), name
+        assert ("results/0001/actors.npz" in files) == ("without-actors" not in name), name
+        assert ("results/0001/lidar_depth.npz" in files) == ("without-depth" not in name), name
     once = dict.fromkeys(
         ("extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "ablation"), 1
     )

@@ -14,7 +14,7 @@ from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.evaluate import evaluate_groups, held_out_depths
 from drivesplat.evaluation.metrics import MIN_REGION_PIXELS
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
-from drivesplat.lidar.depth import Depths
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.scene.prepared_drive import Recording
@@ -32,8 +32,8 @@ def job(holdout: dict[str, int] = HELD_OUT) -> LidarDepthJob:
     )  # fmt: skip
 
 
-def known(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray) -> Depths:
-    return {"rows": rows.astype(np.int32), "columns": columns.astype(np.int32), "depth": depth.astype(np.float32)}
+def known(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray) -> PixelDepths:
+    return PixelDepths(rows.astype(np.int32), columns.astype(np.int32), depth.astype(np.float32))
 
 
 def test_the_figure_is_the_median_over_all_pixels_of_the_group():
@@ -76,9 +76,9 @@ def test_images_are_held_to_the_sweep_of_their_own_key_frame(tiny_root):
     assert [recording.scene.frames[i].sample_index for i in sorted(depths)] == [2, 6, 8, 9]
     assert {groups[i] for i in depths} == {"interpolation", "extrapolation"}
     for index, image in depths.items():
-        assert len(image["depth"]) > 100
-        for key, values in image.items():
-            np.testing.assert_array_equal(values, everything[index][key])
+        assert len(image.depth) > 100
+        for key, values in vars(image).items():
+            np.testing.assert_array_equal(values, vars(everything[index])[key])
 
 
 def test_images_without_a_sweep_of_their_own_are_held_to_none(tiny_root, tmp_path):

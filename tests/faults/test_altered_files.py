@@ -93,7 +93,7 @@ def test_each_of_100_flipped_bits_is_refused_with_file_and_rule(finished, tmp_pa
         "masks.json",
         "seed.ply",
         "parser.pkl",
-        "checkpoint.pt",
+        "checkpoint.npz",
         "train.json",
     } <= kinds
     assert {".jpg", ".bin"} <= kinds and any("masks/regions" in path for path in places)
@@ -145,14 +145,14 @@ def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, 
     """Members that Snakemake does not know, lost and altered, and a declared output."""
     copy = finished.again(tmp_path / "copy")
     (copy.folder / "results/0001/parser.pkl").unlink()
-    (copy.folder / "results/0001/street/checkpoint.pt").unlink()
+    (copy.folder / "results/0001/street/checkpoint.npz").unlink()
     damaged = sorted(copy.folder.glob(path))[-1]
     whole = damaged.read_bytes()
     if lost:
         damaged.unlink()
     else:
         damaged.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    target = "results/0001/street/checkpoint.pt"
+    target = "results/0001/street/checkpoint.npz"
     refused = copy.run(target)
     name, delete, told = DELETE.search(refused.stdout).groups()
     assert refused.returncode and told == rule and (copy.folder / name) == damaged

@@ -45,7 +45,7 @@ def started(copy: WorkflowCopy) -> subprocess.Popen:
 
 def at_work(copy: WorkflowCopy) -> subprocess.Popen:
     """The same, once it has written a resume state."""
-    state = copy.folder / "results/0001/vanilla/resume/state.pt"
+    state = copy.folder / "results/0001/vanilla/resume/state.npz"
     state.unlink(missing_ok=True)
     running = started(copy)
     until(state.exists)
@@ -74,7 +74,7 @@ def test_an_interrupted_run_takes_its_training_along_and_the_next_one_goes_on(co
     assert running.wait(PATIENCE) != 0
     until(lambda: training_process(copy) is None)
     folder = copy.folder / "results/0001/vanilla"
-    assert not (folder / "checkpoint.pt").exists() and (folder / "resume/state.pt").exists()
+    assert not (folder / "checkpoint.npz").exists() and (folder / "resume/state.npz").exists()
     log = copy.folder / "results/logs/0001/vanilla/train.log"
     log.unlink()
     again = started(copy)

@@ -192,7 +192,7 @@ def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
     copy.write_config()
     line = told(copy.run("results/0001/vanilla/train.json"))
     assert "no usable GPU" in line and "device: cpu" in line
-    assert not (copy.folder / "results/0001/vanilla/checkpoint.pt").exists()
+    assert not (copy.folder / "results/0001/vanilla/checkpoint.npz").exists()
 
 
 LOOKS = ("parts.mp4", "ghost_panel.png", "with_car.png", "splat.ply", "parts/parts.json", "scene.usdz", "viewer.html")
@@ -419,7 +419,7 @@ def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
     assert whole.run("results/0001/parser.pkl", "results/0001/masks/masks.json").returncode == 0
     killed = whole.again(tmp_path / "killed")
     assert whole.run("results/0001/metrics.json").returncode == 0
-    state = killed.folder / "results/0001/vanilla/resume/state.pt"
+    state = killed.folder / "results/0001/vanilla/resume/state.npz"
     running = subprocess.Popen(
         killed.command("--cores", "2", "--", "results/0001/metrics.json"), cwd=killed.folder,
         env={**os.environ, "CUDA_VISIBLE_DEVICES": ""}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -432,7 +432,7 @@ def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
     os.kill(trainer, signal.SIGKILL)
     assert running.wait(timeout=120) != 0
     left = {path.name for path in (killed.folder / "results/0001/vanilla").iterdir()}
-    assert not {"checkpoint.pt", "train.json"} & left
+    assert not {"checkpoint.npz", "train.json"} & left
     done = killed.run("results/0001/metrics.json")
     assert done.returncode == 0, done.stdout
     summary = killed.read("results/0001/vanilla/train.json")

@@ -61,9 +61,9 @@ def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(t
     process = in_subprocess(write_until_killed, str(tmp_path))
     _, errors = process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL, errors
-    (half,) = (tmp_path / "resume").glob(".state.*.partial.pt")
+    (half,) = (tmp_path / "resume").glob(".state.*.partial.npz")
     assert half.stat().st_size > 0
-    assert checkpoint_file.load(tmp_path / "resume/state.pt", "train")["step"] == 20
+    assert checkpoint_file.load(tmp_path / "resume/state.npz", "train")["step"] == 20
     _, summary = trained(tmp_path, settings_of(checkpoint_every=20))
     assert summary.resumed_at == [20] and summary.iterations == 60
 
@@ -82,11 +82,11 @@ def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
     with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
         patched.setattr(checkpoint_file, "save", save)
         run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
-    assert checkpoint_file.load(files.resume / "state.pt", "train")["step"] == 10
+    assert checkpoint_file.load(files.resume / "state.npz", "train")["step"] == 10
     provenance = {**PROVENANCE, **({other: "other"} if other else {})}
     with caplog.at_level(logging.INFO):
         run_training(inputs, RESUMABLE, CPU, files, provenance, "train")
-    ignored = f"{files.resume / 'state.pt'} belongs to other settings, code or inputs: training starts at 0"
+    ignored = f"{files.resume / 'state.npz'} belongs to other settings, code or inputs: training starts at 0"
     assert (ignored in caplog.text) == (other is not None)
     assert ("resuming at iteration 10 of 20" in caplog.text) == (other is None)
 
@@ -132,7 +132,7 @@ def test_a_gradient_that_is_no_number_stops_a_training_whose_losses_are_numbers(
         trained(tmp_path, settings, model=model)
     message = str(error.value)
     assert message.startswith("iteration 4: gradient of background quats is not finite;") and "loss" not in message
-    kept = checkpoint_file.load(tmp_path / "resume/state.pt", "train")
+    kept = checkpoint_file.load(tmp_path / "resume/state.npz", "train")
     assert kept["step"] == 2
     assert all(torch.isfinite(value).all() for value in kept["state"]["model"].values())
 
@@ -157,7 +157,7 @@ def quiet_threads(monkeypatch):
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
 
 
-@pytest.mark.parametrize(("size", "named"), [(0, "resume"), (16, "tensorboard"), (8192, "state.pt")])
+@pytest.mark.parametrize(("size", "named"), [(0, "resume"), (16, "tensorboard"), (8192, "state.npz")])
 def test_a_training_on_a_full_disk_names_what_it_could_not_write(tmp_path, quiet_threads, size, named):
     """And leaves no file that could pass for a result."""
     files, inputs = files_in(tmp_path / "vanilla"), inputs_in(tmp_path)

@@ -16,6 +16,7 @@ from drivesplat.model.part import Part
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.preprocess.parser import training_record
+from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.prepared_drive import Recording
@@ -109,17 +110,19 @@ def actors_of(
     return actors
 
 
-def actor_record(track: ActorTrack, count: int = 10, seed: int = 0, pixels: int = 1000) -> dict[str, Any]:
-    """What actors.pkl would hold of an actor that starts from `count` points in its box, which shows so many pixels."""
+def actor_record(track: ActorTrack, count: int = 10, seed: int = 0, pixels: int = 1000) -> ActorRecord:
+    """What actors.npz would hold of an actor that starts from `count` points in its box, which shows so many pixels."""
     rng = np.random.default_rng(seed)
-    motion = track.motion
-    return {
-        "id": track.id, "category": "vehicle.car", "size": track.size, "times": motion.times,
-        "object_to_world": motion.object_to_world, "runs": [list(run) for run in motion.runs], "reach": motion.reach,
-        "points": (rng.uniform(-0.5, 0.5, (count, 3)) * track.size).astype(np.float32),
-        "points_rgb": rng.integers(0, 256, (count, 3)).astype(np.uint8), "lidar_points": count,
-        "pixels": pixels,
-    }  # fmt: skip
+    return ActorRecord(
+        id=track.id,
+        category="vehicle.car",
+        size=track.size,
+        motion=track.motion,
+        points=(rng.uniform(-0.5, 0.5, (count, 3)) * track.size).astype(np.float32),
+        points_rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        lidar_points=count,
+        pixels=pixels,
+    )
 
 
 def looking_at(target: Any, place: Any, time: float = 0.0, width: int = 48, height: int = 32) -> View:

@@ -75,13 +75,13 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
     scene = extract_scene(made.job("extract", SceneSource), root)
     masks = make_masks(scene, made.job("masks", MaskJob), folder / "masks")
     parser = training_record(scene, seed_points(scene, made.job("lidar_seed", SeedJob)), made.job("parser", ParserJob))
-    actors = actors_record(scene, made.job("actors", ActorSeedJob))["actors"]
+    actors = actors_record(scene, made.job("actors", ActorSeedJob)).actors
     depths = lidar_depths(scene, made.job("lidar_depth", LidarDepthJob))
     recording, known = Recording(scene, parser, folder / "masks"), {"sky_known": masks["sky_known"]}
     evals = {}
     for method, settings in made.config.methods.items():
         moving = (actors, depths) if "actors" in settings.parts else ([], [])
-        files = TrainingFiles(folder / method / "checkpoint.pt", folder / method / "train.json")
+        files = TrainingFiles(folder / method / "checkpoint.npz", folder / method / "train.json")
         inputs = TrainingInputs(parser, folder / "masks", *moving, **known)
         run_training(inputs, made.job("train", TrainJob, method), CPU, files, PROVENANCE, method)
         checkpoint, summary = read_checkpoint(files.checkpoint), json.loads(files.summary.read_text())

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
@@ -216,7 +217,7 @@ def job_of(parts: tuple[PartName, ...] = ("background",), sky: SkyKind = "none",
 
 
 def files_in(folder: Path) -> TrainingFiles:
-    return TrainingFiles(folder / "checkpoint.pt", folder / "train.json")
+    return TrainingFiles(folder / "checkpoint.npz", folder / "train.json")
 
 
 def inputs_in(folder: Path, actors: bool = False) -> TrainingInputs:
@@ -231,6 +232,6 @@ def inputs_in(folder: Path, actors: bool = False) -> TrainingInputs:
             path = folder / "masks" / mask_name(kind, "CAM_FRONT", int(time))
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(mask).save(path)
-    depth = {"rows": np.arange(9, dtype=np.int32), "columns": np.arange(9, dtype=np.int32), "depth": np.full(9, 4.0)}
+    depth = PixelDepths(np.arange(9, dtype=np.int32), np.arange(9, dtype=np.int32), np.full(9, 4.0))
     records = [actor_record(track, 25, seed) for seed, track in enumerate(cars())]
     return TrainingInputs(record, folder / "masks", records, [depth] * 5)

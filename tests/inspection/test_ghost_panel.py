@@ -271,7 +271,7 @@ def test_the_record_always_has_the_same_fields(panel_of_car, still):
 def test_a_rendering_with_nan_is_refused(tiny_scene, masks):
     drive = drive_of(one_car(tiny_scene), masks)
     drive.model.parts[0].params["sh0"].data.fill_(float("nan"))
-    with pytest.raises(ResultError, match=r"checkpoint\.pt"):
+    with pytest.raises(ResultError, match=r"checkpoint\.npz"):
         ghost_panel(drive, job_of())
 
 

@@ -13,9 +13,10 @@ from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, drive, scene_at, se
 from helpers.tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.io.plain_pickle import write_plain_pickle
-from drivesplat.lidar.free_space_record import read_free_space
+from drivesplat.io.array_file import write_arrays
+from drivesplat.lidar.free_space_record import FreeSpace, read_free_space, write_free_space
 from drivesplat.lidar.traversal import OCCUPIED, count_passing
+from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.preprocess.free_space import Rays, camera_rays, free_space_record, lidar_rays, proven_empty, proving
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
@@ -45,12 +46,12 @@ def rays_to(ends: np.ndarray, origin: np.ndarray = SENSOR, still: bool = True) -
     return Rays(np.broadcast_to(origin, ends.shape), ends, np.full(len(ends), still))
 
 
-def empty_at(record: dict[str, Any], points: Any) -> np.ndarray:
+def empty_at(record: FreeSpace, points: Any) -> np.ndarray:
     """Which world points (n, 3) the record says lie in empty voxels, by its documented meaning."""
-    cells = np.floor((np.asarray(points, dtype=float) - record["lower"]) / record["voxel"]).astype(int)
-    told = set(record["keys"].tolist())
-    _, ny, nz = record["shape"]
-    inside = ((cells >= 0) & (cells < record["shape"])).all(axis=1)
+    cells = np.floor((np.asarray(points, dtype=float) - record.lower) / record.voxel).astype(int)
+    told = set(record.keys.tolist())
+    _, ny, nz = record.shape
+    inside = ((cells >= 0) & (cells < record.shape)).all(axis=1)
     return np.array(
         [bool(ok) and int((i * ny + j) * nz + k) in told for ok, (i, j, k) in zip(inside, cells, strict=True)]
     )
@@ -214,12 +215,12 @@ def test_rays_of_any_kind_are_arrays():
     points = wall()
     ends = np.concatenate([points, points + by(0.0, 0.0, 0.025)])
     several = Rays.joined([rays_to(points), rays_to(points + by(0.0, 0.0, 0.025))])
-    for key, value in proven_empty(rays_to(ends), settings()).items():
-        np.testing.assert_array_equal(proven_empty(several, settings())[key], value)
+    for key, value in vars(proven_empty(rays_to(ends), settings())).items():
+        np.testing.assert_array_equal(getattr(proven_empty(several, settings()), key), value)
 
 
 def test_no_rays_prove_nothing():
-    assert len(proven_empty(Rays.joined([]), settings())["keys"]) == 0
+    assert len(proven_empty(Rays.joined([]), settings()).keys) == 0
 
 
 def test_a_grid_too_large_is_refused_with_what_to_do():
@@ -271,9 +272,9 @@ def test_rays_start_at_their_own_sweeps_sensor_and_leave_the_own_car_out(tiny_sc
     assert 0.0 < (~rays.still).mean() < 0.2
 
 
-def triangulated(scene: Scene, point: np.ndarray, *seen_by: int) -> dict[str, np.ndarray]:
+def triangulated(scene: Scene, point: np.ndarray, *seen_by: int) -> TriangulatedPoints:
     """A point (3,) that the images of these numbers see."""
-    return {"points": point[None], "seen_by": np.array(seen_by), "seen_point": np.zeros(len(seen_by), dtype=np.int64)}
+    return TriangulatedPoints(point[None], np.array(seen_by), np.zeros(len(seen_by), dtype=np.int64))
 
 
 def test_training_images_prove_what_lies_before_triangulated_points_empty(tiny_scene):
@@ -294,14 +295,10 @@ def test_training_images_prove_what_lies_before_triangulated_points_empty(tiny_s
     y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-1.0, 1.0, 0.1), np.arange(-1.0, 1.0, 0.1)))
     ends = point + np.column_stack([0.0 * y, y, z])
     numbers = np.arange(len(ends))
-    many = {
-        "points": ends,
-        "seen_by": np.repeat(seeing[:2], len(ends)),
-        "seen_point": np.concatenate([numbers, numbers]),
-    }
+    many = TriangulatedPoints(ends, np.repeat(seeing[:2], len(ends)), np.concatenate([numbers, numbers]))
     record = free_space_record(blind, job(), many)
     assert empty_at(record, point - 2.0 * first[:3, 2][None]).all() and not empty_at(record, point[None]).any()
-    assert len(free_space_record(blind, job())["keys"]) == 0
+    assert len(free_space_record(blind, job()).keys) == 0
 
 
 def test_held_out_sweeps_prove_nothing(tiny_root, tmp_path):
@@ -320,10 +317,10 @@ def test_held_out_sweeps_prove_nothing(tiny_root, tmp_path):
 
 
 def test_the_record_reads_as_it_was_written(tiny_scene, tmp_path):
-    record = {**free_space_record(tiny_scene, job()), "provenance": {"stages": {}}}
-    write_plain_pickle(tmp_path / "free_space.pkl", record)
-    assert pickle.dumps(read_free_space(tmp_path / "free_space.pkl")) == pickle.dumps(record)
-    assert len(record["keys"]) > 1000 and (np.diff(record["keys"]) > 0).all()
+    record = dataclasses.replace(free_space_record(tiny_scene, job()), provenance={"stages": {}})
+    write_free_space(tmp_path / "free_space.npz", record)
+    assert pickle.dumps(read_free_space(tmp_path / "free_space.npz")) == pickle.dumps(record)
+    assert len(record.keys) > 1000 and (np.diff(record.keys) > 0).all()
 
 
 GRID = {"lower": np.zeros(3), "voxel": 0.3, "shape": np.array([9, 9, 9]), "keys": np.array([1, 5]), "provenance": {}}
@@ -337,13 +334,15 @@ GRID = {"lower": np.zeros(3), "voxel": 0.3, "shape": np.array([9, 9, 9]), "keys"
     ids=str,
 )  # fmt: skip
 def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
-    path = tmp_path / "free_space.pkl"
+    path = tmp_path / "free_space.npz"
     if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else pickle.dumps(content))
-    with pytest.raises(ResultError, match=r"free_space\.pkl: .*the rule 'free_space' rebuilds it"):
+        path.write_bytes(content if isinstance(content, bytes) else b"")
+    if isinstance(content, dict):
+        write_arrays(path, content)
+    with pytest.raises(ResultError, match=r"free_space\.npz: .*the rule 'free_space' rebuilds it"):
         read_free_space(path)
-    path.write_bytes(pickle.dumps(GRID))
-    assert read_free_space(path)["voxel"] == 0.3
+    write_arrays(path, GRID)
+    assert read_free_space(path).voxel == 0.3
 
 
 # ---- looking it up

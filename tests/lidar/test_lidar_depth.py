@@ -12,9 +12,9 @@ from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.plain_pickle import write_plain_pickle
-from drivesplat.lidar.depth import Depths, taken_apart
-from drivesplat.lidar.depth_record import read_lidar_depth
+from drivesplat.io.array_file import write_arrays
+from drivesplat.lidar.depth import taken_apart
+from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth, write_lidar_depth
 from drivesplat.lidar.movers import Mover, movers
 from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.preprocess.extract import extract_scene
@@ -67,15 +67,15 @@ def lost(root: Path, *key_frames: int) -> Scene:
     return scene
 
 
-def of(image: Depths, values: np.ndarray) -> np.ndarray:
+def of(image: PixelDepths, values: np.ndarray) -> np.ndarray:
     """The values (m, ...) that an array (h, w, ...) has at an image's pixels."""
-    return values[image["rows"], image["columns"]]
+    return values[image.rows, image.columns]
 
 
-def fits(world: World, frame, image: Depths, within: float = 0.02) -> np.ndarray:
+def fits(world: World, frame, image: PixelDepths, within: float = 0.02) -> np.ndarray:
     """Which depths (m,) are those of a surface that their pixel shows somewhere at the image's own moment."""
     truth = of(image, true_depths(world, frame, subpixels=7))
-    return (image["depth"] > truth.min(axis=1) - within) & (image["depth"] < truth.max(axis=1) + within)
+    return (image.depth > truth.min(axis=1) - within) & (image.depth < truth.max(axis=1) + within)
 
 
 @pytest.mark.parametrize("things", [World().things, [CROSSING], [SPEEDING]], ids=["street", "crossing", "speeding"])
@@ -109,7 +109,7 @@ def test_the_rear_of_what_drives_ahead_is_as_far_away_as_its_speed_says(tmp_path
     for frame, image in zip(scene.frames, lidar_depths(scene, job(NOTHING_HELD_OUT)), strict=True):
         own = of(image, shows(world, frame, AHEAD))
         assert own.sum() > 80
-        off = image["depth"][own] - (4.8 + 0.2 * seconds_of(frame.timestamp))
+        off = image.depth[own] - (4.8 + 0.2 * seconds_of(frame.timestamp))
         assert (np.abs(off) < 1e-3).mean() > 0.95, "but for the road before it"
 
 
@@ -121,7 +121,7 @@ def test_a_return_is_in_the_pixel_and_at_the_depth_that_geometry_says(tiny_scene
     pixels = np.stack([-away[:, 1], -away[:, 2], away[:, 0]], axis=1) @ World().intrinsics.T
     known = np.column_stack([np.floor(pixels[:, 1::-1] / pixels[:, 2:] + 0.5), away[:, 0]])
     on_truck = of(image, shows(World(), tiny_scene.frames[0], TRUCK))
-    found = np.stack([image["rows"], image["columns"], image["depth"]], axis=1)[on_truck]
+    found = np.stack([image.rows, image.columns, image.depth], axis=1)[on_truck]
     assert len(found) > 20
     off = np.abs(found[:, None] - known).max(axis=2).min(axis=1)
     assert (off < 1e-3).mean() > 0.9, "but for those on the edge of two pixels"
@@ -140,9 +140,9 @@ def test_what_lidar_sees_over_a_hedge_is_not_what_the_image_shows(tmp_path):
     for spacing in ((0.0, 0.0), TINY_SPACING):
         image = lidar_depths(scene, job(NOTHING_HELD_OUT, spacing=spacing))[0]
         true = of(image, truth)
-        wrong[spacing] = ((true < 10.0) & (image["depth"] > 20.0)).sum()
+        wrong[spacing] = ((true < 10.0) & (image.depth > 20.0)).sum()
     assert wrong[0.0, 0.0] > 50 and wrong[TINY_SPACING] < 0.1 * wrong[0.0, 0.0]
-    assert ((true > 20.0) & (np.abs(image["depth"] - true) < 1.0)).sum() > 70, "the house over the hedge is seen"
+    assert ((true > 20.0) & (np.abs(image.depth - true) < 1.0)).sum() > 70, "the house over the hedge is seen"
 
 
 @pytest.mark.parametrize(
@@ -170,12 +170,12 @@ def test_each_pixel_has_one_depth_and_each_frame_its_place(tiny_scene):
     groups = frame_groups(tiny_scene, job().holdout)
     assert len(images) == len(tiny_scene.frames)
     for image, group in zip(images, groups, strict=True):
-        assert [image[key].dtype for key in ("rows", "columns", "depth")] == [np.int32, np.int32, np.float32]
-        assert len(image["rows"]) == len(image["columns"]) == len(image["depth"])
-        assert (len(image["depth"]) > 100) == (group == "train")
-        places = image["rows"].astype(int) * 96 + image["columns"]
+        assert [getattr(image, key).dtype for key in ("rows", "columns", "depth")] == [np.int32, np.int32, np.float32]
+        assert len(image.rows) == len(image.columns) == len(image.depth)
+        assert (len(image.depth) > 100) == (group == "train")
+        places = image.rows.astype(int) * 96 + image.columns
         assert len(np.unique(places)) == len(places)
-        assert ((image["rows"] >= 0) & (image["rows"] < 54) & (image["columns"] >= 0) & (image["columns"] < 96)).all()
+        assert ((image.rows >= 0) & (image.rows < 54) & (image.columns >= 0) & (image.columns < 96)).all()
 
 
 def test_of_two_returns_in_a_pixel_the_nearer_counts(tmp_path):
@@ -183,10 +183,10 @@ def test_of_two_returns_in_a_pixel_the_nearer_counts(tmp_path):
     scene = drive(tmp_path, TRUCK)
     fine, coarse = (lidar_depths(scene, job(width=width))[0] for width in (480, 48))
     least: dict[tuple, float] = {}
-    for r, c, d in zip(fine["rows"] // 10, fine["columns"] // 10, fine["depth"], strict=True):
+    for r, c, d in zip(fine.rows // 10, fine.columns // 10, fine.depth, strict=True):
         least[r, c] = min(d, least.get((r, c), np.inf))
-    shared = [(d, least[r, c]) for r, c, d in zip(*coarse.values(), strict=True) if (r, c) in least]
-    assert len(shared) > 100 and len(fine["depth"]) > 1.5 * len(shared)
+    shared = [(d, least[r, c]) for r, c, d in zip(*vars(coarse).values(), strict=True) if (r, c) in least]
+    assert len(shared) > 100 and len(fine.depth) > 1.5 * len(shared)
     assert all(d <= expected + 1e-6 for d, expected in shared)
 
 
@@ -194,7 +194,7 @@ def test_of_two_returns_in_a_pixel_the_nearer_counts(tmp_path):
 def test_pixels_are_those_of_the_size_at_which_images_are_trained(tiny_scene, width):
     world = World(width=width, height=width * 54 // 96)
     (image, *_) = lidar_depths(tiny_scene, job(width=width))
-    assert image["columns"].max() > 0.9 * width and image["columns"].max() < width
+    assert image.columns.max() > 0.9 * width and image.columns.max() < width
     assert fits(world, tiny_scene.frames[0], image, within=0.05).mean() > 0.95
 
 
@@ -209,9 +209,9 @@ def test_an_image_gets_the_training_sweep_nearest_in_time_within_a_key_frames_in
     for frame, group, image, before in zip(scene.frames, groups, images, whole, strict=True):
         away = {sweep: abs(0.5 * sweep - seconds_of(frame.timestamp)) for sweep in (0, 1, 3, 4, 5, 7)}
         near = [sweep for sweep in (4, 5, 7) if away[sweep] < 0.5] if group == "train" else []
-        assert (len(image["depth"]) > 0) == bool(near)
+        assert (len(image.depth) > 0) == bool(near)
         if near:
-            same = all(np.array_equal(image[key], before[key]) for key in before)
+            same = all(np.array_equal(value, vars(before)[key]) for key, value in vars(image).items())
             assert same == (min(away, key=away.get) in near)
             kinds.append(same)
     assert kinds.count(True) >= 6 and kinds.count(False) == 1, "at 1.715 s the next sweep stands in for the last"
@@ -255,21 +255,21 @@ def test_what_is_absent_in_the_image_takes_its_returns_along(root):
 def test_returns_of_the_own_car_are_left_out(tiny_scene):
     """The LiDAR is 0.8 m behind the camera and 0.3 m above it."""
     image = lidar_depths(tiny_scene, job(radius=8.0))[0]
-    places = np.stack([image["columns"], image["rows"], np.ones(len(image["rows"]))], axis=1)
+    places = np.stack([image.columns, image.rows, np.ones(len(image.rows))], axis=1)
     rays = places @ np.linalg.inv(World().intrinsics).T
-    points = rays * image["depth"][:, None]
+    points = rays * image.depth[:, None]
     from_lidar = np.hypot(points[:, 0], points[:, 2] + 0.8)
     assert len(points) > 100 and from_lidar.min() > 7.7
-    assert lidar_depths(tiny_scene, job())[0]["depth"].min() < 6.0
+    assert lidar_depths(tiny_scene, job())[0].depth.min() < 6.0
 
 
 def test_pixels_of_the_own_cars_body_have_no_depth(tiny_scene):
     outline = ((0.0, 0.5), (0.5, 0.5), (0.5, 1.0), (0.0, 1.0))
     whole, cut = (lidar_depths(tiny_scene, job(), OwnCar(seen))[0] for seen in ({}, {"CAM_FRONT": (outline,)}))
-    body = [(image["rows"] >= 27) & (image["columns"] <= 48) for image in (whole, cut)]
+    body = [(image.rows >= 27) & (image.columns <= 48) for image in (whole, cut)]
     assert body[0].sum() > 50 and body[1].sum() == 0
-    for key in whole:
-        np.testing.assert_array_equal(whole[key][~body[0]], cut[key])
+    for key, value in vars(whole).items():
+        np.testing.assert_array_equal(value[~body[0]], vars(cut)[key])
 
 
 def one_mover(tiny_scene: Scene) -> Mover:
@@ -296,16 +296,16 @@ def test_people_are_carried_along_and_what_never_moves_is_still(tiny_scene):
 def test_a_drive_without_lidar_has_no_depths_and_a_record_of_them(root, tmp_path):
     shutil.rmtree(root / "samples" / "LIDAR_TOP")
     scene = scene_at(root)
-    write_plain_pickle(tmp_path / "lidar_depth.pkl", {"images": lidar_depths(scene, job()), "provenance": {}})
-    images = read_lidar_depth(tmp_path / "lidar_depth.pkl")["images"]
-    assert len(images) == len(scene.frames) and not any(len(image["depth"]) for image in images)
+    write_lidar_depth(tmp_path / "lidar_depth.npz", LidarDepthRecord(lidar_depths(scene, job())))
+    images = read_lidar_depth(tmp_path / "lidar_depth.npz").images
+    assert len(images) == len(scene.frames) and not any(len(image.depth) for image in images)
 
 
 def test_the_record_reads_as_it_was_written(tiny_scene, tmp_path):
-    record = {"images": lidar_depths(tiny_scene, job()), "provenance": {"stages": {}}}
-    write_plain_pickle(tmp_path / "lidar_depth.pkl", record)
-    assert pickle.dumps(read_lidar_depth(tmp_path / "lidar_depth.pkl")) == pickle.dumps(record)
-    assert pickle.dumps(lidar_depths(tiny_scene, job())) == pickle.dumps(record["images"])
+    record = LidarDepthRecord(lidar_depths(tiny_scene, job()), {"stages": {}})
+    write_lidar_depth(tmp_path / "lidar_depth.npz", record)
+    assert pickle.dumps(read_lidar_depth(tmp_path / "lidar_depth.npz")) == pickle.dumps(record)
+    assert pickle.dumps(lidar_depths(tiny_scene, job())) == pickle.dumps(record.images)
 
 
 @pytest.mark.parametrize(
@@ -315,10 +315,12 @@ def test_the_record_reads_as_it_was_written(tiny_scene, tmp_path):
     ids=str,
 )  # fmt: skip
 def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
-    path = tmp_path / "lidar_depth.pkl"
+    path = tmp_path / "lidar_depth.npz"
     if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else pickle.dumps(content))
-    with pytest.raises(ResultError, match=r"lidar_depth\.pkl: .*the rule 'lidar_depth' rebuilds it"):
+        path.write_bytes(content if isinstance(content, bytes) else b"")
+    if isinstance(content, dict):
+        write_arrays(path, content)
+    with pytest.raises(ResultError, match=r"lidar_depth\.npz: .*the rule 'lidar_depth' rebuilds it"):
         read_lidar_depth(path)
 
 
@@ -346,7 +348,7 @@ def test_on_the_demo_world_depths_agree_with_its_truth(demo_root):
         )
         true = of(image, depth) / 256.0
         true[true == 0] = 1e3
-        errors.append(np.abs(image["depth"] - true))
+        errors.append(np.abs(image.depth - true))
         allowed.append(0.05 * true + 0.3)
         own.append(np.isin(of(image, things), numbers))
     right, of_movers = np.concatenate(errors) < np.concatenate(allowed), np.concatenate(own)

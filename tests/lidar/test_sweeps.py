@@ -216,7 +216,7 @@ def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
         random_seed=0,
     )  # fmt: skip
     scene = scene_at(rich_root, **EVERYTHING)
-    few, many = (actors_record(s, settings)["actors"][0]["points"] for s in (scene_at(rich_root), scene))
+    few, many = (actors_record(s, settings).actors[0].points for s in (scene_at(rich_root), scene))
     expected = []
     for moment in training_seconds(scene):
         own = cast_lidar(WORLD, moment)[:, :3].astype(float) + WORLD.ego_at(moment) + LIDAR_AT - CAR.at(moment)

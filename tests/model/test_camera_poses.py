@@ -230,7 +230,7 @@ def test_a_training_corrects_its_cameras_where_the_settings_say_so(tmp_path, cor
     train = settings_of(iterations=20, checkpoint_every=50, pixels_per_gaussian=0, camera_poses=poses)
     job = TrainJob(parts=("background",), sky="none", train=train, random_seed=0)
     inputs = TrainingInputs(parser_record(tmp_path, recorded_views(6)), tmp_path, [], [])
-    files = TrainingFiles(tmp_path / "it/checkpoint.pt", tmp_path / "it/train.json")
+    files = TrainingFiles(tmp_path / "it/checkpoint.npz", tmp_path / "it/train.json")
     run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
     model, _ = trained_model(read_checkpoint(files.checkpoint))
     told = json.loads(files.summary.read_text())["of_cameras"]

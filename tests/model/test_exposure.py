@@ -244,7 +244,7 @@ def test_the_gains_of_the_demo_rig_are_estimated_before_the_training(rig):
 def test_a_training_starts_from_the_estimated_gains_and_saves_them(rig, tmp_path):
     train = settings_of(iterations=4, checkpoint_every=10, pixels_per_gaussian=0, exposure=AFFINE)
     job = TrainJob(parts=("background",), sky="none", train=train, random_seed=0, reference_camera="CAM_FRONT")
-    files = TrainingFiles(tmp_path / "it/checkpoint.pt", tmp_path / "it/train.json")
+    files = TrainingFiles(tmp_path / "it/checkpoint.npz", tmp_path / "it/train.json")
     run_training(rig, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
     model, _ = trained_model(read_checkpoint(files.checkpoint))
     told = json.loads(files.summary.read_text())["of_cameras"]

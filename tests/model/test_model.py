@@ -22,6 +22,7 @@ from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
+from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.images import pixel_rays
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.actors import ActorSettings
@@ -59,7 +60,7 @@ def parser_record(count: int) -> TrainingRecord:
     )
 
 
-def model_init(record: TrainingRecord, *actors: dict[str, Any]) -> ModelInit:
+def model_init(record: TrainingRecord, *actors: ActorRecord) -> ModelInit:
     return ModelInit(record, list(actors), SKY_COLOR)
 
 
@@ -329,8 +330,8 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
     model = shaken(build_model(model_init(parser_record(20), *records), parts, sky, settings))
     for value in model.parts[1].params.values():
         value.data = value.data[3:]
-    checkpoint_file.save(tmp_path / "a.pt", {"model": model.state_dict(), "parts": definitions(model)})
-    content = checkpoint_file.load(tmp_path / "a.pt", "train")
+    checkpoint_file.save(tmp_path / "a.npz", {"model": model.state_dict(), "parts": definitions(model)})
+    content = checkpoint_file.load(tmp_path / "a.npz", "train")
     rebuilt = rebuild_model(content["model"], content["parts"], sky, settings)
     assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
     for time in (-0.2, 0.0, 0.61, 1.0, 1.8, 2.7, 5.0):
@@ -348,8 +349,8 @@ def test_actors_are_initialised_from_their_records():
     model = build_model(model_init(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
     actors = model.parts[1]
     assert actors.params["owner"].tolist() == [0] * 10 + [1] * 7
-    np.testing.assert_array_equal(actors.params["means"].detach(), np.concatenate([r["points"] for r in records]))
-    colors = np.concatenate([r["points_rgb"] for r in records]) / 255.0
+    np.testing.assert_array_equal(actors.params["means"].detach(), np.concatenate([r.points for r in records]))
+    colors = np.concatenate([r.points_rgb for r in records]) / 255.0
     np.testing.assert_allclose(0.5 + SH_C0 * actors.harmonics(actors.time_state(0.3))[:, 0].detach(), colors, atol=1e-5)
     at = np.linspace(-0.5, 3.0, 15)
     for track, expected in zip(actors.timeline.tracks, (a_track(), a_track("later", 1.0)), strict=True):
@@ -378,8 +379,8 @@ def test_each_actor_is_initialised_with_at_most_its_cap():
     (actors,) = build_model(model_init(parser_record(20), *records), ("actors",), "none", settings).parts
     assert actors.params["owner"].tolist() == [0] * 20 + [1] * 60 and actors.cap_max == 120
     kept = {tuple(row) for row in actors.params["means"].detach()[:20].numpy()}
-    assert len(kept & {tuple(row) for row in records[0]["points"]}) == 20
-    colors = dict(zip(map(tuple, records[0]["points"]), records[0]["points_rgb"], strict=True))
+    assert len(kept & {tuple(row) for row in records[0].points}) == 20
+    colors = dict(zip(map(tuple, records[0].points), records[0].points_rgb, strict=True))
     own = 255.0 * (0.5 + SH_C0 * actors.harmonics(actors.time_state(0.0))[:20, 0].detach().numpy())
     np.testing.assert_allclose(
         own, [colors[tuple(row)] for row in actors.params["means"].detach()[:20].numpy()], atol=0.01
@@ -419,7 +420,7 @@ def test_seeds_are_thinned_to_a_reproducible_subset():
     assert torch.equal(actors.params["means"], again.params["means"])
     for i, count in enumerate((100, 200)):
         own = actors.params["means"].detach()[actors.params["owner"] == i].numpy()
-        points = {tuple(row) for row in actor_record(a_track(), count, seed=i)["points"]}
+        points = {tuple(row) for row in actor_record(a_track(), count, seed=i).points}
         assert len({tuple(row) for row in own} & points) == len(own) > 20
 
 

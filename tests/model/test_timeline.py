@@ -90,8 +90,8 @@ def test_two_annotations_have_no_neighbours():
 
 
 def test_a_track_survives_a_checkpoint(tmp_path):
-    checkpoint_file.save(tmp_path / "a.pt", {"track": a_car().plain()})
-    again = ActorTrack.from_plain(checkpoint_file.load(tmp_path / "a.pt", "train")["track"])
+    checkpoint_file.save(tmp_path / "a.npz", {"track": a_car().plain()})
+    again = ActorTrack.from_plain(checkpoint_file.load(tmp_path / "a.npz", "train")["track"])
     assert (again.id, again.motion.runs, again.motion.reach) == ("car", ((0, 2), (3, 6)), 0.25)
     np.testing.assert_array_equal(again.size, a_car().size)
     at = np.linspace(-0.5, 4.5, 33)

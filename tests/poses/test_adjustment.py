@@ -139,7 +139,7 @@ def test_two_runs_agree_whatever_the_threads(front, front_refined):
     assert again.record["points"] == front_refined.record["points"]
     for a, b in zip(front_refined.scene.frames, again.scene.frames, strict=True):
         np.testing.assert_allclose(a.camera_to_world, b.camera_to_world, atol=1e-6)
-    np.testing.assert_allclose(again.points["points"], front_refined.points["points"], atol=1e-6)
+    np.testing.assert_allclose(again.points.points, front_refined.points.points, atol=1e-6)
 
 
 def test_wrong_matches_do_no_harm(tmp_path, front):

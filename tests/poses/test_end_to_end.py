@@ -75,8 +75,8 @@ def test_images_of_a_street_bring_poses_nearer_to_the_truth(noisy, tmp_path):
     assert (before[:2] > 0.2).all() and (after[:2] < 0.25 * before[:2]).all() and after[2] < 0.05
     trial = refined.record["trial"]
     assert trial["after_px"] < 0.75 * trial["before_px"]
-    points = refined.points["points"]
-    assert len(points) > 50 and set(refined.points["seen_by"]) == set(range(KEY_FRAMES))
+    points = refined.points.points
+    assert len(points) > 50 and set(refined.points.seen_by) == set(range(KEY_FRAMES))
     assert np.median(np.abs(points[:, 2])) < 10.0, "points are of the street, not of the sky"
 
 

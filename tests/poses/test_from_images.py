@@ -142,8 +142,8 @@ def test_what_was_done_is_told(unlocated_made):
 def test_its_points_may_join_the_seed(unlocated, unlocated_made):
     """They lie where the truth has them, as seen from the first image."""
     truth = apply(inverse(unlocated.drive.truth[0]), points_along(curve))
-    found = unlocated_made.points["points"]
-    assert len(found) > 200 and set(unlocated_made.points["seen_by"]) == set(range(10))
+    found = unlocated_made.points.points
+    assert len(found) > 200 and set(unlocated_made.points.seen_by) == set(range(10))
     assert np.median(np.linalg.norm(found[:, None] - truth, axis=2).min(axis=1)) < 0.04
 
 

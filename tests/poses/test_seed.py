@@ -1,4 +1,4 @@
-"""triangulated.pkl: which points become seeds, and where their colours come from."""
+"""triangulated.npz: which points become seeds, and where their colours come from."""
 
 import dataclasses
 import shutil
@@ -10,18 +10,19 @@ from helpers.tiny_world import CAMERA_AT, World, cast
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.plain_pickle import write_plain_pickle
+from drivesplat.io.array_file import write_arrays
 from drivesplat.poses.observations import Observations
 from drivesplat.poses.triangulated import (
-    LEAST_VIEWS,
-    SHARP_PIXELS,
-    mean_over_views,
+    MAX_MEAN_ERROR,
+    MIN_VIEWS,
+    TriangulatedPoints,
     no_points,
     read_triangulated,
-    seen_in,
-    triangulated_record,
+    triangulated_points,
+    write_triangulated,
 )
-from drivesplat.preprocess.lidar_seed import seed_points, triangulated_points
+from drivesplat.preprocess import lidar_seed
+from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.scene.scene import Scene, read_scene
 from drivesplat.settings.lidar_seed import SeedJob
 
@@ -32,13 +33,13 @@ def job(holdout=HELD_OUT, **settings) -> SeedJob:
     return SeedJob.model_validate(values)
 
 
-def record_of(points: np.ndarray, seen_by: list[list[int]]) -> dict[str, np.ndarray]:
+def record_of(points: np.ndarray, seen_by: list[list[int]]) -> TriangulatedPoints:
     """Points (p, 3) and which frames of the scene see each."""
-    return {
-        "points": np.asarray(points, dtype=float),
-        "seen_by": np.array([frame for frames in seen_by for frame in frames], dtype=np.int64),
-        "seen_point": np.repeat(np.arange(len(points)), [len(frames) for frames in seen_by]),
-    }
+    return TriangulatedPoints(
+        points=np.asarray(points, dtype=float),
+        seen_by=np.array([frame for frames in seen_by for frame in frames], dtype=np.int64),
+        seen_point=np.repeat(np.arange(len(points)), [len(frames) for frames in seen_by]),
+    )
 
 
 def key_frame(scene: Scene, index: int) -> int:
@@ -60,33 +61,33 @@ def test_the_record_keeps_sharp_points_and_says_which_frames_see_them():
     seen = Observations(
         image=np.array([0, 1, 0, 2, 1, 2]),
         point=np.array([0, 0, 1, 1, 3, 3]),
-        error=np.array([0.5, 1.5, SHARP_PIXELS, SHARP_PIXELS + 0.1, 0.1, np.inf]),
+        error=np.array([0.5, 1.5, MAX_MEAN_ERROR, MAX_MEAN_ERROR + 0.1, 0.1, np.inf]),
         positions=np.arange(12.0).reshape(4, 3),
         numbers=np.array([7, 8, 9, 11]),
     )
-    record = triangulated_record((10, 20, 30), seen)
-    np.testing.assert_array_equal(record["points"], [[0.0, 1.0, 2.0]])
-    assert record["seen_by"].tolist() == [10, 20] and record["seen_point"].tolist() == [0, 0]
+    record = triangulated_points((10, 20, 30), seen)
+    np.testing.assert_array_equal(record.points, [[0.0, 1.0, 2.0]])
+    assert record.seen_by.tolist() == [10, 20] and record.seen_point.tolist() == [0, 0]
     sharper = dataclasses.replace(seen, error=np.array([0.5, 1.5, 0.2, 0.2, 0.1, 0.3]))
-    record = triangulated_record((10, 20, 30), sharper)
-    np.testing.assert_array_equal(record["points"], seen.positions[[0, 1, 3]])
-    assert record["seen_by"].tolist() == [10, 20, 10, 30, 20, 30]
-    assert record["seen_point"].tolist() == [0, 0, 1, 1, 2, 2]
+    record = triangulated_points((10, 20, 30), sharper)
+    np.testing.assert_array_equal(record.points, seen.positions[[0, 1, 3]])
+    assert record.seen_by.tolist() == [10, 20, 10, 30, 20, 30]
+    assert record.seen_point.tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_points_count_where_enough_of_the_images_see_them():
     record = record_of(np.zeros((3, 3)), [[0, 4], [0, 5, 6], [4, 6]])
-    assert LEAST_VIEWS == 2
-    assert seen_in(record, np.array([0, 4, 5])).tolist() == [True, True, False]
-    means = mean_over_views(record, np.array([0, 4, 5]), np.array([10.0, 0, 0, 0, 20.0, 40.0, 1e9]))
+    assert MIN_VIEWS == 2
+    assert record.seen_in(np.array([0, 4, 5])).tolist() == [True, True, False]
+    means = record.mean_over_views(np.array([0, 4, 5]), np.array([10.0, 0, 0, 0, 20.0, 40.0, 1e9]))
     np.testing.assert_allclose(means, [15.0, 25.0, 20.0])
-    assert seen_in(no_points(), np.array([0])).tolist() == []
+    assert no_points().seen_in(np.array([0])).tolist() == []
 
 
 def test_only_points_of_two_training_images_become_seeds(tiny_scene):
     points = wall(17.0, 19.0, 21.0, 23.0)
     seen_by = [frames_of(tiny_scene, *at) for at in ((0, 1), (1, 2), (2, 6), (3, 4, 6))]
-    chosen, times = triangulated_points(tiny_scene, job(), record_of(points, seen_by))
+    chosen, times = lidar_seed.triangulated_points(tiny_scene, job(), record_of(points, seen_by))
     np.testing.assert_array_equal(chosen, points[[0, 3]])
     moments = {i: tiny_scene.frames[key_frame(tiny_scene, i)].timestamp for i in range(10)}
     np.testing.assert_allclose(times, [(moments[0] + moments[1]) / 2, (moments[3] + moments[4]) / 2])
@@ -123,30 +124,32 @@ def test_their_colours_are_those_of_training_images(tiny_root, tmp_path):
     record = record_of(wall(*along), [frames_of(scene, 1, 2, 3)] * len(along))
     seed = seed_points(scene, job(), triangulated=record)
     assert seed.note["triangulated"] == len(along)
-    own = np.array([np.abs(seed.positions - point).max(axis=1).argmin() for point in record["points"]])
+    own = np.array([np.abs(seed.positions - point).max(axis=1).argmin() for point in record.points])
     empty = World(things=[])
-    truth = [cast(empty, CAMERA_AT, (point - CAMERA_AT)[None], 0.0)[1][0] for point in record["points"]]
+    truth = [cast(empty, CAMERA_AT, (point - CAMERA_AT)[None], 0.0)[1][0] for point in record.points]
     assert np.abs(seed.colors[own].astype(float) - truth).max() < 40
 
 
 @pytest.mark.parametrize(
-    "content", [b"no pickle", {"points": np.zeros((1, 3))}, [1, 2]], ids=["no pickle", "keys lack", "no record"]
+    "content",
+    [b"no archive", {"points": np.zeros((1, 3))}, {**vars(no_points()), "seen_by": np.zeros(1, dtype=np.int64)}],
+    ids=["no archive", "arrays lack", "lengths differ"],
 )
 def test_a_broken_file_is_named_with_its_rule(tmp_path, content):
-    path = tmp_path / "triangulated.pkl"
+    path = tmp_path / "triangulated.npz"
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        write_plain_pickle(path, content)
-    with pytest.raises(ResultError, match=r"triangulated.pkl: .*the rule 'refine_poses' rebuilds it"):
+        write_arrays(path, content)
+    with pytest.raises(ResultError, match=r"triangulated.npz: .*the rule 'refine_poses' rebuilds it"):
         read_triangulated(path)
 
 
 def test_what_is_written_is_read(tmp_path):
     record = record_of(wall(1.0, 2.0), [[0, 1], [1, 2]])
-    write_plain_pickle(tmp_path / "triangulated.pkl", {**record, "provenance": {}})
-    again = read_triangulated(tmp_path / "triangulated.pkl")
-    assert all(np.array_equal(again[key], record[key]) for key in record)
+    write_triangulated(tmp_path / "triangulated.npz", record)
+    again = read_triangulated(tmp_path / "triangulated.npz")
+    assert all(np.array_equal(value, vars(record)[name]) for name, value in vars(again).items())
 
 
 @pytest.mark.parametrize(("name", "rule"), [("scene.json", "extract"), ("scene_refined.json", "refine_poses")])

@@ -5,7 +5,6 @@ import pickle
 import shutil
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,10 +22,10 @@ from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.plain_pickle import write_plain_pickle
+from drivesplat.io.array_file import write_arrays
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.actor_record import motion_of, read_actors
+from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors, write_actors
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.scene import Frame, Scene
@@ -53,17 +52,25 @@ def job(holdout=HELD_OUT, width=None, random_seed=0, radius=2.5, **settings) -> 
     )
 
 
-def actors_of(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> list[dict[str, Any]]:
-    return actors_record(scene, settings, own_car)["actors"]
+def actors_of(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> list[ActorRecord]:
+    return actors_record(scene, settings, own_car).actors
 
 
-def the_actor(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
+def the_actor(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> ActorRecord:
     (actor,) = actors_of(scene, settings, own_car)
     return actor
 
 
-def assert_same(a: dict[str, Any], b: dict[str, Any]) -> None:
-    assert pickle.dumps(a) == pickle.dumps(b)
+def assert_same(a: ActorRecords, b: ActorRecords) -> None:
+    """Bit by bit, their motions too."""
+    assert a.provenance == b.provenance
+    for one, other in zip(a.actors, b.actors, strict=True):
+        for (name, value), (other_name, other_value) in zip(fields_of(one), fields_of(other), strict=True):
+            assert name == other_name and pickle.dumps(value) == pickle.dumps(other_value)
+
+
+def fields_of(actor: ActorRecord) -> list[tuple[str, Any]]:
+    return sorted(({**actor.to_plain(), "motion": None} | actor.motion.to_plain()).items())
 
 
 @pytest.fixture
@@ -96,9 +103,9 @@ def test_the_returns_of_training_sweeps_in_its_box_lie_in_its_own_frame_and_no_o
     actor = the_actor(tiny_scene, job(radius=radius))
     expected = returns_of(World(), CAR, TRAINING, radius=radius)
     assert 30 < len(expected) < len(returns_of(World(), CAR, range(10), radius=radius))
-    assert actor["category"] == "vehicle.car" and actor["size"].tolist() == [4.0, 2.0, 1.6]
-    assert actor["lidar_points"] == len(actor["points"]) == len(actor["points_rgb"])
-    np.testing.assert_allclose(actor["points"], expected, atol=1e-4)
+    assert actor.category == "vehicle.car" and actor.size.tolist() == [4.0, 2.0, 1.6]
+    assert actor.lidar_points == len(actor.points) == len(actor.points_rgb)
+    np.testing.assert_allclose(actor.points, expected, atol=1e-4)
 
 
 @pytest.mark.parametrize(("thing", "seen", "hidden"), [(CAR, (0, -1), (0, 1)), (ONCOMING, (1, 1), (1, -1))])
@@ -107,7 +114,7 @@ def test_gathered_points_lie_on_the_faces_that_the_lidar_sees(tmp_path, thing, s
     its left and not its right (y)."""
     actor = the_actor(drive(tmp_path, thing), job(NOTHING_HELD_OUT))
     half = np.array(thing.size) / 2
-    points = actor["points"].astype(float)
+    points = actor.points.astype(float)
     assert len(points) > 100
     outside = np.abs(points) - half
     np.testing.assert_allclose(outside.max(axis=1), 0.0, atol=0.01)
@@ -119,23 +126,23 @@ def test_gathered_points_lie_on_the_faces_that_the_lidar_sees(tmp_path, thing, s
 @pytest.mark.parametrize("margin", [0.0, 1.0])
 def test_a_margin_grows_the_box_at_its_sides_and_leaves_the_road_out(tiny_scene, margin):
     actor = the_actor(tiny_scene, job(box_margin=margin))
-    np.testing.assert_allclose(actor["points"], returns_of(World(), CAR, TRAINING, margin=margin), atol=1e-4)
-    assert actor["points"][:, 2].min() > FLOOR - 0.8
+    np.testing.assert_allclose(actor.points, returns_of(World(), CAR, TRAINING, margin=margin), atol=1e-4)
+    assert actor.points[:, 2].min() > FLOOR - 0.8
 
 
 def test_sweeps_that_are_missing_or_corrupt_give_nothing(root):
     scene = scene_at(root)
     (root / "samples/LIDAR_TOP/0001__0001.pcd.bin").unlink()
     (root / "samples/LIDAR_TOP/0001__0003.pcd.bin").write_bytes(b"no sweep")
-    np.testing.assert_allclose(the_actor(scene, job())["points"], returns_of(World(), CAR, (0, 4, 5, 7)), atol=1e-4)
+    np.testing.assert_allclose(the_actor(scene, job()).points, returns_of(World(), CAR, (0, 4, 5, 7)), atol=1e-4)
 
 
 def test_few_lidar_points_are_filled_up_with_random_ones_in_the_box(tiny_scene):
-    lidar = the_actor(tiny_scene, job())["points"]
+    lidar = the_actor(tiny_scene, job()).points
     actor = the_actor(tiny_scene, job(min_points=len(lidar) + 1, random_points=4000))
-    assert (actor["lidar_points"], len(actor["points"])) == (len(lidar), 4000)
-    np.testing.assert_array_equal(actor["points"][: len(lidar)], lidar)
-    share = actor["points"][len(lidar) :] / actor["size"] + 0.5
+    assert (actor.lidar_points, len(actor.points)) == (len(lidar), 4000)
+    np.testing.assert_array_equal(actor.points[: len(lidar)], lidar)
+    share = actor.points[len(lidar) :] / actor.size + 0.5
     assert share.min() >= 0.0 and share.max() <= 1.0
     for axis in range(3):
         np.testing.assert_allclose(np.quantile(share[:, axis], [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.04)
@@ -146,27 +153,27 @@ def test_few_lidar_points_are_filled_up_with_random_ones_in_the_box(tiny_scene):
 def test_enough_lidar_points_are_left_alone(tiny_scene, less, count):
     lidar = len(returns_of(World(), CAR, TRAINING))
     actor = the_actor(tiny_scene, job(min_points=lidar + less, random_points=4000))
-    assert len(actor["points"]) == (count or lidar)
+    assert len(actor.points) == (count or lidar)
 
 
 def test_random_points_stay_under_the_most_there_may_be(tiny_scene):
     actor = the_actor(tiny_scene, job(min_points=10**6, random_points=4000, max_points=1000))
-    assert len(actor["points"]) == 1000 and 0 < actor["lidar_points"] < 1000
+    assert len(actor.points) == 1000 and 0 < actor.lidar_points < 1000
 
 
 def test_too_many_points_are_thinned_at_random(tiny_scene):
     whole = returns_of(World(), CAR, TRAINING).round(3)
     actor = the_actor(tiny_scene, job(max_points=100))
-    assert actor["lidar_points"] == len(actor["points"]) == 100
-    numbers = [int(np.abs(whole - point).max(axis=1).argmin()) for point in actor["points"]]
-    np.testing.assert_allclose(actor["points"], whole[numbers], atol=2e-3)
+    assert actor.lidar_points == len(actor.points) == 100
+    numbers = [int(np.abs(whole - point).max(axis=1).argmin()) for point in actor.points]
+    np.testing.assert_allclose(actor.points, whole[numbers], atol=2e-3)
     assert len(set(numbers)) == 100 and max(numbers) > len(whole) / 2 > 100
 
 
 def test_without_any_lidar_an_actor_starts_at_random(root):
     shutil.rmtree(root / "samples" / "LIDAR_TOP")
     actor = the_actor(scene_at(root), job(min_points=1, random_points=300))
-    assert (actor["lidar_points"], len(actor["points"])) == (0, 300)
+    assert (actor.lidar_points, len(actor.points)) == (0, 300)
 
 
 PARKED = Thing("vehicle.car", (4.0, 1.8, 1.5), (12.0, -4.0, 0.75))
@@ -198,9 +205,9 @@ def test_an_actor_is_a_vehicle_that_moves_and_that_a_training_image_sees(tmp_pat
     scene = drive(tmp_path, *(things or [World().things[3]]), width=192, height=108)
     caplog.set_level("INFO")
     record = actors_record(scene, job())
-    assert len(record["actors"]) == expected
+    assert len(record.actors) == expected
     moving = [track.id for track in scene.tracks if track.category.startswith("vehicle.") and things != [PARKED]]
-    left_out = set(moving) - {actor["id"] for actor in record["actors"]}
+    left_out = set(moving) - {actor.id for actor in record.actors}
     assert all(any(track in line for line in caplog.messages if "no training image sees" in line) for track in left_out)
 
 
@@ -230,7 +237,7 @@ RIDERS = [
 )
 def test_settings_say_whether_cycles_and_people_become_actors(tmp_path, settings, expected):
     found = actors_of(drive(tmp_path, *RIDERS), job(**settings))
-    assert {actor["category"].split(".")[-1] for actor in found} == expected and len(found) == len(expected)
+    assert {actor.category.split(".")[-1] for actor in found} == expected and len(found) == len(expected)
 
 
 def painted(scene: Scene, color_of) -> None:
@@ -266,7 +273,7 @@ def test_a_point_has_the_colour_of_the_nearest_training_image_in_which_its_pixel
     world, scene = World(things=[thing]), drive(tmp_path, thing)
     painted(scene, lambda frame: (2 * scene.frames.index(frame) + 10,) * 3)
     actor = the_actor(scene, job(min_points=10**6, random_points=2000))
-    points, expected = actor["points"].astype(float), np.full(2000, -1)
+    points, expected = actor.points.astype(float), np.full(2000, -1)
     best = np.full(2000, np.inf)
     groups = frame_groups(scene, job().holdout)
     for number, (frame, group) in enumerate(zip(scene.frames, groups, strict=True)):
@@ -275,15 +282,15 @@ def test_a_point_has_the_colour_of_the_nearest_training_image_in_which_its_pixel
         best[better], expected[better] = distances[better], 2 * number + 10
     shown = expected >= 0
     assert shown.sum() > 1000 and len(np.unique(expected)) > 1
-    np.testing.assert_array_equal(actor["points_rgb"][shown], np.repeat(expected[shown, None], 3, axis=1))
-    np.testing.assert_array_equal(actor["points_rgb"][~shown], round(expected[shown].mean()))
+    np.testing.assert_array_equal(actor.points_rgb[shown], np.repeat(expected[shown, None], 3, axis=1))
+    np.testing.assert_array_equal(actor.points_rgb[~shown], round(expected[shown].mean()))
 
 
 def test_colours_are_those_of_the_cars_surface(tmp_path):
     """Up to JPEG, pixel size and the stripes' edges: the drive's geometry says what colour each point has."""
     actor = the_actor(drive(tmp_path, *World().things, width=384, height=216), job())
-    stripes = 0.75 + 0.25 * np.sign(np.sin(5.0 * actor["points"].sum(axis=1)))
-    off = np.abs(actor["points_rgb"] - np.array(CAR.color) * stripes[:, None]).max(axis=1)
+    stripes = 0.75 + 0.25 * np.sign(np.sin(5.0 * actor.points.sum(axis=1)))
+    off = np.abs(actor.points_rgb - np.array(CAR.color) * stripes[:, None]).max(axis=1)
     assert (off < 25).mean() > 0.85
 
 
@@ -298,10 +305,10 @@ def test_what_stands_nearer_lends_no_colour(tmp_path):
     masks = {frame.token: shows(world, frame, walker) for frame in scene.frames}
     painted(scene, lambda frame: np.where(masks[frame.token][..., None], (255, 0, 0), (0, 0, 255)))
     actor = the_actor(scene, job(min_points=10**6, random_points=2000))
-    assert actor["category"] == "vehicle.car"
-    pixels, _ = pixels_of(world, CAR, scene.frames[0], actor["points"].astype(float))
+    assert actor.category == "vehicle.car"
+    pixels, _ = pixels_of(world, CAR, scene.frames[0], actor.points.astype(float))
     assert inside(pixels, masks[scene.frames[0].token]).sum() > 100
-    np.testing.assert_array_equal(actor["points_rgb"], np.broadcast_to([0, 0, 255], (2000, 3)))
+    np.testing.assert_array_equal(actor.points_rgb, np.broadcast_to([0, 0, 255], (2000, 3)))
 
 
 LEFT_HALF = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
@@ -311,9 +318,9 @@ WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 def test_the_own_cars_body_lends_no_colour_and_hides(tmp_path):
     scene = drive(tmp_path, CAR)
     painted(scene, lambda frame: np.where(np.arange(96)[:, None] <= 48, (255, 0, 0), (0, 0, 255)))
-    colors = the_actor(scene, job(), OwnCar({"CAM_FRONT": (LEFT_HALF,)}))["points_rgb"]
+    colors = the_actor(scene, job(), OwnCar({"CAM_FRONT": (LEFT_HALF,)})).points_rgb
     assert {tuple(color) for color in colors} == {(0, 0, 255)}
-    assert {tuple(color) for color in the_actor(scene, job())["points_rgb"]} == {(0, 0, 255), (255, 0, 0)}
+    assert {tuple(color) for color in the_actor(scene, job()).points_rgb} == {(0, 0, 255), (255, 0, 0)}
     assert actors_of(scene, job(), OwnCar({"CAM_FRONT": (WHOLE,)})) == []
 
 
@@ -326,8 +333,8 @@ def test_an_actor_that_is_seen_but_shows_no_point_is_grey(tmp_path):
         for number, sweep in enumerate(scene.sweeps)
     ]
     actor = the_actor(dataclasses.replace(scene, sweeps=tuple(left)), job(), OwnCar({"CAM_FRONT": (outline,)}))
-    assert len(actor["points"]) > 50
-    assert {tuple(color) for color in actor["points_rgb"]} == {(127, 127, 127)}
+    assert len(actor.points) > 50
+    assert {tuple(color) for color in actor.points_rgb} == {(127, 127, 127)}
 
 
 def _left_half(path: Path, copy: Path) -> str:
@@ -340,7 +347,7 @@ def test_held_out_images_and_sweeps_contribute_nothing(root):
     """Held-out images become magenta and held-out sweeps garbage in the car's box: not a bit changes."""
     scene, settings = scene_at(root), job(width=64, min_points=10**6, random_points=1000, humans=True)
     before = actors_record(scene, settings)
-    assert len(before["actors"]) == 2
+    assert len(before.actors) == 2
     random, changed = np.random.default_rng(0), 0
     for frame, group in zip(scene.frames, frame_groups(scene, settings.holdout), strict=True):
         if group != "train":
@@ -354,7 +361,7 @@ def test_held_out_images_and_sweeps_contribute_nothing(root):
     assert changed == 4 + 3 + 4, "images at 2, 6, 8, 9, between 2-3, 6-7, 8-9; four sweeps"
     assert_same(actors_record(scene_at(root), settings), before)
     nothing = settings.model_copy(update={"holdout": job(NOTHING_HELD_OUT).holdout})
-    assert len(actors_record(scene_at(root), nothing)["actors"][0]["points"]) > 1500, "the garbage lies in its box"
+    assert len(actors_record(scene_at(root), nothing).actors[0].points) > 1500, "the garbage lies in its box"
 
 
 @pytest.mark.parametrize("what", ["image", "sweep"])
@@ -367,14 +374,14 @@ def test_training_images_and_sweeps_do_contribute(root, what):
         Path(scene.sweeps[0].path).write_bytes(Path(scene.sweeps[3].path).read_bytes())
     after = the_actor(scene_at(root), job())
     key = {"image": "points_rgb", "sweep": "points"}[what]
-    assert before[key].tobytes() != after[key].tobytes()
+    assert vars(before)[key].tobytes() != vars(after)[key].tobytes()
 
 
 def test_equal_random_seeds_give_equal_actors_and_others_do_not(tiny_scene):
     settings = {"min_points": 10**6, "random_points": 1000}
     first, again, other = (actors_record(tiny_scene, job(random_seed=seed, **settings)) for seed in (0, 0, 1))
     assert_same(first, again)
-    assert first["actors"][0]["points"].tobytes() != other["actors"][0]["points"].tobytes()
+    assert first.actors[0].points.tobytes() != other.actors[0].points.tobytes()
 
 
 def test_actors_come_by_id_each_with_random_points_of_its_own_whatever_else_becomes_one(tmp_path):
@@ -385,10 +392,10 @@ def test_actors_come_by_id_each_with_random_points_of_its_own_whatever_else_beco
     scene = dataclasses.replace(scene, tracks=tuple(renamed), sweeps=())
     settings = {"min_points": 1, "random_points": 500}
     alone, all_three = actors_of(scene, job(**settings)), actors_of(scene, job(humans=True, **settings))
-    assert [actor["id"] for actor in alone] == ["a", "c"] and [actor["id"] for actor in all_three] == ["a", "b", "c"]
-    assert alone[0]["points"].tobytes() != alone[1]["points"].tobytes()
+    assert [actor.id for actor in alone] == ["a", "c"] and [actor.id for actor in all_three] == ["a", "b", "c"]
+    assert alone[0].points.tobytes() != alone[1].points.tobytes()
     for one, same in zip(alone, all_three[::2], strict=True):
-        np.testing.assert_array_equal(one["points"], same["points"])
+        np.testing.assert_array_equal(one.points, same.points)
 
 
 def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
@@ -402,25 +409,27 @@ def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
     )  # fmt: skip
     scene = dataclasses.replace(scene, tracks=(track,))
     record = actors_record(scene, job())
-    (actor,) = record["actors"]
-    assert actor["id"] == track.id
-    np.testing.assert_allclose(actor["times"], 0.035 + 0.5 * np.array(kept), atol=1e-9)
-    np.testing.assert_allclose(actor["object_to_world"][:, 0, 3], [SPEEDING.at(0.5 * i)[0] for i in kept], atol=1e-6)
-    assert (actor["runs"], actor["reach"]) == ([[0, 2], [3, 7]], 0.25)
+    (actor,) = record.actors
+    assert actor.id == track.id
+    np.testing.assert_allclose(actor.motion.times, 0.035 + 0.5 * np.array(kept), atol=1e-9)
+    np.testing.assert_allclose(
+        actor.motion.object_to_world[:, 0, 3], [SPEEDING.at(0.5 * i)[0] for i in kept], atol=1e-6
+    )
+    assert (actor.motion.runs, actor.motion.reach) == (((0, 2), (3, 7)), 0.25)
     at = np.linspace(-0.5, 6.0, 40)
-    motion, expected = motion_of(actor), Motion.of_track(scene, track)
+    motion, expected = actor.motion, Motion.of_track(scene, track)
     np.testing.assert_array_equal(motion.poses(at), expected.poses(at))
     np.testing.assert_array_equal(motion.present(at), expected.present(at))
 
 
 def test_the_record_is_plain_and_reads_as_it_was_written(tiny_scene, tmp_path):
-    record = {**actors_record(tiny_scene, job()), "provenance": {"stages": {}}}
-    write_plain_pickle(tmp_path / "actors.pkl", record)
-    read = read_actors(tmp_path / "actors.pkl")
+    record = dataclasses.replace(actors_record(tiny_scene, job()), provenance={"stages": {}})
+    write_actors(tmp_path / "actors.npz", record)
+    read = read_actors(tmp_path / "actors.npz")
     assert_same(read, record)
-    assert read.keys() == {"actors", "provenance"}
-    (actor,) = read["actors"]
-    kinds = {name: (value.dtype, value.ndim) for name, value in actor.items() if isinstance(value, np.ndarray)}
+    (actor,) = read.actors
+    fields = {**vars(actor), **actor.motion.to_plain()}
+    kinds = {name: (value.dtype, value.ndim) for name, value in fields.items() if isinstance(value, np.ndarray)}
     assert kinds == {
         "size": (np.float64, 1), "times": (np.float64, 1), "object_to_world": (np.float64, 3),
         "points": (np.float32, 2), "points_rgb": (np.uint8, 2),
@@ -428,8 +437,8 @@ def test_the_record_is_plain_and_reads_as_it_was_written(tiny_scene, tmp_path):
 
 
 def test_a_drive_in_which_nothing_moves_has_no_actors_and_a_record_of_them(tmp_path):
-    write_plain_pickle(tmp_path / "actors.pkl", {**actors_record(drive(tmp_path, PARKED), job()), "provenance": {}})
-    assert read_actors(tmp_path / "actors.pkl")["actors"] == []
+    write_actors(tmp_path / "actors.npz", actors_record(drive(tmp_path, PARKED), job()))
+    assert read_actors(tmp_path / "actors.npz").actors == []
 
 
 @pytest.mark.parametrize(
@@ -439,10 +448,12 @@ def test_a_drive_in_which_nothing_moves_has_no_actors_and_a_record_of_them(tmp_p
     ids=str,
 )  # fmt: skip
 def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
-    path = tmp_path / "actors.pkl"
+    path = tmp_path / "actors.npz"
     if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else pickle.dumps(content))
-    with pytest.raises(ResultError, match=r"actors\.pkl: .*the rule 'actors' rebuilds it"):
+        path.write_bytes(content if isinstance(content, bytes) else b"")
+    if isinstance(content, dict):
+        write_arrays(path, content)
+    with pytest.raises(ResultError, match=r"actors\.npz: .*the rule 'actors' rebuilds it"):
         read_actors(path)
 
 
@@ -467,7 +478,7 @@ def test_20_actors_in_40_images_are_gathered_and_coloured_within_10_seconds(tiny
     began = time.monotonic()
     found = actors_of(scene, job(NOTHING_HELD_OUT, min_points=10**6, random_points=20_000))
     assert time.monotonic() - began < 10.0
-    assert len(found) >= 5 and all(len(actor["points"]) == 20_000 for actor in found)
+    assert len(found) >= 5 and all(len(actor.points) == 20_000 for actor in found)
 
 
 def test_of_the_real_scene_the_vehicles_that_move_in_sight_become_actors(real_scene_root):
@@ -476,7 +487,7 @@ def test_of_the_real_scene_the_vehicles_that_move_in_sight_become_actors(real_sc
         sweeps=False, on_missing="stop",
     )  # fmt: skip
     found = actors_of(extract_scene(source, real_scene_root), job({}, min_points=2000))
-    assert 4 <= len(found) <= 7 and all(actor["category"].startswith("vehicle.") for actor in found)
+    assert 4 <= len(found) <= 7 and all(actor.category.startswith("vehicle.") for actor in found)
     for actor in found:
-        assert len(actor["points"]) == 8000 and actor["lidar_points"] < 100, "all but one of its sweeps are missing"
-        assert len(np.unique(actor["points_rgb"], axis=0)) > 50
+        assert len(actor.points) == 8000 and actor.lidar_points < 100, "all but one of its sweeps are missing"
+        assert len(np.unique(actor.points_rgb, axis=0)) > 50

@@ -404,7 +404,7 @@ def test_colours_are_rounded_to_the_nearest_uint8_and_clipped():
 
 def test_a_film_with_nan_is_refused(folder, started, tiny_scene):
     checkpoint = a_checkpoint(**{"parts.0.params.sh0": torch.full((1, 1, 3), torch.nan)})
-    with pytest.raises(ResultError, match=r"NaN or Inf.*checkpoint\.pt"):
+    with pytest.raises(ResultError, match=r"NaN or Inf.*checkpoint\.npz"):
         render_film(tiny_scene, checkpoint, a_job(), DeviceSettings(kind="cpu"), folder / "street.mp4")
     assert_nothing_left(folder, started)
 

@@ -24,6 +24,7 @@ from helpers.trainings import (
 )
 
 from drivesplat.io.storage import write_json
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
@@ -84,7 +85,7 @@ def test_a_body_before_the_camera_is_not_learned_and_what_it_hides_is(tmp_path):
 
 
 def test_images_of_a_camera_share_the_mask_of_the_body_and_have_no_depth_there(tmp_path):
-    depth = {"rows": np.array([2, 20], np.int32), "columns": np.array([3, 4], np.int32), "depth": np.array([5.0, 6.0])}
+    depth = PixelDepths(np.array([2, 20], np.int32), np.array([3, 4], np.int32), np.array([5.0, 6.0]))
     none = np.zeros((HEIGHT, WIDTH), dtype=bool)
     guides = Guides({}, {}, dict.fromkeys(range(5), depth), own_car={0: CORNER, 1: CORNER.copy(), 3: none})
     first, second, empty, unknown = load_views(parser_record(tmp_path, recorded_views()), guides, CPU)

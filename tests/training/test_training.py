@@ -47,6 +47,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.io import checkpoint_file
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
@@ -274,10 +275,8 @@ def test_views_know_what_guides_say_of_their_image(tmp_path):
     masks = {i: np.zeros((HEIGHT, WIDTH), dtype=bool) for i in range(5)}
     for i, mask in masks.items():
         mask[i] = True
-    depths = {
-        3: {"rows": np.array([0, 2], np.int32), "columns": np.array([7, 1], np.int32), "depth": np.array([4.5, 9.0])}
-    }
-    none = {"rows": np.zeros(0, np.int32), "columns": np.zeros(0, np.int32), "depth": np.zeros(0, np.float32)}
+    depths = {3: PixelDepths(np.array([0, 2], np.int32), np.array([7, 1], np.int32), np.array([4.5, 9.0]))}
+    none = PixelDepths(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
     guides = Guides(sky=masks, moving={i: masks[4 - i] for i in masks}, lidar={**depths, 4: none})
     loaded = dict(zip((0, 1, 3, 4), load_views(parser_record(tmp_path, recorded_views()), guides, CPU), strict=True))
     for i, view in loaded.items():
@@ -318,7 +317,7 @@ def test_a_training_killed_halfway_resumes_and_ends_as_an_uninterrupted_one(unin
     process = in_subprocess(train_until_killed, str(tmp_path))
     _, errors = process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL, errors
-    assert [path.name for path in (tmp_path / "resume").iterdir()] == ["state.pt"]
+    assert [path.name for path in (tmp_path / "resume").iterdir()] == ["state.npz"]
 
     resumed, summary = trained(tmp_path, settings_of())
     whole, whole_summary = uninterrupted["mcmc"]
@@ -356,7 +355,7 @@ def test_a_training_ended_twice_resumes_twice_and_counts_all_its_time(uninterrup
     for looks in (25, 25):
         with pytest.raises(EndedError):
             trained(tmp_path, settings, EndingViews(recorded_views(), looks))
-    before = checkpoint_file.load(tmp_path / "resume/state.pt", "train")["seconds"]
+    before = checkpoint_file.load(tmp_path / "resume/state.npz", "train")["seconds"]
     resumed, summary = trained(tmp_path, settings)
     assert summary.resumed_at == [20, 40]
     assert summary.seconds > before > 0.0
@@ -379,7 +378,7 @@ def test_resume_states_come_no_sooner_than_their_time(apart, kept, tmp_path, mon
     monkeypatch.setattr("drivesplat.training.train.time", SimpleNamespace(monotonic=lambda: views.seconds))
     with pytest.raises(EndedError):
         trained(tmp_path, settings_of(checkpoint_every=10, checkpoint_apart_s=apart), views)
-    state = tmp_path / "resume/state.pt"
+    state = tmp_path / "resume/state.npz"
     assert (checkpoint_file.load(state, "train")["step"] if state.exists() else None) == kept
 
 
@@ -437,7 +436,7 @@ FOREIGN = ["truncated", "empty", "text", "a tensor", "malicious", "a malicious p
 
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_a_spoilt_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(kind, tmp_path, caplog):
-    path = tmp_path / "state.pt"
+    path = tmp_path / "state.npz"
     spoil(path, kind)
     with caplog.at_level(logging.WARNING):
         assert resume_state.resumable(path, "of this training") is None
@@ -447,7 +446,7 @@ def test_a_spoilt_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(
 
 @pytest.mark.parametrize("kind", [*FOREIGN, "missing", "another record"])
 def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tmp_path):
-    path = tmp_path / "checkpoint.pt"
+    path = tmp_path / "checkpoint.npz"
     spoil(path, kind)
     if kind == "another record":
         torch.save({"fingerprint": "", "step": 3}, path)
@@ -458,13 +457,13 @@ def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tm
 
 
 def test_without_a_resume_state_nothing_is_said(tmp_path, caplog):
-    assert resume_state.resumable(tmp_path / "state.pt", "any") is None
+    assert resume_state.resumable(tmp_path / "state.npz", "any") is None
     assert caplog.text == ""
 
 
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
 def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, monkeypatch, failure):
-    path = tmp_path / "state.pt"
+    path = tmp_path / "state.npz"
     checkpoint_file.save(path, {"step": 1, "means": torch.ones(3)})
 
     def half(content: Any, file: Any) -> None:
@@ -480,12 +479,12 @@ def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, m
 
 def test_a_full_disk_is_told_with_the_files_name_and_keeps_the_earlier_checkpoint(tmp_path):
     """A limit on the size of files stands for the full disk: torch's writer fails in the same way."""
-    path = tmp_path / "state.pt"
+    path = tmp_path / "state.npz"
     checkpoint_file.save(path, {"step": 1})
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
     try:
-        with pytest.raises(ResultError, match=r"state\.pt.*cannot be written"):
+        with pytest.raises(ResultError, match=r"state\.npz.*cannot be written"):
             checkpoint_file.save(path, {"step": 2, "means": torch.zeros(100_000)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -535,8 +534,8 @@ def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoi
     message = str(error.value)
     assert message.startswith("iteration 2: ") and "loss ssim" in message and "gradient of background" in message
     assert "opacity_reg" not in message and "scale_reg" not in message
-    assert str(tmp_path / "resume/state.pt") in message
-    assert checkpoint_file.load(tmp_path / "resume/state.pt", "train")["step"] == 1
+    assert str(tmp_path / "resume/state.npz") in message
+    assert checkpoint_file.load(tmp_path / "resume/state.npz", "train")["step"] == 1
 
 
 @pytest.mark.parametrize("log_every", [1, 50])
@@ -559,14 +558,14 @@ def test_the_guard_names_the_first_iteration_and_its_terms_alone(value):
     guard = FiniteGuard(CPU)
     fine, bad = torch.tensor(1.0), torch.tensor(value)
     guard.watch(0, {"loss l1": fine, "loss ssim": fine, "gradient of means": fine})
-    guard.check("state.pt")
+    guard.check("state.npz")
     guard.watch(6, {"loss l1": fine, "loss ssim": bad, "gradient of means": bad})
     guard.watch(7, {"loss l1": bad, "loss ssim": bad, "gradient of means": bad})
     with pytest.raises(TrainingError) as error:
-        guard.check("state.pt")
+        guard.check("state.npz")
     message = str(error.value)
     assert "iteration 7: loss ssim, gradient of means is not finite" in message
-    assert "loss l1" not in message and "state.pt" in message
+    assert "loss l1" not in message and "state.npz" in message
 
 
 def test_the_guard_keeps_apart_iterations_that_watch_different_terms():
@@ -574,7 +573,7 @@ def test_the_guard_keeps_apart_iterations_that_watch_different_terms():
     guard.watch(3, {"loss l1": torch.tensor(1.0), "loss sky_alpha": torch.tensor(math.nan)})
     guard.watch(2, {"loss l1": torch.tensor(math.nan)})
     with pytest.raises(TrainingError, match="iteration 3: loss l1 is not finite"):
-        guard.check("state.pt")
+        guard.check("state.npz")
 
 
 @pytest.mark.parametrize("log_every", [1, 50])
@@ -661,7 +660,7 @@ def run(folder: Path, job: TrainJob, device: str = "cpu", actors: bool = False) 
 
 def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
     files = run(tmp_path, job_of())
-    assert {path.name for path in files.checkpoint.parent.iterdir()} == {"checkpoint.pt", "train.json", "tensorboard"}
+    assert {path.name for path in files.checkpoint.parent.iterdir()} == {"checkpoint.npz", "train.json", "tensorboard"}
     summary = json.loads(files.summary.read_text())
     content = read_checkpoint(files.checkpoint)
     model, job = trained_model(content)
@@ -752,7 +751,7 @@ def test_a_failed_training_leaves_no_result_but_its_resume_state(tmp_path):
     with pytest.raises(TrainingError):
         run(tmp_path, job)
     assert {path.name for path in (tmp_path / "vanilla").iterdir()} == {"resume", "tensorboard"}
-    assert (tmp_path / "vanilla/resume/state.pt").is_file()
+    assert (tmp_path / "vanilla/resume/state.npz").is_file()
 
 
 def test_without_a_gpu_a_training_is_refused_before_it_begins(tmp_path, monkeypatch):

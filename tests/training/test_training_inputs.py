@@ -27,13 +27,13 @@ def trained(tmp_path_factory) -> WorkflowCopy:
 
 def test_the_stages_leave_records_that_know_where_they_come_from(trained):
     folder = trained.folder / "results/0001"
-    actors, depth = read_actors(folder / "actors.pkl"), read_lidar_depth(folder / "lidar_depth.pkl")
-    assert [actor["category"] for actor in actors["actors"]] == ["vehicle.car"]
-    assert sum(len(image["depth"]) > 0 for image in depth["images"]) == 5
-    assert actors["provenance"]["stages"].keys() == {"extract", "own_car", "actors"}
-    assert depth["provenance"]["stages"].keys() == {"extract", "own_car", "lidar_depth"}
-    free = read_free_space(folder / "free_space.pkl")
-    assert len(free["keys"]) > 1000 and free["provenance"]["stages"].keys() == {"extract", "free_space"}
+    actors, depth = read_actors(folder / "actors.npz"), read_lidar_depth(folder / "lidar_depth.npz")
+    assert [actor.category for actor in actors.actors] == ["vehicle.car"]
+    assert sum(len(image) > 0 for image in depth.images) == 5
+    assert actors.provenance["stages"].keys() == {"extract", "own_car", "actors"}
+    assert depth.provenance["stages"].keys() == {"extract", "own_car", "lidar_depth"}
+    free = read_free_space(folder / "free_space.npz")
+    assert len(free.keys) > 1000 and free.provenance["stages"].keys() == {"extract", "free_space"}
     made_from = [trained.read(training)["provenance"]["stages"].keys() for training in TRAININGS]
     assert made_from[1] - made_from[0] == {"actors", "lidar_depth", "free_space", "mine/train"}
 

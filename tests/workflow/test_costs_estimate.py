@@ -90,13 +90,13 @@ def test_disk_is_what_the_same_jobs_left_for_other_scenes(tmp_path):
     for scene, size in (("0103", 1000), ("0553", 3000)):
         folder = tmp_path / scene / "street"
         (folder / "tensorboard").mkdir(parents=True)
-        (folder / "checkpoint.pt").write_bytes(bytes(size))
+        (folder / "checkpoint.npz").write_bytes(bytes(size))
         (folder / "tensorboard/events").write_bytes(bytes(50))
     own = f"{tmp_path}/0061/street"
     jobs = [
-        (JobId("train", "0061", "street"), (f"{own}/checkpoint.pt", f"{own}/train.json")),
+        (JobId("train", "0061", "street"), (f"{own}/checkpoint.npz", f"{own}/train.json")),
         (JobId("film", "0061", "street", "original"), (f"{own}/original.mp4",)),
-        (JobId("train", "0103", "street"), (f"{tmp_path}/0103/street/checkpoint.pt",)),
+        (JobId("train", "0103", "street"), (f"{tmp_path}/0103/street/checkpoint.npz",)),
     ]
     found = disk_need(tmp_path, jobs, lambda scene: ["0103", "0553", "0655"])
     assert found.needed == 2050, "what is there already is replaced"

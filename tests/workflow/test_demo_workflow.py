@@ -102,11 +102,11 @@ def test_without_a_target_the_demo_stays_out(finished):
 
 
 def test_a_recorded_drive_is_still_refused_without_a_gpu(finished):
-    done = finished.run("results/0001/vanilla/checkpoint.pt")
+    done = finished.run("results/0001/vanilla/checkpoint.npz")
     assert done.returncode != 0
     assert "no usable GPU" in done.stdout and "device: cpu" in done.stdout
     assert "Traceback" not in done.stdout
-    assert not (finished.folder / "results/0001/vanilla/checkpoint.pt").exists()
+    assert not (finished.folder / "results/0001/vanilla/checkpoint.npz").exists()
 
 
 def test_a_world_at_a_recorded_datasets_folder_is_refused_before_any_job(finished):

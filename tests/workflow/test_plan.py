@@ -32,20 +32,20 @@ def taken(made: Plan, scene: str, method: str) -> list[str]:
 
 def test_actors_are_an_input_of_methods_with_that_part_alone():
     made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
-    assert taken(made, "a1", "mine") == ["elsewhere/a1/actors.pkl"]
-    assert taken(made, "b1", "mine") == ["elsewhere/b1/actors.pkl"]
+    assert taken(made, "a1", "mine") == ["elsewhere/a1/actors.npz"]
+    assert taken(made, "b1", "mine") == ["elsewhere/b1/actors.npz"]
     assert taken(made, "a1", "vanilla") == []
 
 
 def test_depth_is_an_input_where_a_training_is_held_to_it():
     made = plan(methods={"vanilla": {}, "held": {"overrides": HELD}})
-    assert taken(made, "a1", "held") == ["elsewhere/a1/lidar_depth.pkl"]
+    assert taken(made, "a1", "held") == ["elsewhere/a1/lidar_depth.npz"]
     assert taken(made, "a1", "vanilla") == []
 
 
 def test_free_space_is_an_input_where_a_training_keeps_gaussians_out_of_it():
     made = plan(methods={"vanilla": {}, "kept_out": {"overrides": KEPT_OUT}})
-    assert taken(made, "a1", "kept_out") == ["elsewhere/a1/free_space.pkl"]
+    assert taken(made, "a1", "kept_out") == ["elsewhere/a1/free_space.npz"]
     assert taken(made, "a1", "vanilla") == []
 
 
@@ -110,7 +110,7 @@ def test_poses_are_refined_unless_they_are_known_to_be_exact(world, enabled, ref
     ("settings", "taken"),
     [
         ({}, []),
-        (REFINED, ["elsewhere/a1/triangulated.pkl"]),
+        (REFINED, ["elsewhere/a1/triangulated.npz"]),
         ({**REFINED, "lidar_seed": {"triangulated": False}}, []),
         ({"lidar_seed": {"triangulated": True}}, []),
     ],
@@ -125,7 +125,7 @@ def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_th
 )
 def test_triangulated_points_are_an_input_of_free_space_where_there_are_any_and_they_are_wanted(settings, taken):
     found = plan(**settings).triangulated_ends(SimpleNamespace(scene="a1"))
-    assert found == ["elsewhere/a1/triangulated.pkl"] * taken
+    assert found == ["elsewhere/a1/triangulated.npz"] * taken
 
 
 def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():

@@ -88,7 +88,7 @@ def test_the_report_has_a_row_per_scene_and_method(finished):
 
 def test_what_a_training_leaves_behind(finished):
     folder = finished.folder / "results/0001/vanilla"
-    trained = {"checkpoint.pt", "train.json", "eval.json", "tensorboard", ".digests"} | set(HELD_OUT_PAIR.values())
+    trained = {"checkpoint.npz", "train.json", "eval.json", "tensorboard", ".digests"} | set(HELD_OUT_PAIR.values())
     films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
     looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
     exports = {"splat.ply", "cameras.json", "parts", "scene.usdz", "viewer.html"}

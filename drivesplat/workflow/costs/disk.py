@@ -8,7 +8,7 @@ from pathlib import Path
 from drivesplat.io.free_disk import free_bytes
 from drivesplat.workflow.costs.measured import JobId
 
-MEMBER_FOLDERS = {"masks.json": ".", "checkpoint.pt": "tensorboard", "parts.json": "."}
+MEMBER_FOLDERS = {"masks.json": ".", "checkpoint.npz": "tensorboard", "parts.json": "."}
 """Outputs beside which a job leaves files that no rule declares, and the folder of these."""
 
 
