@@ -415,8 +415,13 @@ def spoil(path: Path, kind: str) -> None:
     good = {"fingerprint": "of this training", "model": {"means": torch.zeros(50_000)}}
     match kind:
         case "truncated":
-            torch.save(good, path)
+            checkpoint_file.save(path, good)
             path.write_bytes(path.read_bytes()[:100_000])
+        case "a flipped bit":
+            checkpoint_file.save(path, good)
+            content = bytearray(path.read_bytes())
+            content[100_000] ^= 4
+            path.write_bytes(content)
         case "empty":
             path.write_bytes(b"")
         case "text":
@@ -431,7 +436,16 @@ def spoil(path: Path, kind: str) -> None:
             torch.save({**good, "model": torch.nn.Linear(2, 2)}, path)
 
 
-FOREIGN = ["truncated", "empty", "text", "a tensor", "malicious", "a malicious pickle", "a whole module"]
+FOREIGN = [
+    "truncated",
+    "a flipped bit",
+    "empty",
+    "text",
+    "a tensor",
+    "malicious",
+    "a malicious pickle",
+    "a whole module",
+]
 
 
 @pytest.mark.parametrize("kind", FOREIGN)
@@ -449,7 +463,7 @@ def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tm
     path = tmp_path / "checkpoint.npz"
     spoil(path, kind)
     if kind == "another record":
-        torch.save({"fingerprint": "", "step": 3}, path)
+        checkpoint_file.save(path, {"fingerprint": "", "step": 3})
     with pytest.raises(ResultError) as error:
         read_checkpoint(path)
     assert str(path) in str(error.value) and "'train'" in str(error.value) and "\n" not in str(error.value)
@@ -466,11 +480,11 @@ def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, m
     path = tmp_path / "state.npz"
     checkpoint_file.save(path, {"step": 1, "means": torch.ones(3)})
 
-    def half(content: Any, file: Any) -> None:
-        file.write(b"PK half a checkpoint")
+    def half(file: Any, *_: Any, **__: Any) -> None:
+        file.write(b"half an array")
         raise failure
 
-    monkeypatch.setattr(torch, "save", half)
+    monkeypatch.setattr(np.lib.format, "write_array", half)
     with pytest.raises(ResultError if isinstance(failure, OSError) else KeyboardInterrupt):
         checkpoint_file.save(path, {"step": 2})
     assert checkpoint_file.load(path, "train")["step"] == 1
@@ -478,7 +492,7 @@ def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, m
 
 
 def test_a_full_disk_is_told_with_the_files_name_and_keeps_the_earlier_checkpoint(tmp_path):
-    """A limit on the size of files stands for the full disk: torch's writer fails in the same way."""
+    """A limit on the size of files stands for the full disk."""
     path = tmp_path / "state.npz"
     checkpoint_file.save(path, {"step": 1})
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
