@@ -34,10 +34,9 @@ NO_PRIORS = GeometryPriors()
 def geometry_priors(record: TrainingRecord, free_space: FreeSpace | None, settings: TrainSettings) -> GeometryPriors:
     """The priors that `settings` want, on the CPU, from the training record and the record of free space (None: not
     made)."""
+    space = free_space
     return GeometryPriors(
-        SparseGrid.from_numpy(free_space.lower, free_space.voxel, free_space.shape, free_space.keys)
-        if free_space
-        else None,
+        SparseGrid.from_numpy(space.lower, space.voxel, space.shape, space.keys) if space else None,
         road_of(record, settings.road) if settings.road_weight else None,
     )
 

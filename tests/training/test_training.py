@@ -48,6 +48,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from drivesplat.errors import DeviceError, ResultError, TrainingError
 from drivesplat.io import checkpoint_file
 from drivesplat.lidar.depth_record import PixelDepths
+from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
@@ -686,7 +687,7 @@ def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
     assert mean_psnr(model, views) > mean_psnr(untrained(settings_of()), views) + 1.0
 
 
-EVERYWHERE = {"lower": np.full(3, -10.0), "voxel": 20.0, "shape": np.ones(3, np.int64), "keys": np.zeros(1, np.int64)}
+EVERYWHERE = FreeSpace(np.full(3, -10.0), np.ones(3, np.int64), 20.0, np.zeros(1, np.int64))
 """Free space that holds all there is."""
 
 
