@@ -47,6 +47,8 @@ def write_until_killed(folder: str) -> None:
     whole, saves = zipfile.ZipFile.close, []
 
     def close(archive: zipfile.ZipFile) -> None:
+        if archive.fp is None:  # closed before
+            return
         saves.append(archive)
         if len(saves) == 2:
             archive.fp.flush()
