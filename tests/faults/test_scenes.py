@@ -67,7 +67,7 @@ def test_one_scene_that_fails_stops_no_other_and_stands_in_a_partial_report(batc
     assert "Partial: 1 of 2 configured scenes" in page and batch.image.name in page and "data:image/jpeg" in page
     assert "0002: extract: " in batch.said and "results/gap_report.html" in batch.said
     costs = (batch.copy.folder / "results/costs.csv").read_text()
-    assert "0001,vanilla,train," in costs and "0002," not in costs and "What it cost" in page
+    assert "0001,vanilla,train," in costs and "0002," not in costs and "<h2>Costs</h2>" in page
 
 
 def test_once_nothing_fails_the_report_is_whole_and_a_further_run_does_nothing(healed):

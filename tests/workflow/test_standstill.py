@@ -96,14 +96,14 @@ def test_a_standing_cars_movers_are_seen_and_removed(drives):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_where_nothing_moves_looks_say_so_and_nothing_can_be_edited(drives, method):
+def test_where_nothing_moves_figures_say_so_and_nothing_can_be_edited(drives, method):
     made = drives["still"]
     drive = made.drives[method]
     assert [part.name for part in drive.model.parts] == ["background"]
     _, panel = ghost_panel(drive, made.job("ghost_panel", PanelJob, method))
     _, removal = remove_actor(drive, made.job("remove_actor", RemovalJob, method))
-    assert "no vehicle moves" in panel["why_null"] and "no vehicle moves" in removal["why_null"]
-    with pytest.raises(ConfigError, match=r"scene 0001, edit 'gone': nothing can be edited.*something moves"):
+    assert "no moving vehicle" in panel["why_null"] and "no moving vehicle" in removal["why_null"]
+    with pytest.raises(ConfigError, match=r"scene 0001, edit 'gone': nothing can be edited.*moving vehicles"):
         editable_actors(drive.model, drive.recording.scene, "scene 0001, edit 'gone'")
 
 
