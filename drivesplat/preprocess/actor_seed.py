@@ -18,16 +18,16 @@ from drivesplat.lidar.sweeps import training_returns
 from drivesplat.scene.actor_record import ActorRecord, ActorRecords
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
-from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.regions import LEAST_PIXELS, hulls_in, owner_image
 from drivesplat.scene.rigid import apply, inverse
-from drivesplat.scene.scene import Frame, Scene, Sweep, Track
+from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
 
 log = logging.getLogger(__name__)
 
-CYCLES = (ObjectClass.BICYCLE, ObjectClass.MOTORCYCLE, ObjectClass.RIDER)
+ACTORS = "actors"
+"""The part that takes them."""
 UNSEEN = 127
 """Grey of an actor that no pixel shows."""
 
@@ -39,7 +39,7 @@ def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) ->
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
     for mover in sorted(movers(scene), key=lambda mover: mover.track.id):
-        if may_be_actor(mover.track, job.actors):
+        if job.actors.part_of(mover.track.object_class) == ACTORS:
             random = np.random.default_rng((job.random_seed, order[mover.track.id]))
             seeds.append(Seed(mover, *gathered_points(scene, mover, sweeps, job.actors, random)))
     for sight in training_sights(scene, job, own_car):
@@ -52,13 +52,6 @@ def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) ->
     for actor in actors:
         log.info("%s: %d points, %d of them LiDAR's", actor.id, len(actor.points), actor.lidar_points)
     return ActorRecords(actors)
-
-
-def may_be_actor(track: Track, settings: ActorSeedSettings) -> bool:
-    """Whether objects of its class become actors."""
-    if track.object_class in CYCLES:
-        return settings.cycles
-    return track.object_class.is_vehicle or (settings.humans and track.object_class.is_human)
 
 
 def gathered_points(

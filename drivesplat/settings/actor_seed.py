@@ -1,20 +1,36 @@
 """Settings of the rule `actors`."""
 
+from typing import Literal, get_args
+
 from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.train import PartName
+
+ObjectClassName = Literal[
+    "car", "truck", "bus", "trailer", "construction_vehicle", "tram", "vehicle", "motorcycle", "bicycle", "rider",
+    "pedestrian", "animal", "other_movable",
+]  # fmt: skip
+"""The values of `drivesplat.scene.object_class.ObjectClass`."""
+CYCLES = ("motorcycle", "bicycle", "rider")
+NO_VEHICLES = ("pedestrian", "animal", "other_movable")
+DEFAULT_CLASSES: dict[ObjectClassName, PartName] = {
+    name: "background" if name in NO_VEHICLES else "actors" for name in get_args(ObjectClassName)
+}
 
 
 class ActorSeedSettings(Settings):
     """Selection of actors and of their seed points. An actor is a vehicle that moves during the drive and is visible in
     a training image; it gets a set of Gaussians in its own frame."""
 
+    classes: dict[ObjectClassName, PartName] = DEFAULT_CLASSES
+    """The part of a model that represents the moving objects of each class."""
     cycles: bool = True
-    """Make actors of bicycles and motorcycles, too."""
+    """Make actors of motorcycles, bicycles and riders, too. false overrides `classes`."""
     humans: bool = False
-    """Make actors of people, too. They are as rigid as their boxes."""
+    """Make actors of pedestrians, too, as rigid as their boxes. true overrides `classes`."""
     min_points: int = Field(2_000, ge=0)
     """Minimum number of LiDAR points of an actor over the whole drive. With fewer, random points in its box are added.
     """
@@ -24,6 +40,14 @@ class ActorSeedSettings(Settings):
     """Maximum number of seed points of an actor. Further points are dropped at random."""
     box_margin: float = Field(0.1, ge=0, le=2)
     """LiDAR returns closer than this (metres) to the sides or the roof of a box belong to its actor."""
+
+    def part_of(self, object_class: str) -> PartName:
+        """The part that represents the moving objects of a class."""
+        if object_class in CYCLES and not self.cycles:
+            return "background"
+        if object_class == "pedestrian" and self.humans:
+            return "actors"
+        return {**DEFAULT_CLASSES, **self.classes}[object_class]
 
 
 class ActorSeedJob(Settings):

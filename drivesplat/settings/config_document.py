@@ -61,7 +61,8 @@ def _mapping(record: BaseModel, indent: int, told: set[tuple[type, str]] | None 
 def _value(value: Any, indent: int, told: set[tuple[type, str]]) -> str:
     if isinstance(value, BaseModel):
         return "\n" + _mapping(value, indent + 2, told)
-    if isinstance(value, dict) and any(isinstance(item, (BaseModel, dict)) for item in value.values()):
+    nested = isinstance(value, dict) and any(isinstance(item, (BaseModel, dict)) for item in value.values())
+    if nested or (isinstance(value, dict) and len(_scalar(value)) > WIDTH):
         pad = " " * (indent + 2)
         return "\n" + "".join(f"{pad}{key}:{_value(item, indent + 2, told)}" for key, item in value.items())
     plain = list(value) if isinstance(value, tuple) else value

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.overrides import merged
-from drivesplat.settings.train import Parts
+from drivesplat.settings.train import STAGE_OF_PART, PartName, Parts
 
 
 class MethodSettings(Settings):
@@ -16,6 +16,11 @@ class MethodSettings(Settings):
     overrides: dict[str, Any] = Field(default_factory=dict)
     """Settings that differ for this method, as a tree. Only `sky`, `train` and `random_seed` (of its training) may be
     set."""
+
+    @property
+    def moving_parts(self) -> tuple[PartName, ...]:
+        """Those of its parts whose Gaussians are objects that move."""
+        return tuple(part for part in self.parts if part in STAGE_OF_PART)
 
     def varied(self, parts: Parts | None, overrides: Mapping[str, Any]) -> "MethodSettings":
         """This method with other `parts`, unless None, and with `overrides` laid over its own."""

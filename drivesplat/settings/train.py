@@ -12,8 +12,8 @@ from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.road import RoadSettings
 
 PartName = Literal["background", "actors"]
-MOVING_PARTS = frozenset({"actors"})
-"""Parts whose Gaussians belong to moving objects."""
+STAGE_OF_PART: dict[PartName, str] = {"actors": "actors"}
+"""The parts whose Gaussians are objects that move, and the stage that finds these objects in a scene."""
 SkyKind = Literal["none", "mask", "cubemap"]
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 from drivesplat.provenance.code_digest import code_digest
 from drivesplat.settings.config import Config, for_scene
-from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.stages import (
     METHOD_STAGES,
@@ -58,7 +57,7 @@ class Outputs(Inputs):
     @property
     def methods_with_actors(self) -> list[str]:
         """The methods whose models know objects that move: those that can be taken apart and edited."""
-        return [name for name, method in self.config.all_methods.items() if set(method.parts) & MOVING_PARTS]
+        return [name for name, method in self.config.all_methods.items() if method.moving_parts]
 
     def metrics(self, _: Any = None) -> list[str]:
         """The metrics.json of the batch's scenes."""

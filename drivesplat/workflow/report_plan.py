@@ -7,7 +7,6 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.settings.report import HELD_OUT_PAIR, LOOKS, ReportJob
-from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.workflow.outputs import Outputs
 
 EVERYTHING = "all"
@@ -67,7 +66,7 @@ class ReportPlan:
     def settings(self, _: Any = None) -> str:
         """The settings of its job as canonical JSON."""
         config = self._plan.config
-        standing = (name for name, method in config.methods.items() if not set(method.parts) & MOVING_PARTS)
+        standing = (name for name, method in config.methods.items() if not method.moving_parts)
         job = ReportJob(
             expected={scene: self._plan.metrics_stages(scene) for scene in config.batch_scenes},
             reference=next(standing, None),

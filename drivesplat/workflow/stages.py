@@ -28,7 +28,7 @@ from drivesplat.settings.masks import MaskJob
 from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
-from drivesplat.settings.train import MOVING_PARTS, TrainJob
+from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
 
 SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
@@ -91,8 +91,9 @@ def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     """The stages of TRAINING_INPUTS that a method's training on a scene reads."""
     train = for_scene(config, scene, method).train
+    stages_of_parts = {STAGE_OF_PART[part] for part in config.all_methods[method].moving_parts}
     taken = {
-        "actors": "actors" in config.all_methods[method].parts,
+        "actors": "actors" in stages_of_parts,
         "lidar_depth": train.depth_weight > 0,
         "free_space": train.floaters.free_space,
     }
@@ -179,11 +180,11 @@ def _free_space(place: Place) -> FreeSpaceJob:
 
 
 def _train(place: Place) -> TrainJob:
-    config, parts = place.config, place.config.all_methods[place.method].parts
-    train = config.train if set(parts) & MOVING_PARTS else config.train.without_moving_parts()
+    config, method = place.config, place.config.all_methods[place.method]
+    train = config.train if method.moving_parts else config.train.without_moving_parts()
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
     return TrainJob(
-        parts=parts, sky=config.sky, train=train, random_seed=config.random_seed, reference_camera=reference
+        parts=method.parts, sky=config.sky, train=train, random_seed=config.random_seed, reference_camera=reference
     )
 
 

@@ -5,7 +5,7 @@ import pickle
 import shutil
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from helpers.small_drives import (
 )
 from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
+from pydantic import ValidationError
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
@@ -29,9 +30,10 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors, write_actors
 from drivesplat.scene.ego_mask import NOWHERE, OwnCar
 from drivesplat.scene.motion import Motion
+from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
-from drivesplat.settings.actor_seed import ActorSeedJob
+from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, ObjectClassName
 from drivesplat.settings.extract import SceneSource
 
 CAR = World().things[0]
@@ -492,3 +494,34 @@ def test_of_the_real_scene_the_vehicles_that_move_in_sight_become_actors(real_sc
     for actor in found:
         assert len(actor.points) == 8000 and actor.lidar_points < 100, "all but one of its sweeps are missing"
         assert len(np.unique(actor.points_rgb, axis=0)) > 50
+
+
+def test_the_names_of_classes_in_settings_are_those_of_objects():
+    assert get_args(ObjectClassName) == tuple(known.value for known in ObjectClass)
+
+
+@pytest.mark.parametrize("known", ObjectClass)
+def test_by_default_vehicles_are_actors_and_nothing_else_is(known):
+    assert ActorSeedSettings().part_of(known) == ("actors" if known.is_vehicle else "background")
+
+
+@pytest.mark.parametrize(
+    ("settings", "changed"),
+    [
+        ({"cycles": False}, {"motorcycle": "background", "bicycle": "background", "rider": "background"}),
+        ({"humans": True}, {"pedestrian": "actors"}),
+        ({"classes": {"bus": "background", "pedestrian": "actors"}}, {"bus": "background", "pedestrian": "actors"}),
+        ({"classes": {"bicycle": "actors"}, "cycles": False},
+         {"motorcycle": "background", "bicycle": "background", "rider": "background"}),
+    ],
+)  # fmt: skip
+def test_settings_choose_the_part_of_a_class_and_leave_all_others(settings, changed):
+    chosen, default = ActorSeedSettings.model_validate(settings), ActorSeedSettings()
+    assert {known.value: chosen.part_of(known) for known in ObjectClass} == {
+        known.value: changed.get(known.value, default.part_of(known)) for known in ObjectClass
+    }
+
+
+def test_a_class_that_there_is_none_of_is_refused():
+    with pytest.raises(ValidationError, match="lorry"):
+        ActorSeedSettings.model_validate({"classes": {"lorry": "actors"}})

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from drivesplat.settings.config import Config, for_scene
-from drivesplat.settings.train import MOVING_PARTS
 from drivesplat.workflow.costs.measured import TRAIN, WORLD, Cost, JobId
 
 
@@ -63,7 +62,7 @@ class Expectations:
 
     def _moves(self, method: str) -> bool:
         known = self.config.all_methods
-        return method in known and bool(set(known[method].parts) & MOVING_PARTS)
+        return method in known and bool(known[method].moving_parts)
 
 
 @dataclass(frozen=True)
