@@ -117,7 +117,7 @@ class Inputs:
 
     def _training_input(self, stage: str, wildcards: Any) -> list[str]:
         taken = training_inputs(self.config, wildcards.scene, wildcards.method)
-        return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.pkl"] if stage in taken else []
+        return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.npz"] if stage in taken else []
 
     def lpips_record(self, _: Any) -> list[str]:
         """The record of LPIPS's backbone, if LPIPS is enabled."""
