@@ -1,4 +1,4 @@
-"""Where the time of an iteration goes, by its stages; a training is timed only where somebody asks."""
+"""Timing of the stages of an iteration, used by benchmarks."""
 
 import time
 from collections.abc import Iterator
@@ -10,13 +10,13 @@ import torch
 ITERATION = "iteration"
 """The stage that holds all others."""
 OTHER = "other"
-"""What of an iteration belongs to none of its stages."""
+"""The part of an iteration outside its stages."""
 
 _NOTHING = nullcontext()
 
 
 class Clock:
-    """A clock that stands still: what a loop that nobody times is given."""
+    """A clock that measures nothing, for a loop without timing."""
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """A context for a stage of an iteration; stages follow one another within ITERATION."""
@@ -28,29 +28,28 @@ UNTIMED = Clock()
 
 @dataclass(frozen=True)
 class Span:
-    """One pass through a stage: seconds until Python went on, and on a GPU the events around its work."""
+    """One pass through a stage: seconds on the host, and on a GPU the events around its work."""
 
     name: str
     host: float
     events: tuple[torch.cuda.Event, torch.cuda.Event] | None
 
     def on_device(self) -> float:
-        """Seconds that the device took, which on a CPU are those of the host. Events must have happened."""
+        """Seconds on the device; on a CPU those on the host. The events must have completed."""
         return self.host if self.events is None else 1e-3 * self.events[0].elapsed_time(self.events[1])
 
 
 @dataclass(frozen=True)
 class Share:
-    """A stage's mean milliseconds an iteration: on the device, and until Python went on. Where the second is as long as
-    the first, the device may have waited for Python."""
+    """A stage's mean milliseconds per iteration, on the device and on the host. Where they are equal, the device may
+    have waited for Python."""
 
     device_ms: float
     host_ms: float
 
 
 class StageClock(Clock):
-    """Measures stages, the first `warm_up` iterations aside. On a GPU by events in its queue, which nothing waits for
-    while the loop runs."""
+    """Measures stages after the first `warm_up` iterations; on a GPU by CUDA events, without host synchronisation."""
 
     def __init__(self, device: torch.device, warm_up: int):
         self._on_gpu = device.type == "cuda"
@@ -72,8 +71,8 @@ class StageClock(Clock):
         return event
 
     def shares(self) -> dict[str, Share]:
-        """The mean share of every stage in the measured iterations, in the order in which they first came: ITERATION
-        last, before it OTHER. Empty where no iteration was measured."""
+        """The mean times of every stage, in order of first use, then OTHER, then ITERATION. Empty where no iteration
+        was measured."""
         if self._on_gpu:
             torch.cuda.synchronize()
         measured = self._measured()
@@ -96,6 +95,6 @@ class StageClock(Clock):
 
 
 def _mean(spans: list[Span], iterations: int) -> Share:
-    """The share of one stage's passes in so many iterations."""
+    """The mean times of one stage in so many iterations."""
     device, host = sum(span.on_device() for span in spans), sum(span.host for span in spans)
     return Share(1e3 * device / iterations, 1e3 * host / iterations)

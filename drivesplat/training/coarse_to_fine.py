@@ -1,4 +1,4 @@
-"""Training images by iteration: reduced at first, whole at the end."""
+"""Training images by iteration: reduced at first, at full size in the end."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from torch import Tensor
 
 from drivesplat.model.view import View
 from drivesplat.settings.train import TrainSettings
-from drivesplat.training.views import LidarDepth, TrainingView, order
+from drivesplat.training.views import LidarDepth, TrainingView, view_index
 
 
 class TrainingImages:
-    """What a training sees: `views` in a seeded order, in which every one comes once an epoch, each reduced as
-    `settings.coarse_to_fine` has it. Reduced ones are held for as long as they are in use."""
+    """The images of a training: `views` in a seeded order, each once per epoch, reduced according to
+    `settings.coarse_to_fine`. Reduced images are cached while their factor is in use."""
 
     def __init__(self, views: Sequence[TrainingView], settings: TrainSettings, seed: int):
         self.views = views
@@ -33,25 +33,25 @@ class TrainingImages:
         return self._reduced[self.number(step)]
 
     def number(self, step: int) -> int:
-        """Which image it is, of all `views`."""
-        return order(len(self.views), step, self._seed)
+        """The index of an iteration's image in `views`."""
+        return view_index(len(self.views), step, self._seed)
 
     def factor(self, step: int) -> int:
-        """By how much width and height are reduced at an iteration."""
+        """The factor by which width and height are reduced at an iteration."""
         done, coarse = step / self._settings.iterations, self._settings.coarse_to_fine
         wanted = 4 if done < coarse.quarter_until else 2 if done < coarse.half_until else 1
         return next((factor for factor in (4, 2) if factor <= wanted and self._rows >= factor * coarse.least_height), 1)
 
     @cached_property
     def _rows(self) -> int:
-        """Those of the lowest image, 0 without any."""
+        """The rows of the smallest image; 0 without images."""
         return min((view.view.height for view in self.views), default=0)
 
 
 def reduced(view: TrainingView, factor: int) -> TrainingView:
-    """A view at a `factor`-th of its width and height: colours averaged over blocks of pixels; sky, and what moves,
-    where most of a block is that, the own car where any of it is; of LiDAR every return, of classes those of blocks'
-    middles. What of the right and lower edge fills no block is left out."""
+    """A view at 1 / `factor` of its width and height. Colours are averaged over blocks of pixels; a block is sky or
+    moving where most of its pixels are, and ego vehicle where any is. All LiDAR returns are kept; the class of a block
+    is that of its centre. Incomplete blocks at the right and lower edge are dropped."""
     width, height = view.view.width // factor, view.view.height // factor
     K = view.view.K.clone()
     K[:2] /= factor
@@ -61,27 +61,27 @@ def reduced(view: TrainingView, factor: int) -> TrainingView:
         view,
         view=camera,
         pixels=colors.round().to(torch.uint8).permute(1, 2, 0).contiguous(),
-        sky=None if view.sky is None else _share(view.sky, factor) > 0.5,
-        moving=None if view.moving is None else _share(view.moving, factor) > 0.5,
-        own_car=None if view.own_car is None else _share(view.own_car, factor) > 0.0,
+        sky=None if view.sky is None else _coverage(view.sky, factor) > 0.5,
+        moving=None if view.moving is None else _coverage(view.moving, factor) > 0.5,
+        ego_mask=None if view.ego_mask is None else _coverage(view.ego_mask, factor) > 0.0,
         lidar=None if view.lidar is None else _within(view.lidar, view.view.width, camera, factor),
-        classes=None if view.classes is None else _middles(view.classes, factor),
+        classes=None if view.classes is None else _centres(view.classes, factor),
     )
 
 
-def _share(mask: Bool[Tensor, "h w"], factor: int) -> Float[Tensor, "..."]:
-    """How much of every block a mask covers."""
+def _coverage(mask: Bool[Tensor, "h w"], factor: int) -> Float[Tensor, "..."]:
+    """The fraction of every block that a mask covers."""
     return F.avg_pool2d(mask.float()[None], factor)[0]
 
 
-def _middles(values: Tensor, factor: int) -> Tensor:
-    """Those of an image (h, w) in the middle of every block."""
+def _centres(values: Tensor, factor: int) -> Tensor:
+    """The values of an image (h, w) at the centre of every block."""
     rows, columns = (size // factor for size in values.shape)
     return values[factor // 2 :: factor, factor // 2 :: factor][:rows, :columns].contiguous()
 
 
 def _within(lidar: LidarDepth, width: int, reduced: View, factor: int) -> LidarDepth | None:
-    """What LiDAR measured in an image of `width`, by the pixels of the `reduced` one; None where nothing is left."""
+    """LiDAR depth of an image of `width` at the pixels of the `reduced` one; None where none is left."""
     rows, columns = lidar.pixels // width // factor, lidar.pixels % width // factor
     seen = (rows < reduced.height) & (columns < reduced.width)
     if not bool(seen.any()):

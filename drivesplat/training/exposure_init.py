@@ -46,8 +46,8 @@ def log_colors(points: np.ndarray, views: Sequence[TrainingView], cameras: Seque
         index, rows, columns, _ = visible(points.astype(np.float64), *at, shape)
         colors = view.pixels.cpu().numpy()[rows, columns]
         valid = ((colors > VALID_LEVELS[0]) & (colors < VALID_LEVELS[1])).all(axis=1)
-        if view.own_car is not None:
-            valid &= ~view.own_car.cpu().numpy()[rows, columns]
+        if view.ego_mask is not None:
+            valid &= ~view.ego_mask.cpu().numpy()[rows, columns]
         sums[camera, index[valid]] += colors[valid]
         counts[camera, index[valid]] += 1
     return np.log(np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0) / 255.0)

@@ -1,4 +1,5 @@
-"""Floaters: Gaussians where nothing is, since the recording car drove there, or rays went through."""
+"""Floaters: Gaussians in space that is known to be empty, since the ego vehicle drove or LiDAR rays passed through
+it."""
 
 from dataclasses import dataclass
 
@@ -10,15 +11,15 @@ from drivesplat.model.part import Part
 from drivesplat.training.sparse_grid import SparseGrid
 
 LARGEST_STEP = 15.0
-"""Camera positions farther apart than this (metres) are not joined into a path."""
+"""Maximum distance in metres between consecutive camera positions that a path connects."""
 PAIRS = 2**21
-"""Points by segments that are looked at together: 25 MB an array."""
+"""Number of pairs of points and segments per batch: 25 MB an array."""
 
 
 def camera_path(centers: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Starts and ends of the segments between consecutive camera positions, in time order.
 
-    A lone position is a segment of no length.
+    An isolated position is a segment of length 0.
     """
     starts, ends = centers[:-1], centers[1:]
     joined = (ends - starts).norm(dim=1) < LARGEST_STEP
@@ -28,12 +29,12 @@ def camera_path(centers: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Fl
 def near_path(
     points: Float[Tensor, "n 3"], starts: Float[Tensor, "m 3"], ends: Float[Tensor, "m 3"], radius: float
 ) -> Bool[Tensor, " n"]:
-    """Which points are nearer than `radius` metres to any of the segments."""
+    """The mask of points nearer than `radius` metres to any of the segments."""
     along = ends - starts
     squared = along.square().sum(dim=1).clamp(min=1e-12)
     near = []
-    for some in points.split(max(1, PAIRS // max(1, len(starts)))):
-        offsets = some[:, None] - starts
+    for batch in points.split(max(1, PAIRS // max(1, len(starts)))):
+        offsets = batch[:, None] - starts
         fractions = ((offsets * along).sum(dim=2) / squared).clamp(0.0, 1.0)
         distances = (offsets - fractions[..., None] * along).square().sum(dim=2)
         near.append((distances < radius**2).any(dim=1))
@@ -42,8 +43,8 @@ def near_path(
 
 @dataclass(frozen=True)
 class EmptySpace:
-    """Where nothing stands: within `radius` metres (0: nowhere) of the cameras' path from `starts` to `ends` (m, 3),
-    and in the cells of `free`, world metres (None: in none)."""
+    """Space known to be empty: within `radius` metres (0: none) of the camera path from `starts` to `ends` (m, 3), and
+    the cells of `free` in world metres (None: none)."""
 
     starts: Float[Tensor, "m 3"]
     ends: Float[Tensor, "m 3"]
@@ -52,11 +53,11 @@ class EmptySpace:
 
     @property
     def known(self) -> bool:
-        """Whether there is any such place."""
+        """Whether any space is known to be empty."""
         return self.radius > 0 or self.free is not None
 
     def holds(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Which points lie there."""
+        """The mask of points in empty space."""
         segments = (self.starts, self.ends) if self.radius > 0 else (self.starts[:0], self.ends[:0])
         near = near_path(points, *segments, self.radius)
         return near if self.free is None else near | self.free.lookup(points)[1]
@@ -64,10 +65,9 @@ class EmptySpace:
 
 @torch.no_grad()
 def fade_floaters(part: Part, empty: EmptySpace) -> None:
-    """Fades the Gaussians of a part that stands still whose centres lie in empty space.
+    """Fades the Gaussians of a static part whose centres lie in empty space.
 
-    Centres decide, whatever a Gaussian's size: one that is large and flat has its centre in what it shows. Where rays
-    leave room around what they met, a wall's Gaussians do not reach; one whose centre is that far out shows something
-    in the air, whatever it covers behind.
+    Only centres count, whatever the size: the centre of a large flat Gaussian lies in the surface it shows. Free space
+    keeps a margin around LiDAR returns, so a centre inside it belongs to no surface.
     """
     part.fade(empty.holds(part.params["means"]))

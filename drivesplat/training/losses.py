@@ -23,9 +23,9 @@ def loss_terms(
     """The weighted terms whose sum is minimised. Gaussians that are absent at the view's time are not regularised,
     since the image could not counteract. Pixels of the ego vehicle have no effect."""
     gaussians = picture.gaussians
-    alpha = picture.alpha if view.own_car is None else picture.alpha.masked_fill(view.own_car, 1.0)
+    alpha = picture.alpha if view.ego_mask is None else picture.alpha.masked_fill(view.ego_mask, 1.0)
     moving = view.moving if settings.dynamic_weight > 0 else None
-    difference = color_difference(picture.image, view.pixels, view.own_car, moving)
+    difference = color_difference(picture.image, view.pixels, view.ego_mask, moving)
     terms = {
         "l1": (1.0 - settings.ssim_weight) * difference.l1,
         "ssim": settings.ssim_weight * (1.0 - difference.ssim),
@@ -59,7 +59,7 @@ def _dynamic_terms(
     terms = {name: term for part in model.parts for name, term in part.penalties().items()}
     alpha = model.objects_alpha(picture, view.view) if settings.entropy_weight else None
     if alpha is not None:
-        seen = alpha if view.own_car is None else alpha.masked_fill(view.own_car, 1.0)
+        seen = alpha if view.ego_mask is None else alpha.masked_fill(view.ego_mask, 1.0)
         terms["entropy"] = settings.entropy_weight * entropy(seen)
     return terms
 

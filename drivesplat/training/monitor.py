@@ -1,4 +1,4 @@
-"""What a training tells while it runs: TensorBoard, a progress bar, and a halt where numbers stop being numbers."""
+"""Monitoring of a training: TensorBoard, a progress bar, and an error for values that are NaN or Inf."""
 
 import logging
 import sys
@@ -23,18 +23,18 @@ log = logging.getLogger(__name__)
 NEVER = 2**62
 LOGGED_EVERY_S = 10.0
 PICTURE_HEIGHT = 360
-"""Pixels that TensorBoard's images are about as high as, or lower."""
+"""Approximate maximum height in pixels of images in TensorBoard."""
 
 
 class FiniteGuard:
-    """Remembers, without waiting for the device, the first iteration at which each watched value was not finite."""
+    """Records on the device the first iteration at which each watched value was not finite."""
 
     def __init__(self, device: torch.device):
         self._device = device
         self._first: dict[tuple[str, ...], Tensor] = {}
 
     def watch(self, step: int | Tensor, values: dict[str, Tensor]) -> None:
-        """Looks at the scalars `values`, by name, of an iteration, which the device may know (a scalar, int64)."""
+        """Checks the scalars `values`, by name, of an iteration `step`, an int or an int64 scalar on the device."""
         names = tuple(values)
         if names not in self._first:
             self._first[names] = torch.full((len(names),), NEVER, device=self._device)
@@ -59,13 +59,13 @@ class FiniteGuard:
 
 
 class Monitor:
-    """Scalars and images into a TensorBoard folder, how far it is into the log now and then, a progress bar where a
-    terminal looks. Raises ResultError, naming the folder, where it cannot be written."""
+    """Writes scalars and images into a TensorBoard folder, progress and remaining time into the log, and a progress bar
+    to a terminal. Raises ResultError, naming the folder, where it cannot be written."""
 
     def __init__(self, folder: Path, iterations: int, start: int, label: str):
         self._folder = folder
         self._iterations = iterations
-        self._told: tuple[int, float] | None = None
+        self._logged: tuple[int, float] | None = None
         with self._writing():
             self._writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
         self._bar = tqdm(
@@ -76,22 +76,22 @@ class Monitor:
         with self._writing():
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)
-        self._tell(step, time.monotonic())
+        self._log_progress(step, time.monotonic())
         self._bar.update(advanced)
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
 
-    def _tell(self, step: int, now: float) -> None:
-        """Logs '43 %, 12.3 it/s, 120 s left' at most every LOGGED_EVERY_S, by the speed since the last time, the first
-        iterations, in which kernels are compiled, left out; `drivesplat.workflow.costs.progress` reads it."""
-        before, began = self._told = self._told or (step, now)
+    def _log_progress(self, step: int, now: float) -> None:
+        """Logs '43 %, 12.3 it/s, 120 s left' at most every LOGGED_EVERY_S, by the speed since the last message; the
+        first iterations, which compile kernels, do not count. `drivesplat.workflow.costs.progress` reads it."""
+        before, began = self._logged = self._logged or (step, now)
         if now - began < LOGGED_EVERY_S:
             return
-        self._told, speed = (step, now), (step - before) / (now - began)
+        self._logged, speed = (step, now), (step - before) / (now - began)
         left = (self._iterations - step) / speed
         log.info("%.0f %%, %.1f it/s, %.0f s left", 100 * step / self._iterations, speed, left)
 
     def image(self, step: int, view: TrainingView, picture: Picture) -> None:
-        """Recorded and rendered side by side, reduced to what is quickly encoded."""
+        """Writes the recorded and the rendered image side by side, reduced for fast encoding."""
         pair = torch.cat([view.target(), picture.image.detach().clamp(0.0, 1.0)], dim=1).permute(2, 0, 1)
         pair = F.avg_pool2d(pair, max(1, round(pair.shape[1] / PICTURE_HEIGHT)))
         with self._writing():
@@ -106,7 +106,7 @@ class Monitor:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Closes it; what has ended the training goes before what the disk says then."""
+        """Closes the monitor; an error of the training takes precedence over one of the disk."""
         with suppress(ResultError) if kind else nullcontext():
             self.close()
 

@@ -1,4 +1,4 @@
-"""The state of an unfinished training: resumed only by the training that wrote it."""
+"""The state of an unfinished training, from which only the same training resumes."""
 
 import fcntl
 import logging
@@ -51,7 +51,7 @@ def sole_trainer(folder: Path) -> Iterator[None]:
 def state_of(
     model: SplatModel, optimizers: ModelOptimizers, densifiers: list[Densifier], device: torch.device
 ) -> dict[str, Any]:
-    """All that decides how the training goes on."""
+    """Everything that determines the rest of the training."""
     return {
         "model": {key: value.detach() for key, value in model.state_dict().items()},
         "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.all()},
@@ -63,7 +63,7 @@ def state_of(
 
 
 def restore_model(model: SplatModel, state: dict[str, torch.Tensor]) -> None:
-    """Puts saved parameters into a model, whatever its number of Gaussians was."""
+    """Loads saved parameters into a model with any number of Gaussians."""
     for name, value in state.items():
         owner_name, _, key = name.rpartition(".")
         owner = model.get_submodule(owner_name)

@@ -1,7 +1,8 @@
-"""The road under the car's path: a surface that is known, since the car stood on it.
+"""The road under the ego vehicle's path: a known surface, since the vehicle stood on it.
 
-The ego frame lies on the ground under the rear axle. Between two poses its origin goes straight, its vertical turns
-evenly; the road at a place is the plane through the nearest point of that path, square to the vertical there.
+The ego frame lies on the ground under the rear axle. Between two poses its origin and its vertical axis are
+interpolated linearly. The road at a place is the plane through the nearest point of that path, perpendicular to the
+vertical there.
 """
 
 from dataclasses import dataclass, replace
@@ -20,16 +21,16 @@ from drivesplat.training.floaters import LARGEST_STEP
 from drivesplat.training.sparse_grid import SparseGrid
 
 CELL = 0.1
-"""Edge in metres, seen from above, of the cells in which the road is a plane."""
+"""Edge in metres of the horizontal cells in each of which the road is a plane."""
 ROUGHNESS = 0.05
-"""Metres that a road, and the poses of a car on it, may be off without much ado: the loss bends there."""
+"""Tolerated error of road and poses in metres: the transition of the loss from quadratic to linear."""
 
 
 @dataclass(frozen=True)
 class Road:
-    """The road by `cells` seen from above: in each a plane, its unit `normals` (k, 3) and how far along it lies,
-    `offsets` (k,) metres; and how much it counts, `weights` (k,) in [0, 1]. Centres within `reach` metres are its own.
-    """
+    """The road by horizontal `cells`, each with a plane: its unit normal (`normals`, (k, 3)), its offset along the
+    normal in metres (`offsets`, (k,)) and its weight in [0, 1] (`weights`, (k,)). Gaussians with centres within `reach`
+    metres of the plane belong to the road."""
 
     cells: SparseGrid
     normals: Float[Tensor, "k 3"]
@@ -43,21 +44,21 @@ class Road:
 
 
 def road_loss(gaussians: Gaussians, road: Road) -> Float[Tensor, ""]:
-    """How far, in metres, the mass of the road's Gaussians lies from it: the weighted mean over them of the
-    pseudo-Huber norm sqrt(d² + nᵀ Σ n + c²) - c.
+    """The distance in metres of the road's Gaussians from its surface: the weighted mean of the pseudo-Huber norm
+    sqrt(d² + nᵀ Σ n + c²) - c.
 
     With the plane's normal n, d the height of the centre over it, and Σ the covariance, d² + nᵀ Σ n is the mean square
-    distance of a Gaussian's mass from the plane: least where the centre lies in it and the shortest axis along its
-    normal. c is ROUGHNESS: quadratic below, linear above. Gaussians farther out than `reach` are not the road's, nor is
-    what is not there, of opacity 0. 0 where there are none.
+    distance of a Gaussian's mass from the plane, minimal for a centre in the plane and the shortest axis along its
+    normal. c is ROUGHNESS. Gaussians farther away than `reach` and those of opacity 0 do not count. 0 where no Gaussian
+    counts.
     """
     if len(road.weights) == 0:
         return gaussians.means.sum() * 0.0
-    place, on_it = road.cells.lookup(gaussians.means[:, :2])
-    normals = road.normals[place]
-    heights = (gaussians.means * normals).sum(dim=1) - road.offsets[place]
-    on_it &= (heights.detach().abs() < road.reach) & (gaussians.opacities.detach() > 0.0)
-    weights = road.weights[place] * on_it
+    index, on_road = road.cells.lookup(gaussians.means[:, :2])
+    normals = road.normals[index]
+    heights = (gaussians.means * normals).sum(dim=1) - road.offsets[index]
+    on_road &= (heights.detach().abs() < road.reach) & (gaussians.opacities.detach() > 0.0)
+    weights = road.weights[index] * on_road
     axes = rotation_matrix(F.normalize(gaussians.quats, dim=1))
     along = torch.einsum("nij,ni->nj", axes, normals) * gaussians.scales
     distance = torch.sqrt(heights.square() + along.square().sum(dim=1) + ROUGHNESS**2) - ROUGHNESS
@@ -73,7 +74,7 @@ def road_of(record: TrainingRecord, settings: RoadSettings) -> Road:
 
 def driven_road(ego_to_world: np.ndarray, settings: RoadSettings) -> Road:
     """The road under a path of ego poses (m, 4, 4) in time order, on the CPU. Poses farther apart than LARGEST_STEP are
-    not joined."""
+    not connected."""
     origins, verticals = ego_to_world[:, :3, 3], ego_to_world[:, :3, 2]
     joined = np.linalg.norm(np.diff(origins, axis=0), axis=1) < LARGEST_STEP
     first = np.concatenate([np.flatnonzero(joined), np.arange(len(origins))])
@@ -81,24 +82,24 @@ def driven_road(ego_to_world: np.ndarray, settings: RoadSettings) -> Road:
     lower = np.floor((origins[:, :2].min(axis=0) - settings.half_width) / CELL) * CELL
     shape = np.ceil((origins[:, :2].max(axis=0) + settings.half_width - lower) / CELL).astype(np.int64)
     found = [
-        _beside(origins[[a, b]], verticals[[a, b]], lower, shape, settings.half_width)
+        _cells_near(origins[[a, b]], verticals[[a, b]], lower, shape, settings.half_width)
         for a, b in zip(first, last, strict=True)
     ]
-    keys, aside, normals, offsets = (np.concatenate(column) for column in zip(*found, strict=True))
-    nearest = np.lexsort([aside, keys])
+    keys, distances, normals, offsets = (np.concatenate(column) for column in zip(*found, strict=True))
+    nearest = np.lexsort([distances, keys])
     keys, nearest = (values[np.unique(keys[nearest], return_index=True)[1]] for values in (keys[nearest], nearest))
-    weights = 1.0 - (aside[nearest] / settings.half_width) ** 2
+    weights = 1.0 - (distances[nearest] / settings.half_width) ** 2
     planes = (torch.from_numpy(values[nearest]).float() for values in (normals, offsets))
     return Road(
         SparseGrid.from_numpy(lower, CELL, shape, keys), *planes, torch.from_numpy(weights).float(), settings.reach
     )
 
 
-def _beside(
+def _cells_near(
     origins: np.ndarray, verticals: np.ndarray, lower: np.ndarray, shape: np.ndarray, half_width: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The cells within `half_width` metres of a segment, seen from above: keys (c,), distances (c,), and of the planes
-    there unit normals (c, 3) and offsets (c,). `origins` and `verticals` (2, 3) are those of its ends."""
+    """The cells within `half_width` metres of a segment in the horizontal plane: keys (c,), distances (c,), and of the
+    planes there unit normals (c, 3) and offsets (c,). `origins` and `verticals` (2, 3) are those of its ends."""
     corner = np.floor((origins[:, :2].min(axis=0) - half_width - lower) / CELL).clip(0).astype(np.int64)
     end = np.minimum(np.ceil((origins[:, :2].max(axis=0) + half_width - lower) / CELL).astype(np.int64), shape)
     cells = np.stack(np.meshgrid(*map(np.arange, corner, end), indexing="ij"), axis=-1).reshape(-1, 2)
@@ -106,9 +107,9 @@ def _beside(
     length = max(float(along[:2] @ along[:2]), 1e-12)
     fraction = (((centres - origins[0, :2]) @ along[:2]) / length).clip(0.0, 1.0)[:, None]
     nearest = origins[0] + fraction * along
-    aside = np.linalg.norm(centres - nearest[:, :2], axis=1)
+    distances = np.linalg.norm(centres - nearest[:, :2], axis=1)
     normals = (1.0 - fraction) * verticals[0] + fraction * verticals[1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    near = aside < half_width
+    near = distances < half_width
     keys = cells[:, 0] * shape[1] + cells[:, 1]
-    return keys[near], aside[near], normals[near], (normals * nearest).sum(axis=1)[near]
+    return keys[near], distances[near], normals[near], (normals * nearest).sum(axis=1)[near]

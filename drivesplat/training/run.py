@@ -1,4 +1,4 @@
-"""A training from a training record to its files: checkpoint.npz and train.json."""
+"""The stage `train`: from a training record to checkpoint.npz and train.json."""
 
 import dataclasses
 import os
@@ -34,43 +34,43 @@ from drivesplat.training.views import Guides, TrainingView, load_views
 
 @dataclass(frozen=True)
 class TrainingInputs:
-    """What a training reads: the records of parser.pkl, of actors.npz and of lidar_depth.npz (empty where the method
-    has no use for them), the folder of masks, how many `classes` the user's maps there tell apart (0: none), the
-    cameras that see the own car, `sky_known` (where no sky was found, it is not known of any pixel that it is none),
-    and the record of free_space.npz (None where the method has no use for it)."""
+    """The inputs of a training: the training record, the folder of masks, the records of actors and of LiDAR depth
+    (empty where the method does not use them), the number of semantic `classes` in the user's maps (0: none), the
+    cameras that see the ego vehicle, `sky_known` (False where no sky was found, so that sky masks say nothing), and the
+    record of free space (None where the method does not use it)."""
 
     record: TrainingRecord
     masks: Path
     actors: list[ActorRecord]
     lidar_depth: list[PixelDepths]
     classes: int = 0
-    seeing_own_car: frozenset[str] = frozenset()
+    cameras_with_ego: frozenset[str] = frozenset()
     sky_known: bool = True
     free_space: FreeSpace | None = None
 
     def guides(self, job: TrainJob) -> Guides:
-        """What `job` wants to know of the training images."""
+        """The guides of the training images that `job` uses."""
         images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         moving_wanted = self.actors and job.train.dynamic_weight
-        seeing = [i for i in images if self.record.camera_name(i) in self.seeing_own_car]
+        with_ego = [i for i in images if self.record.camera_name(i) in self.cameras_with_ego]
         return Guides(
             sky=_of_each(images, self._sky) if sky_wanted else {},
             moving=_of_each(images, self._moving) if moving_wanted else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
-            classes=_of_each(images, self._classes) if self.told_apart(job) else {},
-            own_car=_of_each(seeing, self._own_car),
+            classes=_of_each(images, self._classes) if self.semantic_classes(job) else {},
+            ego_mask=_of_each(with_ego, self._ego_mask),
         )
 
-    def told_apart(self, job: TrainJob) -> int:
-        """How many classes the Gaussians of `job` tell apart."""
+    def semantic_classes(self, job: TrainJob) -> int:
+        """The number of semantic classes that `job` learns."""
         return self.classes if job.train.semantic_weight else 0
 
     def _sky(self, index: int) -> np.ndarray:
         return read_sky_mask(self.masks, *self._image(index))
 
     def exposed(self, job: TrainJob) -> tuple[str, ...]:
-        """The cameras with training images whose exposure `job` learns: all but the reference."""
+        """The cameras whose exposure `job` learns: all with training images but the reference camera."""
         if job.reference_camera is None:
             return ()
         seen = {self.record.camera_name(i) for i in self.record.train_images}
@@ -79,7 +79,7 @@ class TrainingInputs:
     def _classes(self, index: int) -> np.ndarray:
         return read_classes(self.masks, *self._image(index))
 
-    def _own_car(self, index: int) -> np.ndarray:
+    def _ego_mask(self, index: int) -> np.ndarray:
         return read_labels(self.masks, *self._image(index)) == LABELS["own_car"]
 
     def _moving(self, index: int) -> np.ndarray:
@@ -94,8 +94,8 @@ class TrainingInputs:
 def read_inputs(
     parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str], free_space: Sequence[str]
 ) -> tuple[TrainingInputs, list[dict[str, Any]]]:
-    """The inputs of a training from parser.pkl, masks.json and, where they are given, actors.npz, lidar_depth.npz and
-    free_space.npz, with the provenances of these files."""
+    """Reads the inputs of a training from the files of the parser, of masks and, where given, of actors, LiDAR depth
+    and free space; returns them with the provenances of these files."""
     folder = Path(masks).parent
     record, made = read_training_record(parser), read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
@@ -117,20 +117,20 @@ def read_inputs(
 
 @dataclass(frozen=True)
 class TrainingFiles:
-    """What a training writes."""
+    """The files that a training writes."""
 
     checkpoint: Path
     summary: Path
 
     @property
     def resume(self) -> Path:
-        """What a killed training goes on from; undeclared, so that Snakemake leaves it alone."""
+        """The folder from which a killed training resumes; no rule declares it, so Snakemake keeps it."""
         return self.checkpoint.parent / "resume"
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """What stands ready when a training's first iteration begins."""
+    """What the first iteration of a training needs."""
 
     model: SplatModel
     views: list[TrainingView]
@@ -139,7 +139,7 @@ class Prepared:
 
 
 def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
-    """The training images on the device, an untrained model, and the settings with the cap that holds for them."""
+    """Loads the training images onto the device, builds an untrained model, and resolves the cap in the settings."""
     with explain_out_of_memory(lambda: 0):
         views = load_views(inputs.record, inputs.guides(job), device)
     settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.record, job.train)})
@@ -148,7 +148,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         inputs.record,
         inputs.actors,
         mean_sky_color(views),
-        inputs.told_apart(job),
+        inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
         _times_by_camera(views) if job.train.camera_poses.corrected else {},
     )
@@ -166,8 +166,8 @@ def run_training(
     provenance: dict[str, Any],
     label: str,
 ) -> None:
-    """Trains and writes both files, or raises and leaves neither; the resume state outlives a failure, and a training
-    whose parent has been killed meanwhile: Snakemake, which did not see it end, will have it made again."""
+    """Trains and writes both files, or raises and writes neither. The resume state is kept after a failure, and where
+    the parent process was killed meanwhile: Snakemake did not see this training end and will run it again."""
     started_by = os.getppid()
     with resume_state.sole_trainer(files.resume):
         device = choose_device(device_settings)
@@ -191,17 +191,17 @@ def run_training(
 
 
 def read_summary(path: str | Path) -> dict[str, Any]:
-    """Reads `train.json`. Raises ResultError where it is not one."""
+    """Reads `train.json`. Raises ResultError for any other file."""
     return read_record(path, "train", *(field.name for field in dataclasses.fields(TrainingSummary)), "provenance")
 
 
 def _of_each(images: Sequence[int], read: Callable[[int], np.ndarray]) -> dict[int, np.ndarray]:
-    """What is read of each image, by its number."""
+    """Reads a value for each image, by its number."""
     return dict(zip(images, ahead(read, images), strict=True))
 
 
 def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
-    """By camera the seconds of its training images, increasing."""
+    """The increasing times of the training images of every camera, in seconds."""
     times: dict[str, set[float]] = {}
     for view in views:
         times.setdefault(view.view.camera, set()).add(view.view.time)
@@ -209,8 +209,8 @@ def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
 
 
 def learns_from_sky_masks(job: TrainJob) -> bool:
-    """Whether a term of the loss looks at sky masks; otherwise only the sky's first colour does, and the device need
-    not hold them, a byte a pixel, while it trains."""
+    """Whether a loss term uses sky masks. Otherwise only the initial colour of the sky does, and the masks, a byte per
+    pixel, need not stay on the device."""
     return job.sky == "mask" or job.train.sky_bce_weight > 0
 
 

@@ -1,4 +1,4 @@
-"""The stage `train`: Gaussians fitted to the training images of a scene."""
+"""The training loop: Gaussians fitted to the training images of a scene, with resume state and logs."""
 
 import logging
 import shutil
@@ -27,9 +27,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrainingFolders:
-    """Where a training keeps what outlives it.
+    """The folders of a training's resume state and TensorBoard log.
 
-    `resume` is a folder no rule declares; `fingerprint` is that of settings, code and inputs.
+    No rule declares `resume`; `fingerprint` is that of settings, code and inputs, `label` that of the progress bar.
     """
 
     resume: Path
@@ -44,10 +44,10 @@ class TrainingFolders:
 
 @dataclass(frozen=True)
 class TrainingSummary:
-    """What `train.json` says of a finished training.
+    """The content of `train.json`.
 
-    `peak_gpu_memory_gb`, what torch held at its peak, is None on the CPU; `seconds` counts resumed runs too;
-    `of_cameras` has what was learned of each camera, by name: gains and offsets, how far poses were corrected.
+    `peak_gpu_memory_gb` is torch's peak reservation, None on the CPU; `seconds` includes the runs before a resume;
+    `of_cameras` are the learned gains, offsets and pose corrections of each camera, by name.
     """
 
     iterations: int
@@ -70,22 +70,22 @@ def train(
     priors: GeometryPriors = NO_PRIORS,
     clock: Clock = UNTIMED,
 ) -> TrainingSummary:
-    """Fits `model` in place, resuming where an earlier run of the same training was ended; `clock` times its stages.
+    """Fits `model` in place, resuming an interrupted run of the same training; `clock` times its stages.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock)
-        run = Run.begin(trainer, folders)
+        run = TrainingRun.begin(trainer, folders)
         with Monitor(folders.tensorboard, settings.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
         return run.summary()
 
 
 @dataclass
-class Run:
-    """A training and its place on disk: what was done before this process, and what outlives it."""
+class TrainingRun:
+    """A training and its state on disk."""
 
     trainer: Trainer
     folders: TrainingFolders
@@ -93,11 +93,11 @@ class Run:
     resumed_at: list[int]
     began: float
     saved: float
-    """When its state was last known on disk, or began (by `time.monotonic`, as `began`)."""
+    """When the state was last saved, or else when this run began (`time.monotonic`, as `began`)."""
 
     @classmethod
-    def begin(cls, trainer: Trainer, folders: TrainingFolders) -> "Run":
-        """Takes up the folders's resume state if this training wrote it; otherwise starts at 0."""
+    def begin(cls, trainer: Trainer, folders: TrainingFolders) -> "TrainingRun":
+        """Resumes from the state in `folders` if this training wrote it; otherwise starts at 0."""
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(trainer.device)
@@ -113,7 +113,7 @@ class Run:
 
     @property
     def seconds(self) -> float:
-        """Training time so far, earlier processes included."""
+        """Training time so far, including earlier runs."""
         return self.seconds_before + time.monotonic() - self.began
 
     def check(self) -> None:
@@ -126,7 +126,7 @@ class Run:
             )
 
     def save(self) -> None:
-        """Writes the resume state, unless the training has gone wrong."""
+        """Writes the resume state, unless a check fails."""
         self.check()
         t = self.trainer
         content = {
@@ -141,10 +141,10 @@ class Run:
 
     @property
     def save_due(self) -> bool:
-        """Whether the state is to be kept now: of the last iteration the training's own files are."""
+        """Whether to save the resume state now; after the last iteration the checkpoint is saved instead."""
         step, settings = self.trainer.step, self.trainer.settings
-        apart = time.monotonic() - self.saved >= settings.checkpoint_apart_s
-        return step % settings.checkpoint_every == 0 and step < settings.iterations and apart
+        old_enough = time.monotonic() - self.saved >= settings.checkpoint_apart_s
+        return step % settings.checkpoint_every == 0 and step < settings.iterations and old_enough
 
     def summary(self) -> TrainingSummary:
         t, on_gpu = self.trainer, self.trainer.device.type == "cuda"
@@ -159,24 +159,24 @@ class Run:
             device=device_name(t.device),
             random_seed=t.seed,
             resumed_at=self.resumed_at,
-            of_cameras=learned_of_cameras(t.model),
+            of_cameras=camera_figures(t.model),
         )
 
 
-def _iterate(run: Run, monitor: Monitor) -> None:
+def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
     path = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.images.views]))
     empty = EmptySpace(*path, settings.floaters.radius, trainer.priors.free)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):
-            shown = (trainer.step + 1) % settings.image_every == 0
-            terms, picture, view = trainer.fit_one(shown)
+            with_picture = (trainer.step + 1) % settings.image_every == 0
+            terms, picture, view = trainer.fit_one(with_picture)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
             if trainer.step % settings.log_every == 0:
                 run.check()
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
-            if shown and picture is not None:
+            if with_picture and picture is not None:
                 monitor.image(trainer.step, view, picture)
             if run.save_due:
                 run.save()
@@ -184,11 +184,11 @@ def _iterate(run: Run, monitor: Monitor) -> None:
     trainer.end()
 
 
-def _densify(run: Run, picture: Picture | None, empty: EmptySpace) -> None:
-    """Ends an iteration: each part grows and moves its Gaussians, and those that must not be there fade."""
+def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> None:
+    """Ends an iteration: densifies each part and fades Gaussians in empty space."""
     trainer, settings = run.trainer, run.trainer.settings
     if trainer.densifies():
-        run.check()  # a strategy fed with what is no number ends in an assertion on the GPU, beyond rescue
+        run.check()  # NaN in a strategy triggers a GPU assertion, after which the process cannot continue
         trainer.graphs.check()
         for part in trainer.model.parts:
             part.confine()
@@ -202,12 +202,12 @@ def _densify(run: Run, picture: Picture | None, empty: EmptySpace) -> None:
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:
     losses = {f"loss/{name}": float(value) for name, value in terms.items()}
-    of_cameras = learned_of_cameras(trainer.model)
+    of_cameras = camera_figures(trainer.model)
     return {"loss/total": sum(losses.values()), **losses, "gaussians": float(len(trainer.model)), **of_cameras}
 
 
-def learned_of_cameras(model: SplatModel) -> dict[str, float]:
-    """What a model has learned of cameras, by name: 'exposure/CAM_BACK/gain_red', 'camera_poses/CAM_FRONT/shift_m'."""
+def camera_figures(model: SplatModel) -> dict[str, float]:
+    """The learned figures of cameras by name: 'exposure/CAM_BACK/gain_red', 'camera_poses/CAM_FRONT/shift_m'."""
     learned = {"exposure": model.exposure, "camera_poses": model.camera_poses}
     return {
         f"{kind}/{name}": value

@@ -1,4 +1,4 @@
-"""The training images on the device, as bytes, with their cameras."""
+"""The training images on the device, as uint8, with their cameras."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,7 +18,8 @@ from drivesplat.scene.training_record import TrainingRecord
 
 @dataclass(frozen=True)
 class LidarDepth:
-    """What LiDAR measured in an image: at `pixels` (m,), counted row by row, `depth` (m,) metres along the axis."""
+    """LiDAR depth of an image: at row-major pixel indices `pixels` (m,), `depth` (m,) in metres along the optical
+    axis."""
 
     pixels: Int[Tensor, " m"]
     depth: Float[Tensor, " m"]
@@ -26,9 +27,9 @@ class LidarDepth:
 
 @dataclass(frozen=True)
 class TrainingView:
-    """A camera and what it recorded; `sky` and `moving` are True where the sky is and where something moves, None where
-    that is unknown or not wanted; so are `lidar`, the `classes` of its pixels (UNLABELLED: none) and the pixels of the
-    `own_car`, which are neither sky nor moving, have no class and no depth, and of which nothing is to be learned."""
+    """A camera and its recorded image, with masks of `sky` and of `moving` objects, `lidar` depth, semantic `classes`
+    (UNLABELLED: none) and the `ego_mask`; each None where it is unknown or not wanted. Pixels of the ego vehicle are in
+    no other mask, have no class and no depth, and do not supervise the training."""
 
     view: View
     pixels: UInt8[Tensor, "h w 3"]
@@ -36,7 +37,7 @@ class TrainingView:
     moving: Bool[Tensor, "h w"] | None = None
     lidar: LidarDepth | None = None
     classes: UInt8[Tensor, "h w"] | None = None
-    own_car: Bool[Tensor, "h w"] | None = None
+    ego_mask: Bool[Tensor, "h w"] | None = None
 
     def target(self) -> Float[Tensor, "h w 3"]:
         """The recorded colours in [0, 1]."""
@@ -45,22 +46,22 @@ class TrainingView:
 
 @dataclass(frozen=True)
 class Guides:
-    """What is known of training images beside their pixels, by their number: masks (h, w) bool of the `sky` and of what
-    is `moving`, of the `own_car`, `classes` (h, w) uint8, and the records of `lidar` (rows, columns, depth); an empty
-    mapping where a guide is not wanted."""
+    """Data of training images beside their pixels, by image number: masks (h, w) bool of `sky`, `moving` objects and
+    the ego vehicle (`ego_mask`), `classes` (h, w) uint8, and records of `lidar` (rows, columns, depth). Mappings of
+    unused guides are empty."""
 
     sky: Mapping[int, np.ndarray]
     moving: Mapping[int, np.ndarray]
     lidar: Mapping[int, PixelDepths]
     classes: Mapping[int, np.ndarray] = field(default_factory=dict)
-    own_car: Mapping[int, np.ndarray] = field(default_factory=dict)
+    ego_mask: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 def load_views(record: TrainingRecord, guides: Guides, device: torch.device) -> list[TrainingView]:
     """The training images of a training record, with all masks at training resolution; a camera's images share the mask
-    of the own car."""
+    of the ego vehicle."""
     views: list[TrainingView] = []
-    bodies: dict[bytes, Tensor] = {}
+    known_masks: dict[bytes, Tensor] = {}
     images = record.train_images
     recorded = ahead(lambda i: read_image(record.image_paths[i], record.image_size(i)), images)
     for index, image in zip(images, recorded, strict=True):
@@ -70,15 +71,15 @@ def load_views(record: TrainingRecord, guides: Guides, device: torch.device) -> 
             torch.from_numpy(masks[index].copy()).to(device) if index in masks else None
             for masks in (guides.sky, guides.moving, guides.classes)
         )
-        body = guides.own_car.get(index)
+        body = guides.ego_mask.get(index)
         lidar = _lidar_depth(guides.lidar[index], size[0], body, device) if index in guides.lidar else None
-        own_car = _shared(body, bodies, device) if body is not None and body.any() else None
-        views.append(TrainingView(view_of(record, index, device), pixels, sky, moving, lidar, classes, own_car))
+        ego_mask = _shared(body, known_masks, device) if body is not None and body.any() else None
+        views.append(TrainingView(view_of(record, index, device), pixels, sky, moving, lidar, classes, ego_mask))
     return views
 
 
 def _shared(mask: np.ndarray, known: dict[bytes, Tensor], device: torch.device) -> Tensor:
-    """A mask (h, w) on the device, once for all that are the same."""
+    """A mask (h, w) on the device; equal masks share one tensor."""
     key = np.packbits(mask).tobytes()
     if key not in known:
         known[key] = torch.from_numpy(mask.copy()).to(device)
@@ -96,13 +97,13 @@ def _lidar_depth(record: PixelDepths, width: int, body: np.ndarray | None, devic
     return LidarDepth(torch.from_numpy(pixels).to(device), torch.from_numpy(depth).float().to(device))
 
 
-def order(count: int, step: int, seed: int) -> int:
-    """Which of `count` views step `step` sees: a new seeded permutation every epoch, known without the steps before."""
+def view_index(count: int, step: int, seed: int) -> int:
+    """The index of the view of a step: a new seeded permutation every epoch, independent of earlier steps."""
     epoch, position = divmod(step, count)
     return _epoch(count, epoch, seed)[position]
 
 
 @lru_cache(maxsize=2)
 def _epoch(count: int, epoch: int, seed: int) -> list[int]:
-    """The order of an epoch's views, worked out once for all of its steps."""
+    """The order of the views in an epoch."""
     return np.random.default_rng((seed, epoch)).permutation(count).tolist()

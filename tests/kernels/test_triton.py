@@ -275,9 +275,9 @@ def test_a_training_with_triton_agrees_with_one_without(body, monkeypatch):
         stretch(model)
         views = guided_views(DEVICE)
         if body:
-            own_car = torch.zeros_like(views[0].sky)
-            own_car[-4:, 5:20] = True
-            views = [dataclasses.replace(view, own_car=own_car) for view in views]
+            ego_mask = torch.zeros_like(views[0].sky)
+            ego_mask[-4:, 5:20] = True
+            views = [dataclasses.replace(view, ego_mask=ego_mask) for view in views]
         before = {name: value.clone() for name, value in model.state_dict().items()}
         trainer = Trainer.begin(model.to(DEVICE), views, settings, 0, DEVICE)
         for _ in range(2):

@@ -237,7 +237,7 @@ def test_the_gains_of_the_demo_rig_are_estimated_before_the_training(rig):
     views = load_views(rig.record, Guides({}, {}, {}), CPU)
     found = initial_gains(rig.record, views, ["CAM_BACK"], "CAM_FRONT")
     np.testing.assert_allclose(found["CAM_BACK"], np.power([1.4, 1.1, 0.75], 1 / 2.2), rtol=0.03)
-    hidden = [dataclasses.replace(v, own_car=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]
+    hidden = [dataclasses.replace(v, ego_mask=torch.ones(v.pixels.shape[:2], dtype=torch.bool)) for v in views]
     np.testing.assert_array_equal(initial_gains(rig.record, hidden, ["CAM_BACK"], "CAM_FRONT")["CAM_BACK"], np.ones(3))
 
 

@@ -12,7 +12,7 @@ from drivesplat.scene.masks import UNLABELLED
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
-from drivesplat.training.views import LidarDepth, TrainingView, order
+from drivesplat.training.views import LidarDepth, TrainingView, view_index
 
 WIDTH, HEIGHT = 14, 9
 LEAST_HEIGHT = CoarseToFineSettings().least_height
@@ -32,7 +32,7 @@ def test_colours_are_means_over_blocks_and_what_fills_none_is_left_out():
     assert small.pixels.dtype == torch.uint8 and small.pixels.shape == (2, 3, 3)
     assert np.abs(small.pixels.numpy() - blocks).max() <= 0.5
     assert (small.view.width, small.view.height, small.view.time, small.view.camera) == (3, 2, 1.5, "CAM_FRONT")
-    assert all(getattr(small, guide) is None for guide in ("sky", "moving", "own_car", "lidar", "classes"))
+    assert all(getattr(small, guide) is None for guide in ("sky", "moving", "ego_mask", "lidar", "classes"))
 
 
 @pytest.mark.parametrize("factor", [2, 4])
@@ -51,16 +51,16 @@ def test_a_reduced_camera_sees_the_blocks_of_the_whole_one(factor):
     assert np.abs(images[1] - blocks).max() < 0.01
 
 
-def test_masks_hold_where_most_of_a_block_is_and_the_own_car_where_any_is():
+def test_blocks_take_masks_by_majority_and_the_ego_mask_by_any_pixel():
     share = {"none": 0, "a corner": 1, "half": 8, "most": 9}
     mask = torch.zeros(4, 4 * len(share), dtype=torch.bool)
     for i, count in enumerate(share.values()):
         block = mask[:, 4 * i : 4 * i + 4]
         block.copy_((torch.arange(16) < count).reshape(4, 4))
-    view = dataclasses.replace(a_view(16, 4), sky=mask, moving=mask, own_car=mask)
+    view = dataclasses.replace(a_view(16, 4), sky=mask, moving=mask, ego_mask=mask)
     small = reduced(view, 4)
     assert small.sky.tolist() == small.moving.tolist() == [[False, False, False, True]]
-    assert small.own_car.tolist() == [[False, True, True, True]]
+    assert small.ego_mask.tolist() == [[False, True, True, True]]
 
 
 def test_lidar_keeps_its_depths_at_the_blocks_they_fall_into():
@@ -94,7 +94,7 @@ def images_of(height: int, count: int = 3, **changes: float) -> TrainingImages:
 def test_images_are_whole_where_it_is_said():
     images = images_of(4 * LEAST_HEIGHT)
     assert {images.factor(step) for step in range(100)} == {1}
-    assert images.at(5) is images.views[order(3, 5, 7)] is images.views[images.number(5)]
+    assert images.at(5) is images.views[view_index(3, 5, 7)] is images.views[images.number(5)]
 
 
 @pytest.mark.parametrize(
@@ -118,6 +118,6 @@ def test_reduced_images_come_in_the_order_of_whole_ones_and_once_each_is_made(mo
     for i, view in enumerate(images.views):
         view.pixels.fill_(10 * i)
     seen = [images.at(step) for step in range(100)]
-    assert [int(view.pixels[0, 0, 0]) // 10 for view in seen] == [order(3, step, 7) for step in range(100)]
+    assert [int(view.pixels[0, 0, 0]) // 10 for view in seen] == [view_index(3, step, 7) for step in range(100)]
     assert len({id(view) for view in seen[:50]}) == 3, "reduced once, not at every look"
     assert {id(view) for view in seen[50:]} == {id(view) for view in images.views}

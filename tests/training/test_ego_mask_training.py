@@ -55,11 +55,11 @@ CORNER[HEIGHT // 2 :, : WIDTH // 2] = True
 
 def views_with_a_body(masked: bool) -> list[TrainingView]:
     """Cameras in a row, each with something magenta before its lower left quarter; what that hides others see."""
-    own_car = torch.from_numpy(CORNER)
+    ego_mask = torch.from_numpy(CORNER)
     views = []
     for view in recorded_views(8):
-        pixels = torch.where(own_car[..., None], torch.tensor(BODY, dtype=torch.uint8), view.pixels)
-        views.append(dataclasses.replace(view, pixels=pixels, own_car=own_car if masked else None))
+        pixels = torch.where(ego_mask[..., None], torch.tensor(BODY, dtype=torch.uint8), view.pixels)
+        views.append(dataclasses.replace(view, pixels=pixels, ego_mask=ego_mask if masked else None))
     return views
 
 
@@ -87,11 +87,11 @@ def test_a_body_before_the_camera_is_not_learned_and_what_it_hides_is(tmp_path):
 def test_images_of_a_camera_share_the_mask_of_the_body_and_have_no_depth_there(tmp_path):
     depth = PixelDepths(np.array([2, 20], np.int32), np.array([3, 4], np.int32), np.array([5.0, 6.0]))
     none = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    guides = Guides({}, {}, dict.fromkeys(range(5), depth), own_car={0: CORNER, 1: CORNER.copy(), 3: none})
+    guides = Guides({}, {}, dict.fromkeys(range(5), depth), ego_mask={0: CORNER, 1: CORNER.copy(), 3: none})
     first, second, empty, unknown = load_views(parser_record(tmp_path, recorded_views()), guides, CPU)
-    assert first.own_car.data_ptr() == second.own_car.data_ptr() and first.own_car.dtype == torch.bool
-    np.testing.assert_array_equal(first.own_car.numpy(), CORNER)
-    assert empty.own_car is None and unknown.own_car is None, "a mask without pixels costs nothing"
+    assert first.ego_mask.data_ptr() == second.ego_mask.data_ptr() and first.ego_mask.dtype == torch.bool
+    np.testing.assert_array_equal(first.ego_mask.numpy(), CORNER)
+    assert empty.ego_mask is None and unknown.ego_mask is None, "a mask without pixels costs nothing"
     assert first.lidar.depth.tolist() == [5.0] and unknown.lidar.depth.tolist() == [5.0, 6.0]
 
 
@@ -130,8 +130,8 @@ def test_the_device_holds_sky_masks_where_a_loss_looks_at_them(tmp_path, monkeyp
 
 def test_only_cameras_that_see_the_body_are_asked_for_it(tmp_path):
     inputs = inputs_in(tmp_path, actors=True)
-    assert inputs.guides(job_of()).own_car == {}
-    asked = dataclasses.replace(inputs, seeing_own_car=frozenset({"CAM_FRONT"})).guides(job_of()).own_car
+    assert inputs.guides(job_of()).ego_mask == {}
+    asked = dataclasses.replace(inputs, cameras_with_ego=frozenset({"CAM_FRONT"})).guides(job_of()).ego_mask
     assert list(asked) == [0, 1, 3, 4] and not any(mask.any() for mask in asked.values())
 
 
@@ -147,11 +147,11 @@ def prepared(tmp_path_factory) -> Path:
     search = EgoMaskSearch(cameras=("CAM_BACK",), holdout=holdout, own_car_radius=2.5)
     record = own_car_record(scene, EgoMaskJob(polygons={}, search=search))
     write_json(folder / "own_car.json", {**record, "provenance": {"made": "own_car"}})
-    own_car, _ = read_own_car(folder / "own_car.json")
-    made = make_masks(scene, MaskJob(masks=MaskSettings(), holdout=holdout, images=images), folder / "masks", own_car)
+    ego_mask, _ = read_own_car(folder / "own_car.json")
+    made = make_masks(scene, MaskJob(masks=MaskSettings(), holdout=holdout, images=images), folder / "masks", ego_mask)
     write_json(folder / "masks/masks.json", {**made, "provenance": {}})
     settings = LidarSeedSettings(max_points=2000, far_points=500)
-    seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0), own_car)
+    seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0), ego_mask)
     record = training_record(scene, seed, ParserJob(holdout=holdout, images=images))
     write_training_record(folder / "parser.pkl", record)
     return folder
@@ -159,17 +159,17 @@ def prepared(tmp_path_factory) -> Path:
 
 def test_a_body_that_was_found_reaches_the_training_of_its_camera(prepared, monkeypatch, tmp_path):
     inputs, _ = read_inputs(str(prepared / "parser.pkl"), str(prepared / "masks/masks.json"), [], [], [])
-    assert inputs.seeing_own_car == {"CAM_BACK"}
+    assert inputs.cameras_with_ego == {"CAM_BACK"}
     assert json.loads((prepared / "masks/masks.json").read_text())["own_car"] == {"CAM_BACK": "images"}
     job = job_of(sky="mask", iterations=3, checkpoint_every=10)
     with monkeypatch.context() as patched:
         views = views_given(patched, tmp_path, inputs, job)
     true = true_body("CAM_BACK")
     for view in views:
-        assert (view.own_car is not None) == (view.view.camera == "CAM_BACK")
-        if view.own_car is not None:
-            assert view.own_car.numpy()[true].mean() > 0.9 and not view.sky[view.own_car].any()
-    assert len({view.own_car.data_ptr() for view in views if view.own_car is not None}) == 1
+        assert (view.ego_mask is not None) == (view.view.camera == "CAM_BACK")
+        if view.ego_mask is not None:
+            assert view.ego_mask.numpy()[true].mean() > 0.9 and not view.sky[view.ego_mask].any()
+    assert len({view.ego_mask.data_ptr() for view in views if view.ego_mask is not None}) == 1
     files = files_in(tmp_path / "trained")
     run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
     model, _ = trained_model(read_checkpoint(files.checkpoint))

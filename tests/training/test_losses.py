@@ -431,17 +431,17 @@ def test_only_what_moves_is_made_sure_of():
 
 def beneath(seen: TrainingView) -> TrainingView:
     """A view at whose lower left the own car's body is seen, told as the masks tell it."""
-    own_car = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    own_car[9:, :12] = True
+    ego_mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    ego_mask[9:, :12] = True
     columns, rows = seen.lidar.pixels % WIDTH, seen.lidar.pixels // WIDTH
-    clear = ~own_car[rows, columns]
+    clear = ~ego_mask[rows, columns]
     lidar = LidarDepth(seen.lidar.pixels[clear], seen.lidar.depth[clear])
-    classes = torch.where(own_car, 255, torch.randint(0, 3, (HEIGHT, WIDTH), generator=torch.manual_seed(0)))
+    classes = torch.where(ego_mask, 255, torch.randint(0, 3, (HEIGHT, WIDTH), generator=torch.manual_seed(0)))
     return dataclasses.replace(
         seen,
-        own_car=own_car,
-        sky=seen.sky & ~own_car,
-        moving=seen.moving & ~own_car,
+        ego_mask=ego_mask,
+        sky=seen.sky & ~ego_mask,
+        moving=seen.moving & ~ego_mask,
         lidar=lidar,
         classes=classes.to(torch.uint8),
     )
@@ -458,7 +458,7 @@ def image_terms(picture: Picture, view: TrainingView, model: SplatModel) -> dict
     return {name: term for name, term in terms.items() if not name.endswith("_reg") and not name.startswith("track")}
 
 
-def test_no_term_pulls_on_what_the_own_car_hides():
+def test_no_term_has_a_gradient_behind_the_ego_mask():
     """Colours, opacities and depths of its pixels get no gradient; those of all others get that of the picture with
     the recorded body in its place."""
     model, picture, seen = street()
@@ -469,44 +469,44 @@ def test_no_term_pulls_on_what_the_own_car_hides():
     sum(term for name, term in terms.items() if name != "entropy").backward()
     for name, leaf in leaves.items():
         assert leaf.grad.abs().sum() > 0.0, name
-        assert not leaf.grad[view.own_car].any(), name
-    beside = torch.zeros_like(view.own_car)
+        assert not leaf.grad[view.ego_mask].any(), name
+    beside = torch.zeros_like(view.ego_mask)
     beside[7:9, :12] = True
     assert leaves["image"].grad[beside].abs().min() > 0.0, "what is seen beside the body still counts"
 
 
-def test_what_the_own_car_hides_changes_no_term():
+def test_pixels_of_the_ego_mask_change_no_term():
     model, picture, seen = street()
     view = beneath(seen)
     hidden = dataclasses.replace(
         picture,
-        image=torch.where(view.own_car[..., None], 0.1, picture.image),
-        alpha=torch.where(view.own_car, 0.4, picture.alpha),
-        depth=torch.where(view.own_car, 90.0, picture.depth),
+        image=torch.where(view.ego_mask[..., None], 0.1, picture.image),
+        alpha=torch.where(view.ego_mask, 0.4, picture.alpha),
+        depth=torch.where(view.ego_mask, 90.0, picture.depth),
     )
     before, after = (image_terms(p, view, model) for p in (picture, hidden))
     for name, term in before.items():
         assert torch.equal(term, after[name]), name
-    plain = dataclasses.replace(view, own_car=None)
+    plain = dataclasses.replace(view, ego_mask=None)
     assert not torch.equal(*(image_terms(p, plain, model)["ssim"] for p in (picture, hidden)))
 
 
-def test_pixels_beside_the_own_car_weigh_what_they_do_elsewhere():
+def test_pixels_beside_the_ego_mask_keep_their_weight():
     """L1 and SSIM are means over all pixels of the picture with the recorded body before it."""
     picture, plain = a_case(model := a_model())
-    own_car = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    own_car[9:] = True
-    terms = loss_terms(picture, dataclasses.replace(plain, own_car=own_car), model, TrainSettings(ssim_weight=0.3))
+    ego_mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    ego_mask[9:] = True
+    terms = loss_terms(picture, dataclasses.replace(plain, ego_mask=ego_mask), model, TrainSettings(ssim_weight=0.3))
     recorded = plain.pixels.numpy() / 255.0
-    shown = np.where(own_car[..., None], recorded, picture.image.numpy())
+    shown = np.where(ego_mask[..., None], recorded, picture.image.numpy())
     assert float(terms["l1"]) == pytest.approx(0.7 * np.abs(shown - recorded).mean(), rel=1e-5)
     assert float(terms["ssim"]) == pytest.approx(0.3 * (1.0 - zero_padded_ssim(shown, recorded)), abs=1e-4)
 
 
-def test_actors_behind_the_own_car_are_not_made_sure_of():
+def test_entropy_ignores_actors_behind_the_ego_mask():
     """The body fills the image: of the entropy nothing is left, and no opacity is pulled."""
     model, picture, seen = street()
-    view = dataclasses.replace(seen, own_car=torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
+    view = dataclasses.replace(seen, ego_mask=torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
     term = loss_terms(picture, view, model, TrainSettings())["entropy"]
     assert float(term.detach()) == pytest.approx(0.0, abs=2e-4)
     term.backward()

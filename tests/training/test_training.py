@@ -69,7 +69,7 @@ from drivesplat.training.run import TrainingFiles, mean_sky_color, run_training
 from drivesplat.training.sparse_grid import SparseGrid
 from drivesplat.training.train import TrainingSummary, train
 from drivesplat.training.trainer import Trainer
-from drivesplat.training.views import Guides, TrainingView, load_views, order
+from drivesplat.training.views import Guides, TrainingView, load_views, view_index
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -250,14 +250,14 @@ def test_spherical_harmonics_gain_a_degree_at_a_time(step, degree):
 
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_every_epoch_sees_every_view_once_in_an_order_of_its_own(count):
-    epochs = [[order(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
+    epochs = [[view_index(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
     assert all(sorted(epoch) == list(range(count)) for epoch in epochs)
     assert count == 1 or len({tuple(epoch) for epoch in epochs}) > 1
-    assert epochs == [[order(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
+    assert epochs == [[view_index(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
 
 
 def test_the_order_of_views_hangs_on_the_seed():
-    assert [order(20, i, seed=1) for i in range(20)] != [order(20, i, seed=2) for i in range(20)]
+    assert [view_index(20, i, seed=1) for i in range(20)] != [view_index(20, i, seed=2) for i in range(20)]
 
 
 def test_views_are_the_training_images_and_no_others(tmp_path):
