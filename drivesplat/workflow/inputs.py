@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import DriveSplatError
+from drivesplat.provenance.file_digests import record_output
 from drivesplat.readers.datasets import index, layout
 from drivesplat.readers.truth import TRUTH_FILE
 from drivesplat.scene.scene import REFINED
@@ -58,7 +59,12 @@ class Inputs:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise unwritable_results(self.config, error) from error
+            files = [index(dataset.reader).scene_file(folder, scene) for scene in dataset.scenes]
+            before = [_modified(file) for file in files]
             index(dataset.reader).index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder)
+            for file, modified in zip(files, before, strict=True):
+                if _modified(file) != modified:
+                    record_output(file, "extract", {}, {})
             self._folders[name] = folder
         return self._folders[name]
 
@@ -126,3 +132,8 @@ class Inputs:
     def backbone_file(self, _: Any) -> list[str]:
         """The backbone itself if it is present: adding it reruns the measurements that lacked it."""
         return [BACKBONE] if Path(BACKBONE).is_file() else []
+
+
+def _modified(file: Path) -> int | None:
+    """A file's modification time in ns, None if it is absent."""
+    return file.stat().st_mtime_ns if file.is_file() else None

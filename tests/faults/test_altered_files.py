@@ -69,7 +69,7 @@ def refusal(copy: WorkflowCopy, rule: str, log: Path) -> str | None:
 
     It gets no settings: a script that accepts its inputs fails soon after.
     """
-    read = next(record["read"] for record in records(copy).values() if record["rule"] == rule)
+    read = next(r["read"] for r in records(copy).values() if r["rule"] == rule and r["read"])
     name = {"scene": "scene", "scene_refined": "scene", "parser": "parser"}
     inputs = NamedFiles(**{name.get(Path(path).stem, Path(path).stem): path for path in read})
     wildcards = SimpleNamespace(scene="0001", method="street")
