@@ -1,14 +1,12 @@
-"""How many frames of a trained scene are rendered in a second, and how long its film takes.
+"""Rendering rate of a trained scene, and the time of its film.
 
     python -m benchmarks.frames results/0103/street/checkpoint.npz results/0103/scene.json --width 1600 --height 900
 
-The recorded path at 30 frames a second, twice: rendered to bytes in main memory, frame by frame, by themselves; then
-as the rule `film` does it, encoded, and read again. The first tenth of the frames is not counted among those a second.
+Renders the recorded path at 30 frames per second twice: to bytes in main memory, frame by frame; then as the rule
+`film` does, encoded and verified. The first tenth of the frames is left out of the rate.
 """
 
-import argparse
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -17,7 +15,7 @@ from typing import Any
 
 import torch
 
-from drivesplat.errors import DriveSplatError
+from benchmarks.command import argument_parser, run_command
 from drivesplat.machine.device import device_name
 from drivesplat.model.checkpoint import open_model, read_checkpoint
 from drivesplat.rendering.film import Shot, recorded_shot, render_film
@@ -27,18 +25,18 @@ from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
 
 WARM_UP = 0.1
-"""The share of the frames that is not timed."""
+"""The share of the frames before timing starts."""
 
 
 def measure(scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_settings: DeviceSettings) -> dict[str, Any]:
-    """Frames a second and the film's seconds, with what they are of: device, size, number of frames and Gaussians."""
+    """Frames per second and the film's seconds, with device, image size, number of frames and Gaussians."""
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)
     began = time.perf_counter()
     count = len(shot.cameras)
-    aside = max(1, int(WARM_UP * count))
+    warm_up = max(1, int(WARM_UP * count))
     for number, _ in enumerate(recorded_shot(model, shot, device), start=1):
-        began = time.perf_counter() if number == aside else began
+        began = time.perf_counter() if number == warm_up else began
     seconds = time.perf_counter() - began
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
@@ -50,35 +48,30 @@ def measure(scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_setti
         "height": job.height,
         "gaussians": len(model),
         "frames": count,
-        "frames_per_second": (count - aside) / seconds,
+        "frames_per_second": (count - warm_up) / seconds,
         "film_seconds": film,
         "film_of_seconds": count / job.fps,
     }
 
 
-def main(words: Sequence[str]) -> int:
-    """The command with these words; returns its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.frames", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command with these arguments; returns its exit status."""
+    parser = argument_parser("frames", __doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("scene", type=Path, help="the scene's scene.json")
     parser.add_argument("--camera", default="CAM_FRONT")
     for name, default in (("width", 1600), ("height", 900), ("fps", 30), ("threads", 8)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    told = parser.parse_args(words)
-    torch.set_num_threads(told.threads)
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(options.threads)
     job = FilmJob(
-        camera=told.camera, fps=told.fps, width=told.width, height=told.height, horizontal_fov=None, crf=18,
+        camera=options.camera, fps=options.fps, width=options.width, height=options.height, horizontal_fov=None, crf=18,
         trajectory=TrajectorySettings(),
     )  # fmt: skip
-    checkpoint = read_checkpoint(told.checkpoint)
-    print(json.dumps(measure(read_scene(told.scene), checkpoint, job, DeviceSettings(kind="any")), indent=2))
+    checkpoint = read_checkpoint(options.checkpoint)
+    print(json.dumps(measure(read_scene(options.scene), checkpoint, job, DeviceSettings(kind="any")), indent=2))
     return 0
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except DriveSplatError as error:
-        sys.exit(f"drivesplat: {error}")
+    run_command(main)
