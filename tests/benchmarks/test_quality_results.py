@@ -172,7 +172,7 @@ def test_the_log_of_a_job_says_which_card_it_had_and_when(tmp_path, monkeypatch,
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-8f2e")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     path = tmp_path / "train.log"
-    empty = SimpleNamespace(input=None, output=None, wildcards=SimpleNamespace(scene="0061", method="a-seed0"))
+    empty = SimpleNamespace(input=[], output=[], wildcards=SimpleNamespace(scene="0061", method="a-seed0"))
     resources = SimpleNamespace(device=DeviceSettings().model_dump_json())
     before = datetime.now()
     with job(

@@ -214,7 +214,7 @@ def test_a_scene_without_vehicles_gets_nulls(tmp_path):
         assert result["static"]["psnr"] == result["all"]["psnr"]
         for name in ("ghost_panel", "removal"):
             figures = copy.read(f"results/0001/{method}/{name}.json")
-            assert figures["subject"] is figures["ghosts"] is None and "no vehicle moves" in figures["why_null"]
+            assert figures["subject"] is figures["ghosts"] is None and "no moving vehicle" in figures["why_null"]
             assert "NaN" not in (folder / f"{name}.json").read_text()
         assert (folder / "with_car.png").read_bytes() == (folder / "without_car.png").read_bytes()
 
