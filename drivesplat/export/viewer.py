@@ -9,7 +9,6 @@ stored byte over 127, finest where most of them are: near zero.
 """
 
 import base64
-import html
 import logging
 import zlib
 from pathlib import Path
@@ -20,10 +19,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.export import viewer_page as template
 from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_gaussians
-from drivesplat.export.viewer_page import filled_page
-from drivesplat.io.html_page import json_in_html
+from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import atomic_write
 from drivesplat.model.checkpoint import trained_model
 from drivesplat.model.gaussians import Gaussians
@@ -78,12 +77,8 @@ def viewer_page(
         "start": start_pose(start),
         "arrays": layout,
     }
-    return filled_page(
-        title=html.escape(title),
-        provenance=json_in_html(provenance),
-        scene=json_in_html(scene),
-        payload=base64.b64encode(payload).decode(),
-    )
+    encoded = base64.b64encode(payload).decode()
+    return filled_page(template, title=title, provenance=provenance, scene=scene, payload=encoded)
 
 
 def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:

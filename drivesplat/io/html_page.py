@@ -1,28 +1,28 @@
-"""Pages of HTML from templates that lie beside a package's modules."""
+"""Pages of HTML from Jinja templates that lie beside a package's modules."""
 
-import re
-from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from drivesplat.io.storage import canonical_json
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
 
-def filled_page(package: str, scripts: Sequence[str], **values: str) -> str:
-    """The page.html beside the file `package` with every {{name}} in it filled in; what is filled in is not looked
-    through again.
+def filled_page(package: ModuleType, **values: Any) -> str:
+    """The page.html of a package, filled in with `values`: escaped text, unless a value is `Markup`.
 
-    The values are text of HTML; {{scripts}} are the files of these names there, one after the other.
+    The template can use `file(name)`, the text of a file beside it; `value | figure(form)`, a number in a format of
+    `str.format`, a dash for None; `value | tojson`, which cannot end the HTML element around it.
     """
-    folder = Path(package).parent
-    filling = {**values, "scripts": "\n".join(_text(folder / name) for name in scripts)}
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: filling[found[1]], _text(folder / "page.html"))
-
-
-def json_in_html(value: Any) -> str:
-    """A value as JSON that cannot end the HTML element around it."""
-    return canonical_json(value).replace("<", "\\u003c")
-
-
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
+    folder = Path(package.__file__).parent
+    pages = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    pages.policies["json.dumps_kwargs"] = {"sort_keys": True, "separators": (",", ":"), "allow_nan": False}
+    pages.globals["file"] = lambda name: Markup((folder / name).read_text(encoding="utf-8"))
+    pages.filters["figure"] = lambda value, form: "–" if value is None else form.format(value)
+    return pages.get_template("page.html").render(values)

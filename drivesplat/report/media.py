@@ -63,11 +63,6 @@ def difference_position(first: Image.Image, second: Image.Image) -> float:
     return float(np.average(places, weights=weights)) if weights.any() else 0.5
 
 
-def image_data_url(path: Path) -> str:
-    """An image file as a JPEG data URL. Raises ResultError naming the path if it cannot be read."""
-    return data_url(read_image(path))
-
-
 def data_url(picture: Image.Image) -> str:
     """An RGB image as a JPEG data URL."""
     reduced = picture.copy()

@@ -16,7 +16,7 @@ from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_json
 from drivesplat.report.gaps import gap_report
 from drivesplat.report.html import report_page
-from drivesplat.report.media import MAX_WIDTH, collect_media, difference_position, image_data_url, read_image
+from drivesplat.report.media import MAX_WIDTH, collect_media, data_url, difference_position, read_image
 from drivesplat.report.plot import gap_plot
 from drivesplat.scene.images import write_png
 from drivesplat.settings.report import PICTURES
@@ -107,7 +107,7 @@ def test_large_images_are_reduced(tmp_path):
     paint(tmp_path / "small.png", 100, (160, 90))
     sizes = []
     for name in ("wide", "small"):
-        address = image_data_url(tmp_path / f"{name}.png")
+        address = data_url(read_image(tmp_path / f"{name}.png"))
         picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
         sizes.append(picture.size)
         np.testing.assert_allclose(np.asarray(picture)[5, 5], [100, 200, 155], atol=4)
@@ -118,7 +118,7 @@ def test_large_images_are_reduced(tmp_path):
 def test_a_broken_image_is_named(tmp_path, content):
     (tmp_path / "broken.png").write_bytes(content)
     with pytest.raises(ResultError, match=r"broken\.png is not a readable image"):
-        image_data_url(tmp_path / "broken.png")
+        read_image(tmp_path / "broken.png")
 
 
 def test_a_slider_starts_where_its_images_differ(tmp_path):

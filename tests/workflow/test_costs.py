@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 import yaml
 from helpers import REPOSITORY
+from helpers.reports import NO_LOGS, expecting
 
 from drivesplat.io.storage import write_json
-from drivesplat.report.costs import costs_table
+from drivesplat.report.gaps import gap_report
+from drivesplat.report.html import report_page
 from drivesplat.workflow.costs.measured import JobId, read_costs
 from drivesplat.workflow.costs.run_costs import COSTS, RunCosts
 from drivesplat.workflow.costs.table import LIMIT_SECONDS, costs_in_words, costs_record, scene_totals, write_costs
@@ -93,9 +95,10 @@ def test_a_scene_is_found_under_90_minutes_or_not(tmp_path, minutes, under):
     assert long["seconds"] == pytest.approx(60.0 * minutes) and long["scene_seconds"] == 60.0
     assert long["seconds_by_method"] == {"vanilla": 60.0 * (minutes - 31), "street": 1800.0}
     assert long["training_seconds"] == pytest.approx(60.0 * (minutes - 1))
-    page = costs_table([short, long])
+    report = gap_report([], expecting("0103"), NO_LOGS)
+    page = report_page(report, {}, [short, long])
     assert f"<td>{minutes}.0</td>" in page and f"<td>{'yes' if under else 'no'}</td>" in page
-    assert "<td>yes, so far</td>" in page and costs_table([]) == ""
+    assert "<td>yes, so far</td>" in page and "Costs" not in report_page(report, {})
     said = costs_in_words(costs_record(tmp_path, ["vanilla", "street"]))
     assert f"0103: {minutes}.0 min, {'under' if under else 'not under'} 90" in said and "so far, under 90" in said
 
