@@ -1,10 +1,10 @@
-# A recorded drive of nuScenes into 3D Gaussian splats, and what that is worth on held-out frames.
+# Turns a recorded drive into 3D Gaussian splats and measures them on held-out frames.
 #
 #   snakemake --cores 1 results/0103/metrics.json     one scene, every configured method
 #   snakemake --cores 4                               all scenes: metrics, films, panels, exports, and the report
 #   snakemake --cores 4 metrics                       the figures alone; `films`, `edits`, `looks`, `exports` likewise
 #   snakemake --cores 1 report                        results/gap_report.html of what has been measured
-#   snakemake --cores 1 results/0061/ablation.csv     what each thing in the method `street` is worth, over three seeds
+#   snakemake --cores 1 results/0061/ablation.csv     the contribution of each component of `street`, with three seeds
 #   snakemake --cores 4 estimate                      what all of it would take in time and disk, and how that is known
 #   snakemake --cores 1 costs                         results/costs.csv of what has run
 #   snakemake --report report.zip                     all there is to look at, as a page that opens offline

@@ -1,4 +1,4 @@
-"""drivesplat: recorded drives into 3D Gaussian splats, and what that is worth, measured.
+"""drivesplat: turns recorded drives into 3D Gaussian splats and measures them.
 
-Importing the package is cheap: modules that need torch, gsplat or nuscenes-devkit are imported by name.
+Importing the package is fast: modules that need torch, gsplat or nuscenes-devkit are imported by name.
 """

@@ -23,7 +23,7 @@ rule tracks:
             caption="../report/tracks.rst",
             category="Scene {scene}",
             subcategory="figures",
-            labels={"what": "what moves, with ids"},
+            labels={"what": "moving objects, with ids"},
         ),
     log:
         "<logs>/{scene}/tracks.log",

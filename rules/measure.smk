@@ -1,4 +1,4 @@
-# What a trained method is worth on the images it has not seen.
+# Measures trained methods on held-out images.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl, masks/.
 # OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;

@@ -32,7 +32,7 @@ from helpers.trainings import (
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DeviceError, DriveSplatError, TrainingError
-from drivesplat.io.prefetch import in_advance
+from drivesplat.io.prefetch import prefetch_items
 from drivesplat.kernels import capacity
 from drivesplat.kernels.cuda_graphs import CudaGraph, capture_stream
 from drivesplat.kernels.relocation import relocation
@@ -404,7 +404,7 @@ def test_the_frames_of_a_film_equal_single_frames(street_film, captures, monkeyp
 def test_a_film_whose_lists_overflow_is_captured_anew(street_film, captures):
     """Beside a thread that uses its frames; on the second pass the last graph has the capacity for all of it."""
     model, views, expected = street_film
-    found = [*in_advance(film_frames(model, [(view, None) for view in [*views, *views]]))]
+    found = [*prefetch_items(film_frames(model, [(view, None) for view in [*views, *views]]))]
     assert len(captures) > 1 and None not in captures
     assert any(bool(graph.missing > 0) for graph in captures[:-1]) and not captures[-1].missing > 0
     assert_frames(found, [*expected, *expected])

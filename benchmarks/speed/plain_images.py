@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 from drivesplat.scene.images import read_image, write_png
 from drivesplat.scene.training_record import TrainingRecord
 
@@ -56,7 +56,7 @@ def files_of_size(record: TrainingRecord, folder: Path) -> list[str]:
             write_png(reduced, read_image(recorded, size))
         return str(reduced)
 
-    return list(ahead(file_of, record.train_images))
+    return list(prefetch(file_of, record.train_images))
 
 
 def loader_of(images: Dataset, workers: int, device: torch.device) -> DataLoader:

@@ -18,7 +18,7 @@ from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, 
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.sample_pair import SamplePair, render_sample_pair
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered_with_depth
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.depth import clouds_of, depths_in
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.machine.device import explain_out_of_memory
@@ -193,6 +193,6 @@ def _group_metrics(
             masks |= overlap_masks(record, index, masks["static"])
         return metrics.measure(image, recording.image(index), masks)
 
-    for frame in ahead(measure, renderings(), measuring_threads()):
+    for frame in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(frame)
     return {**with_gap(metrics.summary()), **depth.summary()}

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
@@ -110,7 +110,7 @@ def lateral_metrics(
         masks = region_masks(label_image(recording.scene, aside, size))
         return metrics.measure(image, known.image(truth.lateral, size), masks)
 
-    for errors in ahead(measure, renderings(), measuring_threads()):
+    for errors in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(errors)
     return {str(known.truth.lateral_left_m): metrics.summary()} if frames else None
 
@@ -142,7 +142,7 @@ def removal_metrics(
         masks = {"box": one.inside & ~own_car, "outside": ~one.inside & ~own_car}
         return removed.measure(one.removed, street, masks), untouched.measure(one.untouched, street, masks)
 
-    frames = list(ahead(measure, renderings(), measuring_threads()))
+    frames = list(prefetch(measure, renderings(), measuring_threads()))
     for without, with_it in frames:
         removed.add(without)
         untouched.add(with_it)

@@ -1,4 +1,4 @@
-"""Work done ahead: by threads, in order, a few items at a time, so that memory does not grow with their number."""
+"""Prefetching: threads make a bounded number of items before they are requested, in order."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 A = TypeVar("A")
 B = TypeVar("B")
 THREADS = 4
-"""Decoding and numpy leave Python's lock to others for most of their time."""
+"""Default number of threads. Decoding and numpy release Python's lock most of the time."""
 
 
-def ahead(made: Callable[[A], B], items: Iterable[A], threads: int = THREADS) -> Iterator[B]:
-    """`made` of each item, in order, at most `threads` of them before they are asked for.
+def prefetch(made: Callable[[A], B], items: Iterable[A], threads: int = THREADS) -> Iterator[B]:
+    """`made` of each item, in order, computed by `threads` threads, at most so many before they are requested.
 
-    What one raises is raised in its place.
+    An exception is raised in place of its item.
     """
     waiting: deque[Future[B]] = deque()
     with ThreadPoolExecutor(threads) as pool:
@@ -30,10 +30,10 @@ def ahead(made: Callable[[A], B], items: Iterable[A], threads: int = THREADS) ->
                 future.cancel()
 
 
-def in_advance(items: Iterable[A], at_most: int = THREADS) -> Iterator[A]:
-    """`items`, made by one thread while those before them are used, at most so many before they are asked for.
+def prefetch_items(items: Iterable[A], at_most: int = THREADS) -> Iterator[A]:
+    """`items`, made by one thread while earlier ones are used, at most `at_most` before they are requested.
 
-    What making one raises is raised in its place.
+    An exception is raised in place of its item.
     """
     iterator, end = iter(items), object()
     waiting: deque[Future[Any]] = deque()

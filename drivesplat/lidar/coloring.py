@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def color_by_visibility(
     colors = np.zeros((len(points), 3), dtype=np.uint8)
     best = np.full(len(points), np.inf)
     seen = np.zeros(len(points), dtype=np.int64)
-    for index, in_view, timestamp in ahead(seen_by, views):
+    for index, in_view, timestamp in prefetch(seen_by, views):
         seen[index] += 1
         distance = np.abs(times[index] - timestamp)
         better = distance < best[index]

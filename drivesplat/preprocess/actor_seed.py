@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.movers import Mover, movers
 from drivesplat.lidar.sweeps import training_returns
@@ -91,7 +91,7 @@ class Sight:
 def training_sights(scene: Scene, job: ActorSeedJob, own_car: OwnCar) -> Iterator[Sight]:
     """The training images, one by one."""
     frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
-    return ahead(lambda frame: sight_of(scene, frame, job, own_car), frames)
+    return prefetch(lambda frame: sight_of(scene, frame, job, own_car), frames)
 
 
 def sight_of(scene: Scene, frame: Frame, job: ActorSeedJob, own_car: OwnCar) -> Sight:

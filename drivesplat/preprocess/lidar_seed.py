@@ -15,7 +15,7 @@ from plyfile import PlyParseError
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud, read_positions
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
 from drivesplat.lidar.sweeps import outside_boxes, thin, without_own_car
 from drivesplat.poses.triangulated import TriangulatedPoints
@@ -138,7 +138,7 @@ def color_views(
     scene: Scene, frames: list[Frame], images: ImageSettings, own_car: OwnCar = NOWHERE
 ) -> Iterator[ColorView]:
     """The frames one by one as sources of colour: at 12 Hz all of them would not fit into memory."""
-    return ahead(lambda frame: color_view(scene, frame, images, own_car), frames)
+    return prefetch(lambda frame: color_view(scene, frame, images, own_car), frames)
 
 
 def color_view(scene: Scene, frame: Frame, images: ImageSettings, own_car: OwnCar = NOWHERE) -> ColorView:
@@ -173,7 +173,7 @@ def _far_points(
     settings = job.lidar_seed
     positions, colors = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
     shares = np.diff(settings.far_points * np.arange(len(frames) + 1) // len(frames)).tolist()
-    for frame, (view, candidates), count in zip(frames, ahead(view_of, frames), shares, strict=True):
+    for frame, (view, candidates), count in zip(frames, prefetch(view_of, frames), shares, strict=True):
         ground_z = float(frame.ego_to_world[2, 3])
         p, c = far_points(view, ground_z, candidates, count, settings.far_depths, random)
         positions.append(p)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from drivesplat.io.prefetch import in_advance
+from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.video import write_video
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import open_model
@@ -122,7 +122,7 @@ def write_film(
     """
     began, count = time.perf_counter(), len(shot.cameras)
     frames = tqdm(
-        in_advance(pictures),
+        prefetch_items(pictures),
         total=count,
         desc=path.stem,
         unit="frame",

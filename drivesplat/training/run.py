@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from drivesplat.io import checkpoint_file
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import canonical_json, read_record, sha256_text, write_json
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
@@ -197,7 +197,7 @@ def read_summary(path: str | Path) -> dict[str, Any]:
 
 def _of_each(images: Sequence[int], read: Callable[[int], np.ndarray]) -> dict[int, np.ndarray]:
     """Reads a value for each image, by its number."""
-    return dict(zip(images, ahead(read, images), strict=True))
+    return dict(zip(images, prefetch(read, images), strict=True))
 
 
 def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:

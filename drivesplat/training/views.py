@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from drivesplat.io.prefetch import ahead
+from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.view import View, view_of
 from drivesplat.scene.images import read_image
@@ -63,7 +63,7 @@ def load_views(record: TrainingRecord, guides: Guides, device: torch.device) -> 
     views: list[TrainingView] = []
     known_masks: dict[bytes, Tensor] = {}
     images = record.train_images
-    recorded = ahead(lambda i: read_image(record.image_paths[i], record.image_size(i)), images)
+    recorded = prefetch(lambda i: read_image(record.image_paths[i], record.image_size(i)), images)
     for index, image in zip(images, recorded, strict=True):
         size = record.image_size(index)
         pixels = torch.from_numpy(image.copy()).to(device)

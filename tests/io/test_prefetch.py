@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from drivesplat.io.prefetch import ahead, in_advance
+from drivesplat.io.prefetch import prefetch, prefetch_items
 
 
 def test_results_come_in_order_however_long_each_takes():
@@ -13,13 +13,13 @@ def test_results_come_in_order_however_long_each_takes():
         time.sleep(0.02 if item == 0 else 0.0)
         return 10 * item
 
-    assert list(ahead(slow_at_first, range(20), threads=4)) == [10 * item for item in range(20)]
-    assert list(ahead(slow_at_first, [])) == []
+    assert list(prefetch(slow_at_first, range(20), threads=4)) == [10 * item for item in range(20)]
+    assert list(prefetch(slow_at_first, [])) == []
 
 
 def test_no_more_than_asked_for_are_made_before_they_are_taken():
     made = []
-    results = ahead(lambda item: made.append(item) or item, range(100), threads=3)
+    results = prefetch(lambda item: made.append(item) or item, range(100), threads=3)
     for taken in range(1, 6):
         next(results)
         time.sleep(0.01)
@@ -30,11 +30,11 @@ def test_no_more_than_asked_for_are_made_before_they_are_taken():
 
 def test_several_are_made_at_once():
     meeting = threading.Barrier(3, timeout=5.0)
-    assert list(ahead(lambda item: meeting.wait() >= 0, range(3), threads=3)) == [True] * 3
+    assert list(prefetch(lambda item: meeting.wait() >= 0, range(3), threads=3)) == [True] * 3
 
 
 def test_what_one_raises_is_raised_in_its_place():
-    results = ahead(lambda item: 1 // (item - 2), range(5), threads=2)
+    results = prefetch(lambda item: 1 // (item - 2), range(5), threads=2)
     assert [next(results), next(results)] == [-1, -1]
     with pytest.raises(ZeroDivisionError):
         next(results)
@@ -50,17 +50,17 @@ def test_items_in_advance_are_made_by_one_thread_while_others_are_used():
                 meeting.wait()  # until the first is used
             yield item
 
-    given = in_advance(items(), at_most=4)
+    given = prefetch_items(items(), at_most=4)
     assert next(given) == 0
     meeting.wait()
     assert list(given) == list(range(1, 20))
     assert len(set(made)) == 1 and made[0] != threading.get_ident()
-    assert list(in_advance([])) == []
+    assert list(prefetch_items([])) == []
 
 
 def test_no_more_than_asked_for_are_in_advance():
     made = []
-    given = in_advance((made.append(item) or item for item in range(100)), at_most=3)
+    given = prefetch_items((made.append(item) or item for item in range(100)), at_most=3)
     for taken in range(1, 6):
         next(given)
         time.sleep(0.01)
@@ -70,7 +70,7 @@ def test_no_more_than_asked_for_are_in_advance():
 
 
 def test_what_making_an_item_raises_is_raised_in_its_place():
-    given = in_advance((1 // (item - 2) for item in range(5)), at_most=4)
+    given = prefetch_items((1 // (item - 2) for item in range(5)), at_most=4)
     assert [next(given), next(given)] == [-1, -1]
     with pytest.raises(ZeroDivisionError):
         next(given)
