@@ -9,13 +9,13 @@ from drivesplat.io.storage import sha256_file, write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.images import write_image
 from drivesplat.scene.masks import read_masks_record
-from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.training.run import read_summary
 
 with job(snakemake, dataset=("images", "sweeps")) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)
-    recording, upstream = read_recording(files.scene, files.parser, files.masks)
+    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
     record, summary = read_masks_record(recording.masks), read_summary(files.summary)
     lpips = read_backbone(files.lpips[0]) if files.lpips else None
     truth = Path(files.truth[0]) if files.truth else None

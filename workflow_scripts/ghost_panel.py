@@ -7,12 +7,12 @@ from drivesplat.inspection.ghost_panel import ghost_panel
 from drivesplat.inspection.rendered_view import open_trained_drive
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
-from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.inspection import PanelJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)
-    recording, upstream = read_recording(files.scene, files.parser, files.masks)
+    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
     provenance = current.provenance(*upstream, checkpoint["provenance"])
     panel, figures = ghost_panel(
         open_trained_drive(checkpoint, recording, current.device()), current.settings(PanelJob)

@@ -3,12 +3,12 @@
 from drivesplat.workflow.job import job
 from drivesplat.lidar.depth_record import LidarDepthRecord, write_lidar_depth
 from drivesplat.preprocess.lidar_depth import lidar_depths
-from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.lidar_depth import LidarDepthJob
 
 with job(snakemake, dataset=("sweeps",)) as current:
-    scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
-    images = lidar_depths(scene, current.settings(LidarDepthJob), own_car)
+    scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
+    images = lidar_depths(scene, current.settings(LidarDepthJob), ego_mask)
     provenance = current.provenance(scene.provenance, upstream)
     write_lidar_depth(current.output.depth, LidarDepthRecord(images, provenance))

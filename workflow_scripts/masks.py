@@ -5,11 +5,11 @@ from pathlib import Path
 from drivesplat.workflow.job import job
 from drivesplat.io.storage import write_json
 from drivesplat.preprocess.masks import make_masks
-from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.masks import MaskJob
 
 with job(snakemake, dataset=("images", "sweeps")) as current:
-    scene, (own_car, upstream) = read_scene(current.input.scene), read_own_car(current.input.own_car)
-    record = make_masks(scene, current.settings(MaskJob), Path(current.output.masks).parent, own_car)
+    scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
+    record = make_masks(scene, current.settings(MaskJob), Path(current.output.masks).parent, ego_mask)
     write_json(current.output.masks, {**record, "provenance": current.provenance(scene.provenance, upstream)})

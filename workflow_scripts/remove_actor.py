@@ -8,12 +8,12 @@ from drivesplat.inspection.rendered_view import open_trained_drive
 from drivesplat.io.storage import write_json
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.images import write_image
-from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.inspection import RemovalJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, made, checkpoint = current.input, current.output, read_checkpoint(current.input.checkpoint)
-    recording, upstream = read_recording(files.scene, files.parser, files.masks)
+    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
     provenance = current.provenance(*upstream, checkpoint["provenance"])
     pair, record = remove_actor(
         open_trained_drive(checkpoint, recording, current.device()), current.settings(RemovalJob)

@@ -3,12 +3,12 @@
 from drivesplat.workflow.job import job
 from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.track_table import draw_tracks, subjects_by_image, track_rows, write_tracks
-from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.inspection import TracksJob
 
 with job(snakemake, dataset=("images",)) as current:
     files, camera = current.input, current.settings(TracksJob).eval_camera
-    recording, _ = read_recording(files.scene, files.parser, files.masks)
+    recording, _ = read_prepared_drive(files.scene, files.parser, files.masks)
     subjects = subjects_by_image(recording, camera)
     rows = track_rows(recording, subjects)
     write_tracks(current.output.table, rows)

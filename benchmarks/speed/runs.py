@@ -27,7 +27,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.provenance.record import provenance
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import read_masks_record
-from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.device import DeviceSettings
@@ -56,7 +56,7 @@ def run(task: Task) -> dict[str, Any]:
         before = CpuSample.now()
         times, model = plain(task, device, paths) if task.recipe == "plain" else ours(task, device)
         elsewhere = busy_elsewhere(before, CpuSample.now())
-        recording, _ = read_recording(task.files.scene, task.files.parser, task.files.masks)
+        recording, _ = read_prepared_drive(task.files.scene, task.files.parser, task.files.masks)
         masks, camera = read_masks_record(recording.masks), task.evaluate.eval_camera
         groups = evaluate_groups(model.to(device).requires_grad_(False), recording, camera, None, device)
         return {

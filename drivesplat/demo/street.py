@@ -7,7 +7,7 @@ import numpy as np
 from drivesplat.demo import bodies
 from drivesplat.demo.bodies import Body, Color, Material
 from drivesplat.demo.materials import CURB, LANE, ROAD, SIDEWALK, WINDOW
-from drivesplat.demo.traffic import Motion, ego_motion, pedestrian_motions, vehicle_motions
+from drivesplat.demo.traffic import StreetMotion, ego_motion, pedestrian_motions, vehicle_motions
 from drivesplat.settings.world import WorldSettings
 
 LENGTH = (-80.0, 260.0)
@@ -36,7 +36,7 @@ class Thing:
 
     name: str
     body: Body
-    motion: Motion
+    motion: StreetMotion
     category: str | None = None
     attribute: str | None = None
     walks: bool = False
@@ -58,7 +58,7 @@ class Street:
 
     things: tuple[Thing, ...]
     lamps: np.ndarray
-    ego: Motion
+    ego: StreetMotion
     leading: str | None
 
 
@@ -67,16 +67,16 @@ def build_street(world: WorldSettings) -> Street:
     random = np.random.default_rng(world.random_seed)
     lamp_places = np.array([(x, 6.5 * (-1) ** i) for i, x in enumerate(range(-30, 200, 24))], dtype=float)
     scenery = bodies.joined([*_ground(), *_houses(random), *_trees(random), *_furniture(lamp_places, random)])
-    things = [Thing("scenery", scenery, Motion(0.0, 0.0)), *_parked(world.parked, random), *_cones()]
+    things = [Thing("scenery", scenery, StreetMotion(0.0, 0.0)), *_parked(world.parked, random), *_cones()]
     vehicles = _vehicles(vehicle_motions(world.vehicles, world.ego == "drives"), random)
     walkers = _walkers(pedestrian_motions(world.pedestrians, random))
     lamps = np.column_stack([lamp_places - np.sign(lamp_places) * [0.0, 1.5], np.full(len(lamp_places), 6.6)])
     leading, ego = vehicles[0].name if vehicles else None, ego_motion(world.ego == "drives")
-    own_car = [Thing(OWN_CAR, bodies.tail(), ego)] if world.own_car else []
-    return Street((*things, *vehicles, *walkers, *own_car), lamps, ego, leading)
+    ego_vehicle = [Thing(OWN_CAR, bodies.tail(), ego)] if world.own_car else []
+    return Street((*things, *vehicles, *walkers, *ego_vehicle), lamps, ego, leading)
 
 
-def _walkers(motions: list[Motion]) -> list[Thing]:
+def _walkers(motions: list[StreetMotion]) -> list[Thing]:
     names = [f"pedestrian {i}" for i in range(len(motions))]
     kind = ("human.pedestrian.adult", "pedestrian.moving")
     return [Thing(n, walker(n, 1.0), motion, *kind, walks=True) for n, motion in zip(names, motions, strict=True)]
@@ -149,7 +149,7 @@ def _parked(count: int, random: np.random.Generator) -> list[Thing]:
         body, category = _vehicle_body(i % 5 == 4, random)
         facing = 0.0 if side < 0 else np.pi
         y = side * ((LANE + ROAD) / 2 + random.uniform(-0.1, 0.1))
-        things.append(Thing(f"parked {i}", body, Motion(x, y, heading=facing), category, "vehicle.parked"))
+        things.append(Thing(f"parked {i}", body, StreetMotion(x, y, heading=facing), category, "vehicle.parked"))
     return things
 
 
@@ -161,7 +161,7 @@ def _vehicle_body(is_van: bool, random: np.random.Generator) -> tuple[Body, str]
     return bodies.car(size, color), "vehicle.car"
 
 
-def _vehicles(motions: list[Motion], random: np.random.Generator) -> list[Thing]:
+def _vehicles(motions: list[StreetMotion], random: np.random.Generator) -> list[Thing]:
     things = []
     for i, motion in enumerate(motions):
         body, category = _vehicle_body(i % 3 == 2, random)
@@ -171,5 +171,6 @@ def _vehicles(motions: list[Motion], random: np.random.Generator) -> list[Thing]
 
 def _cones() -> list[Thing]:
     return [
-        Thing(f"cone {i}", bodies.cone(), Motion(x, y), "movable_object.trafficcone") for i, (x, y) in enumerate(CONES)
+        Thing(f"cone {i}", bodies.cone(), StreetMotion(x, y), "movable_object.trafficcone")
+        for i, (x, y) in enumerate(CONES)
     ]

@@ -13,7 +13,7 @@ LANE_CENTER = 1.75
 
 
 @dataclass(frozen=True)
-class Motion:
+class StreetMotion:
     """A way along the street: at `x`, `y` (metres) at second 0 with `speed` (m/s, negative: against x).
 
     The speed swings by `surge` (m/s) and the way sways sideways by `sway` (metres), both over `period` seconds.
@@ -40,7 +40,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class SprungMotion(Motion):
+class SprungMotion(StreetMotion):
     """A way with the pitch, roll and heave of springs while the car drives."""
 
     def pose_at(self, seconds: float) -> np.ndarray:
@@ -53,26 +53,26 @@ class SprungMotion(Motion):
         return pose
 
 
-def ego_motion(drives: bool) -> Motion:
+def ego_motion(drives: bool) -> StreetMotion:
     """The own car's way."""
     return SprungMotion(0.0, -LANE_CENTER, 8.0, 0.6, 0.12, 9.0) if drives else SprungMotion(12.0, -LANE_CENTER)
 
 
-def vehicle_motions(count: int, ego_drives: bool) -> list[Motion]:
+def vehicle_motions(count: int, ego_drives: bool) -> list[StreetMotion]:
     """The ways of `count` vehicles: the first leads the own car, then oncoming and further leading ones by turns."""
     starts = ((13.0, 8.6), (42.0, 9.2), (70.0, 9.0)) if ego_drives else ((24.0, 4.0), (48.0, 6.0), (76.0, 6.5))
-    leading = [Motion(x, -LANE_CENTER, speed, 1.2, 0.1, 7.0 + i) for i, (x, speed) in enumerate(starts)]
-    oncoming = [Motion(96.0 + 42.0 * i, LANE_CENTER, -(9.0 + 0.7 * i), 0.7, 0.1, 8.0) for i in range(3)]
+    leading = [StreetMotion(x, -LANE_CENTER, speed, 1.2, 0.1, 7.0 + i) for i, (x, speed) in enumerate(starts)]
+    oncoming = [StreetMotion(96.0 + 42.0 * i, LANE_CENTER, -(9.0 + 0.7 * i), 0.7, 0.1, 8.0) for i in range(3)]
     by_turns = [motion for pair in zip(leading, oncoming, strict=True) for motion in pair]
     return by_turns[:count]
 
 
-def pedestrian_motions(count: int, random: np.random.Generator) -> list[Motion]:
+def pedestrian_motions(count: int, random: np.random.Generator) -> list[StreetMotion]:
     """The ways of `count` people: along x on the right sidewalk, against it on the left, by turns,
     between lamps and trees."""
     motions = []
     for i in range(count):
         side = (-1) ** (i + 1)
         x, y = 22.0 + 13.0 * i + random.uniform(-2, 2), side * random.uniform(7.02, 7.12)
-        motions.append(Motion(x, y, -side * random.uniform(1.2, 1.6)))
+        motions.append(StreetMotion(x, y, -side * random.uniform(1.2, 1.6)))
     return motions

@@ -29,7 +29,7 @@ JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedFile:
     """One file to record: `path` relative to the dataset's root, `time_us` since the drive's start."""
 
     sensor: Sensor
@@ -72,14 +72,14 @@ def _description(world: WorldSettings) -> str:
     return f"Synthetic street, {light}, {ego}, {world.vehicles} moving vehicles, {world.pedestrians} pedestrians"
 
 
-def _recordings(tables: NuScenesTables, recorder: Recorder, sensor: Sensor) -> list[Recording]:
+def _recordings(tables: NuScenesTables, recorder: Recorder, sensor: Sensor) -> list[RecordedFile]:
     world = recorder.world
     size = (world.width, height_of(world.width)) if sensor.is_camera else (0, 0)
     recordings = []
     for time_us, is_key, index in firing_times(sensor, world.key_frames, sensor.channel in world.sweeps):
         pose = recorder.ego_to_global(time_us * 1e-6)
         recordings.append(
-            Recording(sensor, time_us, is_key, index, *tables.data(sensor, index, time_us, is_key, pose, size))
+            RecordedFile(sensor, time_us, is_key, index, *tables.data(sensor, index, time_us, is_key, pose, size))
         )
     return recordings
 
@@ -109,7 +109,7 @@ def _prepare(world: WorldSettings, root: Path) -> None:
     _at_work = Recorder(world), root
 
 
-def _record(recording: Recording) -> np.ndarray | None:
+def _record(recording: RecordedFile) -> np.ndarray | None:
     """Writes one file; how many LiDAR returns each thing got, None for images."""
     recorder, root = _at_work
     counts = None
@@ -127,6 +127,6 @@ def _visible(index: int) -> np.ndarray:
     return _at_work[0].visible_fractions(index)
 
 
-def _truth(recording: Recording) -> TruthFrame:
+def _truth(recording: RecordedFile) -> TruthFrame:
     recorder, root = _at_work
     return write_truth_frame(root, recorder, recording.sensor, recording.index, recording.time_us, recording.token)

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from drivesplat.evaluation.metrics import psnr
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import region_mask
 from drivesplat.scene.scene_warnings import REC_709, moved, seconds_long, standing
 
 
-def summarize_drive(recording: Recording, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
+def summarize_drive(recording: PreparedDrive, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
     """The `drive` of metrics.json; `measured` are the images by held-out group.
 
     `moved_m`: the largest distance in metres between two ego positions; `standing_s`: seconds at standstill, of
@@ -22,7 +22,7 @@ def summarize_drive(recording: Recording, camera: str, measured: dict[str, list[
     return {"moved_m": moved(scene), "seconds": seconds_long(scene), "standing_s": standing(scene), **groups}
 
 
-def _group(recording: Recording, camera: str, images: list[int]) -> dict[str, float | None]:
+def _group(recording: PreparedDrive, camera: str, images: list[int]) -> dict[str, float | None]:
     """`from_training_m`: distance in metres from a held-out image to the nearest training image of `camera`, mean over
     `images`; None without training images. `luminance`: mean luma (Rec. 709) of their pixels. `flat_psnr`: PSNR in dB
     of the mean colour of their static pixels, the trivial baseline; None without such pixels or if all are equal.

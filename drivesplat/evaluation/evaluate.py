@@ -26,7 +26,7 @@ from drivesplat.model.checkpoint import open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.readers.truth import read_truth
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import REGIONS, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord
@@ -46,7 +46,7 @@ class EvaluationInputs:
 
     checkpoint: dict[str, Any]
     summary: dict[str, Any]
-    recording: Recording
+    recording: PreparedDrive
     masks_record: dict[str, Any]
     lpips_record: dict[str, Any] | None
     truth: Path | None
@@ -142,19 +142,19 @@ def findings(group: dict[str, Any]) -> dict[str, bool | None]:
     }
 
 
-def held_out_depths(recording: Recording, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
+def held_out_depths(recording: PreparedDrive, camera: str, job: LidarDepthJob) -> dict[int, PixelDepths]:
     """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
     missing."""
     scene = recording.scene
     clouds = {cloud.sample_index: cloud for cloud in clouds_of(scene, job, HELD_OUT_GROUPS)}
     images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.record, group, camera)]
     owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
-    return {i: depths_in(scene, scene.frames[i], cloud, job, recording.own_car(i)) for i, cloud in owned.items()}
+    return {i: depths_in(scene, scene.frames[i], cloud, job, recording.ego_mask(i)) for i, cloud in owned.items()}
 
 
 def evaluate_groups(
     model: SplatModel,
-    recording: Recording,
+    recording: PreparedDrive,
     camera: str,
     lpips_map: LpipsMap | None,
     device: torch.device,
@@ -168,7 +168,7 @@ def evaluate_groups(
 
 def _group_metrics(
     model: SplatModel,
-    recording: Recording,
+    recording: PreparedDrive,
     lpips_map: LpipsMap | None,
     device: torch.device,
     depths: Mapping[int, PixelDepths],

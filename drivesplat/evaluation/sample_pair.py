@@ -9,7 +9,7 @@ from drivesplat.evaluation.held_out import held_out_images
 from drivesplat.evaluation.synthetic import rendered
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import region_mask
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 
@@ -24,7 +24,7 @@ class SamplePair:
     rendered: np.ndarray
 
 
-def render_sample_pair(model: SplatModel, recording: Recording, camera: str, device: torch.device) -> SamplePair:
+def render_sample_pair(model: SplatModel, recording: PreparedDrive, camera: str, device: torch.device) -> SamplePair:
     """The held-out key frame of `camera` with the most pixels of moving vehicles, from the first group with held-out
     frames; a training key frame if nothing is held out."""
     group, images = _candidates(recording, camera)
@@ -34,7 +34,7 @@ def render_sample_pair(model: SplatModel, recording: Recording, camera: str, dev
     return SamplePair(group, index, recording.image(index), picture.clip(0.0, 1.0))
 
 
-def _candidates(recording: Recording, camera: str) -> tuple[str, list[int]]:
+def _candidates(recording: PreparedDrive, camera: str) -> tuple[str, list[int]]:
     for group in (*HELD_OUT_GROUPS, "train"):
         images = held_out_images(recording.record, group, camera)
         if images:

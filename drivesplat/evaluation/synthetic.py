@@ -18,7 +18,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
 from drivesplat.readers.truth import Truth, TruthFrame, truth_image
 from drivesplat.scene.images import continuous_intrinsics, read_image
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame
@@ -34,7 +34,7 @@ class DriveTruth:
 
     truth: Truth
     path: Path
-    recording: Recording
+    recording: PreparedDrive
 
     def frames(self, camera: str) -> Iterator[tuple[int, TruthFrame]]:
         """The indices of the images of `camera` that have truth, each with its truth."""
@@ -138,8 +138,8 @@ def removal_metrics(
             yield RemovalRenderings(index, truth.without_leading, inside, *pictures)
 
     def measure(one: RemovalRenderings) -> tuple[dict[str, FrameErrors], dict[str, FrameErrors]]:
-        street, own_car = known.image(one.street, recording.size(one.index)), recording.own_car(one.index)
-        masks = {"box": one.inside & ~own_car, "outside": ~one.inside & ~own_car}
+        street, ego_mask = known.image(one.street, recording.size(one.index)), recording.ego_mask(one.index)
+        masks = {"box": one.inside & ~ego_mask, "outside": ~one.inside & ~ego_mask}
         return removed.measure(one.removed, street, masks), untouched.measure(one.untouched, street, masks)
 
     frames = list(prefetch(measure, renderings(), measuring_threads()))

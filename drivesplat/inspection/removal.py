@@ -80,7 +80,7 @@ def remove_actor(drive: TrainedDrive, job: RemovalJob) -> tuple[RemovalPair, dic
 
 def _pair(view: RenderedView, subject: Subject, removal: Removal) -> RemovalPair:
     before, after, alone = view.render(), view.render(~removal.removed), view.render(removal.removed)
-    hull, visible = fill(subject.hull.polygon, view.size), ~view.drive.recording.own_car(view.index)
+    hull, visible = fill(subject.hull.polygon, view.size), ~view.drive.recording.ego_mask(view.index)
     return RemovalPair(
         with_car=colors_of(before.image),
         without_car=colors_of(after.image),

@@ -15,7 +15,7 @@ from drivesplat.model.checkpoint import open_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View, view_of
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.device import DeviceSettings
 
@@ -25,12 +25,12 @@ class TrainedDrive:
     """A trained model with the recording that it was trained on."""
 
     model: SplatModel
-    recording: Recording
+    recording: PreparedDrive
     device: torch.device
 
 
 def open_trained_drive(
-    checkpoint: dict[str, Any], recording: Recording, device_settings: DeviceSettings
+    checkpoint: dict[str, Any], recording: PreparedDrive, device_settings: DeviceSettings
 ) -> TrainedDrive:
     """The model of a checkpoint (its content) on the device, with its recording. Raises DeviceError."""
     model, device = open_model(checkpoint, device_settings)

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from drivesplat.inspection.figures import BOX, draw_outline, image_grid, show
 from drivesplat.inspection.subject import Subject, visible_subjects
 from drivesplat.io.storage import write_csv
-from drivesplat.scene.prepared_drive import Recording
-from drivesplat.scene.regions import LEAST_PIXELS
+from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.regions import MIN_PIXELS
 from drivesplat.scene.scene import Track
-from drivesplat.scene.tracks import beginnings, box_at, moves_at_all
+from drivesplat.scene.tracks import beginnings, box_at, ever_moves
 
 MAX_IMAGES = 6
 TITLE = "moving objects, labelled with the start of their ids in tracks.csv"
@@ -48,12 +48,12 @@ SubjectsByImage = Mapping[int, Sequence[Subject]]
 """The visible dynamic objects in each key frame of the evaluated camera, by the index of the image."""
 
 
-def subjects_by_image(recording: Recording, camera: str) -> SubjectsByImage:
+def subjects_by_image(recording: PreparedDrive, camera: str) -> SubjectsByImage:
     """The visible dynamic objects in the key frames of `camera`."""
     return {index: visible_subjects(recording, index) for index in recording.scene.key_frames(camera)}
 
 
-def track_rows(recording: Recording, subjects: SubjectsByImage) -> list[TrackRow]:
+def track_rows(recording: PreparedDrive, subjects: SubjectsByImage) -> list[TrackRow]:
     """A row per dynamic track: moving ones first, then by visible time."""
     by_track: dict[str, list[Subject]] = {}
     for subject in (subject for seen in subjects.values() for subject in seen):
@@ -72,7 +72,7 @@ def _row(track: Track, seen: list[Subject], interval: float) -> TrackRow:
     return TrackRow(
         id=track.id,
         category=track.category,
-        moves=moves_at_all(track),
+        moves=ever_moves(track),
         seconds=round(seconds, 2),
         seconds_visible=round(seconds * min(1.0, len(seen) / len(track.timestamps)), 2),
         speed_mean=round(float(np.mean(speeds)), 2),
@@ -88,12 +88,12 @@ def write_tracks(path: str | Path, rows: Sequence[TrackRow]) -> None:
     write_csv(path, [field.name for field in fields(TrackRow)], map(asdict, rows))
 
 
-def draw_tracks(recording: Recording, subjects: SubjectsByImage, rows: Sequence[TrackRow], camera: str) -> Figure:
+def draw_tracks(recording: PreparedDrive, subjects: SubjectsByImage, rows: Sequence[TrackRow], camera: str) -> Figure:
     """Few key frames that show every moving object well, at most MAX_IMAGES, with outlines and the starts of
     their ids; the middle key frame if nothing moves."""
-    largest = {row.id: row.pixels for row in rows if row.moves and row.pixels >= LEAST_PIXELS}
+    largest = {row.id: row.pixels for row in rows if row.moves and row.pixels >= MIN_PIXELS}
     moving = {
-        i: [s for s in seen if s.box.track_id in largest and s.pixels >= LEAST_PIXELS] for i, seen in subjects.items()
+        i: [s for s in seen if s.box.track_id in largest and s.pixels >= MIN_PIXELS] for i, seen in subjects.items()
     }
     shown_well = {
         i: {s.box.track_id: s.pixels for s in seen if s.pixels >= MIN_PIXEL_SHARE * largest[s.box.track_id]}

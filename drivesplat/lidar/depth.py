@@ -6,7 +6,7 @@ import numpy as np
 
 from drivesplat.lidar.coloring import visible
 from drivesplat.lidar.depth_record import PixelDepths
-from drivesplat.lidar.movers import Mover, movers
+from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.lidar.sweeps import returns_of
 from drivesplat.scene.images import continuous_intrinsics, target_size
@@ -19,33 +19,33 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 
 @dataclass(frozen=True)
 class Cloud:
-    """A sweep taken apart: the sensor's place `origin` (3,), returns of what stands still (n, 3) in world coordinates,
+    """A sweep taken apart: the sensor's place `origin` (3,), returns of the static world (n, 3) in world coordinates,
     and what moves, each with its returns (m, 3) in its own frame."""
 
     timestamp: int
     sample_index: int
     origin: np.ndarray
-    still: np.ndarray
-    moving: list[tuple[Mover, np.ndarray]]
+    static: np.ndarray
+    dynamic: list[tuple[DynamicObject, np.ndarray]]
 
 
 def clouds_of(scene: Scene, job: LidarDepthJob, groups: tuple[Group, ...]) -> list[Cloud]:
     """The key-frame sweeps of some groups, taken apart, in time order."""
-    moving = movers(scene)
+    moving = dynamic_objects(scene)
     return [
         taken_apart(sweep, points, scene.seconds(sweep.timestamp), moving, job.box_margin)
         for sweep, points in returns_of(scene, job.holdout, job.own_car_radius, groups)
     ]
 
 
-def taken_apart(sweep: Sweep, points: np.ndarray, seconds: float, moving: list[Mover], margin: float) -> Cloud:
+def taken_apart(sweep: Sweep, points: np.ndarray, seconds: float, moving: list[DynamicObject], margin: float) -> Cloud:
     """A sweep's returns (n, 3) in world coordinates, at its time in `seconds`; what may be road as well as wheel is
     left out."""
-    still = np.ones(len(points), dtype=bool)
+    static = np.ones(len(points), dtype=bool)
     for mover in moving:
-        still &= ~mover.near(points, seconds, margin)
+        static &= ~mover.near(points, seconds, margin)
     own = [(mover, mover.own(points, seconds, margin)) for mover in moving]
-    return Cloud(sweep.timestamp, sweep.sample_index, sweep.sensor_to_world[:3, 3], points[still], own)
+    return Cloud(sweep.timestamp, sweep.sample_index, sweep.sensor_to_world[:3, 3], points[static], own)
 
 
 def nearest_cloud(clouds: list[Cloud], timestamp: int, interval: float) -> Cloud | None:
@@ -58,16 +58,16 @@ def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body
     """The returns of a cloud that a frame sees, the nearest of a pixel. What is absent by then is left out, and so is
     what lies behind the own car's `body` (h, w) bool."""
     size, seconds = target_size(frame, job.images), scene.seconds(frame.timestamp)
-    posed = [(mover.pose(seconds), own) for mover, own in cloud.moving]
+    posed = [(mover.pose(seconds), own) for mover, own in cloud.dynamic]
     carried = [apply(pose, own) for pose, own in posed if pose is not None]
-    points = np.concatenate([cloud.still, *carried])
+    points = np.concatenate([cloud.static, *carried])
     shape, intrinsics = (size[1], size[0]), continuous_intrinsics(frame, size)
     index, rows, columns, depth = visible(points, inverse(frame.camera_to_world), intrinsics, shape)
     ranges = np.linalg.norm(points[index] - cloud.origin, axis=1)
     front = unhidden(rows, columns, depth, patches(ranges, depth, intrinsics, job.ray_spacing), shape)
     index, rows, columns, depth = index[front], rows[front], columns[front], depth[front]
-    boxes = box_depths(scene, frame, size, {mover.track.id for mover, _ in cloud.moving})
-    kept = (index >= len(cloud.still)) | (depth < boxes[rows, columns])
+    boxes = box_depths(scene, frame, size, {mover.track.id for mover, _ in cloud.dynamic})
+    kept = (index >= len(cloud.static)) | (depth < boxes[rows, columns])
     kept &= ~body[rows, columns]
     return nearest_per_pixel(np.column_stack([rows, columns, depth])[kept])
 

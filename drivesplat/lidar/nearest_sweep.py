@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.lidar.sweeps import without_own_car
+from drivesplat.lidar.sweeps import without_ego_vehicle
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.rigid import apply
 from drivesplat.scene.scene import Sweep
@@ -21,5 +21,5 @@ def nearest_returns(
         if abs(sweep.timestamp - timestamp) >= interval:
             break
         with suppress(DatasetError):  # the stage lidar_seed is the one that complains
-            return apply(sweep.sensor_to_world, without_own_car(read_returns(sweep).points, own_car_radius))
+            return apply(sweep.sensor_to_world, without_ego_vehicle(read_returns(sweep).points, own_car_radius))
     return None

@@ -37,12 +37,12 @@ def returns_of(
     found = []
     for sweep in sweeps_of(scene, holdout, groups):
         with suppress(DatasetError):
-            points = without_own_car(read_returns(sweep).points, own_car_radius)
+            points = without_ego_vehicle(read_returns(sweep).points, own_car_radius)
             found.append((sweep, apply(sweep.sensor_to_world, points)))
     return found
 
 
-def without_own_car(points: np.ndarray, radius: float) -> np.ndarray:
+def without_ego_vehicle(points: np.ndarray, radius: float) -> np.ndarray:
     """Sensor-frame returns (n, 3) farther than `radius` metres (horizontally) from the sensor."""
     return points[np.hypot(points[:, 0], points[:, 1]) > radius]
 

@@ -23,7 +23,7 @@ from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob, Refi
 
 WORST_PIXELS = 8.0
 """Reprojection errors up to this make a point while poses are still off."""
-LEAST_SECONDS = 1e-3
+MIN_SECONDS = 1e-3
 """Images that are taken at the same time are joined as if this lay between them."""
 
 
@@ -46,7 +46,7 @@ class Priors:
             cost = cost_functions.AbsolutePosePriorCost(covariance, prior)
             problem.add_residual_block(cost, pyceres.TrivialLoss(), [poses[i]])
         for i, j in pairwise(given):
-            passed = max(LEAST_SECONDS, float(self.seconds[j] - self.seconds[i]))
+            passed = max(MIN_SECONDS, float(self.seconds[j] - self.seconds[i]))
             covariance = np.diag((self.settings.drift * deviations) ** 2 * passed)
             cost = cost_functions.RelativePosePriorCost(covariance, given[i] * given[j].inverse())
             problem.add_residual_block(cost, pyceres.TrivialLoss(), [poses[i], poses[j]])

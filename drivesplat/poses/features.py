@@ -11,7 +11,7 @@ import pycolmap
 from numpy.linalg import inv
 
 from drivesplat.poses.rig import RigImages
-from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
@@ -115,13 +115,13 @@ def views_overlap(a: Frame, b: Frame) -> bool:
 
 
 def shows_what_stands(
-    scene: Scene, frame: Frame, pixels: np.ndarray, own_car: OwnCar, box_margin: float, every_box: bool = False
+    scene: Scene, frame: Frame, pixels: np.ndarray, ego_mask: EgoMask, box_margin: float, every_box: bool = False
 ) -> np.ndarray:
     """Which pixels (n, 2), continuous, of a recorded image show neither a box that moves (`every_box`: any, as where no
     pose says which move), grown by `box_margin` metres, nor the own car: (n,) bool."""
     size = (frame.width, frame.height)
     columns, rows = (pixels[:, i].astype(int).clip(0, size[i] - 1) for i in (0, 1))
-    stands = ~own_car.pixels(frame.camera, size)[rows, columns]
+    stands = ~ego_mask.pixels(frame.camera, size)[rows, columns]
     in_camera = np.column_stack([pixels, np.ones(len(pixels))]) @ inv(continuous_intrinsics(frame, size)).T
     for box in boxes_at(scene, frame.timestamp):
         if box.moves or every_box:
@@ -154,7 +154,7 @@ def _features(images: RigImages, frame: Frame, job: RefinePosesJob) -> tuple[np.
     keypoints = np.asarray(pycolmap.keypoints_to_matrix(found), dtype=np.float32)
     keypoints[:, :2] *= np.array([frame.width, frame.height], dtype=np.float32) / size
     every_box = job.refine_poses.start == "images"
-    stands = shows_what_stands(images.scene, frame, keypoints[:, :2], images.own_car, settings.box_margin, every_box)
+    stands = shows_what_stands(images.scene, frame, keypoints[:, :2], images.ego_mask, settings.box_margin, every_box)
     usable = np.flatnonzero(stands)
     kept = usable[largest(keypoints[usable], settings.max_features)]
     return keypoints[kept], np.ascontiguousarray(np.asarray(described.data)[kept])

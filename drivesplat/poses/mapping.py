@@ -19,11 +19,11 @@ from drivesplat.settings.refine_poses import RefinePosesJob
 
 REMEDY = "such a drive needs recorded poses (refine_poses.start: recorded)"
 """What all failures of poses from images end in."""
-LEAST_ANGLE = 1.5
+MIN_ANGLE = 1.5
 """Rays that meet under a smaller angle (degrees) make no point while poses are still unknown: it would pull at them."""
 FIRST_ANGLE = 6.0
 """Rays of the first two images meet under this angle (degrees) if any do, under a quarter of it at least."""
-LEAST_MODEL = 3
+MIN_MODEL = 3
 """Fewer images than this are no model."""
 
 
@@ -113,7 +113,7 @@ def _options(job: RefinePosesJob, threads: int) -> pycolmap.IncrementalPipelineO
         random_seed=job.random_seed,
         num_threads=threads,
         extract_colors=False,
-        min_model_size=LEAST_MODEL,
+        min_model_size=MIN_MODEL,
         ba_refine_focal_length=False,
         ba_refine_principal_point=False,
         ba_refine_extra_params=False,
@@ -126,7 +126,7 @@ def _options(job: RefinePosesJob, threads: int) -> pycolmap.IncrementalPipelineO
     options.mapper.abs_pose_min_num_inliers = settings.limits.min_points
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
-    options.mapper.filter_min_tri_angle = max(LEAST_ANGLE, settings.min_angle)
+    options.mapper.filter_min_tri_angle = max(MIN_ANGLE, settings.min_angle)
     options.triangulation.min_angle = options.mapper.filter_min_tri_angle
     return options
 

@@ -31,7 +31,7 @@ from drivesplat.poses.observations import Observations
 from drivesplat.poses.refinement_record import Refinement, verdict
 from drivesplat.poses.rig import RigImages, from_pycolmap
 from drivesplat.poses.triangulated import no_points, triangulated_points
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import LimitSettings, RefinePosesJob
@@ -50,7 +50,7 @@ class Trial:
     after: float
 
 
-def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, threads: int = 1) -> Refinement:
+def refine_poses(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_MASK, threads: int = 1) -> Refinement:
     """The refinement of a scene; features on the own car do not count. Logs a warning, and keeps the given poses,
     where images cannot improve them.
 
@@ -59,7 +59,7 @@ def refine_poses(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, t
     """
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR
     key_frames = [i for i, frame in enumerate(scene.frames) if frame.is_key_frame]
-    images = RigImages.of(scene, key_frames, own_car)
+    images = RigImages.of(scene, key_frames, ego_mask)
     with tempfile.TemporaryDirectory(prefix="drivesplat-poses-") as folder:
         database = Path(folder) / "features.db"
         start = find_features(images, job, database, threads)
@@ -94,7 +94,7 @@ def made_by_matches(
     adjusted as recorded ones are. Raises DatasetError where the drive does not allow it."""
     placement = placed_by_images(images, database, job, threads)
     scene = corrected(images.scene, placement.corrections)
-    priors = priors_of(RigImages.of(scene, images.indices, images.own_car), job.refine_poses)
+    priors = priors_of(RigImages.of(scene, images.indices, images.ego_mask), job.refine_poses)
     _, reconstruction = _adjusted(with_poses_of(start, priors.given), priors, database, job, threads)
     seen = observations(reconstruction)
     recorded = np.stack([frame.ego_to_world for frame in images.frames])

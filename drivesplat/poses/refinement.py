@@ -5,7 +5,7 @@ import logging
 from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.poses.refinement_record import Refinement, verdict
 from drivesplat.poses.triangulated import no_points
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 
@@ -15,7 +15,7 @@ UNKNOWN = ("images", "points", "observations", "points_per_image", "reprojection
 """What poses.json knows of a refinement, and not of one that was never tried."""
 
 
-def refined_or_kept(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE, threads: int = 1) -> Refinement:
+def refined_or_kept(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO_MASK, threads: int = 1) -> Refinement:
     """`drivesplat.poses.refine.refine_poses`. Where that is not insisted on (`enabled: auto`, from recorded poses), a
     scene that it cannot refine keeps its poses, with a warning, and so does any where pycolmap cannot be imported.
 
@@ -33,7 +33,7 @@ def refined_or_kept(scene: Scene, job: RefinePosesJob, own_car: OwnCar = NOWHERE
             ) from error
         return _kept(scene, job, reason)
     try:
-        return refine_poses(scene, job, own_car, threads)
+        return refine_poses(scene, job, ego_mask, threads)
     except DatasetError as error:
         if insisted:
             raise

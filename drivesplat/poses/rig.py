@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from drivesplat.errors import DatasetError
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
@@ -31,12 +31,12 @@ class RigImages:
     scene: Scene
     indices: tuple[int, ...]
     cameras: tuple[str, ...]
-    own_car: OwnCar = NOWHERE
+    ego_mask: EgoMask = NO_EGO_MASK
 
     @classmethod
-    def of(cls, scene: Scene, indices: Sequence[int], own_car: OwnCar = NOWHERE) -> "RigImages":
+    def of(cls, scene: Scene, indices: Sequence[int], ego_mask: EgoMask = NO_EGO_MASK) -> "RigImages":
         ordered = tuple(sorted(indices, key=lambda i: (scene.frames[i].timestamp, scene.frames[i].camera)))
-        return cls(scene, ordered, tuple(dict.fromkeys(scene.frames[i].camera for i in ordered)), own_car)
+        return cls(scene, ordered, tuple(dict.fromkeys(scene.frames[i].camera for i in ordered)), ego_mask)
 
     def __len__(self) -> int:
         return len(self.indices)

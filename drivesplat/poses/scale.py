@@ -21,17 +21,17 @@ from drivesplat.settings.refine_poses import LidarRays
 
 WITHIN_US = 100_000.0
 """A sweep tells depths in images up to so many microseconds before and after it."""
-LEAST_DEPTHS = 10
+MIN_DEPTHS = 10
 """An image has a scale of its own where LiDAR meets so many of its points."""
-LEAST_SHARE = 0.25
+MIN_SHARE = 0.25
 """LiDAR tells a drive's scale where so large a share of the images has one."""
-LEAST_PIXELS = 2.0
+MIN_PIXELS = 2.0
 """A return counts at least so far around it."""
 MOVES = 1.0
 """Positions that are farther apart than this (metres) are of a car that moves and was located."""
 STRETCHES = 8
 """A drive is looked at in so many stretches for a drift of its scale,"""
-LEAST_IMAGES = 4
+MIN_IMAGES = 4
 """each of so many images at least."""
 
 
@@ -50,7 +50,7 @@ def depth_ratio(scene: Scene, frame: Frame, seen: Sightings, rays: LidarRays) ->
         return np.nan
     depth = depth_at(seen.pixels, *_returns_in(frame, points, rays))
     known = np.isfinite(depth) & (seen.depth > 0)
-    return float(np.median(depth[known] / seen.depth[known])) if known.sum() >= LEAST_DEPTHS else np.nan
+    return float(np.median(depth[known] / seen.depth[known])) if known.sum() >= MIN_DEPTHS else np.nan
 
 
 def _returns_in(frame: Frame, points: np.ndarray, rays: LidarRays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,13 +63,13 @@ def _returns_in(frame: Frame, points: np.ndarray, rays: LidarRays) -> tuple[np.n
     halves = patches(ranges, depth, k, rays.ray_spacing)
     front = unhidden(rows, columns, depth, halves, shape)
     pixels, _ = project(points[index[front]], world_to_camera, k)
-    return pixels, depth[front], halves[front].clip(LEAST_PIXELS)
+    return pixels, depth[front], halves[front].clip(MIN_PIXELS)
 
 
 def depth_at(wanted: np.ndarray, pixels: np.ndarray, depth: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Depth (n,) at the pixels `wanted` (n, 2) between those (m, 2) where it is known (m,), NaN where none of them is
     within its `reach` (m, 2). What is linear in pixels on a plane is depth's inverse."""
-    if len(pixels) < LEAST_DEPTHS or not len(wanted):
+    if len(pixels) < MIN_DEPTHS or not len(wanted):
         return np.full(len(wanted), np.nan)
     cell = np.median(reach, axis=0)
     near = np.isfinite(cKDTree(pixels / cell).query(wanted / cell, p=np.inf, distance_upper_bound=1.0)[0])
@@ -94,14 +94,14 @@ def by_positions(recorded: np.ndarray, model: Model) -> np.ndarray:
 
 def told_by_lidar(scales: np.ndarray) -> bool:
     """Whether enough images have a scale (n,) for the drive to have one."""
-    return bool(np.isfinite(scales).mean() >= LEAST_SHARE)
+    return bool(np.isfinite(scales).mean() >= MIN_SHARE)
 
 
 def drift(scales: np.ndarray) -> float:
     """By which factor scales (n,), in the order of time, change along a drive: the largest over the smallest median of
     its stretches. Those that are NaN do not count."""
     known = scales[np.isfinite(scales)]
-    stretches = np.array_split(known, np.clip(len(known) // LEAST_IMAGES, 1, STRETCHES))
+    stretches = np.array_split(known, np.clip(len(known) // MIN_IMAGES, 1, STRETCHES))
     medians = [float(np.median(stretch)) for stretch in stretches]
     return max(medians) / min(medians)
 

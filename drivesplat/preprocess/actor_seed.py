@@ -13,12 +13,12 @@ import numpy as np
 
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
-from drivesplat.lidar.movers import Mover, movers
+from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.sweeps import training_returns
 from drivesplat.scene.actor_record import ActorRecord, ActorRecords
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
-from drivesplat.scene.regions import LEAST_PIXELS, hulls_in, owner_image
+from drivesplat.scene.regions import MIN_PIXELS, hulls_in, owner_image
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import training_images
@@ -32,19 +32,19 @@ UNSEEN = 127
 """Grey of an actor that no pixel shows."""
 
 
-def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) -> ActorRecords:
+def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MASK) -> ActorRecords:
     """The actors of a scene, without provenance. A mover that no training image sees is left
     out."""
     sweeps = training_returns(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
-    for mover in sorted(movers(scene), key=lambda mover: mover.track.id):
+    for mover in sorted(dynamic_objects(scene), key=lambda mover: mover.track.id):
         if job.actors.part_of(mover.track.object_class) == ACTORS:
             random = np.random.default_rng((job.random_seed, order[mover.track.id]))
             seeds.append(Seed(mover, *gathered_points(scene, mover, sweeps, job.actors, random)))
-    for sight in training_sights(scene, job, own_car):
+    for view in actor_views(scene, job, ego_mask):
         for seed in seeds:
-            seed.look(sight)
+            seed.look(view)
     unseen = [seed.mover.track.id for seed in seeds if not seed.seen]
     if unseen:
         log.info("%d tracks that move are left out, no training image sees them: %s", len(unseen), ", ".join(unseen))
@@ -56,7 +56,7 @@ def actors_record(scene: Scene, job: ActorSeedJob, own_car: OwnCar = NOWHERE) ->
 
 def gathered_points(
     scene: Scene,
-    mover: Mover,
+    mover: DynamicObject,
     sweeps: list[tuple[Sweep, np.ndarray]],
     settings: ActorSeedSettings,
     random: np.random.Generator,
@@ -75,7 +75,7 @@ def gathered_points(
 
 
 @dataclass(frozen=True)
-class Sight:
+class ActorView:
     """A training image: `pixels` (h, w, 3) uint8; `owners` (h, w), whose every pixel is, as a number of `tracks`, which
     tells it by id, -1 where it is nobody's; `seen`, the tracks that are seen there."""
 
@@ -88,23 +88,23 @@ class Sight:
     seen: set[str]
 
 
-def training_sights(scene: Scene, job: ActorSeedJob, own_car: OwnCar) -> Iterator[Sight]:
+def actor_views(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask) -> Iterator[ActorView]:
     """The training images, one by one."""
     frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
-    return prefetch(lambda frame: sight_of(scene, frame, job, own_car), frames)
+    return prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames)
 
 
-def sight_of(scene: Scene, frame: Frame, job: ActorSeedJob, own_car: OwnCar) -> Sight:
-    """A frame, with what is seen in it: of LEAST_PIXELS pixels and not hidden by nearer boxes and the own car."""
+def actor_view(scene: Scene, frame: Frame, job: ActorSeedJob, ego_mask: EgoMask) -> ActorView:
+    """A frame, with what is seen in it: of MIN_PIXELS pixels and not hidden by nearer boxes and the own car."""
     size = target_size(frame, job.images)
     hulls = hulls_in(scene, frame, size)
     owners, covered = owner_image(hulls, size)
-    owners[own_car.pixels(frame.camera, size)] = -1
+    owners[ego_mask.pixels(frame.camera, size)] = -1
     tracks = {hull.box.track_id: number for number, hull in enumerate(hulls)}
     shown = np.bincount(owners[owners >= 0], minlength=len(hulls))
-    seen = {track for track, number in tracks.items() if shown[number] and covered[number] >= LEAST_PIXELS}
+    seen = {track for track, number in tracks.items() if shown[number] and covered[number] >= MIN_PIXELS}
     pixels, intrinsics = read_image(frame.image_path, size), continuous_intrinsics(frame, size)
-    return Sight(frame, scene.seconds(frame.timestamp), intrinsics, pixels, owners, tracks, seen)
+    return ActorView(frame, scene.seconds(frame.timestamp), intrinsics, pixels, owners, tracks, seen)
 
 
 class Seed:
@@ -113,27 +113,27 @@ class Seed:
     A point has the colour of the image whose camera was nearest to it, of those in which its pixel is the actor's.
     """
 
-    def __init__(self, mover: Mover, points: np.ndarray, lidar: int):
+    def __init__(self, mover: DynamicObject, points: np.ndarray, lidar: int):
         self.mover = mover
         self.seen, self.pixels = False, 0
         self._points, self._lidar = points, lidar
         self._colors = np.zeros((len(points), 3), dtype=np.uint8)
         self._distances = np.full(len(points), np.inf)
 
-    def look(self, sight: Sight) -> None:
+    def look(self, view: ActorView) -> None:
         """Takes the colours that an image shows better than those before it."""
-        self.seen |= self.mover.track.id in sight.seen
-        number, pose = sight.tracks.get(self.mover.track.id), self.mover.pose(sight.seconds)
+        self.seen |= self.mover.track.id in view.seen
+        number, pose = view.tracks.get(self.mover.track.id), self.mover.pose(view.seconds)
         if number is None or pose is None:
             return
-        self.pixels += int((sight.owners == number).sum())
+        self.pixels += int((view.owners == number).sum())
         points = apply(pose, self._points)
-        camera = inverse(sight.frame.camera_to_world), sight.intrinsics
-        index, rows, columns, _ = in_image(points, *camera, sight.owners.shape)
-        distances = np.linalg.norm(points[index] - sight.frame.camera_to_world[:3, 3], axis=1)
-        better = (sight.owners[rows, columns] == number) & (distances < self._distances[index])
+        camera = inverse(view.frame.camera_to_world), view.intrinsics
+        index, rows, columns, _ = in_image(points, *camera, view.owners.shape)
+        distances = np.linalg.norm(points[index] - view.frame.camera_to_world[:3, 3], axis=1)
+        better = (view.owners[rows, columns] == number) & (distances < self._distances[index])
         self._distances[index[better]] = distances[better]
-        self._colors[index[better]] = sight.pixels[rows[better], columns[better]]
+        self._colors[index[better]] = view.pixels[rows[better], columns[better]]
 
     def record(self) -> ActorRecord:
         """The actor. Points that no image shows have the others' mean colour."""

@@ -40,10 +40,10 @@ WIDTH = 320
 """Pixels across at which images are compared; lengths in pixels below are at this width."""
 STEP = 1.0
 """Metres between the images compared: what is taken at a standstill shows all the world unmoved."""
-LEAST_IMAGES, MOST_IMAGES = 10, 60
-LEAST_WAY = 20.0
+MIN_IMAGES, MAX_IMAGES = 10, 60
+MIN_PATH_LENGTH = 20.0
 """Metres from which on what is near has gone by."""
-LEAST_VARIATION = 16.0
+MIN_VARIATION = 16.0
 """Grey levels by which half of the image varies at least: by night nothing can be told."""
 STILL = 0.3
 """The body varies at most by this fraction of what half of the image varies by."""
@@ -61,7 +61,7 @@ MARGIN = 2
 """Pixels by which a body that was found is enlarged: its edge is out of focus."""
 
 
-def own_car_record(scene: Scene, job: EgoMaskJob) -> dict[str, Any]:
+def ego_mask_record(scene: Scene, job: EgoMaskJob) -> dict[str, Any]:
     """The record of `drivesplat.scene.ego_mask`, provenance aside. Raises DatasetError naming an image that is
     unreadable."""
     cameras = {}
@@ -79,12 +79,12 @@ def known(scene: Scene, camera: str, job: EgoMaskJob) -> tuple[tuple[Outline, ..
         return (job.polygons[camera],), "polygons", None
     if job.search is None or camera not in job.search.cameras:
         return (), None, "not looked for, and no outline is given (masks.own_car, masks.own_car_polygons)"
-    outlines, why = found_in(Drive.of(scene, camera, job.search))
+    outlines, why = found_in(ComparedImages.of(scene, camera, job.search))
     return outlines, "images" if outlines else None, why
 
 
 @dataclass(frozen=True)
-class Drive:
+class ComparedImages:
     """The images of one camera that are compared, and the sweeps that may tell of them; both in time order."""
 
     frames: tuple[Frame, ...]
@@ -114,14 +114,14 @@ class Drive:
 
     @cached_property
     def images(self) -> np.ndarray:
-        """(n, h, w, 3) uint8 of at most MOST_IMAGES, spread over the drive."""
+        """(n, h, w, 3) uint8 of at most MAX_IMAGES, spread over the drive."""
         with ThreadPoolExecutor() as pool:
             return np.stack([*pool.map(lambda frame: read_image(frame.image_path, self.size), self.compared)])
 
     @property
     def compared(self) -> list[Frame]:
         """The images themselves, as the scene knows them."""
-        count = min(MOST_IMAGES, len(self.frames))
+        count = min(MAX_IMAGES, len(self.frames))
         return [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, count).round().astype(int)]
 
     def pixels(self, at_full_width: int) -> int:
@@ -142,22 +142,22 @@ def _apart(a: Frame, b: Frame) -> float:
     return float(np.linalg.norm(a.camera_to_world[:3, 3] - b.camera_to_world[:3, 3]))
 
 
-def found_in(drive: Drive) -> tuple[tuple[Outline, ...], str | None]:
+def found_in(drive: ComparedImages) -> tuple[tuple[Outline, ...], str | None]:
     """The body's outlines, as far as the images of a drive show it for certain; where they do not, why."""
-    if len(drive.frames) < LEAST_IMAGES or drive.way < LEAST_WAY:
+    if len(drive.frames) < MIN_IMAGES or drive.way < MIN_PATH_LENGTH:
         return (), (
             f"the car hardly moves: {len(drive.frames)} images at least {STEP:g} m apart over {drive.way:.0f} m, where "
-            f"{LEAST_IMAGES} over {LEAST_WAY:g} m are needed"
+            f"{MIN_IMAGES} over {MIN_PATH_LENGTH:g} m are needed"
         )
     swept = lidar_images(drive)
-    if len(swept) < LEAST_IMAGES:
-        return (), f"LiDAR tells of {len(swept)} images where {LEAST_IMAGES} are needed: an even road stays alike, too"
+    if len(swept) < MIN_IMAGES:
+        return (), f"LiDAR tells of {len(swept)} images where {MIN_IMAGES} are needed: an even road stays alike, too"
     unmet = reaching_the_edge(below_horizon(drive) & (np.sum(swept, axis=0) < 2))
     if not unmet.any():
         return (), "LiDAR meets something all along the edge of the images"
     varies, usual = variation(drive.images)
     whole = float(np.median(varies))
-    if whole < LEAST_VARIATION:
+    if whole < MIN_VARIATION:
         return (), f"half of the image varies by {whole:.0f} grey levels or less: too little to tell what stays"
     varies, _ = variation(evenly_lit(drive.images, unmet & _rim(unmet.shape, drive.pixels(RING))))
     still = (varies < STILL * whole) & (usual > LEVELS[0]) & (usual < LEVELS[1]) & below_horizon(drive)
@@ -194,14 +194,14 @@ def variation(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (high - low).max(axis=-1), middle.mean(axis=-1)
 
 
-def below_horizon(drive: Drive) -> np.ndarray:
+def below_horizon(drive: ComparedImages) -> np.ndarray:
     """The pixels (h, w) bool that look down, the car standing level."""
     frame = drive.frames[0]
     camera_to_ego = inverse(frame.ego_to_world) @ frame.camera_to_world
     return pixel_rays(drive.size, continuous_intrinsics(frame, drive.size), camera_to_ego)[..., 2] < 0.0
 
 
-def lidar_images(drive: Drive) -> list[np.ndarray]:
+def lidar_images(drive: ComparedImages) -> list[np.ndarray]:
     """Per image that a sweep is near to, in time, the pixels (h, w) bool about which LiDAR met something. It sits above
     the cameras and farther from the car's edges, so that it sees nothing beyond the body that they do not see as well.
     """
@@ -225,7 +225,7 @@ def reaching_the_edge(mask: np.ndarray) -> np.ndarray:
     return np.isin(labels, at_edge[at_edge > 0])
 
 
-def pieces(candidate: np.ndarray, drive: Drive) -> list[np.ndarray]:
+def pieces(candidate: np.ndarray, drive: ComparedImages) -> list[np.ndarray]:
     """The connected pieces (h, w) bool of a mask that reach the image's edge and are large enough, without specks and
     gaps."""
     opened = cv2.morphologyEx(_framed(candidate), cv2.MORPH_OPEN, _disc(drive.pixels(1)))
@@ -243,7 +243,7 @@ def _framed(mask: np.ndarray) -> np.ndarray:
     return cv2.copyMakeBorder(mask.astype(np.uint8), PAD, PAD, PAD, PAD, cv2.BORDER_REPLICATE)
 
 
-def ends(body: np.ndarray, varies: np.ndarray, drive: Drive) -> bool:
+def ends(body: np.ndarray, varies: np.ndarray, drive: ComparedImages) -> bool:
     """Whether pixels (h, w) bool vary much less than those beside them, on either side of their edge."""
     near, far = drive.pixels(1), drive.pixels(RING)
     inside = body & ~_shrunk(body, far) & _shrunk(body, near)

@@ -10,12 +10,12 @@ from PIL import Image, UnidentifiedImageError
 from drivesplat.errors import DatasetError
 from drivesplat.readers.datasets import reader
 from drivesplat.scene.scene import Frame, Scene, place_of
-from drivesplat.scene.scene_warnings import cautions, luminance
+from drivesplat.scene.scene_warnings import luminance, scene_warnings
 from drivesplat.settings.extract import SceneSource
 
 log = logging.getLogger(__name__)
 
-MOST_NAMED = 10
+MAX_NAMED = 10
 """Of images that are left out, so many are named one by one."""
 
 
@@ -32,10 +32,10 @@ def extract_scene(source: SceneSource, root: Path, scene_tables: Path | None = N
     bad = [(frame, fault) for frame, fault in zip(scene.frames, faults, strict=True) if fault]
     if bad and source.on_missing == "stop":
         raise DatasetError(_remedied(*bad[0]))
-    for frame, fault in bad[:MOST_NAMED]:
+    for frame, fault in bad[:MAX_NAMED]:
         log.warning("%s: %s; left out", place_of(frame), fault)
-    if len(bad) > MOST_NAMED:
-        log.warning("%d more of %d images are missing or corrupt; left out", len(bad) - MOST_NAMED, len(scene.frames))
+    if len(bad) > MAX_NAMED:
+        log.warning("%d more of %d images are missing or corrupt; left out", len(bad) - MAX_NAMED, len(scene.frames))
     kept = tuple(frame for frame, fault in zip(scene.frames, faults, strict=True) if not fault)
     if not kept:
         raise DatasetError(
@@ -43,7 +43,7 @@ def extract_scene(source: SceneSource, root: Path, scene_tables: Path | None = N
             f"{scene.frames[0].image_path})"
         )
     scene = dataclasses.replace(scene, dataset=source.dataset, frames=kept, missing_images=len(bad))
-    for sentence in cautions(scene, luminance(scene)):
+    for sentence in scene_warnings(scene, luminance(scene)):
         log.warning("scene %s: %s", scene.name, sentence)
     return scene
 

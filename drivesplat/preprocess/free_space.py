@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivesplat.errors import ConfigError
+from drivesplat.lidar.dynamic_objects import dynamic_objects
 from drivesplat.lidar.free_space_record import FreeSpace
-from drivesplat.lidar.movers import movers
 from drivesplat.lidar.sweeps import training_returns
 from drivesplat.lidar.traversal import OCCUPIED, count_passing, empty_voxels
 from drivesplat.poses.triangulated import TriangulatedPoints
@@ -32,24 +32,24 @@ from drivesplat.settings.free_space import FreeSpaceJob, FreeSpaceSettings
 
 log = logging.getLogger(__name__)
 
-MOST_VOXELS = 2**31
+MAX_VOXELS = 2**31
 """A grid of more (a byte each while it is made) is refused."""
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays from `origins` (r, 3) to what they met at `ends` (r, 3), world metres; `still` (r,) bool: whether that
-    stands still."""
+    """Rays from `origins` (r, 3) to what they met at `ends` (r, 3), world metres; `static` (r,) bool: whether that
+    is static."""
 
     origins: np.ndarray
     ends: np.ndarray
-    still: np.ndarray
+    static: np.ndarray
 
     @classmethod
     def joined(cls, several: Sequence["Rays"]) -> "Rays":
         """All of `several` as one."""
         origins, ends = (np.concatenate([np.empty((0, 3)), *(getattr(r, of) for r in several)]) for of in _PLACES)
-        return cls(origins, ends, np.concatenate([np.empty(0, dtype=bool), *(r.still for r in several)]))
+        return cls(origins, ends, np.concatenate([np.empty(0, dtype=bool), *(r.static for r in several)]))
 
 
 _PLACES = ("origins", "ends")
@@ -65,13 +65,13 @@ def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: Triangulate
 
 def lidar_rays(scene: Scene, job: FreeSpaceJob) -> Rays:
     """The rays of the training sweeps, each from its sweep's own sensor; the own car's returns are left out."""
-    moving, found = movers(scene), []
+    moving, found = dynamic_objects(scene), []
     for sweep, points in training_returns(scene, job.holdout, job.own_car_radius):
-        still = np.ones(len(points), dtype=bool)
+        static = np.ones(len(points), dtype=bool)
         for mover in moving:
-            still &= ~mover.near(points, scene.seconds(sweep.timestamp), job.box_margin)
+            static &= ~mover.near(points, scene.seconds(sweep.timestamp), job.box_margin)
         origins = np.broadcast_to(sweep.sensor_to_world[:3, 3], points.shape)
-        found.append(Rays(origins, points, still))
+        found.append(Rays(origins, points, static))
     return Rays.joined(found)
 
 
@@ -92,14 +92,14 @@ def proven_empty(rays: Rays, settings: FreeSpaceSettings) -> FreeSpace:
     """
     starts, ends = proving(rays, settings)
     lower, shape = _bounds(np.concatenate([starts, ends]), settings.voxel)
-    if shape.prod(dtype=np.float64) > MOST_VOXELS:
+    if shape.prod(dtype=np.float64) > MAX_VOXELS:
         raise ConfigError(
             f"free_space: a grid of {' x '.join(map(str, shape))} voxels is too large; "
             "raise free_space.voxel or lower free_space.range"
         )
     counts = np.zeros(tuple(shape), dtype=np.uint8)
     count_passing(counts, (starts - lower) / settings.voxel, (ends - lower) / settings.voxel)
-    cells = np.floor((rays.ends[rays.still] - lower) / settings.voxel)
+    cells = np.floor((rays.ends[rays.static] - lower) / settings.voxel)
     occupied = cells[((cells >= 0) & (cells < shape)).all(axis=1)].astype(np.int64)
     counts[tuple(occupied.T)] = OCCUPIED
     keys = empty_voxels(counts, settings.min_rays)

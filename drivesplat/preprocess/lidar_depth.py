@@ -10,7 +10,7 @@ import numpy as np
 
 from drivesplat.lidar.depth import clouds_of, depths_in, nearest_cloud, nearest_per_pixel
 from drivesplat.lidar.depth_record import PixelDepths
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups
@@ -19,13 +19,13 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 log = logging.getLogger(__name__)
 
 
-def lidar_depths(scene: Scene, job: LidarDepthJob, own_car: OwnCar = NOWHERE) -> list[PixelDepths]:
+def lidar_depths(scene: Scene, job: LidarDepthJob, ego_mask: EgoMask = NO_EGO_MASK) -> list[PixelDepths]:
     """What LiDAR says of each of the scene's frames, the own car's body left out; nothing of those that no training
     sees."""
     clouds, images = clouds_of(scene, job, ("train",)), []
     for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
         cloud = nearest_cloud(clouds, frame.timestamp, scene.key_frame_interval) if group == "train" else None
-        body = own_car.pixels(frame.camera, target_size(frame, job.images))
+        body = ego_mask.pixels(frame.camera, target_size(frame, job.images))
         images.append(depths_in(scene, frame, cloud, job, body) if cloud else nearest_per_pixel(np.empty((0, 3))))
     known = [len(image) for image in images if len(image)]
     log.info("%d depths in %d of %d images", sum(known), len(known), len(images))

@@ -17,17 +17,17 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud, read_positions
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
-from drivesplat.lidar.sweeps import outside_boxes, thin, without_own_car
+from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
 from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.preprocess.far_points import far_points, uncovered
 from drivesplat.readers.sweeps import read_returns, sweep_fault
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.regions import fill, hulls_in
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.splits import sweep_groups, training_images
-from drivesplat.scene.tracks import boxes_of, tracks_that_move
+from drivesplat.scene.tracks import boxes_of, moving_tracks
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 def seed_points(
-    scene: Scene, job: SeedJob, own_car: OwnCar = NOWHERE, triangulated: TriangulatedPoints | None = None
+    scene: Scene, job: SeedJob, ego_mask: EgoMask = NO_EGO_MASK, triangulated: TriangulatedPoints | None = None
 ) -> PointCloud:
     """The seed of a scene, to which the own car's body lends nothing; `triangulated` is the content of its
     triangulated.npz. Its note counts points by source, missing sweeps, and names the points file.
@@ -59,12 +59,12 @@ def seed_points(
     }
     positions, times = (np.concatenate(columns) for columns in zip(*sources.values(), strict=True))
     source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
-    colors, seen = color_by_visibility(positions, times, color_views(scene, frames, job.images, own_car))
+    colors, seen = color_by_visibility(positions, times, color_views(scene, frames, job.images, ego_mask))
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
     positions, colors, source = positions[kept], colors[kept], source[kept]
-    far, far_colors = _far_points(scene, frames, positions, job, own_car, random)
+    far, far_colors = _far_points(scene, frames, positions, job, ego_mask, random)
     note = {
         **{name: int((source == i).sum()) for i, name in enumerate(sources)},
         "far": len(far),
@@ -91,7 +91,7 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
             f"scene {scene.name} has no LiDAR sweeps; set lidar_seed.on_missing: warn to seed from images alone"
         )
     positions, times, missing = [np.empty((0, 3))], [np.empty(0)], 0
-    moving = tracks_that_move(scene)
+    moving = moving_tracks(scene)
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
         try:
             points = read_returns(sweep).points
@@ -103,7 +103,7 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
             continue
         if group != "train":
             continue
-        points = apply(sweep.sensor_to_world, without_own_car(points, settings.own_car_radius))
+        points = apply(sweep.sensor_to_world, without_ego_vehicle(points, settings.own_car_radius))
         boxes = boxes_of(moving, sweep.timestamp, scene.key_frame_interval)
         points = points[outside_boxes(points, boxes, settings.box_margin)]
         positions.append(points)
@@ -135,16 +135,16 @@ def triangulated_points(scene: Scene, job: SeedJob, record: TriangulatedPoints) 
 
 
 def color_views(
-    scene: Scene, frames: list[Frame], images: ImageSettings, own_car: OwnCar = NOWHERE
+    scene: Scene, frames: list[Frame], images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK
 ) -> Iterator[ColorView]:
     """The frames one by one as sources of colour: at 12 Hz all of them would not fit into memory."""
-    return prefetch(lambda frame: color_view(scene, frame, images, own_car), frames)
+    return prefetch(lambda frame: color_view(scene, frame, images, ego_mask), frames)
 
 
-def color_view(scene: Scene, frame: Frame, images: ImageSettings, own_car: OwnCar = NOWHERE) -> ColorView:
+def color_view(scene: Scene, frame: Frame, images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK) -> ColorView:
     """A frame as a source of colour; pixels of moving boxes and of the own car are not usable."""
     size = target_size(frame, images)
-    usable = ~own_car.pixels(frame.camera, size)
+    usable = ~ego_mask.pixels(frame.camera, size)
     for hull in hulls_in(scene, frame, size):
         if hull.box.moves:
             usable[fill(hull.polygon, size)] = False
@@ -162,12 +162,12 @@ def _far_points(
     frames: list[Frame],
     covered: np.ndarray,
     job: SeedJob,
-    own_car: OwnCar,
+    ego_mask: EgoMask,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
 
     def view_of(frame: Frame) -> tuple[ColorView, np.ndarray]:
-        view = color_view(scene, frame, job.images, own_car)
+        view = color_view(scene, frame, job.images, ego_mask)
         return view, uncovered(view, covered)
 
     settings = job.lidar_seed

@@ -18,7 +18,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.lidar.nearest_sweep import nearest_returns
 from drivesplat.lidar.sweeps import training_sweeps
 from drivesplat.preprocess.sky_mask import sky_mask
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
 from drivesplat.scene.masks import UNLABELLED, mask_name
 from drivesplat.scene.regions import LABELS, label_image
@@ -28,7 +28,7 @@ from drivesplat.settings.masks import MaskJob
 
 log = logging.getLogger(__name__)
 
-LEAST_SKY = 0.005
+MIN_SKY = 0.005
 """Where the heuristic finds less sky than this share of all pixels, it has found none: it looks for what is bright."""
 NO_SKY = (
     "scene %s: no sky was found, as by night or in a tunnel: losses about the sky are left out; "
@@ -36,7 +36,7 @@ NO_SKY = (
 )
 
 
-def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHERE) -> dict[str, Any]:
+def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_EGO_MASK) -> dict[str, Any]:
     """Writes the masks of every image below `folder`; returns the record for masks.json. The own car's body is a region
     of its own, no sky, and of no class. The sky of a training image is told by sweeps that a training may see alone.
 
@@ -47,7 +47,7 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHE
     def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
         size = target_size(frame, job.images)
         labels = _regions(scene, frame, job, size)
-        labels[own_car.pixels(frame.camera, size)] = LABELS["own_car"]
+        labels[ego_mask.pixels(frame.camera, size)] = LABELS["own_car"]
         body = labels == LABELS["own_car"]
         sweeps = training if group == "train" else scene.sweeps
         sky = _sky(sweeps, frame, job, size, scene.key_frame_interval) & ~body
@@ -58,7 +58,7 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHE
     with ThreadPoolExecutor() as pool:
         sky_shares, classes, bodies = zip(*pool.map(one, scene.frames, groups), strict=True)
     seeing = {frame.camera for frame, body in zip(scene.frames, bodies, strict=True) if body}
-    sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= LEAST_SKY
+    sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= MIN_SKY
     if not sky_known:
         log.warning(NO_SKY, scene.name)
     return {
@@ -69,7 +69,7 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, own_car: OwnCar = NOWHE
         "sky_share": float(np.mean(sky_shares)),
         "sky_known": sky_known,
         "semantic_classes": max(classes),
-        "own_car": {camera: own_car.source.get(camera, "masks") for camera in sorted(seeing)},
+        "own_car": {camera: ego_mask.source.get(camera, "masks") for camera in sorted(seeing)},
     }
 
 

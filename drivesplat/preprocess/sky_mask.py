@@ -6,9 +6,9 @@ from scipy import ndimage
 
 from drivesplat.scene.images import pixel_rays, project
 
-LEAST_ELEVATION = np.sin(np.radians(1.0))
+MIN_ELEVATION = np.sin(np.radians(1.0))
 """Sky lies at least a degree above the horizon."""
-LEAST_BRIGHTNESS = 0.35
+MIN_BRIGHTNESS = 0.35
 """Sky is at least this bright, or ..."""
 BRIGHT = 0.7
 """... needs no blue tint from this brightness on (overcast)."""
@@ -31,8 +31,8 @@ def sky_mask(
     brightness = smoothed.mean(axis=2)
     gradient = np.hypot(ndimage.sobel(brightness, axis=0), ndimage.sobel(brightness, axis=1)) / 8.0 * scale
     blue = smoothed[..., 2] >= smoothed[..., 0]
-    candidate = (brightness > LEAST_BRIGHTNESS) & (blue | (brightness > BRIGHT)) & (gradient < SMOOTH)
-    candidate &= pixel_rays((width, height), intrinsics, camera_to_world)[..., 2] > LEAST_ELEVATION
+    candidate = (brightness > MIN_BRIGHTNESS) & (blue | (brightness > BRIGHT)) & (gradient < SMOOTH)
+    candidate &= pixel_rays((width, height), intrinsics, camera_to_world)[..., 2] > MIN_ELEVATION
     if lidar is not None:
         candidate &= ~_near_returns(
             lidar, np.linalg.inv(camera_to_world), intrinsics, (height, width), max(1, round(LIDAR_REACH * scale))

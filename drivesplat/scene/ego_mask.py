@@ -27,7 +27,7 @@ Outline = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
-class OwnCar:
+class EgoMask:
     """The own car's body in the images of the cameras that see it: `outlines` in fractions of width and height, and
     their `source`, 'polygons' or 'images', by camera."""
 
@@ -39,7 +39,7 @@ class OwnCar:
         return enclosed(self.outlines.get(camera, ()), size)
 
 
-NOWHERE = OwnCar()
+NO_EGO_MASK = EgoMask()
 
 
 def enclosed(outlines: tuple[Outline, ...], size: tuple[int, int]) -> np.ndarray:
@@ -50,7 +50,7 @@ def enclosed(outlines: tuple[Outline, ...], size: tuple[int, int]) -> np.ndarray
     return pixels.astype(bool)
 
 
-def read_own_car(path: str | Path) -> tuple[OwnCar, dict[str, Any]]:
+def read_ego_mask(path: str | Path) -> tuple[EgoMask, dict[str, Any]]:
     """Reads own_car.json, and the provenance in it. Raises ResultError where the file is not one, naming it and the
     rule that makes it."""
     content = read_json(path, RULE)
@@ -60,6 +60,6 @@ def read_own_car(path: str | Path) -> tuple[OwnCar, dict[str, Any]]:
             name: tuple(tuple((float(x), float(y)) for x, y in outline) for outline in camera["outlines"])
             for name, camera in known.items()
         }
-        return OwnCar(outlines, {name: camera["source"] for name, camera in known.items()}), content["provenance"]
+        return EgoMask(outlines, {name: camera["source"] for name, camera in known.items()}), content["provenance"]
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise unreadable(path, RULE, f"not a record of the own car ({error})") from error

@@ -14,7 +14,7 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 
 
 @dataclass(frozen=True)
-class Recording:
+class PreparedDrive:
     """A `scene`, the training `record` made of it, whose images are the scene's frames in their order, and the folder
     `masks` of the stage of that name; without it the labels are those of the scene's boxes."""
 
@@ -40,7 +40,7 @@ class Recording:
             return label_image(self.scene, frame, size)
         return read_labels(self.masks, frame.camera, frame.timestamp, size)
 
-    def own_car(self, index: int) -> np.ndarray:
+    def ego_mask(self, index: int) -> np.ndarray:
         """The pixels (h, w) bool of an image in which the recording car's own body is seen."""
         return self.labels(index) == LABELS["own_car"]
 
@@ -49,8 +49,10 @@ class Recording:
         return next((name for name, images in self.record.splits.items() if index in images), None)
 
 
-def read_recording(scene: str | Path, parser: str | Path, masks: str | Path) -> tuple[Recording, list[dict[str, Any]]]:
+def read_prepared_drive(
+    scene: str | Path, parser: str | Path, masks: str | Path
+) -> tuple[PreparedDrive, list[dict[str, Any]]]:
     """The recording of scene.json, parser.pkl and masks.json, and the provenances of these files."""
-    recording = Recording(read_scene(scene), read_training_record(parser), Path(masks).parent)
+    recording = PreparedDrive(read_scene(scene), read_training_record(parser), Path(masks).parent)
     record = read_masks_record(recording.masks)
     return recording, [recording.scene.provenance, recording.record.provenance, record["provenance"]]

@@ -15,9 +15,9 @@ from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.tracks import Box, boxes_at
 
 NEAR_PLANE = 0.1
-FARTHEST = 80.0
-LEAST_PIXELS = 100
-LEAST_VISIBILITY = 2
+MAX_DISTANCE = 80.0
+MIN_PIXELS = 100
+MIN_VISIBILITY = 2
 
 LABELS = {
     "static": 0,
@@ -138,8 +138,8 @@ def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray
 def label_of(hull: Hull, pixels: int) -> str:
     """The label of a hull that covers so many pixels."""
     box = hull.box
-    hidden = 0 < box.visibility < LEAST_VISIBILITY
-    if hidden or hull.distance > FARTHEST or pixels < LEAST_PIXELS:
+    hidden = 0 < box.visibility < MIN_VISIBILITY
+    if hidden or hull.distance > MAX_DISTANCE or pixels < MIN_PIXELS:
         return "left_out"
     if box.object_class.is_vehicle:
         kind = "car" if box.object_class is ObjectClass.CAR else "other_vehicle"

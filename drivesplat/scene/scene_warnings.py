@@ -7,9 +7,9 @@ from PIL import Image
 from scipy.spatial.distance import pdist
 
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.tracks import tracks_that_move
+from drivesplat.scene.tracks import moving_tracks
 
-LEAST_BASELINE = 1.0
+MIN_BASELINE = 1.0
 """Metres. From images that lie this far apart, a point 20 m away and off by a pixel is off by a third of a metre in
 depth at nuScenes' focal length (z^2 / (f b), f = 1266 pixels); from less than that, geometry is LiDAR's alone."""
 STANDS = 0.3
@@ -56,11 +56,11 @@ def _luma(path: str) -> float:
         return float((np.asarray(image.convert("RGB")) @ REC_709).mean() / 255.0)
 
 
-def cautions(scene: Scene, brightness: float) -> list[str]:
+def scene_warnings(scene: Scene, brightness: float) -> list[str]:
     """What to know before the figures of a scene are read, a sentence a circumstance; `brightness` is `luminance`."""
     found = []
     distance, seconds, stands = moved(scene), seconds_long(scene), standing(scene)
-    if distance < LEAST_BASELINE:
+    if distance < MIN_BASELINE:
         found.append(
             f"the car hardly moves ({distance:.1f} m in {seconds:.1f} s): nothing can be triangulated, depth is "
             "LiDAR's alone; held-out images show what training images show: expect a PSNR that is high and says "
@@ -80,7 +80,7 @@ def cautions(scene: Scene, brightness: float) -> list[str]:
         found.append(
             "nothing is annotated (the test split of nuScenes has no boxes): what moves counts as static and smears"
         )
-    elif not any(track.object_class.is_vehicle for track in tracks_that_move(scene)):
+    elif not any(track.object_class.is_vehicle for track in moving_tracks(scene)):
         found.append(
             "no vehicle moves: gap_db compares with parked ones (null without them), there is no vehicle to remove or "
             "edit, and a method with actors has none but what actors.humans may add"

@@ -96,7 +96,7 @@ def boxes_at(scene: Scene, timestamp: int) -> list[Box]:
     return boxes_of(scene.tracks, timestamp, scene.key_frame_interval)
 
 
-def moves_at_all(track: Track) -> bool:
+def ever_moves(track: Track) -> bool:
     """Whether a vehicle or person ever moves in this scene, by the same thresholds."""
     times = track.timestamps
     for first, last in runs(track.sample_indices):
@@ -105,9 +105,9 @@ def moves_at_all(track: Track) -> bool:
     return False
 
 
-def tracks_that_move(scene: Scene) -> list[Track]:
+def moving_tracks(scene: Scene) -> list[Track]:
     """The tracks that ever move in a scene: they leave nothing behind that stands still."""
-    return [track for track in scene.tracks if moves_at_all(track)]
+    return [track for track in scene.tracks if ever_moves(track)]
 
 
 def runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:

@@ -9,7 +9,7 @@ from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.rig import SENSORS
 from drivesplat.demo.tables import token
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.regions import LABELS, LEAST_PIXELS, fill, hulls_in, label_image
+from drivesplat.scene.regions import LABELS, MIN_PIXELS, fill, hulls_in, label_image
 from drivesplat.settings.extract import SceneSource
 
 SIZE = (400, 225)
@@ -44,7 +44,7 @@ def vehicles(scene, recorder, frame, things):
     tokens = {token("demo", "instance", thing.name): n for n, thing in enumerate(recorder.things)}
     for hull in hulls_in(scene, frame, SIZE):
         own = things == tokens[hull.box.track_id]
-        if hull.box.category.startswith("vehicle.") and hull.box.visibility == 4 and own.sum() >= LEAST_PIXELS:
+        if hull.box.category.startswith("vehicle.") and hull.box.visibility == 4 and own.sum() >= MIN_PIXELS:
             yield recorder.things[tokens[hull.box.track_id]].name, fill(hull.polygon, SIZE), own
 
 
@@ -74,5 +74,5 @@ def test_the_label_image_calls_moving_what_moves_and_parked_what_is_parked(scene
         expected = [LABELS[f"{kind}_car"], LABELS[f"{kind}_other_vehicle"]]
         assert np.isin(labels[own], expected).mean() > 0.8, name
     walker = things == list(names).index("pedestrian 0")
-    if walker.sum() >= LEAST_PIXELS:
+    if walker.sum() >= MIN_PIXELS:
         assert (labels[walker] == LABELS["moving_human"]).mean() > 0.8

@@ -11,7 +11,7 @@ from drivesplat.demo.imaging import Camera, central_hits, developed, photograph
 from drivesplat.demo.lighting import daylight, lamplight
 from drivesplat.demo.raycast import Stage
 from drivesplat.demo.street import Thing
-from drivesplat.demo.traffic import Motion
+from drivesplat.demo.traffic import StreetMotion
 
 SUN_HEIGHT = math.radians(50)
 SUN = np.array([math.cos(SUN_HEIGHT), 0.0, math.sin(SUN_HEIGHT)])
@@ -24,12 +24,12 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 def floor(top: float = 0.0) -> Thing:
     """A white plane; PLAIN's mottle fades where one pixel sees metres of it."""
     body = bodies.box((-50.0, -50.0, top - 1.0), (50.0, 50.0, top), Material.PLAIN, (1.0, 1.0, 1.0))
-    return Thing("floor", body, Motion(0.0, 0.0))
+    return Thing("floor", body, StreetMotion(0.0, 0.0))
 
 
 def roof(at: float) -> Thing:
     body = bodies.box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0))
-    return Thing("roof", body, Motion(0.0, 0.0))
+    return Thing("roof", body, StreetMotion(0.0, 0.0))
 
 
 def one_pixel(rotation: np.ndarray, height: float, focal: float = 0.1) -> Camera:
@@ -101,7 +101,9 @@ def test_headlights_shine_ahead_and_not_behind():
     ego = np.eye(4)
     night = lamplight(np.zeros((0, 3)), ego)
     wall = {
-        x: Thing("wall", bodies.box((x, -9.0, -9.0), (x + 1.0, 9.0, 9.0), Material.PLAIN, (1.0,) * 3), Motion(0.0, 0.0))
+        x: Thing(
+            "wall", bodies.box((x, -9.0, -9.0), (x + 1.0, 9.0, 9.0), Material.PLAIN, (1.0,) * 3), StreetMotion(0.0, 0.0)
+        )
         for x in (20.0, -21.0)
     }
     forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -155,7 +157,7 @@ def test_one_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
 
 def test_more_samples_smooth_edges_and_keep_the_mean():
     wall = bodies.box((-50.0, 0.3, -9.0), (50.0, 20.0, 9.0), Material.PLAIN, (0.0, 0.0, 0.0))
-    things = [Thing("wall", wall, Motion(0.0, 0.0))]
+    things = [Thing("wall", wall, StreetMotion(0.0, 0.0))]
     camera = Camera(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), one_pixel(DOWN, 30.0).camera_to_street, 41, 41)
     sharp, smooth = (photograph(Stage(things, 0.0), LIGHT, camera, samples)[..., 0] for samples in (1, 16))
     assert len(np.unique(smooth.round(2))) > len(np.unique(sharp.round(2)))

@@ -12,18 +12,18 @@ from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.evaluate import measured_images
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.preprocess.parser import training_record
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.parser import ParserJob
 
 
-def recording_of(scene: Scene, holdout=HELD_OUT) -> Recording:
+def recording_of(scene: Scene, holdout=HELD_OUT) -> PreparedDrive:
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    return Recording(scene, training_record(scene, seed, ParserJob(holdout=holdout, images={})))
+    return PreparedDrive(scene, training_record(scene, seed, ParserJob(holdout=holdout, images={})))
 
 
-def record_of(recording: Recording) -> dict:
+def record_of(recording: PreparedDrive) -> dict:
     return summarize_drive(recording, "CAM_FRONT", measured_images(recording.record, "CAM_FRONT"))
 
 

@@ -17,7 +17,7 @@ from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.lidar_depth import lidar_depths
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -63,7 +63,7 @@ def test_too_few_pixels_are_no_figure_and_no_sweep_is_no_entry(count, summary):
     assert errors.summary() == summary
 
 
-def held_out_recording(root: Path) -> Recording:
+def held_out_recording(root: Path) -> PreparedDrive:
     return recording_of(scene_at(root), **HELD_OUT)
 
 

@@ -23,7 +23,7 @@ from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.actor_record import read_actors
-from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.scene import read_scene
 from drivesplat.scene.training_record import read_training_record
@@ -42,7 +42,7 @@ def alexnet(path: Path) -> None:
 READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "scene.json": (read_scene, "extract"),
     "scene_refined.json": (read_scene, "refine_poses"),
-    "own_car.json": (read_own_car, "own_car"),
+    "own_car.json": (read_ego_mask, "own_car"),
     "masks.json": (lambda path: read_masks_record(path.parent), "masks"),
     "seed.ply": (lambda path: read_ply(path, "lidar_seed"), "lidar_seed"),
     "parser.pkl": (read_training_record, "parser"),
@@ -120,13 +120,13 @@ def test_a_resume_state_of_any_kind_executes_nothing(tmp_path, kind):
 
 
 def test_no_script_reads_results_but_by_a_reader_that_is_tested():
-    """`read_recording` and `read_inputs` are made of others."""
+    """`read_prepared_drive` and `read_inputs` are made of others."""
     tested = {
         "read_json",
-        "read_recording",
+        "read_prepared_drive",
         "read_inputs",
         "read_scene",
-        "read_own_car",
+        "read_ego_mask",
         "read_masks_record",
         "read_ply",
     }

@@ -16,7 +16,7 @@ from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import training_record
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.settings import Settings
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, load
@@ -77,7 +77,7 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
     parser = training_record(scene, seed_points(scene, made.job("lidar_seed", SeedJob)), made.job("parser", ParserJob))
     actors = actors_record(scene, made.job("actors", ActorSeedJob)).actors
     depths = lidar_depths(scene, made.job("lidar_depth", LidarDepthJob))
-    recording, known = Recording(scene, parser, folder / "masks"), {"sky_known": masks["sky_known"]}
+    recording, known = PreparedDrive(scene, parser, folder / "masks"), {"sky_known": masks["sky_known"]}
     evals = {}
     for method, settings in made.config.methods.items():
         moving = (actors, depths) if "actors" in settings.parts else ([], [])

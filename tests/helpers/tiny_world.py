@@ -234,8 +234,8 @@ def cast_lidar(world: World, seconds: float) -> np.ndarray:
     distance, _ = cast(world, world.ego_at(seconds) + LIDAR_AT, rays, seconds)
     hit = distance < 70.0
     points = rays[hit] * distance[hit, None]
-    own_car = np.array([[0.5, 0.3, -0.4], [-0.5, -0.2, -0.5]])
-    points = np.concatenate([own_car, points])
+    ego_mask = np.array([[0.5, 0.3, -0.4], [-0.5, -0.2, -0.5]])
+    points = np.concatenate([ego_mask, points])
     return np.column_stack([points, np.full((len(points), 2), 1.0)]).astype(np.float32)
 
 

@@ -17,21 +17,21 @@ from drivesplat.inspection.track_table import (
     track_rows,
     write_tracks,
 )
-from drivesplat.scene.prepared_drive import Recording
+from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import SHORT, beginnings
 
 
 @pytest.fixture(scope="module")
-def recording(tiny_scene) -> Recording:
+def recording(tiny_scene) -> PreparedDrive:
     return recording_of(tiny_scene)
 
 
-def rows_of(recording: Recording) -> list:
+def rows_of(recording: PreparedDrive) -> list:
     return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"))
 
 
-def drawn(recording: Recording) -> Figure:
+def drawn(recording: PreparedDrive) -> Figure:
     subjects = subjects_by_image(recording, "CAM_FRONT")
     return draw_tracks(recording, subjects, track_rows(recording, subjects), "CAM_FRONT")
 

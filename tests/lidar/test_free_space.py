@@ -269,7 +269,7 @@ def test_rays_start_at_their_own_sweeps_sensor_and_leave_the_own_car_out(tiny_sc
     assert len(starts) == 10 and len({tuple(origin) for origin in rays.origins}) == 6
     assert {tuple(origin) for origin in rays.origins} < starts
     assert np.linalg.norm((rays.ends - rays.origins)[:, :2], axis=1).min() > 2.5
-    assert 0.0 < (~rays.still).mean() < 0.2
+    assert 0.0 < (~rays.static).mean() < 0.2
 
 
 def triangulated(scene: Scene, point: np.ndarray, *seen_by: int) -> TriangulatedPoints:
@@ -290,7 +290,7 @@ def test_training_images_prove_what_lies_before_triangulated_points_empty(tiny_s
     centres = [blind.frames[i].camera_to_world[:3, 3] for i in seeing[:2]]
     np.testing.assert_allclose(rays.origins, centres)
     np.testing.assert_allclose(rays.ends, [point, point])
-    assert rays.still.all()
+    assert rays.static.all()
     assert len(camera_rays(blind, job(), triangulated(blind, point, seeing[0], held_out[0])).ends) == 0
     y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-1.0, 1.0, 0.1), np.arange(-1.0, 1.0, 0.1)))
     ends = point + np.column_stack([0.0 * y, y, z])

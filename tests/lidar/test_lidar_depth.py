@@ -15,12 +15,12 @@ from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
 from drivesplat.lidar.depth import taken_apart
 from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth, write_lidar_depth
-from drivesplat.lidar.movers import Mover, movers
+from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.readers.truth import read_truth
-from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
@@ -265,15 +265,15 @@ def test_returns_of_the_own_car_are_left_out(tiny_scene):
 
 def test_pixels_of_the_own_cars_body_have_no_depth(tiny_scene):
     outline = ((0.0, 0.5), (0.5, 0.5), (0.5, 1.0), (0.0, 1.0))
-    whole, cut = (lidar_depths(tiny_scene, job(), OwnCar(seen))[0] for seen in ({}, {"CAM_FRONT": (outline,)}))
+    whole, cut = (lidar_depths(tiny_scene, job(), EgoMask(seen))[0] for seen in ({}, {"CAM_FRONT": (outline,)}))
     body = [(image.rows >= 27) & (image.columns <= 48) for image in (whole, cut)]
     assert body[0].sum() > 50 and body[1].sum() == 0
     for key, value in vars(whole).items():
         np.testing.assert_array_equal(value[~body[0]], vars(cut)[key])
 
 
-def one_mover(tiny_scene: Scene) -> Mover:
-    (mover,) = [mover for mover in movers(tiny_scene) if mover.track.category == "vehicle.car"]
+def one_mover(tiny_scene: Scene) -> DynamicObject:
+    (mover,) = [mover for mover in dynamic_objects(tiny_scene) if mover.track.category == "vehicle.car"]
     return mover
 
 
@@ -284,13 +284,13 @@ def test_returns_under_a_moving_box_are_neither_its_own_nor_still(tiny_scene):
     under = np.stack([np.full(8, 8.5), np.full(8, 0.3), heights], axis=1)
     beside = np.array([[8.5, 1.05, 0.5], [8.5, 1.15, 0.5], [6.45, 0.0, 0.5], [6.35, 0.0, 0.5]])
     cloud = taken_apart(tiny_scene.sweeps[0], np.concatenate([under, beside]), 0.035, [one_mover(tiny_scene)], 0.1)
-    np.testing.assert_allclose(cloud.still, [*under[[0, 1, 7]], *beside[[1, 3]]])
-    ((_, own),) = cloud.moving
+    np.testing.assert_allclose(cloud.static, [*under[[0, 1, 7]], *beside[[1, 3]]])
+    ((_, own),) = cloud.dynamic
     np.testing.assert_allclose(own, np.array([*under[4:7], *beside[[0, 2]]]) - [8.5, 0.0, 0.8], atol=1e-6)
 
 
 def test_people_are_carried_along_and_what_never_moves_is_still(tiny_scene):
-    assert {mover.track.category for mover in movers(tiny_scene)} == {"vehicle.car", "human.pedestrian.adult"}
+    assert {mover.track.category for mover in dynamic_objects(tiny_scene)} == {"vehicle.car", "human.pedestrian.adult"}
 
 
 def test_a_drive_without_lidar_has_no_depths_and_a_record_of_them(root, tmp_path):
@@ -337,7 +337,7 @@ def test_on_the_demo_world_depths_agree_with_its_truth(demo_root):
     and of what moves nearly all."""
     scene = demo_scene(demo_root)
     truth = read_truth(demo_root / "truth/truth.json")
-    moving = {mover.track.id for mover in movers(scene)}
+    moving = {mover.track.id for mover in dynamic_objects(scene)}
     numbers = [int(number) for number, track in truth.instances.items() if track in moving]
     errors, allowed, own = [], [], []
     told = job(NOTHING_HELD_OUT, margin=0.2, spacing=LidarDepthSettings().ray_spacing)
@@ -363,9 +363,9 @@ def test_turned_boxes_carry_their_returns_round(tiny_scene):
     turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
     poses = np.stack([rigid(turn, np.array([12.0, 1.0 * i, 0.8])) for i, turn in enumerate(turns)])
     turning = dataclasses.replace(car, object_to_world=poses)
-    (mover,) = movers(dataclasses.replace(tiny_scene, tracks=(turning,)))
+    (mover,) = dynamic_objects(dataclasses.replace(tiny_scene, tracks=(turning,)))
     nose = poses[0, :3, 3] + [1.9, 0.0, 0.0]
-    ((_, own),) = taken_apart(tiny_scene.sweeps[0], nose[None], 0.035, [mover], 0.1).moving
+    ((_, own),) = taken_apart(tiny_scene.sweeps[0], nose[None], 0.035, [mover], 0.1).dynamic
     np.testing.assert_allclose(own, [[1.9, 0.0, 0.0]], atol=1e-6)
     later = mover.pose(1.035)
     np.testing.assert_allclose(later[:3, :3] @ own[0] + later[:3, 3], [12.0, 2.0 + 1.9, 0.8], atol=1e-6)

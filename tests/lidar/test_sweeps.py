@@ -18,7 +18,7 @@ from PIL import Image
 
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.actor_seed import actors_record
-from drivesplat.preprocess.ego_mask import own_car_record
+from drivesplat.preprocess.ego_mask import ego_mask_record
 from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.preprocess.lidar_seed import lidar_points, seed_points
@@ -129,7 +129,7 @@ def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
         "actors": actors_record(scene, job("actors", ActorSeedJob, holdout)),
         "lidar_depth": lidar_depths(scene, job("lidar_depth", LidarDepthJob, holdout)),
         "free_space": free_space_record(scene, job("free_space", FreeSpaceJob, holdout)),
-        "own_car": own_car_record(scene, job("own_car", EgoMaskJob, holdout)),
+        "own_car": ego_mask_record(scene, job("own_car", EgoMaskJob, holdout)),
         "sky": [read_sky_mask(folder, f.camera, f.timestamp, (f.width, f.height)) for f in training],
         "images": [Path(parser.image_paths[i]).read_bytes() for i in parser.splits["train"]],
     }

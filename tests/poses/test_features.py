@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.poses.features import find_features, image_pairs, largest, meets_box, shows_what_stands, views_overlap
 from drivesplat.poses.rig import RigImages
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene, Track
@@ -102,13 +102,13 @@ def car(speed: float, ahead: float = 12.0, category: str = "vehicle.car") -> Tra
 
 
 def stands_of(
-    track: Track | None, job: RefinePosesJob, camera: str = "CAM_FRONT", own_car: OwnCar = NOWHERE
+    track: Track | None, job: RefinePosesJob, camera: str = "CAM_FRONT", ego_mask: EgoMask = NO_EGO_MASK
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (n, 2) spread over the image of the first key frame, and which of them show what stands."""
     drive = drive_of(1, (camera,), way=lambda _: np.eye(4), error=lambda _: np.eye(4))
     scene = dataclasses.replace(drive.scene, tracks=() if track is None else (track,))
     pixels = np.stack(np.meshgrid(np.arange(5.0, SIZE[0], 10.0), np.arange(5.0, SIZE[1], 10.0)), axis=-1).reshape(-1, 2)
-    return pixels, shows_what_stands(scene, scene.frames[0], pixels, own_car, margin_of(job))
+    return pixels, shows_what_stands(scene, scene.frames[0], pixels, ego_mask, margin_of(job))
 
 
 def margin_of(job: RefinePosesJob) -> float:
@@ -157,11 +157,11 @@ def test_a_box_beside_the_camera_is_left_out_where_it_passes_the_image_plane():
 
 def test_the_own_cars_body_is_left_out():
     outline = {"CAM_BACK": ((0.0, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0))}
-    own_car = OwnCar({camera: (corners,) for camera, corners in outline.items()})
-    pixels, stands = stands_of(None, job_of(), "CAM_BACK", own_car)
+    ego_mask = EgoMask({camera: (corners,) for camera, corners in outline.items()})
+    pixels, stands = stands_of(None, job_of(), "CAM_BACK", ego_mask)
     clear = np.abs(pixels[:, 1] - 0.8 * SIZE[1]) > 2
     np.testing.assert_array_equal(stands[clear], pixels[clear, 1] < 0.8 * SIZE[1])
-    assert stands_of(None, job_of(), own_car=own_car)[1].all()
+    assert stands_of(None, job_of(), ego_mask=ego_mask)[1].all()
 
 
 def test_of_too_many_features_those_of_the_largest_scale_stay_in_their_order():
@@ -193,13 +193,13 @@ def test_features_lie_where_things_are_in_the_recorded_image_and_not_on_what_mov
     job = job_of(features={"max_image_size": max_image_size})
     found = find_features(RigImages.of(scene, [0]), job, tmp_path / "f.db", 1)
     pixels = np.stack([point.xy for point in found.images[1].points2D])
-    still = shows_what_stands(scene, scene.frames[0], places, NOWHERE, margin_of(job))
+    still = shows_what_stands(scene, scene.frames[0], places, NO_EGO_MASK, margin_of(job))
     assert 5 < (~still).sum() < still.sum()
     apart = np.linalg.norm(pixels[:, None] - places, axis=2)
     near = apart.min(axis=1) < 1.5
     offsets = (pixels - places[apart.argmin(axis=1)])[near]
     assert near.sum() > 40 and (np.abs(np.median(offsets, axis=0)) < 0.15).all()
-    assert shows_what_stands(scene, scene.frames[0], pixels, NOWHERE, margin_of(job)).all()
+    assert shows_what_stands(scene, scene.frames[0], pixels, NO_EGO_MASK, margin_of(job)).all()
     inside = ((places > 30) & (places < np.array([290, 150]))).all(axis=1)
     assert (apart.min(axis=0)[still & inside] < 1.5).mean() > 0.8
 

@@ -28,7 +28,7 @@ from drivesplat.io.array_file import write_arrays
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors, write_actors
-from drivesplat.scene.ego_mask import NOWHERE, OwnCar
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scene import Frame, Scene
@@ -55,12 +55,12 @@ def job(holdout=HELD_OUT, width=None, random_seed=0, radius=2.5, **settings) -> 
     )
 
 
-def actors_of(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> list[ActorRecord]:
-    return actors_record(scene, settings, own_car).actors
+def actors_of(scene: Scene, settings: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MASK) -> list[ActorRecord]:
+    return actors_record(scene, settings, ego_mask).actors
 
 
-def the_actor(scene: Scene, settings: ActorSeedJob, own_car: OwnCar = NOWHERE) -> ActorRecord:
-    (actor,) = actors_of(scene, settings, own_car)
+def the_actor(scene: Scene, settings: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MASK) -> ActorRecord:
+    (actor,) = actors_of(scene, settings, ego_mask)
     return actor
 
 
@@ -321,10 +321,10 @@ WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 def test_the_own_cars_body_lends_no_colour_and_hides(tmp_path):
     scene = drive(tmp_path, CAR)
     painted(scene, lambda frame: np.where(np.arange(96)[:, None] <= 48, (255, 0, 0), (0, 0, 255)))
-    colors = the_actor(scene, job(), OwnCar({"CAM_FRONT": (LEFT_HALF,)})).points_rgb
+    colors = the_actor(scene, job(), EgoMask({"CAM_FRONT": (LEFT_HALF,)})).points_rgb
     assert {tuple(color) for color in colors} == {(0, 0, 255)}
     assert {tuple(color) for color in the_actor(scene, job()).points_rgb} == {(0, 0, 255), (255, 0, 0)}
-    assert actors_of(scene, job(), OwnCar({"CAM_FRONT": (WHOLE,)})) == []
+    assert actors_of(scene, job(), EgoMask({"CAM_FRONT": (WHOLE,)})) == []
 
 
 def test_an_actor_that_is_seen_but_shows_no_point_is_grey(tmp_path):
@@ -335,7 +335,7 @@ def test_an_actor_that_is_seen_but_shows_no_point_is_grey(tmp_path):
         dataclasses.replace(sweep, path=_left_half(Path(sweep.path), tmp_path / f"left{number}.bin"))
         for number, sweep in enumerate(scene.sweeps)
     ]
-    actor = the_actor(dataclasses.replace(scene, sweeps=tuple(left)), job(), OwnCar({"CAM_FRONT": (outline,)}))
+    actor = the_actor(dataclasses.replace(scene, sweeps=tuple(left)), job(), EgoMask({"CAM_FRONT": (outline,)}))
     assert len(actor.points) > 50
     assert {tuple(color) for color in actor.points_rgb} == {(127, 127, 127)}
 

@@ -12,9 +12,9 @@ from PIL import Image
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_json
 from drivesplat.preprocess import ego_mask as own_car_search
-from drivesplat.preprocess.ego_mask import Drive, ends, found_in, known, outlines_of, own_car_record
+from drivesplat.preprocess.ego_mask import ComparedImages, ego_mask_record, ends, found_in, known, outlines_of
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.ego_mask import OwnCar, enclosed, read_own_car
+from drivesplat.scene.ego_mask import EgoMask, enclosed, read_ego_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.config import load
@@ -134,7 +134,7 @@ def test_a_car_that_waits_is_judged_by_the_images_of_its_way(seen):
     waited = [frame for frame in seen.frames if frame.camera == "CAM_BACK" and frame.sample_index == 5]
     more = [dataclasses.replace(waited[0], timestamp=waited[0].timestamp + i) for i in range(1, 31)]
     scene = dataclasses.replace(seen, frames=(*seen.frames, *more))
-    assert len(Drive.of(scene, "CAM_BACK", LOOKING).frames) == KEY_FRAMES
+    assert len(ComparedImages.of(scene, "CAM_BACK", LOOKING).frames) == KEY_FRAMES
     np.testing.assert_array_equal(body_in(scene), body_in(seen))
 
 
@@ -197,7 +197,7 @@ def test_most_of_an_image_is_no_body(unseen, tmp_path):
 
 def test_what_varies_ever_more_has_no_end(unseen):
     """A body ends at once; a road grows more varied with distance."""
-    drive = Drive.of(unseen, "CAM_BACK", LOOKING)
+    drive = ComparedImages.of(unseen, "CAM_BACK", LOOKING)
     rows = np.arange(90.0)[:, None].repeat(160, axis=1)
     lower = rows >= 70
     assert ends(lower, np.where(lower, 4.0, 20.0), drive)
@@ -210,7 +210,7 @@ def test_what_varies_ever_more_has_no_end(unseen):
 def test_the_users_outline_wins_and_other_cameras_are_looked_at(seen):
     outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0))
     job = EgoMaskJob(polygons={"CAM_BACK": outline}, search=LOOKING.model_copy(update={"cameras": ("CAM_FRONT",)}))
-    cameras = own_car_record(seen, job)["cameras"]
+    cameras = ego_mask_record(seen, job)["cameras"]
     assert (cameras["CAM_BACK"]["source"], cameras["CAM_BACK"]["outlines"]) == ("polygons", (outline,))
     assert cameras["CAM_BACK"]["share"] == pytest.approx(0.05, abs=0.002) and cameras["CAM_BACK"]["why_null"] is None
     assert cameras["CAM_FRONT"]["why_null"] and "not looked for" in cameras["CAM_BACK_RIGHT"]["why_null"]
@@ -242,12 +242,12 @@ def test_the_camera_that_is_measured_is_spared_by_default():
 
 
 def test_a_record_returns_as_it_was_written(seen, tmp_path):
-    record = own_car_record(seen, JOB)
+    record = ego_mask_record(seen, JOB)
     write_json(tmp_path / "own_car.json", {**record, "provenance": {"stages": {}}})
-    own_car, provenance = read_own_car(tmp_path / "own_car.json")
-    assert provenance == {"stages": {}} and own_car.source == {"CAM_BACK": "images"}
-    np.testing.assert_array_equal(own_car.pixels("CAM_BACK", SIZE), body_in(seen))
-    assert own_car.pixels("CAM_FRONT", SIZE).shape == (90, 160) and not own_car.pixels("CAM_FRONT", SIZE).any()
+    ego_mask, provenance = read_ego_mask(tmp_path / "own_car.json")
+    assert provenance == {"stages": {}} and ego_mask.source == {"CAM_BACK": "images"}
+    np.testing.assert_array_equal(ego_mask.pixels("CAM_BACK", SIZE), body_in(seen))
+    assert ego_mask.pixels("CAM_FRONT", SIZE).shape == (90, 160) and not ego_mask.pixels("CAM_FRONT", SIZE).any()
 
 
 @pytest.mark.parametrize(
@@ -257,14 +257,14 @@ def test_a_foreign_record_is_named_with_its_rule(tmp_path, content):
     if content is not None:
         (tmp_path / "own_car.json").write_text(content)
     with pytest.raises(ResultError, match=r"own_car\.json.*'own_car'"):
-        read_own_car(tmp_path / "own_car.json")
+        read_ego_mask(tmp_path / "own_car.json")
 
 
 @pytest.mark.parametrize("size", [(160, 90), (400, 225), (1600, 900)])
 def test_outlines_enclose_what_they_were_drawn_around_at_any_size(size):
     y, x = np.mgrid[:90, :160]
     mask = (y > 70 + 0.002 * (x - 80) ** 2) | ((x < 20) & (y > 40))
-    drawn = OwnCar({"A": outlines_of(mask)}).pixels("A", size)
+    drawn = EgoMask({"A": outlines_of(mask)}).pixels("A", size)
     rows, columns = (np.arange(n) * m // n for n, m in ((size[1], 90), (size[0], 160)))
     expected = mask[rows][:, columns]
     assert (drawn != expected).mean() < 0.015
@@ -283,7 +283,7 @@ def test_the_front_camera_of_a_real_drive_sees_no_body(real_scene_root, monkeypa
         dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
         sweeps=False, on_missing="stop",
     )  # fmt: skip
-    drive = Drive.of(extract_scene(source, real_scene_root), "CAM_FRONT", LOOKING)
+    drive = ComparedImages.of(extract_scene(source, real_scene_root), "CAM_FRONT", LOOKING)
     assert found_in(drive)[1].startswith("LiDAR tells of ")
     nothing = np.zeros((drive.size[1], drive.size[0]), dtype=bool)
     monkeypatch.setattr(own_car_search, "lidar_images", lambda drive: [nothing] * len(drive.compared))

@@ -15,18 +15,18 @@ from plyfile import PlyData, PlyElement
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
-from drivesplat.lidar.sweeps import outside_boxes, thin, without_own_car
+from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.far_points import far_points, uncovered
 from drivesplat.preprocess.lidar_seed import color_view, lidar_points, seed_points
 from drivesplat.readers.sweeps import read_returns
-from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import project
 from drivesplat.scene.regions import fill, hull_of
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
-from drivesplat.scene.tracks import Box, box_at, tracks_that_move
+from drivesplat.scene.tracks import Box, box_at, moving_tracks
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
@@ -104,8 +104,8 @@ def test_a_larger_margin_takes_more_around_moving_objects(tiny_scene):
 
 def test_returns_of_the_own_car_are_those_near_the_sensor_horizontally():
     points = np.array([[0.5, 0.3, -0.4], [2.6, 0.0, 0.0], [1.8, 1.8, 5.0], [1.7, 1.7, 0.0], [0.0, 0.0, 9.0]])
-    np.testing.assert_array_equal(without_own_car(points, 2.5), points[[1, 2]])
-    np.testing.assert_array_equal(without_own_car(points[:2], 0.0), points[:2])
+    np.testing.assert_array_equal(without_ego_vehicle(points, 2.5), points[[1, 2]])
+    np.testing.assert_array_equal(without_ego_vehicle(points[:2], 0.0), points[:2])
 
 
 def test_own_car_returns_are_there_unless_they_are_taken_out(tiny_scene):
@@ -142,7 +142,7 @@ def test_a_track_that_moves_later_leaves_no_points_while_it_stands(tiny_scene):
     later = dataclasses.replace(truck, object_to_world=poses)
     stays, leaves = (dataclasses.replace(tiny_scene, tracks=(track,)) for track in (truck, later))
     assert not box_at(later, START_US, 500_000.0).moves
-    assert tracks_that_move(leaves) == [later] and tracks_that_move(stays) == []
+    assert moving_tracks(leaves) == [later] and moving_tracks(stays) == []
     on_truck = [
         within(points[times == START_US], "vehicle.truck", 0.0, 0.1).sum()
         for points, times, _ in (lidar_points(scene, job(voxel_size=0.0)) for scene in (stays, leaves))
@@ -531,7 +531,7 @@ def test_the_own_cars_body_lends_no_colour(root):
     half = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
     red = {}
     for name, seen in (("whole", {}), ("half", {"CAM_FRONT": (half,)})):
-        cloud = seed_points(scene, job(), OwnCar(seen))
+        cloud = seed_points(scene, job(), EgoMask(seen))
         red[name] = int((cloud.colors[:, 0] > 150).sum())
         assert len(cloud.positions) > 200 and cloud.note["far"] > 100
     assert red["whole"] > 100 and red["half"] == 0

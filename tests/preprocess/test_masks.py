@@ -15,7 +15,7 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.masks import NO_SKY, make_masks
 from drivesplat.preprocess.sky_mask import sky_mask
 from drivesplat.readers.sweeps import read_returns
-from drivesplat.scene.ego_mask import OwnCar
+from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import project, read_image
 from drivesplat.scene.masks import UNLABELLED, mask_name, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, label_image, region_mask
@@ -30,9 +30,9 @@ SIZE = (96, 54)
 WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 
 
-def seen_in_front(outline: tuple) -> OwnCar:
+def seen_in_front(outline: tuple) -> EgoMask:
     """The own car within an outline of CAM_FRONT's images."""
-    return OwnCar({"CAM_FRONT": (outline,)}, {"CAM_FRONT": "polygons"})
+    return EgoMask({"CAM_FRONT": (outline,)}, {"CAM_FRONT": "polygons"})
 
 
 def job(width=None, **masks) -> MaskJob:
@@ -280,8 +280,8 @@ def test_a_label_that_there_is_none_is_refused_naming_setting_and_file(two_image
 def test_the_own_cars_outline_is_left_out_of_every_region(two_images, tmp_path):
     """The lower right quarter of the image, in fractions of its width and height; one pixel of rounding."""
     outline = ((0.5, 0.5), (1.0, 0.5), (1.0, 1.0), (0.5, 1.0))
-    own_car = OwnCar({"CAM_FRONT": (outline,), "CAM_BACK": (WHOLE,)}, {"CAM_FRONT": "polygons", "CAM_BACK": "images"})
-    assert make_masks(two_images, job(), tmp_path, own_car)["own_car"] == {"CAM_FRONT": "polygons"}
+    ego_mask = EgoMask({"CAM_FRONT": (outline,), "CAM_BACK": (WHOLE,)}, {"CAM_FRONT": "polygons", "CAM_BACK": "images"})
+    assert make_masks(two_images, job(), tmp_path, ego_mask)["own_car"] == {"CAM_FRONT": "polygons"}
     for frame in two_images.frames:
         labels = read_labels(tmp_path, "CAM_FRONT", frame.timestamp, SIZE)
         everything = region_mask(labels, "all")

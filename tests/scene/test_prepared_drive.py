@@ -14,7 +14,7 @@ from drivesplat.evaluation.evaluate import evaluate_groups
 from drivesplat.io.storage import write_json
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.prepared_drive import read_recording
+from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import write_scene
 from drivesplat.scene.training_record import write_training_record
@@ -55,9 +55,9 @@ def test_an_image_is_the_recorded_one_at_the_size_of_training(tiny_scene, width)
 def test_labels_are_those_of_the_masks_where_there_are_some_and_else_of_the_boxes(tiny_scene, masks, labels):
     given, bare = recording_of(tiny_scene, masks, 48), recording_of(tiny_scene, width=48)
     np.testing.assert_array_equal(given.labels(4), labels)
-    np.testing.assert_array_equal(given.own_car(4), labels == LABELS["own_car"])
+    np.testing.assert_array_equal(given.ego_mask(4), labels == LABELS["own_car"])
     np.testing.assert_array_equal(bare.labels(4), label_image(tiny_scene, tiny_scene.frames[4], (48, 27)))
-    assert not bare.own_car(4).any()
+    assert not bare.ego_mask(4).any()
 
 
 def test_every_image_has_the_split_it_was_given(tiny_scene):
@@ -73,13 +73,13 @@ def test_a_recording_is_read_with_the_provenance_of_its_three_files(tiny_scene, 
     write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance={"made": "scene"}))
     write_training_record(tmp_path / "parser.pkl", record)
     paths = (tmp_path / "scene.json", tmp_path / "parser.pkl", masks / "masks.json")
-    recording, provenances = read_recording(*paths)
+    recording, provenances = read_prepared_drive(*paths)
     assert provenances == [{"made": "scene"}, {"made": "parser"}, {"made": "masks"}]
     assert recording.frame(2).token == tiny_scene.frames[2].token and recording.size(2) == (48, 27)
     np.testing.assert_array_equal(recording.labels(2), labels)
     (tmp_path / "masks.json").write_text("[]")
     with pytest.raises(ResultError, match=r"masks\.json.*masks"):
-        read_recording(*paths[:2], tmp_path / "masks.json")
+        read_prepared_drive(*paths[:2], tmp_path / "masks.json")
 
 
 def test_held_out_groups_are_measured_over_the_regions_of_the_labels(tiny_scene, masks, labels):

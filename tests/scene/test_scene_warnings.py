@@ -11,7 +11,7 @@ from helpers.tiny_world import World, write_world
 from PIL import Image
 
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.scene_warnings import cautions, luminance, moved, seconds_long, standing
+from drivesplat.scene.scene_warnings import luminance, moved, scene_warnings, seconds_long, standing
 
 DAY = 0.4
 
@@ -89,7 +89,7 @@ CASES = {
 
 @pytest.mark.parametrize(("change", "brightness", "expected"), CASES.values(), ids=CASES)
 def test_each_circumstance_is_one_sentence_and_others_are_none(tiny_scene, change, brightness, expected):
-    found = cautions(change(tiny_scene), brightness)
+    found = scene_warnings(change(tiny_scene), brightness)
     assert [sentence[: len(start)] for sentence, start in zip(found, expected, strict=True)] == expected
     assert not any("\n" in sentence for sentence in found)
 

@@ -6,7 +6,7 @@ from helpers.classed import classed
 
 from drivesplat.scene.rigid import apply, interpolate, inverse, rigid
 from drivesplat.scene.scene import Track
-from drivesplat.scene.tracks import Box, box_at, boxes_at, moves_at_all
+from drivesplat.scene.tracks import Box, box_at, boxes_at, ever_moves
 
 INTERVAL = 500_000.0
 """Microseconds between key frames."""
@@ -173,13 +173,13 @@ def test_a_box_moves_while_it_moves_and_a_track_that_ever_moves_does():
     starts = track([0, 1, 2], [(0, 0, 0), (0.1, 0, 0), (3.1, 0, 0)])
     assert not box_at(starts, at(0.25), INTERVAL).moves
     assert box_at(starts, at(0.75), INTERVAL).moves
-    assert moves_at_all(starts)
-    assert not moves_at_all(track([0, 1, 2], [(0, 0, 0), (0.1, 0, 0), (0.2, 0, 0)]))
-    assert not moves_at_all(track([0], [(0, 0, 0)]))
+    assert ever_moves(starts)
+    assert not ever_moves(track([0, 1, 2], [(0, 0, 0), (0.1, 0, 0), (0.2, 0, 0)]))
+    assert not ever_moves(track([0], [(0, 0, 0)]))
 
 
 def test_a_jump_across_a_gap_is_no_motion():
-    assert not moves_at_all(track([0, 1, 3, 4], [(0, 0, 0), (0, 0, 0), (30.0, 0, 0), (30.0, 0, 0)]))
+    assert not ever_moves(track([0, 1, 3, 4], [(0, 0, 0), (0, 0, 0), (30.0, 0, 0), (30.0, 0, 0)]))
 
 
 def test_corners_are_half_the_size_from_the_centre_along_the_objects_axes():

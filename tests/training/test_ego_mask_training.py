@@ -28,11 +28,11 @@ from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
-from drivesplat.preprocess.ego_mask import own_car_record
+from drivesplat.preprocess.ego_mask import ego_mask_record
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.preprocess.parser import training_record
-from drivesplat.scene.ego_mask import read_own_car
+from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.training_record import write_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
@@ -145,9 +145,9 @@ def prepared(tmp_path_factory) -> Path:
     scene, images = rig_drive(folder, ["CAM_FRONT", "CAM_BACK"], own_car=True), ImageSettings()
     holdout = HoldoutSettings(every_nth=6, offset=3, last_block=0)
     search = EgoMaskSearch(cameras=("CAM_BACK",), holdout=holdout, own_car_radius=2.5)
-    record = own_car_record(scene, EgoMaskJob(polygons={}, search=search))
+    record = ego_mask_record(scene, EgoMaskJob(polygons={}, search=search))
     write_json(folder / "own_car.json", {**record, "provenance": {"made": "own_car"}})
-    ego_mask, _ = read_own_car(folder / "own_car.json")
+    ego_mask, _ = read_ego_mask(folder / "own_car.json")
     made = make_masks(scene, MaskJob(masks=MaskSettings(), holdout=holdout, images=images), folder / "masks", ego_mask)
     write_json(folder / "masks/masks.json", {**made, "provenance": {}})
     settings = LidarSeedSettings(max_points=2000, far_points=500)

@@ -7,14 +7,14 @@ import numpy as np
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Scene, Track
-from drivesplat.scene.tracks import in_box, tracks_that_move
+from drivesplat.scene.tracks import in_box, moving_tracks
 
 CLEARANCE = 0.1
 """What lies lower over a box's floor than this (metres) may be road as well as wheel."""
 
 
 @dataclass(frozen=True)
-class Mover:
+class DynamicObject:
     """A track that moves, and its motion."""
 
     track: Track
@@ -41,6 +41,6 @@ class Mover:
         return in_box(points, pose, self.track.size, margin, -margin)
 
 
-def movers(scene: Scene) -> list[Mover]:
+def dynamic_objects(scene: Scene) -> list[DynamicObject]:
     """Every vehicle and person that ever moves in a scene, by the measuring protocol's thresholds."""
-    return [Mover(track, Motion.of_track(scene, track)) for track in tracks_that_move(scene)]
+    return [DynamicObject(track, Motion.of_track(scene, track)) for track in moving_tracks(scene)]
