@@ -62,4 +62,4 @@ def test_a_run_says_so_before_its_estimate(tmp_path):
     asked = copy.run("estimate")
     lines = [line for line in asked.stdout.splitlines() if line.startswith("drivesplat: ")]
     assert lines[0].startswith("drivesplat: train.iterations: 60 does not hold for method vanilla"), asked.stdout
-    assert " jobs, about " in lines[1]
+    assert " jobs, time not measured yet, " in lines[1]
