@@ -4,9 +4,9 @@ from drivesplat.workflow.job import job
 from drivesplat.export.usd_asset import export_usd
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scene import read_scene
-from drivesplat.settings.export import UsdJob
+from drivesplat.settings.export import ExportJob
 
 with job(snakemake) as current:
     scene, checkpoint = read_scene(current.input.scene), read_checkpoint(current.input.checkpoint)
     provenance = current.provenance(scene.provenance, checkpoint["provenance"])
-    export_usd(current.output.usd, checkpoint, scene, current.settings(UsdJob), provenance)
+    export_usd(current.output.usd, checkpoint, scene, current.settings(ExportJob), provenance)

@@ -15,13 +15,13 @@ from drivesplat.model.checkpoint import trained_model
 from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, smooth_poses
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.export import UsdJob
+from drivesplat.settings.export import ExportJob
 
 log = logging.getLogger(__name__)
 
 
 def export_usd(
-    path: str | Path, checkpoint: dict[str, Any], scene: Scene, job: UsdJob, provenance: dict[str, Any]
+    path: str | Path, checkpoint: dict[str, Any], scene: Scene, job: ExportJob, provenance: dict[str, Any]
 ) -> None:
     """Writes the `job.gaussians` Gaussians of a checkpoint (its content) with the largest coverage, and the recorded
     `job.eval_camera`. Raises DatasetError if the scene lacks that camera."""

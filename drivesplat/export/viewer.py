@@ -30,7 +30,7 @@ from drivesplat.model.part import Sky
 from drivesplat.rendering.color_bytes import to_uint8
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Frame, Scene
-from drivesplat.settings.export import ViewerJob
+from drivesplat.settings.export import ExportJob
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ def export_viewer(
     path: str | Path,
     checkpoint: dict[str, Any],
     scene: Scene,
-    job: ViewerJob,
+    job: ExportJob,
     method: str,
     provenance: dict[str, Any],
 ) -> None:

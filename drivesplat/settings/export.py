@@ -12,15 +12,8 @@ class ExportSettings(Settings):
     """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
 
 
-class UsdJob(Settings):
-    """All settings that determine one scene.usdz."""
-
-    eval_camera: str
-    gaussians: int
-
-
-class ViewerJob(Settings):
-    """All settings that determine one viewer.html."""
+class ExportJob(Settings):
+    """All settings that determine one scene.usdz or one viewer.html."""
 
     eval_camera: str
     gaussians: int

@@ -11,6 +11,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.settings import Settings
+from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
@@ -18,7 +19,7 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.settings.export import UsdJob, ViewerJob
+from drivesplat.settings.export import ExportJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.inspection import PanelJob, RemovalJob, SubjectSettings, TracksJob
@@ -59,22 +60,23 @@ class Place:
     def dataset(self) -> DatasetSettings:
         return self.config.datasets[self.dataset_name]
 
-    @property
-    def subject(self) -> SubjectSettings:
-        """The vehicle that the user selected for the scene."""
-        return self.config.subjects.get(self.scene, SubjectSettings())
-
 
 def stage_settings(config: Config, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:
     """The canonical JSON of everything a stage of a scene (and method, and film) may know.
 
     Raises ValueError for a stage that there is none of, ConfigError for an unknown scene.
     """
-    if stage not in _RECORDS:
+    if stage not in _STAGES:
         raise ValueError(f"no stage is called {stage!r}")
     there, dataset = for_scene(config, scene, method), config.dataset_of(scene)
     place = Place(there, dataset, scene if stage in OF_ONE_SCENE else "", method or "", film or "")
-    return canonical_json(_RECORDS[stage](place).model_dump(mode="json"))
+    return canonical_json(_record(stage, place).model_dump(mode="json"))
+
+
+def _record(stage: str, place: Place) -> Settings:
+    record, own_fields = _STAGES[stage]
+    sections = {name: getattr(place.config, name) for name in record.model_fields if name in Config.model_fields}
+    return record(**sections | own_fields(place))
 
 
 def refines_poses(config: Config, scene: str) -> bool:
@@ -109,122 +111,90 @@ def idle_variants(config: Config, scene: str) -> list[str]:
     return [without for without, settings in zip(job.without, others, strict=True) if settings == whole]
 
 
-def _extract(place: Place) -> SceneSource:
-    config, dataset = place.config, place.dataset
-    return SceneSource(
-        dataset=place.dataset_name,
-        reader=dataset.reader,
-        version=dataset.version,
-        scene=place.scene,
-        frames=dataset.frames.get(place.scene),
-        cameras=config.cameras,
-        sweeps=config.sweeps,
-        lidar_sweeps=config.lidar_seed.sweeps,
-        on_missing=config.extract.on_missing,
-    )
+def _nothing(_: Place) -> dict[str, Any]:
+    return {}
 
 
-def _refine_poses(place: Place) -> RefinePosesJob:
-    config, lidar = place.config, None
-    if config.refine_poses.start == "images":
-        lidar = LidarRays(ray_spacing=config.lidar_depth.ray_spacing, own_car_radius=config.lidar_seed.own_car_radius)
-    return RefinePosesJob(refine_poses=config.refine_poses, random_seed=config.random_seed, lidar=lidar)
+def _scene_source(at: Place) -> dict[str, Any]:
+    return {
+        "dataset": at.dataset_name,
+        "reader": at.dataset.reader,
+        "version": at.dataset.version,
+        "scene": at.scene,
+        "frames": at.dataset.frames.get(at.scene),
+        "lidar_sweeps": at.config.lidar_seed.sweeps,
+        "on_missing": at.config.extract.on_missing,
+    }
 
 
-def _own_car(place: Place) -> EgoMaskJob:
-    config, kind = place.config, place.config.masks.own_car
+def _ego_mask(at: Place) -> dict[str, Any]:
+    config, kind = at.config, at.config.masks.own_car
     polygons = config.masks.own_car_polygons if kind != "none" else {}
     spared = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
     cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *spared})
-    search = EgoMaskSearch(cameras=cameras, holdout=config.holdout, own_car_radius=config.lidar_seed.own_car_radius)
-    return EgoMaskJob(polygons=polygons, search=search if cameras else None)
+    search = EgoMaskSearch(cameras=cameras, holdout=config.holdout, **_lidar(at, "own_car_radius"))
+    return {"polygons": polygons, "search": search if cameras else None}
 
 
-def _lidar_seed(place: Place) -> SeedJob:
-    config = place.config
-    return SeedJob(
-        lidar_seed=config.lidar_seed, holdout=config.holdout, images=config.images, random_seed=config.random_seed
-    )
+def _lidar_rays(at: Place) -> dict[str, Any]:
+    if at.config.refine_poses.start != "images":
+        return {}
+    return {"lidar": LidarRays(ray_spacing=at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius"))}
 
 
-def _actors(place: Place) -> ActorSeedJob:
-    config = place.config
-    return ActorSeedJob(
-        actors=config.actors,
-        holdout=config.holdout,
-        images=config.images,
-        own_car_radius=config.lidar_seed.own_car_radius,
-        random_seed=config.random_seed,
-    )
+def _lidar_depth(at: Place) -> dict[str, Any]:
+    return {"ray_spacing": at.config.lidar_depth.ray_spacing, **_lidar(at, "own_car_radius", "box_margin")}
 
 
-def _lidar_depth(place: Place) -> LidarDepthJob:
-    config = place.config
-    return LidarDepthJob(
-        ray_spacing=config.lidar_depth.ray_spacing,
-        holdout=config.holdout,
-        images=config.images,
-        own_car_radius=config.lidar_seed.own_car_radius,
-        box_margin=config.lidar_seed.box_margin,
-    )
+def _lidar(at: Place, *names: str) -> dict[str, Any]:
+    """Settings of the seed that hold for all uses of LiDAR."""
+    return {name: getattr(at.config.lidar_seed, name) for name in names}
 
 
-def _free_space(place: Place) -> FreeSpaceJob:
-    config = place.config
-    return FreeSpaceJob(
-        free_space=config.free_space,
-        holdout=config.holdout,
-        own_car_radius=config.lidar_seed.own_car_radius,
-        box_margin=config.lidar_seed.box_margin,
-    )
-
-
-def _train(place: Place) -> TrainJob:
-    config, method = place.config, place.config.all_methods[place.method]
+def _training(at: Place) -> dict[str, Any]:
+    config, method = at.config, at.config.all_methods[at.method]
     train = config.train if method.moving_parts else config.train.without_moving_parts()
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
-    return TrainJob(
-        parts=method.parts, sky=config.sky, train=train, random_seed=config.random_seed, reference_camera=reference
-    )
+    return {"parts": method.parts, "train": train, "reference_camera": reference}
 
 
-def _evaluate(place: Place) -> EvaluateJob:
-    config = place.config
-    return EvaluateJob(
-        eval_camera=config.eval_camera,
-        cameras=config.cameras,
-        sweeps=config.sweeps,
-        holdout=config.holdout,
-        lidar=_lidar_depth(place),
-        lpips=config.lpips.enabled,
-        removal=config.removal if place.dataset.world else None,
-    )
+def _evaluation(at: Place) -> dict[str, Any]:
+    return {
+        "lidar": _record("lidar_depth", at),
+        "lpips": at.config.lpips.enabled,
+        "removal": at.config.removal if at.dataset.world else None,
+    }
 
 
-def _format(place: Place) -> dict[str, Any]:
+def _format(at: Place) -> dict[str, Any]:
     """The fields of a `FilmFormat`."""
     fields = ("fps", "width", "height", "horizontal_fov", "crf")
-    return {"camera": place.config.eval_camera, **{name: getattr(place.config.render, name) for name in fields}}
+    return {"camera": at.config.eval_camera, **{name: getattr(at.config.render, name) for name in fields}}
 
 
-def _film(place: Place) -> FilmJob:
-    trajectories = place.config.render.trajectories
-    if place.film not in trajectories:
-        raise ConfigError(no_such_film(place.config, f"dataset {place.dataset_name}", place.film))
-    return FilmJob(trajectory=trajectories[place.film], **_format(place))
+def _film(at: Place) -> dict[str, Any]:
+    trajectories = at.config.render.trajectories
+    if at.film not in trajectories:
+        raise ConfigError(no_such_film(at.config, f"dataset {at.dataset_name}", at.film))
+    return {"trajectory": trajectories[at.film], **_format(at)}
+
+
+def _edit(at: Place) -> dict[str, Any]:
+    edits = scene_edits(at.config, at.scene)
+    if at.film not in edits:
+        raise ConfigError(no_such_edit(at.scene, at.film, edits))
+    return {"edit": edits[at.film], "frames": at.config.render.edited_frames, **_format(at)}
+
+
+def _subject(at: Place) -> dict[str, Any]:
+    """The vehicle that the user selected for the scene."""
+    return {"subject": at.config.subjects.get(at.scene, SubjectSettings())}
 
 
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
     """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
     path = config.datasets[config.dataset_of(scene)].edits.get(scene)
     return read_edits(Path(path).expanduser()) if path else {}
-
-
-def _edit(place: Place) -> EditJob:
-    edits = scene_edits(place.config, place.scene)
-    if place.film not in edits:
-        raise ConfigError(no_such_edit(place.scene, place.film, edits))
-    return EditJob(edit=edits[place.film], frames=place.config.render.edited_frames, **_format(place))
 
 
 def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:
@@ -239,43 +209,30 @@ def no_such_film(config: Config, whose: str, name: str) -> str:
     return f"{whose} has no film called {name!r}; there are: {known} (add it to render.trajectories)"
 
 
-def _ghost_panel(place: Place) -> PanelJob:
-    return PanelJob(eval_camera=place.config.eval_camera, subject=place.subject, ghosts=place.config.ghosts)
-
-
-def _remove_actor(place: Place) -> RemovalJob:
-    return RemovalJob(
-        eval_camera=place.config.eval_camera,
-        subject=place.subject,
-        ghosts=place.config.ghosts,
-        removal=place.config.removal,
-    )
-
-
-_RECORDS: dict[str, Callable[[Place], Settings]] = {
-    "demo_world": lambda at: WorldJob(scene=at.scene, version=at.dataset.version, world=at.dataset.world),
-    "extract": _extract,
-    "own_car": _own_car,
-    "refine_poses": _refine_poses,
-    "lidar_seed": _lidar_seed,
-    "parser": lambda at: ParserJob(holdout=at.config.holdout, images=at.config.images),
-    "masks": lambda at: MaskJob(masks=at.config.masks, holdout=at.config.holdout, images=at.config.images),
-    "actors": _actors,
-    "lidar_depth": _lidar_depth,
-    "free_space": _free_space,
-    "train": _train,
-    "evaluate": _evaluate,
-    "scene_metrics": lambda _: Settings(),
-    "ablation": lambda at: at.config.ablation.job,
-    "tracks": lambda at: TracksJob(eval_camera=at.config.eval_camera),
-    "film": _film,
-    "film_parts": lambda at: FilmFormat(**_format(at)),
-    "edit": _edit,
-    "ghost_panel": _ghost_panel,
-    "remove_actor": _remove_actor,
-    "export": lambda _: Settings(),
-    "export_usd": lambda at: UsdJob(eval_camera=at.config.eval_camera, gaussians=at.config.export.usd_gaussians),
-    "export_viewer": lambda at: ViewerJob(
-        eval_camera=at.config.eval_camera, gaussians=at.config.export.viewer_gaussians
-    ),
+_STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
+    "demo_world": (WorldJob, lambda at: {"scene": at.scene, "version": at.dataset.version, "world": at.dataset.world}),
+    "extract": (SceneSource, _scene_source),
+    "own_car": (EgoMaskJob, _ego_mask),
+    "refine_poses": (RefinePosesJob, _lidar_rays),
+    "lidar_seed": (SeedJob, _nothing),
+    "parser": (ParserJob, _nothing),
+    "masks": (MaskJob, _nothing),
+    "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
+    "lidar_depth": (LidarDepthJob, _lidar_depth),
+    "free_space": (FreeSpaceJob, lambda at: _lidar(at, "own_car_radius", "box_margin")),
+    "train": (TrainJob, _training),
+    "evaluate": (EvaluateJob, _evaluation),
+    "scene_metrics": (Settings, _nothing),
+    "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
+    "tracks": (TracksJob, _nothing),
+    "film": (FilmJob, _film),
+    "film_parts": (FilmFormat, _format),
+    "edit": (EditJob, _edit),
+    "ghost_panel": (PanelJob, _subject),
+    "remove_actor": (RemovalJob, _subject),
+    "export": (Settings, _nothing),
+    "export_usd": (ExportJob, lambda at: {"gaussians": at.config.export.usd_gaussians}),
+    "export_viewer": (ExportJob, lambda at: {"gaussians": at.config.export.viewer_gaussians}),
 }
+"""The record of every stage, and a function that gives those of its fields that are not sections of the config, or are
+changed for it."""

@@ -19,7 +19,7 @@ from drivesplat.model.build import definitions
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import rigid
-from drivesplat.settings.export import UsdJob
+from drivesplat.settings.export import ExportJob
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 
@@ -59,7 +59,7 @@ def checkpoint():
 @pytest.fixture(scope="module")
 def package(tmp_path_factory, checkpoint, tiny_scene):
     path = tmp_path_factory.mktemp("usd") / "scene.usdz"
-    job = UsdJob(eval_camera="CAM_FRONT", gaussians=KEPT)
+    job = ExportJob(eval_camera="CAM_FRONT", gaussians=KEPT)
     export_usd(path, checkpoint, tiny_scene, job, PROVENANCE)
     return path
 
@@ -301,7 +301,7 @@ def test_a_failing_packer_is_reported_and_leaves_no_file(tmp_path, monkeypatch, 
 
 
 def test_a_missing_camera_is_named(tmp_path, checkpoint, tiny_scene):
-    job = UsdJob(eval_camera="CAM_BACK", gaussians=KEPT)
+    job = ExportJob(eval_camera="CAM_BACK", gaussians=KEPT)
     with pytest.raises(DatasetError, match=r"scene 0001 .*CAM_BACK.*CAM_FRONT.*eval_camera"):
         export_usd(tmp_path / "scene.usdz", checkpoint, tiny_scene, job, PROVENANCE)
     assert not list(tmp_path.iterdir())

@@ -21,7 +21,7 @@ from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.usd import splat_stage, write_usdz
 from drivesplat.export.usd_asset import export_usd
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.settings.export import UsdJob
+from drivesplat.settings.export import ExportJob
 
 PROVENANCE = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64, "stages": {}}
 MIDDLE = 2.25
@@ -43,7 +43,7 @@ def package(tmp_path_factory, scene):
     path = tmp_path_factory.mktemp("usd") / "scene.usdz"
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(usd_asset, "trained_model", lambda _: (street(), None))
-        export_usd(path, {}, scene, UsdJob(eval_camera="CAM_FRONT", gaussians=1000), PROVENANCE)
+        export_usd(path, {}, scene, ExportJob(eval_camera="CAM_FRONT", gaussians=1000), PROVENANCE)
     return path
 
 
@@ -242,7 +242,7 @@ def test_the_budget_is_shared_by_all_groups_and_an_empty_object_is_valid(tmp_pat
     """The two wide, opaque Gaussians of the background cover most."""
     monkeypatch.setattr(usd_asset, "trained_model", lambda _: (street(), None))
     monkeypatch.setattr("helpers.hand_made_traffic.own_gaussians", lambda *_: some_gaussians(12, 1, 0)[slice(0, 1)])
-    job = UsdJob(eval_camera="CAM_FRONT", gaussians=2)
+    job = ExportJob(eval_camera="CAM_FRONT", gaussians=2)
     export_usd(tmp_path / "scene.usdz", {}, scene, job, PROVENANCE)
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
     assert sum(counts(stage).values()) == 2 and counts(stage).keys() == {"/World/background", *PATHS.values()}

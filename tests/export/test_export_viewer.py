@@ -26,7 +26,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame
-from drivesplat.settings.export import ViewerJob
+from drivesplat.settings.export import ExportJob
 from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 
@@ -92,7 +92,7 @@ def checkpoint():
 @pytest.fixture(scope="module")
 def page(tmp_path_factory, checkpoint, tiny_scene) -> str:
     path = tmp_path_factory.mktemp("viewer") / "viewer.html"
-    job = ViewerJob(eval_camera="CAM_FRONT", gaussians=KEPT)
+    job = ExportJob(eval_camera="CAM_FRONT", gaussians=KEPT)
     export_viewer(path, checkpoint, tiny_scene, job, "vanilla", PROVENANCE)
     return path.read_text(encoding="utf-8")
 
@@ -140,7 +140,7 @@ def test_objects_present_at_the_middle_image_are_placed_there(tmp_path, tiny_sce
     """Two vehicles, of which one is absent then; beside a background without view dependence."""
     model = SplatModel([round_gaussians([[1.0, 2.0, 3.0]]), Traffic()], None)
     monkeypatch.setattr(viewer, "trained_model", lambda _: (model, None))
-    job = ViewerJob(eval_camera="CAM_FRONT", gaussians=1000)
+    job = ExportJob(eval_camera="CAM_FRONT", gaussians=1000)
     export_viewer(tmp_path / "viewer.html", {}, tiny_scene, job, "street", PROVENANCE)
     scene, arrays = decoded((tmp_path / "viewer.html").read_text(encoding="utf-8"))
     there = placed(own_gaussians(TURNING, 2.25), COURSES[TURNING].pose(2.25))
