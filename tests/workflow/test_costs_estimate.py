@@ -8,9 +8,16 @@ from helpers import REPOSITORY
 from helpers.workflow_copy import WorkflowCopy
 
 from drivesplat.settings.config import load, merged
-from drivesplat.workflow.costs.disk import disk_need
-from drivesplat.workflow.costs.estimate import Machine, PlannedJob, estimate, in_full, in_one_line, spelled
-from drivesplat.workflow.costs.expected import Expectations, Work, wall_seconds
+from drivesplat.workflow.costs.estimate import (
+    Expectations,
+    Machine,
+    PlannedJob,
+    estimate,
+    in_full,
+    in_one_line,
+    spelled,
+    wall_seconds,
+)
 from drivesplat.workflow.costs.measured import Cost, JobId
 from drivesplat.workflow.costs.run_costs import planned_job
 
@@ -31,38 +38,38 @@ def test_the_nearest_that_was_measured_counts():
         [Cost(JobId("masks", s), t, "") for s, t in (("0103", 3.0), ("0553", 5.0))],
     )
     demo = Cost(JobId("masks", "demo"), 100.0, "")
-    assert expectations(own, *peers, demo).of(JobId("masks", "0061")).seconds == 7.0
+    assert expectations(own, *peers, demo).of(JobId("masks", "0061")) == (7.0, {own.job})
     found = expectations(*peers, demo).of(JobId("masks", "0061"))
-    assert (found.seconds, found.measured) == (4.0, {JobId("masks", "0103"), JobId("masks", "0553")})
-    found = expectations(demo).of(JobId("masks", "0061"))
-    assert (found.seconds, found.measured) == (None, frozenset()), "another dataset tells nothing"
+    assert found == (4.0, {JobId("masks", "0103"), JobId("masks", "0553")})
+    assert expectations(demo).of(JobId("masks", "0061")) == (None, set()), "another dataset tells nothing"
 
 
 def test_a_training_goes_with_its_iterations():
     measured = [training("0061", "vanilla", 100.0, 10000), training("0061", "street", 300.0, 15000)]
     known = expectations(*measured, train={"iterations": 30000})
-    assert known.of(JobId("train", "0103", "vanilla")).seconds == 300.0
-    assert known.of(JobId("train", "0103", "street")).seconds == 600.0
+    assert known.of(JobId("train", "0103", "vanilla"))[0] == 300.0
+    assert known.of(JobId("train", "0103", "street"))[0] == 600.0
     more = expectations(measured[0], train={"iterations": 30000}).of(JobId("train", "0103", "street"))
-    assert not more.measured, "a method without parts that move tells nothing of one with them"
-    assert more.seconds is None
+    assert more == (None, set()), "a method without parts that move tells nothing of one with them"
 
 
 def test_a_synthetic_world_tells_the_cost_of_no_other():
     measured = expectations(Cost(JobId("demo_world", film="demo"), 50.0, ""))
-    assert measured.of(JobId("demo_world", film="demo")).seconds == 50.0
-    assert measured.of(JobId("demo_world", film="large")).seconds is None
+    assert measured.of(JobId("demo_world", film="demo")) == (50.0, {JobId("demo_world", film="demo")})
+    assert measured.of(JobId("demo_world", film="large")) == (None, set())
 
 
 def test_scenes_and_methods_share_cores_and_cards():
-    work = [Work(JobId("train", scene, m), 100.0, 8, True) for scene in "abcd" for m in ("vanilla", "street")]
-    work += [Work(JobId("masks", scene), 10.0, 1, False) for scene in "abcd"]
-    assert wall_seconds(work, cores=1, gpus=1) == 840.0
-    assert wall_seconds(work, cores=4, gpus=8) == 810.0, "a training takes all four"
-    assert wall_seconds(work, cores=64, gpus=1) == 800.0
-    assert wall_seconds(work, cores=64, gpus=4) == 200.0
-    assert wall_seconds(work, cores=64, gpus=8) == 110.0, "a training waits for its scene's masks"
-    assert wall_seconds([], cores=1, gpus=1) == 0.0
+    work = [
+        PlannedJob(JobId("train", scene, m), 8, True, seconds=100.0) for scene in "abcd" for m in ("vanilla", "street")
+    ]
+    work += [PlannedJob(JobId("masks", scene), 1, False, seconds=10.0) for scene in "abcd"]
+    assert wall_seconds(work, Machine(1, 1)) == 840.0
+    assert wall_seconds(work, Machine(4, 8)) == 810.0, "a training takes all four"
+    assert wall_seconds(work, Machine(64, 1)) == 800.0
+    assert wall_seconds(work, Machine(64, 4)) == 200.0
+    assert wall_seconds(work, Machine(64, 8)) == 110.0, "a training waits for its scene's masks"
+    assert wall_seconds([], Machine(1, 1)) == 0.0
 
 
 def test_an_estimate_says_how_it_knows_and_what_is_not_measured_yet(tmp_path):
@@ -93,15 +100,16 @@ def test_disk_is_what_the_same_jobs_left_for_other_scenes(tmp_path):
         (folder / "checkpoint.npz").write_bytes(bytes(size))
         (folder / "tensorboard/events").write_bytes(bytes(50))
     own = f"{tmp_path}/0061/street"
-    jobs = [
-        (JobId("train", "0061", "street"), (f"{own}/checkpoint.npz", f"{own}/train.json")),
-        (JobId("film", "0061", "street", "original"), (f"{own}/original.mp4",)),
-        (JobId("train", "0103", "street"), (f"{tmp_path}/0103/street/checkpoint.npz",)),
+    planned = [
+        PlannedJob(JobId("train", "0061", "street"), 1, True, (f"{own}/checkpoint.npz", f"{own}/train.json")),
+        PlannedJob(JobId("film", "0061", "street", "original"), 1, True, (f"{own}/original.mp4",)),
+        PlannedJob(JobId("train", "0103", "street"), 1, True, (f"{tmp_path}/0103/street/checkpoint.npz",)),
     ]
-    found = disk_need(tmp_path, jobs, lambda scene: ["0103", "0553", "0655"])
-    assert found.needed == 2050, "what is there already is replaced"
-    assert found.unknown == 1 and found.free > 0
-    assert disk_need(tmp_path / "not/there/yet", [], lambda scene: []).free > 0
+    known = expectations()
+    assert [known.disk_bytes(one, tmp_path) for one in planned] == [2050.0, None, 0.0], "what is there is replaced"
+    found = estimate(planned, known, Machine(1, 1), tmp_path)
+    assert (found.disk, found.unknown_disk) == (2050.0, 1) and found.free_disk > 0
+    assert estimate([], known, Machine(1, 1), tmp_path / "not/there/yet").free_disk > 0
 
 
 @pytest.mark.parametrize(("gpu", "on_gpu"), [(1, True), (0, False), (None, False)])

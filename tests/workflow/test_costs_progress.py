@@ -11,10 +11,9 @@ from helpers import REPOSITORY
 
 from drivesplat.settings.config import load
 from drivesplat.training import monitor
-from drivesplat.workflow.costs.estimate import Machine, PlannedJob
-from drivesplat.workflow.costs.expected import Expectations
+from drivesplat.workflow.costs.estimate import Expectations, Machine, PlannedJob
 from drivesplat.workflow.costs.measured import Cost, JobId
-from drivesplat.workflow.costs.progress import RunProgress, Watch
+from drivesplat.workflow.costs.progress import RunProgress, watch
 
 CONFIG = load(yaml.safe_load((REPOSITORY / "config.yaml").read_text()))
 MASKS, TRAIN, FILM = (
@@ -111,13 +110,12 @@ def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_watch_prints_and_outlives_what_goes_wrong(tmp_path, capsys, fails):
     finished = set() if not fails else None
-    watch = Watch(progress(tmp_path, finished), every_s=0.01)
-    watch.start()
+    ended = watch(progress(tmp_path, finished), every_s=0.01)
     deadline, said = time.monotonic() + 10, ""
     while said.count("\n") < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
         said += capsys.readouterr().err
-    watch.stop()
+    ended.set()
     assert (
         said.count("drivesplat: ") >= 2
         and ("the progress of the run is unknown" if fails else "0 % of the work") in said

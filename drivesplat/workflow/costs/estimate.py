@@ -1,14 +1,18 @@
-"""The expected time and disk of a run before it starts, from what has been measured in its results folder."""
+"""The expected time and disk of a run, from what the same jobs took and left in its results folder."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from drivesplat.workflow.costs.disk import DiskNeed, disk_need
-from drivesplat.workflow.costs.expected import Expectations, Work, wall_seconds
-from drivesplat.workflow.costs.measured import JobId
+from drivesplat.io.free_disk import free_bytes
+from drivesplat.settings.config import Config, for_scene
+from drivesplat.workflow.costs.measured import TRAIN, WORLD, Cost, JobId
 
 NOT_MEASURED = "not measured yet"
+MEMBER_FOLDERS = {"masks.json": ".", "checkpoint.npz": "tensorboard", "parts.json": "."}
+"""Outputs beside which a job writes files that no rule declares, and the folder of these."""
 
 
 @dataclass(frozen=True)
@@ -21,18 +25,109 @@ class Machine:
 
 @dataclass(frozen=True)
 class PlannedJob:
-    """A job that is to run, the threads it takes, whether it takes a GPU, and its declared outputs."""
+    """A job that is to run: its threads, whether it takes a GPU, its declared outputs, and the seconds that it still
+    takes (None: not measured)."""
 
     job: JobId
     threads: int
     on_gpu: bool
     outputs: tuple[str, ...] = ()
+    seconds: float | None = None
+
+
+class Expectations:
+    """The expected costs of jobs of a `config`, given measured `costs`."""
+
+    def __init__(self, config: Config, costs: Sequence[Cost]):
+        self._config = config
+        self._costs: dict[tuple[str, str], list[Cost]] = defaultdict(list)
+        for cost in costs:
+            self._costs[self._kind(cost.job)].append(cost)
+
+    def of(self, job: JobId) -> tuple[float | None, set[JobId]]:
+        """The median seconds of measured jobs, and these jobs: the job itself where it ran before; else those of its
+        stage and method on other scenes of the dataset; else those of its stage. None where there are none. The seconds
+        of a training are scaled with its iterations."""
+        peers = self._costs.get(self._kind(job), [])
+        alike: list[Callable[[Cost], bool]] = [
+            lambda cost: cost.job == job,
+            lambda cost: cost.job.method == job.method,
+            lambda cost: job.stage != TRAIN or self._moves(cost.job.method) == self._moves(job.method),
+        ]
+        for like in alike:
+            found = {c.job: seconds for c in peers if like(c) and (seconds := self._scaled(c, job)) is not None}
+            if found:
+                return statistics.median(found.values()), set(found)
+        return None, set()
+
+    def disk_bytes(self, planned: PlannedJob, results: Path) -> float | None:
+        """Bytes that a job will add to the results folder: none where it replaces files, else the median of what it
+        left for the other scenes of the dataset, None where there is nothing."""
+        if _size(planned.outputs):
+            return 0.0
+        scene = planned.job.scene
+        places = [
+            path.relative_to(results / scene) for path in map(Path, planned.outputs) if results / scene in path.parents
+        ]
+        peers = (
+            other for other in self._config.scenes if other != scene and self._dataset(other) == self._dataset(scene)
+        )
+        known = [size for other in peers if (size := _size(results / other / place for place in places))]
+        return statistics.median(known) if known else None
+
+    def _kind(self, job: JobId) -> tuple[str, str]:
+        """The stage and dataset of a job, whose jobs are compared; a synthetic world is compared with no other."""
+        return job.stage, job.film if job.stage == WORLD else self._dataset(job.scene)
+
+    def _dataset(self, scene: str) -> str:
+        """A scene's dataset, empty for jobs of no scene; a scene that is no longer configured has one of its own."""
+        return self._config.dataset_names.get(scene, f"?{scene}" if scene else "")
+
+    def _scaled(self, cost: Cost, job: JobId) -> float | None:
+        if job.stage != TRAIN:
+            return cost.seconds
+        iterations = for_scene(self._config, job.scene, job.method).train.iterations
+        return cost.seconds * iterations / cost.iterations if cost.iterations else None
+
+    def _moves(self, method: str) -> bool:
+        known = self._config.all_methods
+        return method in known and bool(known[method].moving_parts)
+
+
+def _size(files: Iterable[str | Path]) -> float:
+    """Bytes of these files and of those that their jobs wrote beside them; 0 where there are none."""
+    found: set[Path] = set()
+    for path in (Path(file) for file in files if Path(file).is_file()):
+        found.add(path)
+        if path.name in MEMBER_FOLDERS:
+            found |= {file for file in (path.parent / MEMBER_FOLDERS[path.name]).rglob("*") if file.is_file()}
+    return float(sum(file.stat().st_size for file in found))
+
+
+def wall_seconds(planned: Iterable[PlannedJob], machine: Machine) -> float:
+    """A lower bound of the time that jobs of known seconds take: cores are never idle, each GPU has one job, and a
+    method's training waits for its scene's stages. Close where there is more work than machine."""
+    jobs = [(one, one.seconds) for one in planned if one.seconds is not None]
+    busy = sum(seconds * min(one.threads, machine.cores) for one, seconds in jobs) / max(1, machine.cores)
+    on_gpus = sum(seconds for one, seconds in jobs if one.on_gpu) / max(1, machine.gpus)
+    own, trainings, longest = (defaultdict[tuple[str, str], float](float) for _ in range(3))
+    for one, seconds in jobs:
+        place = one.job.scene, one.job.method
+        if not one.job.method:
+            own[place] += seconds
+        elif one.job.stage == TRAIN:
+            trainings[place] += seconds
+        else:
+            longest[place] = max(longest[place], seconds)
+    chains = [own[scene, ""] + trainings[scene, m] + longest[scene, m] for scene, m in {*own, *trainings, *longest}]
+    return max([busy, on_gpus, *chains])
 
 
 @dataclass(frozen=True)
 class Estimate:
     """The expected wall time (s) of those of a run's `jobs` that are `known` from `measured` jobs; per stage the number
-    of jobs and the mean seconds of the known ones (None: not measured), the dearest first; and the disk they fill."""
+    of jobs and the mean seconds of the known ones (None: not measured), the dearest first; the bytes that the run adds,
+    without those of `unknown_disk` jobs, and the free bytes."""
 
     jobs: int
     seconds: float
@@ -40,30 +135,31 @@ class Estimate:
     measured: int
     by_stage: dict[str, tuple[int, float | None]]
     machine: Machine
-    disk: DiskNeed
+    disk: float
+    unknown_disk: int
+    free_disk: float
 
 
 def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine: Machine, results: Path) -> Estimate:
     """The estimate of `planned` jobs in a results folder."""
     expected = [expectations.of(one.job) for one in planned]
-    work = [
-        Work(one.job, found.seconds, one.threads, one.on_gpu)
-        for one, found in zip(planned, expected, strict=True)
-        if found.seconds is not None
-    ]
-    stages: dict[str, list[float]] = {one.job.stage: [] for one in planned}
-    for known in work:
-        stages[known.job.stage].append(known.seconds)
-    jobs = [one.job.stage for one in planned]
-    dearest = sorted(stages, key=lambda stage: -sum(stages[stage]))
+    stages: dict[str, list[float | None]] = defaultdict(list)
+    for one, (seconds, _) in zip(planned, expected, strict=True):
+        stages[one.job.stage].append(seconds)
+    known = {stage: [value for value in values if value is not None] for stage, values in stages.items()}
+    dearest = sorted(stages, key=lambda stage: -sum(known[stage]))
+    disk = [expectations.disk_bytes(one, results) for one in planned]
+    jobs = [replace(one, seconds=seconds) for one, (seconds, _) in zip(planned, expected, strict=True)]
     return Estimate(
         jobs=len(planned),
-        seconds=wall_seconds(work, machine.cores, machine.gpus),
-        known=len(work),
-        measured=len(frozenset().union(*(found.measured for found in expected))),
-        by_stage={s: (jobs.count(s), sum(stages[s]) / len(stages[s]) if stages[s] else None) for s in dearest},
+        seconds=wall_seconds(jobs, machine),
+        known=sum(map(len, known.values())),
+        measured=len(set().union(*(measured for _, measured in expected))),
+        by_stage={s: (len(stages[s]), statistics.fmean(known[s]) if known[s] else None) for s in dearest},
         machine=machine,
-        disk=disk_need(results, [(one.job, one.outputs) for one in planned], expectations.peers),
+        disk=sum((size or 0.0 for size in disk), 0.0),
+        unknown_disk=disk.count(None),
+        free_disk=float(free_bytes(results)),
     )
 
 
@@ -71,8 +167,7 @@ def in_one_line(found: Estimate) -> str:
     """'27 jobs, about 12 min on 4 cores (from 22 measured jobs; 3 not measured yet), about 0.4 GB of disk (…)'."""
     if not found.jobs:
         return "nothing is to be run"
-    jobs = f"{found.jobs} job{'s' * (found.jobs > 1)}"
-    return f"{jobs}, {_time(found)}, {_disk(found)}"
+    return f"{found.jobs} job{'s' * (found.jobs > 1)}, {_time(found)}, {_disk(found)}"
 
 
 def _time(found: Estimate) -> str:
@@ -87,12 +182,13 @@ def _time(found: Estimate) -> str:
 
 
 def _disk(found: Estimate) -> str:
-    disk, free = found.disk, f"{found.disk.free / 1e9:.1f} GB free"
-    if disk.unknown == found.jobs:
+    free = f"{found.free_disk / 1e9:.1f} GB free"
+    if found.unknown_disk == found.jobs:
         return f"disk {NOT_MEASURED} ({free})"
-    missing = f"; {disk.unknown} jobs {NOT_MEASURED}" if disk.unknown else ""
-    warning = "; that is more than there is" if disk.needed > disk.free else ""
-    return f"about {_spelled_bytes(disk.needed)} of disk ({free}{missing}){warning}"
+    missing = f"; {found.unknown_disk} jobs {NOT_MEASURED}" if found.unknown_disk else ""
+    warning = "; that is more than there is" if found.disk > found.free_disk else ""
+    size = f"{found.disk / 1e9:.1f} GB" if found.disk >= 1e9 else f"{found.disk / 1e6:.0f} MB"
+    return f"about {size} of disk ({free}{missing}){warning}"
 
 
 def in_full(found: Estimate) -> str:
@@ -109,7 +205,3 @@ def spelled(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
-
-
-def _spelled_bytes(size: float) -> str:
-    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

@@ -5,10 +5,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from drivesplat.workflow.costs.estimate import NOT_MEASURED, Machine, PlannedJob, spelled
-from drivesplat.workflow.costs.expected import Expectations, Work, wall_seconds
+from drivesplat.workflow.costs.estimate import NOT_MEASURED, Expectations, Machine, PlannedJob, spelled, wall_seconds
 from drivesplat.workflow.costs.measured import TRAIN, JobId
 from drivesplat.workflow.job_logs import has_begun, is_cut_short
 
@@ -45,7 +45,7 @@ class RunProgress:
         expectations, finished = self._expectations(), self._finished()
         done, unknown, left, at_work = 0.0, 0, [], []
         for one in self._planned:
-            seconds = expectations.of(one.job).seconds
+            seconds, _ = expectations.of(one.job)
             working = False if one.job in finished else self._is_at_work(one.job)
             remaining = seconds if working is None else 0.0
             if working:
@@ -57,10 +57,10 @@ class RunProgress:
                 unknown += 1
                 continue
             done += max(0.0, (seconds or 0.0) - remaining)
-            left.append(Work(one.job, remaining, one.threads, one.on_gpu))
-        whole = done + sum(work.seconds for work in left)
+            left.append(replace(one, seconds=remaining))
+        whole = done + sum(one.seconds for one in left)
         share = "" if unknown else f"{100.0 * done / whole if whole else 100.0:.0f} % of the work, "
-        time_left = spelled(wall_seconds(left, self._machine.cores, self._machine.gpus))
+        time_left = spelled(wall_seconds(left, self._machine))
         more = f" and {len(at_work) - MAX_NAMED} more" if len(at_work) > MAX_NAMED else ""
         named = f"; at work: {', '.join(at_work[:MAX_NAMED])}{more}" if at_work else ""
         missing = f" and {unknown} jobs {NOT_MEASURED}" if unknown else ""
@@ -92,24 +92,18 @@ def _tail(path: Path) -> str:
         return file.read().decode(errors="replace")
 
 
-class Watch:
-    """A thread that prints a run's progress every EVERY_S seconds until it is told to stop, or the process ends."""
+def watch(progress: RunProgress, every_s: float = EVERY_S) -> threading.Event:
+    """Starts a thread that prints a run's progress every `every_s` seconds until the returned event is set, or the
+    process ends."""
+    ended = threading.Event()
 
-    def __init__(self, progress: RunProgress, every_s: float = EVERY_S):
-        self._progress, self._every_s = progress, every_s
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._look, name="progress", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._ended.set()
-
-    def _look(self) -> None:
-        while not self._ended.wait(self._every_s):
+    def look() -> None:
+        while not ended.wait(every_s):
             try:
-                line = self._progress.line(time.time())
+                line = progress.line(time.time())
             except Exception as error:  # a failure to report progress must not end the run
                 line = f"the progress of the run is unknown ({type(error).__name__}: {error})"
             print(f"drivesplat: {line}", file=sys.stderr, flush=True)
+
+    threading.Thread(target=look, name="progress", daemon=True).start()
+    return ended

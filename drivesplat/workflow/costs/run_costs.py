@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,10 +10,17 @@ from typing import Any
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.settings.overridden import without_effect
-from drivesplat.workflow.costs.estimate import Estimate, Machine, PlannedJob, estimate, in_full, in_one_line
-from drivesplat.workflow.costs.expected import Expectations
+from drivesplat.workflow.costs.estimate import (
+    Estimate,
+    Expectations,
+    Machine,
+    PlannedJob,
+    estimate,
+    in_full,
+    in_one_line,
+)
 from drivesplat.workflow.costs.measured import BENCHMARKS, JobId, read_costs
-from drivesplat.workflow.costs.progress import RunProgress, Watch
+from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
 from drivesplat.workflow.plan import Plan
 
@@ -27,7 +35,7 @@ class RunCosts:
         self._plan, self._workflow, self._targets = plan, workflow, targets
         self._results = Path(plan.config.results_dir)
         self._jobs: dict[JobId, Any] = {}
-        self._watch: Watch | None = None
+        self._ended: threading.Event | None = None
 
     def tell_estimate(self) -> bool:
         """Prints which settings will not hold, and what is to be expected, in full, where that is all that is asked
@@ -45,15 +53,11 @@ class RunCosts:
             self._jobs = self._needed()
             if self._jobs:
                 _say(in_one_line(self.estimate()))
-                self._watch_jobs()
+                logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
+                watched = self._planned, logs, self._expectations, self._finished, self._machine, time.time()
+                self._ended = watch(RunProgress(*watched))
         except Exception as error:  # a failed estimate must not end the run
             _say(f"the run cannot be estimated ({type(error).__name__}: {error})")
-
-    def _watch_jobs(self) -> None:
-        logs = {name: Path(str(job.log[0])) for name, job in self._jobs.items() if job.log}
-        args = self._planned, logs, self._expectations, self._finished, self._machine, time.time()
-        self._watch = Watch(RunProgress(*args))
-        self._watch.start()
 
     def estimate(self) -> Estimate:
         """What is to be expected of the run."""
@@ -62,8 +66,8 @@ class RunCosts:
     def end(self) -> None:
         """Writes costs.csv and costs.json, and says which scenes of this run took 90 minutes or more. A failure is told
         and ends nothing."""
-        if self._watch is not None:
-            self._watch.stop()
+        if self._ended is not None:
+            self._ended.set()
         try:
             record = write_costs(self._results, list(self._plan.config.methods))
         except (DriveSplatError, OSError) as error:
