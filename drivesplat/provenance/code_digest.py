@@ -9,7 +9,7 @@ from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
 
-from drivesplat.provenance.syntax_digest import SyntaxDigest, syntax_digests
+from drivesplat.provenance.syntax_digest import cached_digest
 
 PACKAGE = "drivesplat"
 PACKAGE_FOLDER = Path(__file__).parents[1]
@@ -32,13 +32,10 @@ def code_digest(script: str | Path) -> str:
             modules[name] = _content(file)
             waiting |= _imports(file, package=name if file.name == "__init__.py" else name.rpartition(".")[0])
     content = [_content(path), *(f"{name}\n{modules[name]}" for name in sorted(modules))]
-    syntax_digests(PACKAGE_FOLDER / "__pycache__").save()
     return hashlib.sha256("\n\n".join(content).encode()).hexdigest()
 
 
-@cache
-def _syntax(path: Path) -> SyntaxDigest:
-    return syntax_digests(PACKAGE_FOLDER / "__pycache__").of(path)
+_syntax = cache(cached_digest)
 
 
 @cache

@@ -1,6 +1,6 @@
 """Digests of Python source by its syntax tree: comments, docstrings, layout and the Python version change nothing.
 
-A digest follows from the file's bytes alone and is cached by them: planning the workflow needs those of all modules.
+A digest follows from the file's bytes alone, and is cached: planning the workflow needs those of all modules.
 """
 
 import ast
@@ -13,11 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from drivesplat.errors import ResultError
-from drivesplat.io.storage import atomic_write
-
-MAX_CACHED = 5000
-"""Number of cached files above which those not used by this process are dropped; about 300 bytes each."""
 IGNORED_FIELDS = ("kind", "ctx")
 """Fields of syntax nodes that say how a string was spelled, or repeat what the parent node says."""
 
@@ -33,44 +28,26 @@ class SyntaxDigest:
     constants that spell dotted names."""
 
 
-class SyntaxDigests:
-    """Digests of files, cached at `path` where that can be written."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._known: dict[str, SyntaxDigest] = {}
-        with suppress(OSError, ValueError, TypeError, AttributeError):  # absent, truncated or foreign: computed again
-            stored = json.loads(path.read_text(encoding="utf-8"))
-            self._known = {key: SyntaxDigest(digest, tuple(names)) for key, (digest, names) in stored.items()}
-        self._used: set[str] = set()
-        self._changed = False
-
-    def of(self, file: Path) -> SyntaxDigest:
-        """The digest of a file. Raises SyntaxError where it is not Python."""
-        content = file.read_bytes()
-        key = hashlib.sha256(content).hexdigest()
-        self._used.add(key)
-        if key not in self._known:
-            self._known[key] = syntax_digest(content)
-            self._changed = True
-        return self._known[key]
-
-    def save(self) -> None:
-        """Writes the cache if it has changed."""
-        if not self._changed:
-            return
-        if len(self._known) > MAX_CACHED:
-            self._known = {key: known for key, known in self._known.items() if key in self._used}
-        with suppress(ResultError), atomic_write(self._path) as file:
-            file.write(json.dumps({key: (d.digest, d.names) for key, d in self._known.items()}).encode())
-        self._changed = False
+def cached_digest(file: Path) -> SyntaxDigest:
+    """The digest of a file, cached beside it as bytecode is. Raises SyntaxError where it is not Python."""
+    content = file.read_bytes()
+    key = hashlib.sha256(_own_content() + content).hexdigest()
+    cache = file.parent / "__pycache__" / f"{file.stem}.syntax.json"
+    with suppress(OSError, ValueError, TypeError):  # absent, truncated or foreign: computed again
+        known, digest, names = json.loads(cache.read_text(encoding="utf-8"))
+        if known == key:
+            return SyntaxDigest(digest, tuple(names))
+    found = syntax_digest(content)
+    with suppress(OSError):
+        cache.parent.mkdir(exist_ok=True)
+        cache.write_text(json.dumps([key, found.digest, found.names]), encoding="utf-8")
+    return found
 
 
 @cache
-def syntax_digests(folder: Path) -> SyntaxDigests:
-    """The cache in `folder` of this version of the module."""
-    version = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
-    return SyntaxDigests(folder / f"syntax-digests-{version}.json")
+def _own_content() -> bytes:
+    """This module: another version of it may compute other digests."""
+    return Path(__file__).read_bytes()
 
 
 def syntax_digest(content: bytes) -> SyntaxDigest:
@@ -92,7 +69,6 @@ def canonical_tree(node: Any) -> str:
         return repr(node)
     fields = ((name, _canonical_field(node, name)) for name in node._fields if name not in IGNORED_FIELDS)
     written = (f"{name}={canonical_tree(value)}" for name, value in fields if value is not None and value != [])
-
     return f"{type(node).__name__}({','.join(written)})"
 
 

@@ -11,7 +11,6 @@ import pytest
 from helpers import REPOSITORY
 
 from drivesplat.provenance import code_digest as module
-from drivesplat.provenance.syntax_digest import syntax_digests
 
 LEAF = '''\
 """What the others import."""
@@ -97,7 +96,7 @@ def toy(tmp_path, monkeypatch) -> Path:
 
 def forget() -> None:
     """As a new process would: it reads every file anew."""
-    for cached in (syntax_digests, module._syntax, module._content, module._imports, module._file_of):
+    for cached in (module._syntax, module._content, module._imports, module._file_of):
         cached.cache_clear()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from drivesplat.provenance import syntax_digest as module
-from drivesplat.provenance.syntax_digest import SyntaxDigests, canonical_tree, syntax_digest
+from drivesplat.provenance.syntax_digest import SyntaxDigest, cached_digest, canonical_tree, syntax_digest
 
 CODE = 'import a.b\nfrom . import c\nfrom ..d import e as f\n\nNAME = "g.h"\nWORDS = "i. j"\n'
 
@@ -78,47 +78,41 @@ def test_different_code_has_different_digests(one, other):
     assert syntax_digest(one.encode()).digest != syntax_digest(other.encode()).digest
 
 
-def test_a_file_is_parsed_once_for_all_processes(file, tmp_path, monkeypatch):
-    first = SyntaxDigests(tmp_path / "cached.json")
-    expected = first.of(file)
-    first.save()
+def cache_of(file: Path) -> Path:
+    return file.parent / "__pycache__" / "code.syntax.json"
+
+
+def test_a_file_is_parsed_once_for_all_processes(file, monkeypatch):
+    expected = cached_digest(file)
+    assert expected == syntax_digest(file.read_bytes())
     monkeypatch.setattr(module, "syntax_digest", None)
     os.utime(file, (1, 1))
-    assert SyntaxDigests(tmp_path / "cached.json").of(file) == expected
+    assert cached_digest(file) == expected
 
 
-def test_changed_content_has_another_digest_even_with_the_same_time_and_size(file, tmp_path):
-    known, time = SyntaxDigests(tmp_path / "cached.json"), file.stat().st_mtime_ns
-    before = known.of(file)
+def test_changed_content_has_another_digest_even_with_the_same_time_and_size(file):
+    before, time = cached_digest(file), file.stat().st_mtime_ns
     file.write_text(CODE.replace("g.h", "g.k"))
     os.utime(file, ns=(time, time))
-    assert known.of(file) == syntax_digest(file.read_bytes()) != before
+    assert cached_digest(file) == syntax_digest(file.read_bytes()) != before
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"a": ["b"]}', "null"])
-def test_a_truncated_or_foreign_cache_is_computed_again(file, tmp_path, content):
-    path = tmp_path / "cached.json"
-    path.write_text(content)
-    known = SyntaxDigests(path)
-    assert known.of(file) == syntax_digest(file.read_bytes())
-    known.save()
-    assert SyntaxDigests(path)._known == known._known and len(known._known) == 1
+def test_another_version_of_the_digest_does_not_take_what_is_cached(file, monkeypatch):
+    cached_digest(file)
+    monkeypatch.setattr(module, "_own_content", lambda: b"another version")
+    monkeypatch.setattr(module, "syntax_digest", lambda content: SyntaxDigest("new", ()))
+    assert cached_digest(file).digest == "new"
 
 
-def test_a_folder_that_cannot_be_written_goes_without_a_cache(file, tmp_path):
-    (tmp_path / "folder").write_text("a file")
-    known = SyntaxDigests(tmp_path / "folder/cached.json")
-    assert known.of(file) == syntax_digest(file.read_bytes())
-    known.save()
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '["a", "b"]', "null", '["a", "b", 3]'])
+def test_a_truncated_or_foreign_cache_is_computed_again(file, content):
+    cached_digest(file)
+    whole = cache_of(file).read_text()
+    cache_of(file).write_text(content)
+    assert cached_digest(file) == syntax_digest(file.read_bytes())
+    assert cache_of(file).read_text() == whole
 
 
-def test_unused_digests_are_dropped_from_a_full_cache(file, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "MAX_CACHED", 3)
-    path = tmp_path / "cached.json"
-    for number in range(5):
-        file.write_text(f"NUMBER = {number}\n")
-        known = SyntaxDigests(path)
-        known.of(file)
-        known.save()
-    assert 1 <= len(SyntaxDigests(path)._known) <= 3
-    assert SyntaxDigests(path).of(file) == syntax_digest(file.read_bytes())
+def test_a_folder_that_cannot_be_written_goes_without_a_cache(file):
+    (file.parent / "__pycache__").write_text("a file")
+    assert cached_digest(file) == syntax_digest(file.read_bytes())
