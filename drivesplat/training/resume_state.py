@@ -1,8 +1,6 @@
 """The state of an unfinished training, from which only the same training resumes."""
 
-import fcntl
 import logging
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +10,7 @@ import torch
 
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.io import checkpoint_file
+from drivesplat.io.file_lock import LockHeldError, locked_file
 from drivesplat.io.storage import unwritable
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.densify import Densifier
@@ -28,23 +27,15 @@ def sole_trainer(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = open(folder / "lock", "ab+", buffering=0)  # noqa: SIM115 (closed by the with below)
+        lock = locked_file(folder / "lock")
     except OSError as error:
         raise unwritable(folder, error) from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            holder = file.read().decode(errors="replace").strip() or "unknown"
-            raise TrainingError(
-                f"process {holder} is still training in {folder}; wait for it or end it (kill {holder}), then run again"
-            ) from None
-        try:
-            file.truncate(0)
-            file.write(str(os.getpid()).encode())
-        except OSError as error:
-            raise unwritable(folder, error) from error
+    except LockHeldError as error:
+        raise TrainingError(
+            f"process {error.holder} is still training in {folder}; wait for it or end it (kill {error.holder}), "
+            "then run again"
+        ) from None
+    with lock:
         yield
 
 

@@ -1,6 +1,5 @@
 """Visible GPUs, counted without importing torch, and locks that give each job a GPU of its own."""
 
-import fcntl
 import logging
 import os
 import subprocess
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from drivesplat.errors import DeviceError
+from drivesplat.io.file_lock import LockHeldError, locked_file
 
 log = logging.getLogger(__name__)
 
@@ -66,10 +66,17 @@ def _free_card(cards: dict[str, str], jobs_per_card: int) -> tuple[str, BinaryIO
     holders = []
     for place in range(jobs_per_card):
         for card, identity in cards.items():
-            lock, holder = _lock(_lock_folder() / f"{identity}.{place}")
-            if lock is not None:
-                return card, lock, []
-            holders.append(holder)
+            path = _lock_folder() / f"{identity}.{place}"
+            try:
+                path.parent.mkdir(mode=0o700, exist_ok=True)
+                return card, locked_file(path), []
+            except LockHeldError as error:
+                holders.append(error.holder)
+            except OSError as error:
+                raise DeviceError(
+                    f"{path}: cannot be written ({error.strerror or error}), and says which job has which GPU; "
+                    "fix its permissions, or set TMPDIR to a folder of this machine"
+                ) from error
     return "", None, holders
 
 
@@ -101,25 +108,3 @@ def _identities(cards: Sequence[str]) -> list[str]:
 def _lock_folder() -> Path:
     """The folder of this user's locks on this machine."""
     return Path(tempfile.gettempdir()) / f"drivesplat-cards-{os.getuid()}"
-
-
-def _lock(path: Path) -> tuple[BinaryIO | None, str]:
-    """The open, locked file, or None, and the process that holds it."""
-    try:
-        path.parent.mkdir(mode=0o700, exist_ok=True)
-        file = open(path, "a+b")  # noqa: SIM115
-    except OSError as error:
-        raise DeviceError(
-            f"{path}: cannot be written ({error.strerror or error}), and says which job has which GPU; "
-            "fix its permissions, or set TMPDIR to a folder of this machine"
-        ) from error
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        with file:
-            file.seek(0)
-            return None, file.read().decode(errors="replace").strip() or "unknown"
-    file.truncate(0)
-    file.write(str(os.getpid()).encode())
-    file.flush()
-    return file, str(os.getpid())

@@ -3,7 +3,6 @@
 Everything here is cheap to import and to compute; it runs once in the main process and once in every job.
 """
 
-import fcntl
 import os
 import re
 from collections.abc import Callable, Mapping
@@ -13,6 +12,7 @@ from typing import Any
 
 from drivesplat.demo.mark import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
+from drivesplat.io.file_lock import LockHeldError, locked_file
 from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
@@ -187,12 +187,10 @@ class Plan(Outputs):
         folder = Path(self.config.results_dir)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._held_lock = open(folder / ".lock", "w", encoding="utf-8")  # noqa: SIM115 (held until the process ends)
+            self._held_lock = locked_file(folder / ".lock")
         except OSError as error:
             raise unwritable_results(self.config, error) from error
-        try:
-            fcntl.flock(self._held_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except LockHeldError:
             raise DriveSplatError(
                 f"another run is working in {folder}/; wait for it, or give this one its own folder (results_dir)"
             ) from None

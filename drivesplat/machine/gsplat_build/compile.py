@@ -1,7 +1,6 @@
 """Compiling gsplat's kernels with progress reports, and installing them where gsplat's loader looks first."""
 
 import argparse
-import fcntl
 import os
 import re
 import shutil
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drivesplat.errors import DeviceError
+from drivesplat.io.file_lock import LockHeldError, locked_file
 from drivesplat.io.storage import atomic_path, write_json
 from drivesplat.machine.gsplat_build import diagnose
 from drivesplat.machine.gsplat_build.installed import RECORD, package_folder, versions
@@ -94,11 +94,11 @@ def compile_and_install(toolkit: Toolkit, archs: Sequence[str], jobs: int, repor
 @contextmanager
 def _exclusive(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder.with_suffix(".lock"), "w", encoding="utf-8") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise DeviceError(f"another process is compiling gsplat (in {folder}); wait for it") from None
+    try:
+        lock = locked_file(folder.with_suffix(".lock"))
+    except LockHeldError:
+        raise DeviceError(f"another process is compiling gsplat (in {folder}); wait for it") from None
+    with lock:
         os.set_inheritable(lock.fileno(), True)  # compilers that outlive this process keep the lock
         yield
 

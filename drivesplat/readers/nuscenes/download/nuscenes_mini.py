@@ -1,15 +1,13 @@
 """The rule `download_nuscenes_mini`: downloads the archive, verifies it, unpacks it beside the dataset's folder, and
 moves the result there as a whole. The next run resumes one that was killed."""
 
-import fcntl
 import logging
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
+from drivesplat.io.file_lock import LockHeldError, locked_file
 from drivesplat.readers.nuscenes import layout
 from drivesplat.readers.nuscenes.download.console import announce
 from drivesplat.readers.nuscenes.download.destination import dataroot, is_present, require_permission
@@ -33,10 +31,13 @@ def download(job: DownloadJob) -> None:
         return
     folder = work_folder(job)
     try:
-        with _locked(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with locked_file(folder / "lock"):
             if not is_present(job):  # another run may have been faster
                 _fill(job, folder)
             _clear(folder, job.nuscenes_mini.keep_archive)
+    except LockHeldError:
+        raise DatasetError(f"another run is downloading into {folder}; wait for it") from None
     except OSError as error:
         where = error.filename or folder
         raise DatasetError(
@@ -68,18 +69,6 @@ def _fill(job: DownloadJob, folder: Path) -> None:
         raise DatasetError(f"{source.url}: {error}; it has been removed") from error
     os.sync()
     unpacked.rename(dataroot(job))  # replaces an empty folder, and nothing else
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Excludes other runs from the folder until this one ends. Raises DatasetError if another has it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "lock", "w", encoding="utf-8") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise DatasetError(f"another run is downloading into {folder}; wait for it") from None
-        yield
 
 
 def _clear(folder: Path, keep_archive: bool) -> None:
