@@ -181,7 +181,7 @@ def ended_by(tmp_path: Path, error: Exception | None, capsys: pytest.CaptureFixt
     """What a rule's script that raises `error` says on the console, and what its log holds."""
     root = logging.getLogger()
     before = root.handlers[:], root.level, logging.raiseExceptions, threading.excepthook
-    nothing = dict.fromkeys(("input", "output", "threads", "params", "resources"))
+    nothing = {"input": [], "output": [], "threads": 1, "params": None, "resources": None}
     place = {"rule": "film", "wildcards": SimpleNamespace(scene="0001"), "log": [str(tmp_path / "logs/x.log")]}
     try:
         with pytest.raises(SystemExit) as ended, job(SimpleNamespace(**nothing, **place)):
