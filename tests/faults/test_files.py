@@ -190,6 +190,8 @@ NO_RESULTS = {
     "resume_state.py": "a lock",
     "gpus.py": "a lock",
     "fetch.py": "a download, which is checked before it counts",
+    "reader.py": "tables of one scene in a temporary folder",
+    "scene_tables.py": "files in the making in a temporary folder, which go that way when whole",
     "storage.py": "the way all others go",
     "array_file.py": "members of an archive, which goes that way",
 }
