@@ -168,7 +168,15 @@ def write_scene(path: str | Path, scene: Scene) -> None:
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Reads `scene.json`. Raises ResultError where the file is not one, naming it and the rule that makes it."""
+    """Reads scene.json. Raises ResultError that names the file and its rule where it is not a scene record.
+
+    >>> scene = read_scene("results/0001/scene.json")
+    >>> frame = scene.frames[0]
+    >>> frame.camera, frame.camera_to_world.shape, scene.seconds(frame.timestamp)
+    ('CAM_FRONT', (4, 4), 0.0)
+    >>> [track.object_class.value for track in scene.tracks]
+    ['car', 'truck', 'pedestrian', 'other_movable']
+    """
     rule = "refine_poses" if Path(path).name == REFINED else "extract"
     content = read_json(path, rule)
     try:

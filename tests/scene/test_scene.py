@@ -1,6 +1,7 @@
 """scene.json: a scene returns to the last bit, a bad file is named with its rule, and times find their key frames."""
 
 import dataclasses
+import doctest
 import json
 
 import numpy as np
@@ -64,6 +65,13 @@ def test_a_scene_without_frame_range_sweeps_or_tracks_returns(tmp_path):
     scene = dataclasses.replace(some_scene(), sweeps=(), tracks=(), key_frame_range=None)
     write_scene(tmp_path / "scene.json", scene)
     assert_same_record(read_scene(tmp_path / "scene.json"), scene)
+
+
+def test_the_example_of_reading_a_scene_runs(tmp_path, tiny_scene, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_scene("results/0001/scene.json", tiny_scene)
+    (example,) = doctest.DocTestFinder().find(read_scene, "read_scene", globs={"read_scene": read_scene})
+    assert doctest.DocTestRunner().run(example) == doctest.TestResults(failed=0, attempted=4)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.99])
