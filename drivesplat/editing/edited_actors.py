@@ -19,19 +19,10 @@ LOOKAHEAD = 60.0
 
 
 @dataclass(frozen=True)
-class RecordedActor:
-    """An object before any edit: `size` (3,) is length, width, height in metres."""
-
-    id: str
-    category: str
-    size: np.ndarray
-    motion: Motion
-
-
-@dataclass(frozen=True)
 class EditedActor:
     """An actor of an edited drive: `id` is a track's or the name of a duplicate. It has the Gaussians of the track
-    `source`, scaled by `scale` about the box centre to `size` (3,) metres. Unless `edited` it moves as recorded."""
+    `source`, scaled by `scale` about the box centre to `size` (3,): length, width, height in metres. Unless
+    `edited` it moves as recorded."""
 
     id: str
     source: str
@@ -40,6 +31,11 @@ class EditedActor:
     size: np.ndarray
     edited: bool
     path: ActorPath = field(repr=False)
+
+    @classmethod
+    def recorded(cls, id: str, category: str, size: np.ndarray, motion: Motion) -> "EditedActor":
+        """An actor before any edit."""
+        return cls(id, id, 1.0, category, size, False, recorded_path(motion, float(size[2])))
 
     def present(self, times: np.ndarray) -> np.ndarray:
         """Whether the actor is present at `times` (n,) in film seconds: (n,) bool."""
@@ -54,26 +50,21 @@ class EditedActor:
 
 
 def edited_actors(
-    actors: Sequence[RecordedActor], edit: Edit, where: str, other_ids: Collection[str] = ()
+    actors: Sequence[EditedActor], edit: Edit, where: str, other_ids: Collection[str] = ()
 ) -> list[EditedActor]:
-    """The actors after all steps of an edit: in their order without the removed ones, then the duplicates.
+    """The recorded `actors` after all steps of an edit: in their order without the removed ones, then the duplicates.
 
     `other_ids` are those of tracks that cannot be edited; no duplicate may have one. Raises ConfigError, one line that
     starts with `where` (the scene and the edit), if a step names an unknown track, changes nothing or contradicts an
     earlier step.
     """
-    state = _EditState({actor.id: _as_recorded(actor) for actor in actors}, {}, frozenset(other_ids))
+    state = _EditState({actor.id: actor for actor in actors}, {}, frozenset(other_ids))
     for number, step in enumerate(edit.steps, start=1):
         try:
             state = _after_step(state, step, number)
         except _StepError as error:
             raise ConfigError(f"{where}, step {number} ({step.kind}): {error}") from None
     return list(state.actors.values())
-
-
-def _as_recorded(actor: RecordedActor) -> EditedActor:
-    path = recorded_path(actor.motion, float(actor.size[2]))
-    return EditedActor(actor.id, actor.id, 1.0, actor.category, actor.size, False, path)
 
 
 class _StepError(Exception):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.editing.edited_actors import EditedActor, RecordedActor, edited_actors
+from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
@@ -84,7 +84,7 @@ def render_edit(
     }
 
 
-def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[RecordedActor]:
+def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[EditedActor]:
     """The actors of the model, with their motion as trained.
 
     Messages start with `where`. Raises ConfigError if there are none, ResultError if the scene lacks one of them.
@@ -98,7 +98,7 @@ def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[Recorde
             raise ResultError(
                 f"{where}: scene.json has no track {name}, which checkpoint.npz contains; delete that file and rerun"
             )
-        actors.append(RecordedActor(track.id, track.category, track.size, group.motion))
+        actors.append(EditedActor.recorded(track.id, track.category, track.size, group.motion))
     if not actors:
         raise ConfigError(
             f"{where}: nothing can be edited, since the model of this method has no actors; "

@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
-from drivesplat.errors import ResultError
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.unique_names import unique_names
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_group, usd_matrix
-from drivesplat.io.storage import atomic_path
+from drivesplat.io.storage import atomic_path, unwritable
 
 APERTURE_WIDTH = 0.36
 """A sensor width of 36 mm in the lens unit of UsdGeom.Camera: a tenth of the scene's unit, here 10 cm."""
@@ -80,13 +79,9 @@ def write_usdz(path: str | Path, stage: Usd.Stage) -> None:
             written = stage.GetRootLayer().Export(str(layer))
             written = written and UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(aside))
         except Tf.ErrorException as error:
-            raise _unwritable(path, error.args[0].commentary) from error
+            raise unwritable(path, error.args[0].commentary) from error
         if not written:
-            raise _unwritable(path, "OpenUSD gives no reason")
-
-
-def _unwritable(path: Path, why: str) -> ResultError:
-    return ResultError(f"{path}: cannot be written ({why}); free space or fix its permissions")
+            raise unwritable(path, "OpenUSD gives no reason")
 
 
 def _define_groups(stage: Usd.Stage, groups: Mapping[str, SampledGroup]) -> None:

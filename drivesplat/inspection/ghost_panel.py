@@ -6,7 +6,13 @@ from typing import Any
 import numpy as np
 
 from drivesplat.evaluation.metrics import psnr_record
-from drivesplat.inspection.ghosts import MIN_COVERING_OPACITY, SAMPLE_DISTANCE, boxes_along_path, ghosts_of
+from drivesplat.inspection.ghosts import (
+    MIN_COVERING_OPACITY,
+    SAMPLE_DISTANCE,
+    boxes_along_path,
+    ghost_figures,
+    ghosts_of,
+)
 from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive, colors_of
 from drivesplat.inspection.subject import Subject, choose_subject, no_subject_reason, subject_record
 from drivesplat.scene.images import continuous_intrinsics, project
@@ -70,7 +76,7 @@ def _ghost_image(
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """The amplified ghosts in their own colours over the `dimmed` image (h, w, 3), and their figures."""
     ghosts = ghosts_of(view, subject.box, settings)
-    alone = view.render(ghosts.rows)
+    alone = view.render(ghosts)
     opacity = colors_of(alone.alpha)
     covered = opacity >= MIN_COVERING_OPACITY
     amplification = 1.0
@@ -80,7 +86,7 @@ def _ghost_image(
     weight = np.minimum(amplification * opacity, 1.0)[..., None]
     image = weight * own_color.clip(0.0, 1.0) + (1.0 - weight) * dimmed
     figures = {"covered_share": float(covered.mean()), "drawn_times": amplification}
-    return image, {**ghosts.figures(view.gaussians), **figures}
+    return image, {**ghost_figures(view.gaussians, ghosts), **figures}
 
 
 def _ground_path(view: RenderedView, subject: Subject) -> np.ndarray:

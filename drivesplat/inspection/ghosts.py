@@ -1,6 +1,5 @@
 """Ghosts: Gaussians that a static model leaves along the path of a moving object."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -56,30 +55,24 @@ def in_swept_volume(track: Track, interval: float, points: np.ndarray, floor: fl
     return inside
 
 
-@dataclass(frozen=True)
-class Ghosts:
-    """`rows` (n,) bool: which Gaussians are ghosts of a box at one time."""
-
-    rows: Bool[Tensor, " n"]
-
-    def figures(self, gaussians: Gaussians) -> dict[str, Any]:
-        """Their number, and sum, mean and median of their opacities; mean and median are None without ghosts."""
-        opacities = gaussians.opacities[self.rows]
-        count = len(opacities)
-        return {
-            "gaussians": count,
-            "opacity_sum": float(opacities.sum()),
-            "opacity_mean": float(opacities.mean()) if count else None,
-            "opacity_median": float(np.median(opacities.cpu().numpy())) if count else None,
-        }
+def ghost_figures(gaussians: Gaussians, ghosts: Bool[Tensor, " n"]) -> dict[str, Any]:
+    """The number of ghosts, and sum, mean and median of their opacities; mean and median are None without ghosts."""
+    opacities = gaussians.opacities[ghosts]
+    count = len(opacities)
+    return {
+        "gaussians": count,
+        "opacity_sum": float(opacities.sum()),
+        "opacity_mean": float(opacities.mean()) if count else None,
+        "opacity_median": float(np.median(opacities.cpu().numpy())) if count else None,
+    }
 
 
-def ghosts_of(view: RenderedView, box: Box, settings: GhostSettings) -> Ghosts:
-    """The ghosts of the object at `box`: Gaussians in the volume that its box sweeps during the scene, but outside of
-    the box now. Gaussians of dynamic parts move with their objects and are no ghosts."""
+def ghosts_of(view: RenderedView, box: Box, settings: GhostSettings) -> Bool[Tensor, " n"]:
+    """The mask of the ghosts of the object at `box`: Gaussians in the volume that its box sweeps during the scene,
+    but outside of the box now. Gaussians of dynamic parts move with their objects and are no ghosts."""
     scene, gaussians = view.drive.recording.scene, view.gaussians
     track = scene.track(box.track_id)
     points = gaussians.means.cpu().double().numpy()
     rows = in_swept_volume(track, scene.key_frame_interval, points, settings.clearance) & ~box.holds(points)
     moving = view.drive.model.moving()
-    return Ghosts(torch.from_numpy(rows).to(moving.device) & ~moving)
+    return torch.from_numpy(rows).to(moving.device) & ~moving

@@ -10,7 +10,7 @@ from skimage.color import rgb2gray
 from skimage.filters import sobel
 
 from drivesplat.evaluation.metrics import psnr_record
-from drivesplat.inspection.ghosts import MIN_COVERING_OPACITY, ghosts_of
+from drivesplat.inspection.ghosts import MIN_COVERING_OPACITY, ghost_figures, ghosts_of
 from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive, colors_of
 from drivesplat.inspection.subject import Subject, choose_subject, no_subject_reason, subject_record
 from drivesplat.model.removal import Removal, removal_of
@@ -144,10 +144,10 @@ def _edge(pair: RemovalPair, distance_outside: np.ndarray) -> dict[str, float | 
 def _ghost_figures(view: RenderedView, subject: Subject, pair: RemovalPair, job: RemovalJob) -> dict[str, Any]:
     """The ghosts that remain, and whether they are visible outside the box."""
     ghosts = ghosts_of(view, subject.box, job.ghosts)
-    opacity = colors_of(view.render(ghosts.rows).alpha)
+    opacity = colors_of(view.render(ghosts).alpha)
     covered = (opacity >= MIN_COVERING_OPACITY) & pair.outside
     return {
-        **ghosts.figures(view.gaussians),
+        **ghost_figures(view.gaussians, ghosts),
         "covered_share_outside": _mean(covered, pair.outside),
         "reach_outside_box": bool(covered.any()),
     }

@@ -3,7 +3,8 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from itertools import repeat, takewhile
+from typing import TypeVar
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -11,8 +12,11 @@ THREADS = 4
 """Default number of threads. Decoding and numpy release Python's lock most of the time."""
 
 
-def prefetch(made: Callable[[A], B], items: Iterable[A], threads: int = THREADS) -> Iterator[B]:
-    """`made` of each item, in order, computed by `threads` threads, at most so many before they are requested.
+def prefetch(
+    made: Callable[[A], B], items: Iterable[A], threads: int = THREADS, at_most: int | None = None
+) -> Iterator[B]:
+    """`made` of each item, in order, computed by `threads` threads, `at_most` (default: `threads`) before they are
+    requested.
 
     An exception is raised in place of its item.
     """
@@ -20,7 +24,7 @@ def prefetch(made: Callable[[A], B], items: Iterable[A], threads: int = THREADS)
     with ThreadPoolExecutor(threads) as pool:
         try:
             for item in items:
-                if len(waiting) == threads:
+                if len(waiting) == (at_most or threads):
                     yield waiting.popleft().result()
                 waiting.append(pool.submit(made, item))
             while waiting:
@@ -36,13 +40,5 @@ def prefetch_items(items: Iterable[A], at_most: int = THREADS) -> Iterator[A]:
     An exception is raised in place of its item.
     """
     iterator, end = iter(items), object()
-    waiting: deque[Future[Any]] = deque()
-    with ThreadPoolExecutor(1) as pool:
-        try:
-            waiting.extend(pool.submit(next, iterator, end) for _ in range(at_most))
-            while (item := waiting.popleft().result()) is not end:
-                waiting.append(pool.submit(next, iterator, end))
-                yield item
-        finally:
-            for future in waiting:
-                future.cancel()
+    made = prefetch(lambda _: next(iterator, end), repeat(None), threads=1, at_most=at_most + 1)
+    yield from takewhile(lambda item: item is not end, made)

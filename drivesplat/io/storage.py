@@ -30,9 +30,10 @@ def unreadable(path: str | Path, rule: str, why: str, delete: str | Path | None 
     return ResultError(f"{path}: {why}; delete {delete or 'it'} and rerun: the rule '{rule}' rebuilds it")
 
 
-def unwritable(path: str | Path, error: OSError) -> ResultError:
+def unwritable(path: str | Path, why: OSError | str) -> ResultError:
     """The one sentence for a file or folder that cannot be written."""
-    return ResultError(f"{path}: cannot be written ({error.strerror or error}); free space or fix its permissions")
+    reason = why.strerror or why if isinstance(why, OSError) else why
+    return ResultError(f"{path}: cannot be written ({reason}); free space or fix its permissions")
 
 
 @contextmanager

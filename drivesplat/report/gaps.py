@@ -34,19 +34,18 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
     measured: dict[str, Any] = {}
     protocols: dict[str, Any] = {}
     for path in paths:
+        scene = Path(path).parent.name
         try:
             record = read_json(path, rule="scene_metrics")
             checked_digest(path, warn=False)
-            scene = record["scene"]
             reasons = _mismatches(record, job.expected, measured)
             scene_rows = [_row(record, method) for method in record["methods"]]
+            scene = record["scene"]
         except ResultError as error:
-            left_out.append({"scene": Path(path).parent.name, "why": str(error)})
-            continue
+            reasons = [str(error)]
         except (AttributeError, KeyError, TypeError) as error:
-            why = unreadable(path, "scene_metrics", f"not the metrics of a scene ({type(error).__name__}: {error})")
-            left_out.append({"scene": Path(path).parent.name, "why": str(why)})
-            continue
+            why = f"not the metrics of a scene ({type(error).__name__}: {error})"
+            reasons = [str(unreadable(path, "scene_metrics", why))]
         if reasons:
             left_out.append({"scene": scene, "why": "; ".join(reasons)})
             continue
@@ -85,11 +84,10 @@ def _mismatches(record: dict[str, Any], expected: dict[str, Any], measured: dict
         return ["not in the config"]
     reasons = differences(expected[scene], record["provenance"]["stages"])
     own = _comparable(record)
-    for other, protocol in measured.items():
-        unlike = [key for key in _COMPARABLE if protocol[key] != own[key]]
-        if unlike:
-            reasons.append(f"its protocol differs from that of scene {other}: {', '.join(unlike)}")
-        break
+    other = next(iter(measured), None)
+    unlike = [key for key in _COMPARABLE if other is not None and measured[other][key] != own[key]]
+    if unlike:
+        reasons.append(f"its protocol differs from that of scene {other}: {', '.join(unlike)}")
     return reasons
 
 

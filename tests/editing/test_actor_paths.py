@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.editing.edited_actors import EditedActor, RecordedActor, edited_actors
+from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
@@ -20,13 +20,13 @@ DIRECTION = np.array([np.cos(0.6), np.sin(0.6), 0.0])
 LEFT = np.array([-np.sin(0.6), np.cos(0.6), 0.0])
 
 
-def driver(pose_at, key_frames=range(21), name="car", size=SIZE, category="vehicle.car") -> RecordedActor:
+def driver(pose_at, key_frames=range(21), name="car", size=SIZE, category="vehicle.car") -> EditedActor:
     """An object annotated at `key_frames`, half a second apart, where `pose_at` says."""
     indices = np.array(key_frames)
     ends = np.flatnonzero(np.diff(indices) != 1)
     runs = zip([0, *(ends + 1).tolist()], [*ends.tolist(), len(indices) - 1], strict=True)
     poses = np.stack([pose_at(0.5 * i) for i in key_frames])
-    return RecordedActor(name, category, size, Motion(0.5 * indices, poses, tuple(runs), 0.25))
+    return EditedActor.recorded(name, category, size, Motion(0.5 * indices, poses, tuple(runs), 0.25))
 
 
 def facing(yaw: float, place, pitch: float = 0.0) -> np.ndarray:
@@ -54,7 +54,7 @@ def parked(seconds: float) -> np.ndarray:
     return facing(0.6, [3.0, 4.0, 0.75])
 
 
-def edited_by_id(actors: list[RecordedActor], *steps: dict) -> dict[str, EditedActor]:
+def edited_by_id(actors: list[EditedActor], *steps: dict) -> dict[str, EditedActor]:
     edited = edited_actors(actors, Edit.model_validate({"steps": steps}), "edits.yaml: edit 'it'")
     return {actor.id: actor for actor in edited}
 
@@ -108,7 +108,7 @@ LATER = [
 )
 def test_an_actor_is_as_recorded_until_the_edit_starts(pose_at, step):
     actor, at = edited(pose_at, step), np.arange(0.0, 4.0, 0.01)
-    recorded = driver(pose_at).motion.poses(at)
+    recorded = driver(pose_at).path.trajectory.motion.poses(at)
     assert np.linalg.norm((actor.poses(at) - recorded)[:, :3, 3], axis=1).max() < 1e-9
     assert degrees_between(actor.poses(at), recorded).max() < 1e-6
     assert actor.edited and actor.present(at).all()
@@ -117,8 +117,8 @@ def test_an_actor_is_as_recorded_until_the_edit_starts(pose_at, step):
 def test_actors_without_a_step_are_exactly_as_recorded():
     actors = edited_by_id([driver(circle), driver(straight, name="other")], {"stop": {"track": "other", "at": 2.0}})
     assert not actors["car"].edited and actors["other"].edited
-    np.testing.assert_array_equal(actors["car"].poses(FILM), driver(circle).motion.poses(FILM))
-    np.testing.assert_array_equal(actors["car"].present(FILM), driver(circle).motion.present(FILM))
+    np.testing.assert_array_equal(actors["car"].poses(FILM), driver(circle).path.trajectory.motion.poses(FILM))
+    np.testing.assert_array_equal(actors["car"].present(FILM), driver(circle).path.trajectory.motion.present(FILM))
 
 
 def test_a_speed_factor_from_the_start_scales_the_distance():
@@ -259,7 +259,7 @@ def test_speed_factors_multiply():
 
 
 def test_with_a_speed_factor_a_waiting_actor_waits_as_recorded():
-    actor, motion = edited(waiting, {"speed": {"factor": 2.0}}), driver(waiting).motion
+    actor, motion = edited(waiting, {"speed": {"factor": 2.0}}), driver(waiting).path.trajectory.motion
     at = np.arange(0.0, 4.9, 0.01)
     np.testing.assert_allclose(actor.poses(at), motion.poses(2.0 * at), atol=1e-9)
 
@@ -280,7 +280,7 @@ def test_a_parked_vehicle_drives_off_along_its_heading():
 
 @pytest.mark.parametrize("lateral", [3.5, -2.0])
 def test_a_shift_from_the_start_gives_a_parallel_path(lateral):
-    actor, motion = edited(circle, {"shift": {"lateral": lateral}}), driver(circle).motion
+    actor, motion = edited(circle, {"shift": {"lateral": lateral}}), driver(circle).path.trajectory.motion
     poses, recorded = actor.poses(FILM), motion.poses(FILM)
     np.testing.assert_allclose(poses[:, :3, :3], recorded[:, :3, :3], atol=1e-12)
     middle = (FILM > 2) & (FILM < 8)
@@ -329,7 +329,10 @@ def test_a_longitudinal_shift_follows_the_bends_of_the_path():
 
 def test_a_longitudinal_shift_keeps_waiting_times():
     """On a straight path, 12 m further on, it moves as recorded; its annotated heading varies by 0.6 degrees there."""
-    actor, recorded = edited(waiting, {"shift": {"longitudinal": 12.0}}), driver(waiting).motion.poses(FILM)
+    actor, recorded = (
+        edited(waiting, {"shift": {"longitudinal": 12.0}}),
+        driver(waiting).path.trajectory.motion.poses(FILM),
+    )
     np.testing.assert_allclose(actor.poses(FILM)[:, :3, 3], recorded[:, :3, 3] + 12.0 * DIRECTION, atol=0.01)
     assert degrees_between(actor.poses(FILM), recorded).max() < 0.6
 
@@ -354,7 +357,7 @@ def test_a_stop_during_a_lane_change_leaves_it_unfinished():
 
 @pytest.mark.parametrize("pose_at", [straight, circle, waiting])
 def test_a_reversed_actor_follows_the_recording_backwards_in_time(pose_at):
-    actor, motion = edited(pose_at, {"reverse": {}}), driver(pose_at).motion
+    actor, motion = edited(pose_at, {"reverse": {}}), driver(pose_at).path.trajectory.motion
     np.testing.assert_allclose(actor.poses(FILM), motion.poses(END - FILM), atol=1e-9)
     turned = edited(pose_at, {"reverse": {"turn": True}}).poses(FILM)
     np.testing.assert_allclose(turned[:, :3, 3], actor.poses(FILM)[:, :3, 3], atol=1e-9)
@@ -385,7 +388,7 @@ def test_a_rescaled_actor_stays_on_the_ground():
     def uphill(seconds: float) -> np.ndarray:
         return facing(0.6, [8.0 * seconds, 0.0, 1.0], pitch=-0.2)
 
-    actor, recorded = edited(uphill, {"rescale": {"factor": 1.3}}), driver(uphill).motion.poses(FILM)
+    actor, recorded = edited(uphill, {"rescale": {"factor": 1.3}}), driver(uphill).path.trajectory.motion.poses(FILM)
     assert actor.scale == pytest.approx(1.3) and actor.source == "car"
     np.testing.assert_allclose(actor.size, 1.3 * SIZE)
     ground = [0.0, 0.0, -SIZE[2] / 2, 1.0]
@@ -400,10 +403,12 @@ def test_swapped_actors_follow_each_others_path_on_the_ground():
     actors = edited_by_id([driver(straight), tall], {"swap": {"track": "car", "with": "truck"}})
     car, truck = actors["car"], actors["truck"]
     at = np.arange(2.0, 5.0, 0.1)
-    np.testing.assert_allclose(car.poses(at) @ [0, 0, -0.75, 1], tall.motion.poses(at) @ [0, 0, -1.75, 1], atol=1e-9)
-    straight_on = driver(straight).motion.poses(at)
+    np.testing.assert_allclose(
+        car.poses(at) @ [0, 0, -0.75, 1], tall.path.trajectory.motion.poses(at) @ [0, 0, -1.75, 1], atol=1e-9
+    )
+    straight_on = driver(straight).path.trajectory.motion.poses(at)
     np.testing.assert_allclose(truck.poses(at) @ [0, 0, -1.75, 1], straight_on @ [0, 0, -0.75, 1], atol=1e-9)
-    np.testing.assert_array_equal(car.present(FILM), tall.motion.present(FILM))
+    np.testing.assert_array_equal(car.present(FILM), tall.path.trajectory.motion.present(FILM))
     assert truck.present(FILM).all()
     assert (car.source, car.category, car.scale) == ("car", "vehicle.car", 1.0)
     np.testing.assert_array_equal(truck.size, tall.size)

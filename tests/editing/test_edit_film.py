@@ -26,7 +26,7 @@ from helpers.hand_made_street import (
 from helpers.hand_made_traffic import placed
 from PIL import Image
 
-from drivesplat.editing.edited_actors import RecordedActor, edited_actors
+from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, actor_placements, collisions, editable_actors, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
@@ -369,6 +369,6 @@ def test_a_camera_collides_inside_the_box_of_a_present_actor():
     seconds = np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
     across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
-    car = RecordedActor("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
+    car = EditedActor.recorded("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
     found = collisions(edited_actors([car], BESIDE, ""), CameraPath(np.arange(6), cameras), seconds)
     assert found.tolist() == [False, True, True, False, True, False]

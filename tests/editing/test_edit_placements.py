@@ -225,7 +225,7 @@ def test_gaussians_are_placed_where_a_step_moves_their_actor(model, scene, step,
 @pytest.mark.parametrize("name", [AHEAD, TURNING])
 def test_a_rescaled_actor_stands_on_its_recorded_ground(model, scene, name):
     """The box grows about the middle of its floor."""
-    motion = {actor.id: actor.motion for actor in editable_actors(model, scene, "here")}[name]
+    motion = {actor.id: actor.path.trajectory.motion for actor in editable_actors(model, scene, "here")}[name]
     for time, edited in zip(
         TIMES, edited_gaussians(model, scene, {"rescale": {"track": name, "factor": 1.4}}), strict=True
     ):
@@ -244,7 +244,7 @@ def test_a_removed_actor_is_absent(model, scene):
 
 def test_swapped_actors_are_in_each_others_place_on_the_ground(model, scene):
     """At the other's times, too: the truck is a metre and a half higher and absent for a while."""
-    motions = {actor.id: actor.motion for actor in editable_actors(model, scene, "here")}
+    motions = {actor.id: actor.path.trajectory.motion for actor in editable_actors(model, scene, "here")}
     heights = {name: driver.size[2] for name, driver in DRIVERS.items()}
     for time, edited in zip(
         TIMES, edited_gaussians(model, scene, {"swap": {"track": AHEAD, "with": GONE}}), strict=True

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivesplat.editing.edited_actors import RecordedActor, edited_actors
+from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.edit import Edit
@@ -11,12 +11,12 @@ from drivesplat.settings.edit import Edit
 IDS = ("6e5c0000aaaa", "6e7d0000bbbb", "91ab0000cccc")
 
 
-def recorded(name: str, first: int = 4, last: int = 12) -> RecordedActor:
+def recorded(name: str, first: int = 4, last: int = 12) -> EditedActor:
     """A car at 10 m/s, annotated half a second apart from key frame `first` to `last`."""
     times = 0.5 * np.arange(first, last + 1)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, 0, 3] = 10.0 * times
-    return RecordedActor(
+    return EditedActor.recorded(
         name, "vehicle.car", np.array([4.0, 2.0, 1.5]), Motion(times, poses, ((0, len(times) - 1),), 0.25)
     )
 

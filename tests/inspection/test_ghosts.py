@@ -10,7 +10,7 @@ from helpers.classed import classed
 from helpers.hand_made import Own, recording_of, round_gaussians
 from scipy.spatial.transform import Rotation
 
-from drivesplat.inspection.ghosts import Ghosts, boxes_along_path, ghosts_of, in_swept_volume
+from drivesplat.inspection.ghosts import boxes_along_path, ghost_figures, ghosts_of, in_swept_volume
 from drivesplat.inspection.rendered_view import RenderedView, TrainedDrive
 from drivesplat.model.part import Part
 from drivesplat.model.splat_model import SplatModel
@@ -234,7 +234,7 @@ PLACES = np.array(
 GHOSTS = np.array([True, True, False, False, False, False, False, False, True])
 
 
-def ghosts_at(sight: RenderedView, clearance: float = 0.2) -> Ghosts:
+def ghosts_at(sight: RenderedView, clearance: float = 0.2) -> torch.Tensor:
     scene = sight.drive.recording.scene
     box = box_at(scene.tracks[0], sight.frame.timestamp, scene.key_frame_interval)
     return ghosts_of(sight, box, GhostSettings(clearance=clearance))
@@ -242,17 +242,17 @@ def ghosts_at(sight: RenderedView, clearance: float = 0.2) -> Ghosts:
 
 def test_ghosts_lie_on_the_path_but_not_in_the_present_box(tiny_scene):
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER))
-    np.testing.assert_array_equal(found.rows, GHOSTS)
+    np.testing.assert_array_equal(found, GHOSTS)
 
 
 def test_ghosts_depend_on_the_time(tiny_scene):
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:4]), index=1))
-    np.testing.assert_array_equal(found.rows, [True, True, True, False])
+    np.testing.assert_array_equal(found, [True, True, True, False])
 
 
 def test_without_clearance_the_road_counts_as_ghosts(tiny_scene):
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER), clearance=0.0)
-    np.testing.assert_array_equal(np.flatnonzero(found.rows & ~torch.from_numpy(GHOSTS)), [4])
+    np.testing.assert_array_equal(np.flatnonzero(found & ~torch.from_numpy(GHOSTS)), [4])
 
 
 @pytest.mark.parametrize("whose", ["it", "another"])
@@ -260,7 +260,7 @@ def test_gaussians_of_dynamic_parts_are_no_ghosts(tiny_scene, whose):
     """Two parts of the same Gaussians: those that go where their object goes are no ghosts wherever they lie."""
     parts = round_gaussians(PLACES), Own(round_gaussians(PLACES), whose)
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), *parts, index=LATER))
-    np.testing.assert_array_equal(found.rows, [*GHOSTS, *np.zeros_like(GHOSTS)])
+    np.testing.assert_array_equal(found, [*GHOSTS, *np.zeros_like(GHOSTS)])
 
 
 def test_gaussians_of_the_object_in_a_static_part_can_be_ghosts(tiny_scene, monkeypatch):
@@ -268,13 +268,13 @@ def test_gaussians_of_the_object_in_a_static_part_can_be_ghosts(tiny_scene, monk
     monkeypatch.setattr(Own, "moves", False)
     parts = Own(round_gaussians(PLACES), "it"), round_gaussians(PLACES)
     found = ghosts_at(sight_of(drive_ahead(tiny_scene), *parts, index=LATER))
-    np.testing.assert_array_equal(found.rows, [*GHOSTS, *GHOSTS])
+    np.testing.assert_array_equal(found, [*GHOSTS, *GHOSTS])
 
 
 def test_figures_of_ghosts(tiny_scene):
     opacities = [0.1, 0.4, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9, 0.7]
     sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES, opacities=opacities), index=LATER)
-    figures = ghosts_at(sight).figures(sight.gaussians)
+    figures = ghost_figures(sight.gaussians, ghosts_at(sight))
     assert figures["gaussians"] == 3
     assert figures["opacity_sum"] == pytest.approx(1.2, abs=1e-6)
     assert figures["opacity_mean"] == pytest.approx(0.4, abs=1e-6)
@@ -283,12 +283,12 @@ def test_figures_of_ghosts(tiny_scene):
 
 def test_the_median_of_two_is_their_mean(tiny_scene):
     sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:2], opacities=[0.2, 0.6]), index=LATER)
-    assert ghosts_at(sight).figures(sight.gaussians)["opacity_median"] == pytest.approx(0.4, abs=1e-6)
+    assert ghost_figures(sight.gaussians, ghosts_at(sight))["opacity_median"] == pytest.approx(0.4, abs=1e-6)
 
 
 @pytest.mark.parametrize("places", [PLACES[4:6], PLACES[:0]])
 def test_without_ghosts_the_means_are_null(tiny_scene, places):
     """Nothing on the way, or no Gaussian at all."""
     sight = sight_of(drive_ahead(tiny_scene), round_gaussians(places), index=LATER)
-    figures = json.loads(json.dumps(ghosts_at(sight).figures(sight.gaussians), allow_nan=False))
+    figures = json.loads(json.dumps(ghost_figures(sight.gaussians, ghosts_at(sight)), allow_nan=False))
     assert figures == {"gaussians": 0, "opacity_sum": 0.0, "opacity_mean": None, "opacity_median": None}

@@ -11,7 +11,7 @@ from helpers import REPOSITORY
 
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.tables import token
-from drivesplat.editing.edited_actors import RecordedActor, edited_actors
+from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.scene.motion import Motion
@@ -189,11 +189,11 @@ def test_yaml_merges_stay_possible(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def demo_actors() -> list[RecordedActor]:
+def demo_actors() -> list[EditedActor]:
     """What moves in the demo's drive, at all its key frames."""
     recorder, times = Recorder(WorldSettings()), 0.5 * np.arange(20)
     return [
-        RecordedActor(
+        EditedActor.recorded(
             token("demo", "instance", thing.name), thing.category, np.asarray(thing.body.size),
             Motion(times, np.stack([recorder.box_to_global(thing, t) for t in times]), ((0, 19),), 0.25),
         )
