@@ -47,7 +47,7 @@ def read_file(path: str | Path, kind: type[File], document: str, changes: Mappin
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a benchmark file sets a scene, seeds and more by name; see {document}")
     with error_prefix(str(path)):
-        file = validated(kind, {**content, **(changes or {})}, "", document)
+        file = validated(kind, {**content, **(changes or {})}, document=document)
         require_known(file.config, SHARED_SETTINGS, "config")
     return file
 

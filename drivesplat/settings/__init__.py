@@ -4,6 +4,7 @@ Fields are documented by attribute docstrings, so that a reworded comment does n
 `drivesplat.provenance.code_digest`).
 """
 
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
@@ -34,30 +35,36 @@ class Settings(BaseModel):
         return value
 
 
-def validated(model: type[S], values: dict[str, Any], where: str, document: str = "config.yaml") -> S:
-    """Validates `values`, which `document` describes, as `model`.
+def validated(
+    model: type[S], values: dict[str, Any], where: str = "", document: str = "config.yaml", keys: Sequence[str] = ()
+) -> S:
+    """Validates `values` as `model`.
 
-    Raises ConfigError: one line that names each invalid key, with `where` before it, its value and the allowed range.
+    Raises ConfigError: one line that begins with `where` and names each invalid key, its value and the allowed range.
+    For unknown and missing keys it refers to `document`, or gives all `keys`.
     """
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise ConfigError("; ".join(_sentence(item, where, document) for item in error.errors())) from None
+        sentences = (_sentence(item, document, ", ".join(keys)) for item in error.errors())
+        raise ConfigError(where + "; ".join(sentences)) from None
 
 
-def _quoted(value: Any) -> str:
+def quoted(value: Any) -> str:
     """A value, truncated to MAX_QUOTED characters."""
     text = repr(value)
     return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}…"
 
 
-def _sentence(item: dict[str, Any], where: str, document: str) -> str:
-    if not item["loc"]:
-        return where + item["msg"].removeprefix("Value error, ")
-    key = where + ".".join(str(part) for part in item["loc"])
-    if item["type"] == "extra_forbidden":
-        return f"unknown key '{key}' (value {_quoted(item['input'])}): check its spelling against {document}"
-    if item["type"] == "missing":
-        return f"'{key}' is missing: {document} says what it is"
+def _sentence(item: Mapping[str, Any], document: str, keys: str) -> str:
+    """One error of pydantic as a sentence."""
+    key, value = ".".join(map(str, item["loc"])), quoted(item["input"])
     message = item["msg"].removeprefix("Value error, ")
-    return f"'{key}' is {_quoted(item['input'])}: {message[:1].lower()}{message[1:]}"
+    if not key:
+        return message
+    if item["type"] == "extra_forbidden":
+        hint = f"; there are: {keys}" if keys else f" (value {value}): check its spelling against {document}"
+        return f"unknown key '{key}'{hint}"
+    if item["type"] == "missing":
+        return f"'{key}' is missing" + (f"; there are: {keys}" if keys else f": {document} says what it is")
+    return f"'{key}' is {value}: {message[:1].lower()}{message[1:]}"

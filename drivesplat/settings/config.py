@@ -192,7 +192,7 @@ def load(values: Mapping[str, Any]) -> Config:
             "a result of this workflow is among the config files, where Snakemake takes what follows --configfile: "
             "put -- before the targets, as in --configfile mine.yaml -- results/0103/metrics.json"
         )
-    config = validated(Config, dict(values), "")
+    config = validated(Config, dict(values))
     variants = {name: variant for name, variant in config.ablation.without.items() if variant is not None}
     for kind, named, allowed in (
         ("datasets", config.datasets, DATASET_OVERRIDES),

@@ -7,9 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from drivesplat.errors import ConfigError
+from drivesplat.settings import quoted, validated
 from drivesplat.settings.edit import Edit, Step
 from drivesplat.settings.names import NAME
 from drivesplat.settings.yaml_file import read_yaml
@@ -28,35 +27,32 @@ def read_edits(path: str | Path) -> dict[str, Edit]:
         raise ConfigError(f"{path}: an edits file holds the one key 'edits', under it a list of steps per name")
     edits = {} if content["edits"] is None else content["edits"]
     if not isinstance(edits, dict):
-        raise ConfigError(f"{path}: 'edits' is {_quoted(edits)}; it holds a list of steps per name")
+        raise ConfigError(f"{path}: 'edits' is {quoted(edits)}; it holds a list of steps per name")
     return {_name(name, f"{path}: edit"): _edit(steps, f"{path}: edit {name!r}") for name, steps in edits.items()}
 
 
 def _edit(steps: Any, where: str) -> Edit:
     if not isinstance(steps, list) or not steps:
-        raise ConfigError(
-            f"{where} is {_quoted(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}"
-        )
+        raise ConfigError(f"{where} is {quoted(steps)}; it is a list of steps, at least one: - remove: {{track: 6e5c}}")
     return Edit(steps=tuple(_step(step, f"{where}, step {number}") for number, step in enumerate(steps, start=1)))
 
 
 def _step(step: Any, where: str) -> Step:
     kinds = ", ".join(Step.model_fields)
     if not isinstance(step, dict) or len(step) != 1:
-        raise ConfigError(f"{where} is {_quoted(step)}; a step has one key, one of {kinds}")
+        raise ConfigError(f"{where} is {quoted(step)}; a step has one key, one of {kinds}")
     (kind, fields), *_ = step.items()
     if kind not in Step.model_fields:
         raise ConfigError(f"{where}: there is no step {kind!r}; there are: {kinds}")
     where = f"{where} ({kind})"
     if not isinstance(fields, dict):
-        raise ConfigError(f"{where} is {_quoted(fields)}; it is a mapping: {kind}: {{{_example(kind)}}}")
+        raise ConfigError(f"{where} is {quoted(fields)}; it is a mapping: {kind}: {{{_example(kind)}}}")
     for key in fields:
         if not isinstance(key, str):
             raise ConfigError(f"{where}: {key!r} stands where a key should; a decimal has a point: 3.5, not 3,5")
-    try:
-        checked = Step.model_validate({kind: fields})
-    except ValidationError as error:
-        raise ConfigError(f"{where}: " + "; ".join(_sentence(item, kind) for item in error.errors())) from None
+    record = Step.model_fields[kind].annotation.__args__[0]
+    keys = [field.alias or name for name, field in record.model_fields.items()]
+    checked = Step(**{kind: validated(record, fields, f"{where}: ", keys=keys)})
     if checked.duplicate is not None:
         name = _name(checked.duplicate.name, f"{where}: 'as'")
         if name in RESERVED:
@@ -72,30 +68,5 @@ def _name(name: Any, what: str) -> str:
     return name
 
 
-def _keys(kind: str) -> list[str]:
-    """The keys of a step as spelled in the file."""
-    record = Step.model_fields[kind].annotation.__args__[0]
-    return [field.alias or name for name, field in record.model_fields.items()]
-
-
 def _example(kind: str) -> str:
     return "lateral: 2.0" if kind == "ego" else "track: 6e5c, ..."
-
-
-def _sentence(item: Any, kind: str) -> str:
-    """One pydantic error of a step as a sentence."""
-    key = ".".join(str(part) for part in item["loc"][1:])
-    message = item["msg"].removeprefix("Value error, ")
-    if not key:
-        return message
-    if item["type"] == "extra_forbidden":
-        return f"unknown key {key!r}; there are: {', '.join(_keys(kind))}"
-    if item["type"] == "missing":
-        return f"{key!r} is missing; there are: {', '.join(_keys(kind))}"
-    return f"{key!r} is {_quoted(item['input'])}: {message[:1].lower()}{message[1:]}"
-
-
-def _quoted(value: Any) -> str:
-    """A value of the file, truncated to 60 characters."""
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
