@@ -46,8 +46,7 @@ from drivesplat.rasterization import Rendering, rasterize
 from drivesplat.rendering import captured_frames
 from drivesplat.rendering.frames import film_frame, film_frames
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
+from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings, TrainSettings
 from drivesplat.training import trainer as trainer_module
 from drivesplat.training.trainer import Trainer
 

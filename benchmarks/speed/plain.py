@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from drivesplat.model.background import Background
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import GaussianSettings
 
 FULL_LENGTH = 30_000
 """The length of the example's schedule."""

@@ -29,8 +29,8 @@ from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.scene.training_record import read_training_record
-from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.train import CoarseToFineSettings
 from drivesplat.training.clock import UNTIMED, Clock, StageClock
 from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
 from drivesplat.training.train import TrainingFolders, train

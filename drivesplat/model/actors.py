@@ -26,8 +26,7 @@ from drivesplat.model.parameters import init_params, learning_rates, make_parame
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.scene.motion import Motion
-from drivesplat.settings.actors import ActorSettings, TrackSettings
-from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings
 
 
 @dataclass(frozen=True)

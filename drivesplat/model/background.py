@@ -10,7 +10,7 @@ from torch import Tensor
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import Part
-from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import GaussianSettings
 
 
 class Background(Part):

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from drivesplat.kernels.spherical_harmonics import SH_C0
-from drivesplat.settings.gaussians import GaussianSettings
+from drivesplat.settings.train import GaussianSettings
 
 
 def init_params(

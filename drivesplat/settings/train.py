@@ -5,11 +5,6 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.actors import ActorSettings
-from drivesplat.settings.camera_poses import CameraPoseSettings
-from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.road import RoadSettings
 
 PartName = Literal["background", "actors"]
 STAGE_OF_PART: dict[PartName, str] = {"actors": "actors"}
@@ -32,6 +27,117 @@ Parts = Annotated[
     Field(json_schema_extra={"contains": {"const": "background"}, "uniqueItems": True}),
 ]
 """Parts of a model."""
+
+
+class GaussianSettings(Settings):
+    """Initial values and learning rates of Gaussians. Learning rates are those of gsplat's example trainer."""
+
+    sh_degree: int = Field(1, ge=0, le=3)
+    """Degree of the spherical harmonics of the colours. A drive shows objects from few directions; degree 3 gives the
+    same held-out PSNR with twice the memory (docs/measured.md)."""
+    init_opacity: float = Field(0.1, gt=0, lt=1)
+    """Initial opacity of seed Gaussians."""
+    init_scale: float = Field(0.4, gt=0, le=10)
+    """Initial scale of a seed Gaussian, in units of the root mean square distance to its three nearest neighbours.
+    Small and faint seeds give higher PSNR where LiDAR is dense."""
+    lr_means: float = Field(1.6e-4, gt=0)
+    """Learning rate of positions, in units of the scene scale. Decays exponentially to a hundredth."""
+    lr_scales: float = Field(5e-3, gt=0)
+    """Learning rate of log scales."""
+    lr_quats: float = Field(1e-3, gt=0)
+    """Learning rate of rotations."""
+    lr_opacities: float = Field(5e-2, gt=0)
+    """Learning rate of opacity logits."""
+    lr_sh0: float = Field(2.5e-3, gt=0)
+    """Learning rate of the colours' constant term."""
+    lr_classes: float = Field(1e-2, gt=0)
+    """Learning rate of class logits, where class maps are given (masks.semantic_folder)."""
+    lr_shN: float = Field(1.25e-4, gt=0)
+    """Learning rate of the colours' view-dependent terms."""
+
+
+class TrackSettings(Settings):
+    """Learned corrections of the annotated poses of actors. Poses between annotations are interpolated smoothly."""
+
+    corrected: bool = True
+    """Correct annotated positions and headings."""
+    lr_translation: float = Field(1e-3, gt=0)
+    """Learning rate of the position corrections (metres)."""
+    lr_yaw: float = Field(5e-4, gt=0)
+    """Learning rate of the heading corrections (radians)."""
+    size_weight: float = Field(0.001, ge=0)
+    """Loss weight of the mean square of the corrections, in units of `sigma_translation` and `sigma_yaw`."""
+    bend_weight: float = Field(0.001, ge=0)
+    """Loss weight of the mean square of their second differences along a track, in the same units. It keeps corrections
+    smooth, so that they hold for the held-out frames in between (docs/street.md)."""
+    sigma_translation: float = Field(0.1, gt=0)
+    """Expected error of an annotated position (metres)."""
+    sigma_yaw: float = Field(0.03, gt=0)
+    """Expected error of an annotated heading (radians)."""
+
+
+class ActorSettings(Settings):
+    """The part `actors`: moving vehicles, each a set of Gaussians in the frame of its box."""
+
+    cap_max: int = Field(200_000, ge=1, le=20_000_000)
+    """Maximum number of Gaussians of all actors together. Each actor keeps at least four."""
+    least: int = Field(500, ge=1)
+    """Number of Gaussians that every actor may have. Beyond it, train.pixels_per_gaussian limits an actor by the number
+    of training pixels in its box."""
+    sh_degree: int = Field(1, ge=0, le=3)
+    """Degree of the spherical harmonics of their colours, in the object's frame."""
+    fourier: int = Field(5, ge=1, le=16)
+    """Number of Fourier coefficients over time of every colour coefficient. 1 = colours constant in time."""
+    box_margin: float = Field(0.1, ge=0, le=2)
+    """Gaussians with centres farther than this (metres) outside their box are faded out."""
+    tracks: TrackSettings = TrackSettings()
+
+
+class CameraPoseSettings(Settings):
+    """Bounded, smooth corrections of the camera poses of training images, learned along with the Gaussians. Held-out
+    images and all other times take interpolated corrections.
+
+    Applies after `refine_poses`, or instead of it. Unbounded corrections raise training PSNR and lower held-out PSNR,
+    since training poses drift away from held-out poses.
+    """
+
+    corrected: bool = False
+    """Correct camera poses during training."""
+    max_shift: float = Field(0.05, gt=0, le=1)
+    """Maximum translation of a camera along each of its axes (metres)."""
+    max_turn: float = Field(0.3, gt=0, le=10)
+    """Maximum rotation of a camera about each of its axes (degrees)."""
+    learning_rate: float = Field(2e-3, gt=0)
+    """Learning rate, in fractions of these bounds. Decays exponentially to a hundredth."""
+    size_weight: float = Field(0.001, ge=0)
+    """Loss weight of the mean square of the corrections, in fractions of the bounds."""
+    bend_weight: float = Field(0.01, ge=0)
+    """Loss weight of the mean square of their second differences from image to image, in the same units."""
+
+
+class CoarseToFineSettings(Settings):
+    """Trains with reduced images and fewer Gaussians at first, so that early iterations are faster (after DashGaussian,
+    Chen et al. 2025, arXiv 2503.18402)."""
+
+    quarter_until: float = Field(0.2, ge=0, le=1)
+    """Fraction of the iterations that use images of a quarter of the width and height."""
+    half_until: float = Field(0.7, ge=0, le=1)
+    """Fraction of the iterations after which images have full size. Before it they have half the width and height."""
+    least_height: int = Field(225, ge=16)
+    """Minimum number of rows of a reduced image. 900 rows are reduced to 225; images of 640x360 are not reduced."""
+    share: float = Field(0.6, gt=0, le=1)
+    """Fraction of the Gaussian limit that applies while images are reduced, with strategy: mcmc. The full limit
+    applies early enough for the number of Gaussians to reach it before densification stops."""
+
+
+class RoadSettings(Settings):
+    """Selection of the background Gaussians that train.road_weight acts on."""
+
+    half_width: float = Field(1.2, gt=0, le=10)
+    """Maximum lateral distance from the path of the vehicle's centre (metres). The weight falls with this distance,
+    since kerbs and grass may begin beside the vehicle."""
+    reach: float = Field(0.3, gt=0, le=2)
+    """Maximum height of a centre above or below the road surface (metres)."""
 
 
 class McmcSettings(Settings):

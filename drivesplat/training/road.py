@@ -16,7 +16,7 @@ from torch import Tensor
 from drivesplat.kernels.quaternions import rotation_matrix
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.road import RoadSettings
+from drivesplat.settings.train import RoadSettings
 from drivesplat.training.floaters import LARGEST_STEP
 from drivesplat.training.sparse_grid import SparseGrid
 

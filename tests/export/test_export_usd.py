@@ -20,8 +20,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.export import ExportJob
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 
 COUNT, KEPT = 60, 40
 PROVENANCE = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64, "stages": {}}

@@ -27,8 +27,7 @@ from drivesplat.model.view import View
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.export import ExportJob
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 
 COUNT, KEPT = 60, 40
 PROVENANCE = {"settings_sha256": "a" * 64, "stages": {"train": {"note": "</script><b>"}}}

@@ -11,8 +11,7 @@ from drivesplat.model.background import Background
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import DefaultSettings, McmcSettings, TrainSettings
+from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings, TrainSettings
 from drivesplat.training.densify import Densifier
 from drivesplat.training.optimizers import Optimizers
 

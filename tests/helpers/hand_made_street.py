@@ -18,10 +18,8 @@ from drivesplat.model.view import View
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene, Track
-from drivesplat.settings.actors import ActorSettings
-from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.render import FilmFormat
-from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainJob, TrainSettings
 from helpers.classed import classed
 from helpers.hand_made import about_z, round_gaussians
 from helpers.hand_made import actors_of as made_actors

@@ -23,10 +23,10 @@ from drivesplat.model.view import View
 from drivesplat.scene.masks import mask_name
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import (
     DefaultSettings,
     FloaterSettings,
+    GaussianSettings,
     McmcSettings,
     PartName,
     SkyKind,

@@ -16,9 +16,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.motion import Motion
-from drivesplat.settings.actors import ActorSettings, TrackSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings, TrainSettings
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 

@@ -13,9 +13,7 @@ from drivesplat.model.actors import ActorPoses, Actors, track_penalties
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
-from drivesplat.settings.actors import ActorSettings, TrackSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import DefaultSettings, McmcSettings
+from drivesplat.settings.train import ActorSettings, DefaultSettings, GaussianSettings, McmcSettings, TrackSettings
 from drivesplat.training.optimizers import make_optimizers
 
 TIMES = np.linspace(1.0, 3.0, 5)

@@ -16,9 +16,8 @@ from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.rigid import rigid
-from drivesplat.settings.camera_poses import CameraPoseSettings
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train import CameraPoseSettings, TrainJob, TrainSettings
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.resume_state import restore_model

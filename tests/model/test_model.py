@@ -25,9 +25,7 @@ from drivesplat.model.view import View
 from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.images import pixel_rays
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.actors import ActorSettings
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainSettings
 
 SH_C0 = 0.5 / np.sqrt(np.pi)
 SKY_COLOR = np.array([0.2, 0.4, 0.8])

@@ -30,9 +30,8 @@ from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainSettings
 
 WIDTH, HEIGHT, FPS = 160, 120, 30
 SIZE = (WIDTH, HEIGHT)

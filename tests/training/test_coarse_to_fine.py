@@ -9,8 +9,7 @@ import torch
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
 from drivesplat.scene.masks import UNLABELLED
-from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import CoarseToFineSettings, TrainSettings
 from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.views import LidarDepth, TrainingView, view_index
 

@@ -16,9 +16,7 @@ from drivesplat.kernels.gsplat_private import cpu_strategies
 from drivesplat.kernels.relocation import relocation
 from drivesplat.model.actors import Actors
 from drivesplat.model.splat_model import Picture, SplatModel
-from drivesplat.settings.actors import ActorSettings
-from drivesplat.settings.coarse_to_fine import CoarseToFineSettings
-from drivesplat.settings.train import DefaultSettings, McmcSettings
+from drivesplat.settings.train import ActorSettings, CoarseToFineSettings, DefaultSettings, McmcSettings
 from drivesplat.training.densify import Densifier, coarse_cap
 from drivesplat.training.optimizers import make_optimizers
 from drivesplat.training.trainer import Trainer

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from drivesplat.model.background import Background
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import DefaultSettings, McmcSettings
+from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
 from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, camera_path, fade_floaters, near_path
 from drivesplat.training.sparse_grid import SparseGrid
 

@@ -13,8 +13,7 @@ from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import rigid
-from drivesplat.settings.road import RoadSettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import RoadSettings, TrainSettings
 from drivesplat.training.floaters import LARGEST_STEP
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geometry_priors, geometry_terms, thickness
 from drivesplat.training.road import CELL, ROUGHNESS, Road, driven_road, road_loss, road_of

@@ -15,8 +15,7 @@ from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.training.losses import (
     class_cross_entropy,
     depth_loss,

@@ -9,8 +9,7 @@ from drivesplat.kernels import triton_support
 from drivesplat.model.background import Background
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.settings.gaussians import GaussianSettings
-from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train import GaussianSettings, TrainSettings
 from drivesplat.training.optimizers import DeviceSchedule, make_optimizers, set_learning_rates
 
 DEVICES = [

@@ -52,12 +52,12 @@ from drivesplat.lidar.free_space_record import FreeSpace
 from drivesplat.model.checkpoint import read_checkpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
-from drivesplat.settings.actors import ActorSettings
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.gaussians import GaussianSettings
 from drivesplat.settings.train import (
+    ActorSettings,
     DefaultSettings,
     FloaterSettings,
+    GaussianSettings,
     TrainJob,
 )
 from drivesplat.training import resume_state
