@@ -43,10 +43,7 @@ class PanelJob(Settings):
     ghosts: GhostSettings
 
 
-class RemovalJob(Settings):
+class RemovalJob(PanelJob):
     """All settings that determine one removal."""
 
-    eval_camera: str
-    subject: SubjectSettings
-    ghosts: GhostSettings
     removal: RemovalSettings

@@ -63,35 +63,31 @@ class Outputs(Inputs):
         """The metrics.json of the batch's scenes."""
         return [f"{self.config.results_dir}/{scene}/metrics.json" for scene in self.config.batch_scenes]
 
-    def films(self, _: Any = None) -> list[str]:
-        """The films of the batch's scenes."""
-        return self.films_of(self.config.batch_scenes)
+    def films(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
+        """The films of every method of `scenes`, by default the batch's, and those of the parts of methods that can be
+        taken apart."""
+        return self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], scenes)
 
-    def edits(self, _: Any = None) -> list[str]:
-        """The edited films of the batch's scenes. Raises ConfigError where an edits file is wrong."""
-        return self.edits_of(self.config.batch_scenes)
+    def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
+        """The films of every edit of `scenes`, by default the batch's, by every method that can be edited. Raises
+        ConfigError where an edits file is invalid."""
+        return self.of_methods(lambda *at: [f"edits/{edit}.mp4" for edit in self._edit_names(*at)], scenes)
 
     def looks(self, _: Any = None) -> list[str]:
         """The pictures of the batch's scenes and methods."""
         tracks = [f"{self.config.results_dir}/{scene}/tracks.png" for scene in self.config.batch_scenes]
-        return [*tracks, *self._of_methods(self.config.batch_scenes, lambda *_: LOOKS)]
+        return [*tracks, *self.of_methods(lambda *_: LOOKS)]
 
     def exports(self, _: Any = None) -> list[str]:
         """The exported files of the batch's scenes and methods."""
-        return self._of_methods(self.config.batch_scenes, lambda *_: EXPORTS)
+        return self.of_methods(lambda *_: EXPORTS)
 
-    def films_of(self, scenes: Iterable[str]) -> list[str]:
-        """The films of every method of `scenes`, and those of the parts of methods that can be taken apart."""
-        return self._of_methods(scenes, lambda *place: [f"{film}.mp4" for film in self._film_names(*place)])
-
-    def edits_of(self, scenes: Iterable[str]) -> list[str]:
-        """The films of every edit of `scenes`, by every method that can be edited."""
-        return self._of_methods(scenes, lambda *place: [f"edits/{edit}.mp4" for edit in self._edit_names(*place)])
-
-    def _of_methods(self, scenes: Iterable[str], names: Callable[[str, str], Iterable[str]]) -> list[str]:
-        """The files below the folders of all methods of `scenes`; `names` gives those of a scene and a method."""
+    def of_methods(self, names: Callable[[str, str], Iterable[str]], scenes: Iterable[str] | None = None) -> list[str]:
+        """The files below the folders of all methods of `scenes`, by default the batch's; `names` gives those of one
+        scene and method."""
         results, methods = self.config.results_dir, self.config.methods
-        return [f"{results}/{s}/{m}/{name}" for s in scenes for m in methods for name in names(s, m)]
+        chosen = self.config.batch_scenes if scenes is None else scenes
+        return [f"{results}/{s}/{m}/{name}" for s in chosen for m in methods for name in names(s, m)]
 
     def _film_names(self, scene: str, method: str) -> list[str]:
         parts = [PARTS_FILM] if method in self.methods_with_actors else []

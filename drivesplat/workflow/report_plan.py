@@ -1,6 +1,5 @@
 """What the report across scenes is made of, and from what."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -55,13 +54,14 @@ class ReportPlan:
 
     def pictures(self, _: Any = None) -> list[str]:
         """The pictures that its page shows. Those that come with the figures are there when the figures are."""
-        with_figures = self._of_methods(HELD_OUT_PAIR.values())
-        return [*(_there(with_figures) if self._alone else with_figures), *self._seen(self._of_methods(LOOKS.values()))]
+        with_figures = self._plan.of_methods(lambda *_: HELD_OUT_PAIR.values(), self.scenes)
+        looks = self._plan.of_methods(lambda *_: LOOKS.values(), self.scenes)
+        return [*(_present(with_figures) if self._alone else with_figures), *self._shown(looks)]
 
     def links(self, _: Any = None) -> list[str]:
         """What its page links to: films, edits, and what opens in a browser."""
-        films, edits = self._plan.films_of(self.scenes), self._plan.edits_of(self.scenes)
-        return self._seen([*films, *edits, *self._of_methods(["viewer.html"])])
+        viewers = self._plan.of_methods(lambda *_: ["viewer.html"], self.scenes)
+        return self._shown([*self._plan.films(scenes=self.scenes), *self._plan.edits(scenes=self.scenes), *viewers])
 
     def settings(self, _: Any = None) -> str:
         """The settings of its job as canonical JSON."""
@@ -74,14 +74,9 @@ class ReportPlan:
         )
         return canonical_json(job.model_dump(mode="json"))
 
-    def _of_methods(self, names: Iterable[str]) -> list[str]:
-        """The files of these names in the folders of all methods of its scenes."""
-        methods, wanted = self._plan.config.methods, tuple(names)
-        return [f"{self._results}/{s}/{m}/{name}" for s in self.scenes for m in methods for name in wanted]
-
-    def _seen(self, files: list[str]) -> list[str]:
-        return files if self._everything else _there(files)
+    def _shown(self, files: list[str]) -> list[str]:
+        return files if self._everything else _present(files)
 
 
-def _there(files: list[str]) -> list[str]:
+def _present(files: list[str]) -> list[str]:
     return [file for file in files if Path(file).is_file()]

@@ -274,9 +274,9 @@ def test_nothing_else_knows_of_the_ablation():
         for stage in METHOD_STAGES:
             told = (stage_settings(made.config, stage, "a1", method) for made in (with_it, without))
             assert next(told) == next(told)
-    assert with_it.films_of(["a1", "demo"]) == without.films_of(["a1", "demo"])
-    assert with_it.edits_of(["a1", "demo"]) == without.edits_of(["a1", "demo"]) != []
-    assert {Path(edit).parts[2] for edit in with_it.edits_of(["demo"])} == {"street"}
+    assert with_it.films(scenes=["a1", "demo"]) == without.films(scenes=["a1", "demo"])
+    assert with_it.edits(scenes=["a1", "demo"]) == without.edits(scenes=["a1", "demo"]) != []
+    assert {Path(edit).parts[2] for edit in with_it.edits(scenes=["demo"])} == {"street"}
     assert with_it.report([]).settings() == without.report([]).settings()
 
 

@@ -11,6 +11,8 @@ from typing import Any
 BENCHMARKS = "benchmarks"
 """The folder of benchmark files in that of the results."""
 TRAIN, FILM, EDIT, FILM_PARTS, WORLD = "train", "film", "edit", "film_parts", "demo_world"
+COLUMNS = {"max_rss_mb": "max_rss", "cpu_seconds": "cpu_time", "mean_load": "mean_load"}
+"""Fields of a Cost and the columns of Snakemake's benchmark files that hold them."""
 RENAMED = {"metrics": "scene_metrics"}
 """Stages whose benchmark file is called otherwise."""
 
@@ -67,17 +69,18 @@ def read_costs(results: Path) -> tuple[list[Cost], list[str]]:
     files = {JobId.of(file.relative_to(folder)): file for file in sorted(folder.rglob("*.tsv"))}
     trained = {JobId(TRAIN, *file.parent.parts[-2:]): file for file in sorted(results.glob("*/*/train.json"))}
     for job in sorted({*files, *trained}, key=lambda job: (job.scene, job.method, job.stage, job.film)):
-        benchmark = _reading(_benchmark, files.get(job), complaints)
-        summary = _reading(_summary, trained.get(job), complaints)
+        benchmark = _reading(_benchmark, files.get(job), complaints) or {}
+        summary, resumed = _reading(_summary, trained.get(job), complaints) or ({}, False)
         if job in trained and job not in files:
             complaints.append(f"{trained[job]}: its job left no benchmark; only the training loop's seconds are known")
-        cost = _cost(job, benchmark, summary)
-        if cost is not None:
-            costs.append(cost)
+        # the benchmark of a training that was resumed has its last part alone
+        fields = benchmark | summary if resumed else summary | benchmark
+        if fields:
+            costs.append(Cost(job, **fields))
     return costs, complaints
 
 
-def _reading(reader: Any, path: Path | None, complaints: list[str]) -> dict[str, Any] | None:
+def _reading(reader: Any, path: Path | None, complaints: list[str]) -> Any:
     if path is None:
         return None
     try:
@@ -87,8 +90,8 @@ def _reading(reader: Any, path: Path | None, complaints: list[str]) -> dict[str,
         return None
 
 
-def _benchmark(path: Path) -> dict[str, float | None]:
-    """The last line of a benchmark file; what Snakemake could not measure ('-', 'NA') is None."""
+def _benchmark(path: Path) -> dict[str, Any]:
+    """The fields of a Cost in the last line of a benchmark file, None for '-' and 'NA': Snakemake measured nothing."""
     with open(path, encoding="utf-8", newline="") as file:
         lines = list(csv.DictReader(file, delimiter="\t"))
     if not lines:
@@ -97,7 +100,8 @@ def _benchmark(path: Path) -> dict[str, float | None]:
     seconds = _figure(last["s"])
     if seconds is None:
         raise ValueError(f"{last['s']!r} are no seconds")
-    return {"s": seconds, **{key: _figure(last.get(key)) for key in ("max_rss", "cpu_time", "mean_load")}}
+    figures = {field: _figure(last.get(column)) for field, column in COLUMNS.items()}
+    return {"seconds": seconds, "seconds_from": "benchmark", **figures}
 
 
 def _figure(text: str | None) -> float | None:
@@ -108,37 +112,18 @@ def _figure(text: str | None) -> float | None:
     return value if math.isfinite(value) and value >= 0 else None
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    """What of train.json tells costs."""
+def _summary(path: Path) -> tuple[dict[str, Any], bool]:
+    """The fields of a Cost in train.json, and whether the training was resumed."""
     content = json.loads(path.read_text(encoding="utf-8"))
     memory = content["peak_gpu_memory_gb"]
-    return {
+    fields = {
         "seconds": float(content["seconds"]),
+        "seconds_from": "train.json",
         "iterations": int(content["iterations"]),
-        "resumed": bool(content["resumed_at"]),
         "gpu_memory_gb": None if memory is None else float(memory),
         "device": str(content["device"]),
     }
-
-
-def _cost(job: JobId, benchmark: dict[str, Any] | None, summary: dict[str, Any] | None) -> Cost | None:
-    """The benchmark of a training that was resumed has its last part alone, so that its own record counts."""
-    told = {key: summary[key] for key in ("gpu_memory_gb", "device", "iterations")} if summary else {}
-    if summary and (benchmark is None or summary["resumed"]):
-        used = {"seconds": summary["seconds"], "seconds_from": "train.json"}
-    elif benchmark:
-        used = {"seconds": benchmark["s"], "seconds_from": "benchmark"}
-    else:
-        return None
-    figures = {} if benchmark is None else benchmark
-    return Cost(
-        job,
-        **used,
-        max_rss_mb=figures.get("max_rss"),
-        cpu_seconds=figures.get("cpu_time"),
-        mean_load=figures.get("mean_load"),
-        **told,
-    )
+    return fields, bool(content["resumed_at"])
 
 
 def by_scene(costs: Iterable[Cost]) -> Iterator[tuple[str, list[Cost]]]:
