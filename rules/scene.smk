@@ -96,7 +96,7 @@ rule lidar_seed:
         scene=plan.scene,
         own_car="<results>/{scene}/own_car.json",
         points_file=plan.points_file,
-        triangulated=plan.triangulated_seeds,
+        triangulated=plan.triangulated("lidar_seed"),
     output:
         seed="<results>/{scene}/seed.ply",
     log:
@@ -225,7 +225,7 @@ rule free_space:
     """
     input:
         scene=plan.scene,
-        triangulated=plan.triangulated_ends,
+        triangulated=plan.triangulated("free_space"),
     output:
         free_space="<results>/{scene}/free_space.npz",
     log:

@@ -13,9 +13,9 @@ rule train:
     input:
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
-        actors=plan.actors,
-        lidar_depth=plan.lidar_depth,
-        free_space=plan.free_space,
+        actors=plan.training_input("actors"),
+        lidar_depth=plan.training_input("lidar_depth"),
+        free_space=plan.training_input("free_space"),
     output:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",

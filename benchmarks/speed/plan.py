@@ -100,9 +100,9 @@ def files_for(run: SnakemakeRun, method: str) -> SceneFiles:
         plan.scene(at),
         str(folder / "parser.pkl"),
         str(folder / "masks/masks.json"),
-        tuple(plan.actors(at)),
-        tuple(plan.lidar_depth(at)),
-        tuple(plan.free_space(at)),
+        tuple(plan.training_input("actors")(at)),
+        tuple(plan.training_input("lidar_depth")(at)),
+        tuple(plan.training_input("free_space")(at)),
     )
 
 

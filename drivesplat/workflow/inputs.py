@@ -1,7 +1,8 @@
 """Input functions of rules: the files to read depend on the config."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.provenance.file_digests import record_output
@@ -92,38 +93,29 @@ class Inputs:
         name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
 
-    def triangulated_seeds(self, wildcards: Any) -> list[str]:
-        """The points triangulated by pose refinement, if they are used as seeds."""
-        return self._triangulated(wildcards, for_scene(self.config, wildcards.scene).lidar_seed.triangulated)
+    def triangulated(self, stage: Literal["lidar_seed", "free_space"]) -> Callable[[Any], list[str]]:
+        """The function of wildcards that gives the points triangulated by pose refinement, if the stage uses them."""
 
-    def triangulated_ends(self, wildcards: Any) -> list[str]:
-        """The same points, if rays to them are used to find empty space."""
-        return self._triangulated(wildcards, for_scene(self.config, wildcards.scene).free_space.triangulated)
+        def points(wildcards: Any) -> list[str]:
+            used = getattr(for_scene(self.config, wildcards.scene), stage).triangulated
+            made = used and refines_poses(self.config, wildcards.scene)
+            return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.npz"] if made else []
 
-    def _triangulated(self, wildcards: Any, wanted: bool) -> list[str]:
-        made = wanted and refines_poses(self.config, wildcards.scene)
-        return [f"{self.config.results_dir}/{wildcards.scene}/triangulated.npz"] if made else []
+        return points
 
     def points_file(self, wildcards: Any) -> list[str]:
         """The user's extra seed points, if given."""
         path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
         return [str(Path(path).expanduser())] if path else []
 
-    def actors(self, wildcards: Any) -> list[str]:
-        """The seeds of actors, if the method trains actors."""
-        return self._training_input("actors", wildcards)
+    def training_input(self, stage: str) -> Callable[[Any], list[str]]:
+        """The function of wildcards that gives the result of one of TRAINING_INPUTS, if the training reads it."""
 
-    def lidar_depth(self, wildcards: Any) -> list[str]:
-        """LiDAR depth in the training images, if the training is supervised with it."""
-        return self._training_input("lidar_depth", wildcards)
+        def result(wildcards: Any) -> list[str]:
+            taken = training_inputs(self.config, wildcards.scene, wildcards.method)
+            return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.npz"] if stage in taken else []
 
-    def free_space(self, wildcards: Any) -> list[str]:
-        """The space that LiDAR rays crossed, if the training keeps Gaussians out of it."""
-        return self._training_input("free_space", wildcards)
-
-    def _training_input(self, stage: str, wildcards: Any) -> list[str]:
-        taken = training_inputs(self.config, wildcards.scene, wildcards.method)
-        return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.npz"] if stage in taken else []
+        return result
 
     def lpips_record(self, _: Any) -> list[str]:
         """The record of LPIPS's backbone, if LPIPS is enabled."""

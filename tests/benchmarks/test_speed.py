@@ -60,7 +60,7 @@ def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path)
     assert json.loads(run.plan.settings("train")(at)) == task.train.model_dump(mode="json")
     assert (task.code, task.stage) == (run.plan.code("train"), "street-77-seed5/train")
     assert [[*paths] for paths in (task.files.actors, task.files.lidar_depth, task.files.free_space)] == [
-        run.plan.actors(at), run.plan.lidar_depth(at), run.plan.free_space(at)
+        run.plan.training_input("actors")(at), run.plan.training_input("lidar_depth")(at), run.plan.training_input("free_space")(at)
     ]  # fmt: skip
     assert {Path(path).name for path in targets_of(run)} == {
         "scene_refined.json", "parser.pkl", "masks.json", "actors.npz", "lidar_depth.npz"

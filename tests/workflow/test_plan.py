@@ -12,7 +12,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.settings.config import load
 from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
 from drivesplat.workflow.plan import Plan
-from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, refines_poses, stage_settings
+from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, TRAINING_INPUTS, refines_poses, stage_settings
 
 ACTORS = ["background", "actors"]
 HELD = {"train": {"depth_weight": 0.01}}
@@ -27,7 +27,7 @@ def plan(**values: Any) -> Plan:
 
 def taken(made: Plan, scene: str, method: str) -> list[str]:
     at = SimpleNamespace(scene=scene, method=method)
-    return [*made.actors(at), *made.lidar_depth(at), *made.free_space(at)]
+    return [file for stage in TRAINING_INPUTS for file in made.training_input(stage)(at)]
 
 
 def test_actors_are_an_input_of_methods_with_that_part_alone():
@@ -116,7 +116,7 @@ def test_poses_are_refined_unless_they_are_known_to_be_exact(world, enabled, ref
     ],
 )
 def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_they_are_wanted(settings, taken):
-    assert plan(**settings).triangulated_seeds(SimpleNamespace(scene="a1")) == taken
+    assert plan(**settings).triangulated("lidar_seed")(SimpleNamespace(scene="a1")) == taken
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_triangulated_points_are_an_input_of_the_seed_where_there_are_any_and_th
     [({}, 0), (REFINED, 1), ({**REFINED, "free_space": {"triangulated": False}}, 0)],
 )
 def test_triangulated_points_are_an_input_of_free_space_where_there_are_any_and_they_are_wanted(settings, taken):
-    found = plan(**settings).triangulated_ends(SimpleNamespace(scene="a1"))
+    found = plan(**settings).triangulated("free_space")(SimpleNamespace(scene="a1"))
     assert found == ["elsewhere/a1/triangulated.npz"] * taken
 
 
