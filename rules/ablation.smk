@@ -1,4 +1,4 @@
-# The contribution of each component of a method: the method trained again without it.
+# Ablation: the contribution of each component of a method, from trainings without it.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/eval.json of the method and of all its variants, with every seed: methods
 # that the section `ablation` of the config names, trained and measured by the rules `train` and `evaluate`.

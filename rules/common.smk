@@ -1,7 +1,7 @@
-# The config, validated; refusals before any job; the one way by which rules get settings and code digests.
+# Validation of the config and of the targets before any job; settings and code digests of rules.
 #
 # A rule's `params` are its settings (canonical JSON of its own subtree, defaults filled in) and the digest of its code.
-# Snakemake compares nothing else of them, so key order, comments and other stages' settings never rerun anything.
+# Snakemake compares only these, so key order, comments and settings of other stages rerun nothing.
 import os
 import sys
 

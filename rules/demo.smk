@@ -1,4 +1,4 @@
-# Synthetic worlds: what a newcomer without a dataset starts from, with the truth that real logs lack.
+# Synthetic worlds: a start without a dataset, with ground truth that recorded drives lack.
 #
 # REQUIRED INPUTS: none.
 # OUTPUTS: the tables of a nuScenes dataset at the dataset's dataroot; samples/, sweeps/, maps/ and truth/ beside them.

@@ -1,4 +1,4 @@
-# A drive that was never driven: cars gone, moved, slower, larger, the camera's car elsewhere.
+# Edited drives: vehicles removed, moved, slowed or scaled, and the ego vehicle on another path.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz of a method with actors, scene.json; the scene's edits file,
 # named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not.

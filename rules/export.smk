@@ -1,4 +1,4 @@
-# What leaves the workflow: the splat for other programs, with the trajectory it was recorded along.
+# Exports for other programs: the Gaussians, with the recorded trajectory.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl.
 # OUTPUTS: <results>/{scene}/{method}/splat.ply, cameras.json, parts/parts.json (and the PLYs beside it); scene.usdz;

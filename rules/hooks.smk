@@ -1,8 +1,8 @@
-# What happens when a run starts and when it ends, however it ends.
+# Hooks of a run: the estimate and the lock at its start, costs and partial report at its end.
 #
 # REQUIRED INPUTS: none.
 # OUTPUTS: <results>/costs.csv and costs.json, of all jobs that have run; where jobs failed, the partial report. No rule
-# declares the costs: they change with every job, and nothing is made of them.
+# declares the costs: they change with every job, and no rule reads them.
 
 
 rule costs:

@@ -1,4 +1,4 @@
-# A trained method as a person sees it: films, the ghosts of what moved, the drive without a car.
+# Pictures and films of trained methods: trajectories, ghosts of moving vehicles, removal of a vehicle.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl, masks/.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png;

@@ -1,7 +1,7 @@
-# The gap between static and moving pixels, across scenes and methods.
+# The gap between static and dynamic pixels, across scenes and methods.
 #
-# REQUIRED INPUTS: <results>/{scene}/metrics.json of all scenes, with their pictures and films; of those measured, and
-# what there is of them, where the report alone is asked for.
+# REQUIRED INPUTS: <results>/{scene}/metrics.json of all scenes, with their pictures and films; where the report is the
+# only target, of the measured scenes, with the files that exist.
 # OUTPUTS: <results>/gap_report.html, gap_report.json and gap_report.csv, and a table on the console.
 
 
@@ -13,7 +13,7 @@ rule gap_report:
     input:
         metrics=across_scenes.metrics,
         pictures=across_scenes.pictures,
-        # linked, not read: a film that is made anew is no other report
+        # linked, not read: a new film does not change the report
         links=ancient(across_scenes.links),
     output:
         page=report(

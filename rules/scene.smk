@@ -1,4 +1,4 @@
-# From a dataset's tables to what a training needs.
+# Preprocessing: from a dataset's tables to the inputs of a training.
 #
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);

@@ -2,8 +2,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.npz, lidar_depth.npz and free_space.npz
 # if the method has actors, is supervised with LiDAR depth, and keeps Gaussians out of empty space.
-# OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While it runs,
-# resume/ holds what a killed training goes on from; no rule declares it, so that Snakemake leaves it alone.
+# OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While a training
+# runs, resume/ holds its resume checkpoint; no rule declares it, so that Snakemake does not delete it.
 
 
 rule train:

@@ -22,22 +22,22 @@ PATIENCE_S = 1.0
 
 
 def visible_cards() -> int:
-    """The number of GPUs of any maker that this process may use; at least 1, so that a CPU can run GPU rules."""
+    """The number of GPUs of any vendor that this process may use; at least 1, so that GPU rules can run on a CPU."""
     return max(1, len(_visible()[1]))
 
 
 def any_card() -> bool:
-    """Whether this process may use a GPU, of any maker."""
+    """Whether this process may use a GPU of any vendor."""
     return bool(_visible()[1])
 
 
 def hold_card(jobs_per_card: int) -> BinaryIO | None:
     """Locks a GPU that fewer than `jobs_per_card` jobs of this user hold on this machine, and hides all others from
-    this process; call it before any library looks for a GPU.
+    this process. Must be called before any library looks for a GPU.
 
-    Returns the file whose kernel lock says so: the card is held until it is closed, at the latest until the process
-    ends, however it ends. None where there is nothing to hold: no card, or a single one, given by a scheduler, of which
-    nobody knows which it is. Waits, and says so, while all are taken. Raises DeviceError where no lock can be made.
+    Returns the locked file: the lock lasts until the file is closed or the process ends. Returns None without a GPU,
+    and for a single GPU assigned by a scheduler, whose identity is unknown. Waits, with a warning, while all GPUs are
+    taken. Raises DeviceError where no lock file can be written.
     """
     variable, names = _visible()
     cards = dict(zip(names, _identities(names), strict=True))

@@ -15,7 +15,7 @@ from drivesplat.workflow.stages import refines_poses, training_inputs
 
 
 def unwritable_results(config: Config, error: OSError) -> DriveSplatError:
-    """What to tell where the results folder cannot be written."""
+    """The error for a results folder that cannot be written."""
     return DriveSplatError(
         f"{config.results_dir}/: cannot be written ({error.strerror or error}); "
         "fix its permissions, or give this run another folder (results_dir)"
@@ -31,8 +31,8 @@ class Inputs:
         self._folders: dict[str, Path] = {}
 
     def tables(self, wildcards: Any) -> list[str]:
-        """The files that decide a scene's scene.json: all tables of a synthetic world; of a recorded dataset the rows
-        that the scene needs, which planning extracts, so that touched tables rerun nothing."""
+        """The files that scene.json is made from: all tables of a synthetic world; for a recorded dataset, the file of
+        the scene's own rows, which planning keeps up to date, so that touched tables rerun nothing."""
         name = self.config.dataset_of(wildcards.scene)
         dataset = self.config.datasets[name]
         if dataset.world:
@@ -40,7 +40,7 @@ class Inputs:
         return [str(index(dataset.reader).scene_file(self._scene_tables(name), wildcards.scene))]
 
     def table_of_scenes(self, wildcards: Any) -> str:
-        """A table of a scene's dataset, below whose root the recordings are: where it has moved to, all is remade."""
+        """A table of a scene's dataset, which gives the dataset's root. A dataset that has moved reruns everything."""
         name = self.config.dataset_of(wildcards.scene)
         return f"{self._root(name)}/{self.config.datasets[name].version}/scene.json"
 

@@ -1,4 +1,4 @@
-"""The seam between Snakemake's scripts and the library: settings in, errors out in one line."""
+"""The interface between rules' scripts and the library: settings, provenance, logs, and errors in one line."""
 
 import errno
 import gc
@@ -67,8 +67,8 @@ class Job:
         return model.model_validate_json(self._params.settings)
 
     def device(self) -> DeviceSettings:
-        """Where to run; not one of the settings, since it decides no result. From now on until it ends, the job has a
-        GPU, where there is one to have, and sees no other."""
+        """The device to run on; not part of the settings, since it changes no result. Reserves a GPU for the job until
+        it ends, where there is one, and hides all others."""
         settings = DeviceSettings.model_validate_json(self._resources.device)
         if settings.kind != "cpu" and self._card is None:  # a second lock would wait for the first
             self._card = hold_card(settings.jobs_per_card)
@@ -89,20 +89,20 @@ class Job:
             check_dataset(Path(record).parent, dataset)
 
     def record_dataset(self, **files: Iterable[str | Path]) -> None:
-        """Keeps the digests of the dataset's `files` by kind, for the jobs that read them."""
+        """Computes the digests of the dataset's `files` by kind, for the record beside the outputs."""
         self._dataset = {
             kind: file_digests(path for path in paths if Path(path).is_file()) for kind, paths in files.items()
         }
 
     def record_outputs(self) -> None:
-        """Keeps the digests of all that the job has read and written, for the jobs that read it."""
+        """Writes the digests of all files that the job has read and written."""
         for path, before in self._members.items():
             record_output(path, self._rule, before, self._read, self._dataset)
 
 
 @contextmanager
 def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) -> Iterator[Job]:
-    """A rule's script as a context: logs into the rule's log, and ends a failure in one line on the console.
+    """The context of a rule's script: logs into the rule's log, and reports a failure in one line on the console.
 
     Inputs are compared with what their rules wrote, unless the script does that itself (`check_inputs`); `dataset` are
     the kinds of the dataset's files that the script reads ('images', 'sweeps').
@@ -142,7 +142,7 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
 
 
 def _log_into(path: Path) -> None:
-    """Sends what is logged into the file at `path`, warnings and errors to the console as well."""
+    """Logs into the file at `path`; warnings and errors also go to the console."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handler = logging.FileHandler(path, mode="w", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a run makes of the configured scenes, and what settings and code each result should come from."""
+"""The results of the configured scenes, and the settings and code that each should come from."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -56,7 +56,7 @@ class Outputs(Inputs):
 
     @property
     def methods_with_actors(self) -> list[str]:
-        """The methods whose models know objects that move: those that can be taken apart and edited."""
+        """The methods with parts for moving objects: those that can be edited and shown part by part."""
         return [name for name, method in self.config.all_methods.items() if method.moving_parts]
 
     def metrics(self, _: Any = None) -> list[str]:
@@ -64,8 +64,8 @@ class Outputs(Inputs):
         return [f"{self.config.results_dir}/{scene}/metrics.json" for scene in self.config.batch_scenes]
 
     def films(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
-        """The films of every method of `scenes`, by default the batch's, and those of the parts of methods that can be
-        taken apart."""
+        """The films of every method of `scenes`, by default the batch's, and of the parts of methods with moving
+        objects."""
         return self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], scenes)
 
     def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:

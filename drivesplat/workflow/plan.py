@@ -1,6 +1,6 @@
-"""What the Snakefile needs before anything runs: settings and code digests of rules, and checks of the targets.
+"""The interface of the Snakefile to the library: settings and code digests of rules, and checks of targets.
 
-Everything here is cheap to import and to compute; it runs once in the main process and once in every job.
+Everything here must import and run quickly: it runs in the main process and in every job.
 """
 
 import os
@@ -79,13 +79,12 @@ class Plan(Outputs):
         return self._devices[name]
 
     def cards(self, wildcards: Any) -> int:
-        """The number of GPUs that each training or rendering of a scene takes: 1, or 0 on the CPU. Looks at the GPUs of
-        this machine, where the jobs run."""
+        """The number of GPUs that a training or rendering of a scene takes: 1, or 0 on the CPU of this machine."""
         return self._device(wildcards.scene)[1]
 
     def threads(self, on_gpu: int) -> Callable[[Any], int]:
-        """The threads of such a job: `on_gpu` with a GPU, otherwise half of the processors, since two jobs side by side
-        finish sooner than one after the other on all processors."""
+        """The threads of such a job: `on_gpu` with a GPU, otherwise half of the processors, since two jobs in parallel
+        finish sooner than two in sequence on all processors."""
         on_cpu = max(1, len(os.sched_getaffinity(0)) // 2)
         return lambda wildcards: on_gpu if self.cards(wildcards) else on_cpu
 
@@ -99,7 +98,7 @@ class Plan(Outputs):
 
     def refuse_unknown(self, targets: list[str]) -> None:
         """Raises ConfigError with the known names if a target names an unknown scene, method or film, or an ablation
-        that would train one variant twice."""
+        with a variant equal to the complete method."""
         for target in targets:
             scene, *rest = self._inside_results(target)
             if not rest:
@@ -180,9 +179,9 @@ class Plan(Outputs):
         return list(path.relative_to(results).parts) or [""] if path.is_relative_to(results) else [""]
 
     def hold_results(self) -> None:
-        """Keeps a second run out of the results folder until this process ends, however it ends.
+        """Locks the results folder against a second run until this process ends, however it ends.
 
-        Raises DriveSplatError.
+        Raises DriveSplatError if another run holds the lock.
         """
         folder = Path(self.config.results_dir)
         try:

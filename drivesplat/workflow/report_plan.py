@@ -1,4 +1,4 @@
-"""What the report across scenes is made of, and from what."""
+"""The inputs and settings of the report across scenes."""
 
 from pathlib import Path
 from typing import Any
@@ -37,8 +37,8 @@ class ReportPlan:
         return [scene for scene in scenes if Path(self._results, scene, "metrics.json").is_file()]
 
     def refuse_empty(self) -> None:
-        """Raises ConfigError where the report is asked for by itself and would hold none of the scenes that have been
-        measured, since their datasets do not belong to it."""
+        """Raises ConfigError if the report is the only target and excludes all scenes that have been measured, since
+        their datasets are not in the batch."""
         batch = set(self._plan.config.batch_scenes)
         others = [scene for scene in self._plan.config.scenes if scene not in batch]
         measured = [scene for scene in others if Path(self._results, scene, "metrics.json").is_file()]
@@ -53,13 +53,13 @@ class ReportPlan:
         return [f"{self._results}/{scene}/metrics.json" for scene in self.scenes]
 
     def pictures(self, _: Any = None) -> list[str]:
-        """The pictures that its page shows. Those that come with the figures are there when the figures are."""
+        """The pictures that its page shows. Every metrics.json comes with a pair of held-out images."""
         with_figures = self._plan.of_methods(lambda *_: HELD_OUT_PAIR.values(), self.scenes)
         looks = self._plan.of_methods(lambda *_: LOOKS.values(), self.scenes)
         return [*(_present(with_figures) if self._alone else with_figures), *self._shown(looks)]
 
     def links(self, _: Any = None) -> list[str]:
-        """What its page links to: films, edits, and what opens in a browser."""
+        """The files that its page links to: films, edits and viewers."""
         viewers = self._plan.of_methods(lambda *_: ["viewer.html"], self.scenes)
         return self._shown([*self._plan.films(scenes=self.scenes), *self._plan.edits(scenes=self.scenes), *viewers])
 

@@ -1,6 +1,6 @@
-"""The settings that each stage of a scene, a method or a film gets: the param that Snakemake compares.
+"""The settings of each stage of a scene, method or film: the param that Snakemake compares.
 
-A stage is a rule; its record holds everything that decides its result, its inputs aside.
+A stage is a rule; its record holds everything but the inputs that determines its result.
 """
 
 from collections.abc import Callable, Iterable
@@ -62,9 +62,9 @@ class Place:
 
 
 def stage_settings(config: Config, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:
-    """The canonical JSON of everything a stage of a scene (and method, and film) may know.
+    """The canonical JSON of all settings of a stage, for a scene and, where given, a method and a film.
 
-    Raises ValueError for a stage that there is none of, ConfigError for an unknown scene.
+    Raises ValueError for an unknown stage, ConfigError for an unknown scene.
     """
     if stage not in _STAGES:
         raise ValueError(f"no stage is called {stage!r}")

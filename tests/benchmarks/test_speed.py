@@ -60,8 +60,8 @@ def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path)
     assert json.loads(run.plan.settings("train")(at)) == task.train.model_dump(mode="json")
     assert (task.code, task.stage) == (run.plan.code("train"), "street-77-seed5/train")
     assert [[*paths] for paths in (task.files.actors, task.files.lidar_depth, task.files.free_space)] == [
-        run.plan.training_input("actors")(at), run.plan.training_input("lidar_depth")(at), run.plan.training_input("free_space")(at)
-    ]  # fmt: skip
+        run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "free_space")
+    ]
     assert {Path(path).name for path in targets_of(run)} == {
         "scene_refined.json", "parser.pkl", "masks.json", "actors.npz", "lidar_depth.npz"
     }  # fmt: skip

@@ -19,8 +19,8 @@ RENAMED = {"metrics": "scene_metrics"}
 
 @dataclass(frozen=True)
 class JobId:
-    """Which job of the workflow: stage, scene, method, and the name of its film or edit; empty where there is none. The
-    film of a synthetic world's job is its dataset."""
+    """The identity of a job: stage, scene, method, and name of its film or edit, each empty where it has none. For the
+    job that generates a synthetic world, `film` is the dataset."""
 
     stage: str
     scene: str = ""
@@ -29,7 +29,7 @@ class JobId:
 
     @classmethod
     def of(cls, benchmark: PurePath) -> "JobId":
-        """The job whose benchmark file this is, counted from the folder of benchmarks."""
+        """The job of a benchmark file, given by its path relative to the folder of benchmarks."""
         *place, name = benchmark.with_suffix("").parts
         if place == [WORLD]:
             return cls(WORLD, film=name)
@@ -41,14 +41,14 @@ class JobId:
 
     @property
     def name(self) -> str:
-        """The job for a person: '0103 street train'."""
+        """The job in words: '0103 street train'."""
         return " ".join(word for word in (self.scene, self.method, self.stage, self.film) if word)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a job cost. `seconds` of wall time are those of the whole job, or, of a training that was resumed or has no
-    benchmark, those of the training loop (`seconds_from`); memory is the main memory's peak. None: not known."""
+    """The cost of a job: wall time of the whole job or, for a training that was resumed or has no benchmark, of the
+    training loop (`seconds_from` tells which), and peak memory. None: unknown."""
 
     job: JobId
     seconds: float
@@ -62,8 +62,8 @@ class Cost:
 
 
 def read_costs(results: Path) -> tuple[list[Cost], list[str]]:
-    """What is known of the jobs of a results folder, in the order of their names, and a sentence for each file that is
-    missing or cannot be read: what it would tell is left out, or told by another."""
+    """The costs of the jobs of a results folder, sorted by name, and a sentence for each file that is missing or cannot
+    be read, whose figures are left out."""
     costs, complaints = [], []
     folder = results / BENCHMARKS
     files = {JobId.of(file.relative_to(folder)): file for file in sorted(folder.rglob("*.tsv"))}
@@ -73,7 +73,7 @@ def read_costs(results: Path) -> tuple[list[Cost], list[str]]:
         summary, resumed = _reading(_summary, trained.get(job), complaints) or ({}, False)
         if job in trained and job not in files:
             complaints.append(f"{trained[job]}: its job left no benchmark; only the training loop's seconds are known")
-        # the benchmark of a training that was resumed has its last part alone
+        # a benchmark covers only the last process of a resumed training
         fields = benchmark | summary if resumed else summary | benchmark
         if fields:
             costs.append(Cost(job, **fields))

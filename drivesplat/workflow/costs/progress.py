@@ -17,13 +17,13 @@ MAX_NAMED = 4
 """Running jobs that are named at most."""
 TAIL_BYTES = 4096
 _PROGRESS = re.compile(r"([\d.]+) %, [\d.]+ it/s, (\d+) s left")
-"""How a training tells its log how far it is (`drivesplat.training.monitor`)."""
+"""The progress that a training logs (`drivesplat.training.monitor`)."""
 
 
 class RunProgress:
-    """The progress of a run of `planned` jobs; their `logs` tell which are at work and how far trainings are.
+    """The progress of a run of `planned` jobs, whose `logs` tell which are running and how far trainings are.
 
-    Expected seconds are updated every time: finished jobs of this run are measured, too.
+    Expected seconds are updated with every line, since jobs that finish in this run are measured, too.
     """
 
     def __init__(
@@ -67,8 +67,8 @@ class RunProgress:
         return f"{share}{len(finished)} of {len(self._planned)} jobs, about {time_left}{missing} left{named}"
 
     def _is_at_work(self, job: JobId) -> bool | None:
-        """Whether a job is at work, as its log of this run says, and not over, though Snakemake may take seconds to
-        count it; None where it has not begun."""
+        """Whether a job is running, by its log of this run, since Snakemake counts a finished job seconds later; None
+        before it begins."""
         log = self._logs.get(job)
         try:
             text = log.read_text("utf-8") if log and log.stat().st_mtime >= self._began else ""

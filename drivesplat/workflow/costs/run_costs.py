@@ -1,4 +1,4 @@
-"""What Snakemake's hooks report of costs: an estimate when a run starts, its progress, costs.csv when it ends."""
+"""The costs of a run, for Snakemake's hooks: an estimate at its start, its progress, and costs.csv at its end."""
 
 import os
 import sys
@@ -25,11 +25,11 @@ from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, writ
 from drivesplat.workflow.plan import Plan
 
 COSTS, ESTIMATE = "costs", "estimate"
-"""Targets that make nothing: the first has costs.csv brought up to date, with the second only the estimate is told."""
+"""Targets that run no job: the first updates and prints costs.csv, the second prints the estimate."""
 
 
 class RunCosts:
-    """The costs of a run of Snakemake's `workflow` that is asked for `targets`; of what it plans once it has begun."""
+    """The costs of a run of Snakemake's `workflow` for `targets`."""
 
     def __init__(self, plan: Plan, workflow: Any, targets: Sequence[str]):
         self._plan, self._workflow, self._targets = plan, workflow, targets
@@ -38,8 +38,8 @@ class RunCosts:
         self._ended: threading.Event | None = None
 
     def tell_estimate(self) -> bool:
-        """Prints which settings will not hold, and what is to be expected, in full, where that is all that is asked
-        for; whether it is."""
+        """Prints the settings without effect and, if ESTIMATE is a target, the estimate in full. Returns whether it
+        is."""
         self._jobs = self._needed()
         for sentence in without_effect(self._plan.config, {(job.scene, job.method) for job in self._jobs}):
             _say(sentence)
@@ -48,7 +48,7 @@ class RunCosts:
         return ESTIMATE in self._targets
 
     def begin(self) -> None:
-        """Prints the estimate in a line, and from then on how far the run is; a failure is told and ends nothing."""
+        """Prints the estimate in a line and, from then on, the progress. A failure is printed and the run goes on."""
         try:
             self._jobs = self._needed()
             if self._jobs:
@@ -60,12 +60,12 @@ class RunCosts:
             _say(f"the run cannot be estimated ({type(error).__name__}: {error})")
 
     def estimate(self) -> Estimate:
-        """What is to be expected of the run."""
+        """The estimate of the run."""
         return estimate(self._planned, self._expectations(), self._machine, self._results)
 
     def end(self) -> None:
-        """Writes costs.csv and costs.json, and says which scenes of this run took 90 minutes or more. A failure is told
-        and ends nothing."""
+        """Writes costs.csv and costs.json, and prints which scenes of this run took 90 minutes or more. A failure is
+        printed and does not end the run."""
         if self._ended is not None:
             self._ended.set()
         try:
@@ -82,7 +82,7 @@ class RunCosts:
                 _say(f"scene {total['scene']}: {finding(total)}; {self._results / FILES[0]} says where it went")
 
     def _needed(self) -> dict[JobId, Any]:
-        """Snakemake's jobs that are to run, by what they are; those that only gather others are none."""
+        """Snakemake's jobs that are to run, without those that only collect the results of others."""
         jobs = (job for job in self._workflow.dag.needrun_jobs() if job.benchmark)
         folder = self._results / BENCHMARKS
         return {JobId.of(Path(os.path.relpath(job.benchmark, folder))): job for job in jobs}
@@ -93,7 +93,7 @@ class RunCosts:
 
     @property
     def _machine(self) -> Machine:
-        """Where cores are not counted, as on a cluster, as many as its jobs may take at a time."""
+        """The cores and GPUs of the run; on a cluster, which counts no cores, those of its concurrent jobs."""
         resources = self._workflow.global_resources
         cores, nodes, gpus = (resources[n].value if n in resources else None for n in ("_cores", "_nodes", "gpu"))
         widest = max((one.threads for one in self._planned), default=1)
@@ -107,7 +107,7 @@ class RunCosts:
 
 
 def planned_job(name: JobId, job: Any) -> PlannedJob:
-    """One of Snakemake's jobs. It takes a GPU where it asks for one: on processors its rule asks for none."""
+    """One of Snakemake's jobs. It takes a GPU if its rule requests one, which rules on the CPU do not."""
     return PlannedJob(name, int(job.threads), bool(job.resources.get("gpu")), tuple(map(str, job.output)))
 
 

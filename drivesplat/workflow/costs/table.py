@@ -1,4 +1,4 @@
-"""costs.csv and costs.json: a row per job that has run, and what each scene comes to."""
+"""costs.csv and costs.json: a row per job that has run, and the total of each scene."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from drivesplat.workflow.costs.measured import TRAIN, Cost, by_scene, read_costs
 
 FILES = ("costs.csv", "costs.json")
 LIMIT_SECONDS = 90 * 60.0
-"""What the project that this one follows wanted a scene to take at most; a finding, never a gate."""
+"""Target for the time of a scene; reported, not enforced."""
 ABLATION = "ablation"
 COLUMNS = (
     "scene", "method", "stage", "film", "seconds", "seconds_from", "max_rss_mb", "cpu_seconds", "mean_load",
@@ -18,8 +18,8 @@ COLUMNS = (
 
 
 def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[str, Any]]:
-    """What each scene's jobs come to, one after another, and whether that is under 90 minutes. The variants of an
-    ablation are no part of it, but `methods`; `complete`: whether all of these have been trained."""
+    """The summed costs of each scene's jobs, and whether they are under 90 minutes. Counts the scene's stages and
+    `methods`, without ablation variants; `complete`: whether all `methods` have been trained."""
     totals = []
     for scene, own in by_scene(costs):
         counted = [c for c in own if c.job.method in methods or (not c.job.method and c.job.stage != ABLATION)]
@@ -51,7 +51,7 @@ _PEAKS = ("max_rss_mb", "gpu_memory_gb")
 
 
 def costs_record(results: Path, methods: Collection[str]) -> dict[str, Any]:
-    """The content of costs.json: `rows` as in costs.csv, totals of `scenes`, and what could not be `read`."""
+    """The content of costs.json: `rows` as in costs.csv, totals of `scenes`, and sentences about `unreadable` files."""
     costs, complaints = read_costs(results)
     scenes = scene_totals(costs, methods)
     under = {total["scene"]: total["under_90_minutes"] for total in scenes}
@@ -67,7 +67,7 @@ def costs_record(results: Path, methods: Collection[str]) -> dict[str, Any]:
 
 
 def write_costs(results: Path, methods: Collection[str]) -> dict[str, Any]:
-    """Writes costs.csv and costs.json of what there is; returns the latter's content.
+    """Writes costs.csv and costs.json; returns the latter's content.
 
     Raises ResultError where they cannot be written.
     """
@@ -83,7 +83,7 @@ def _spelled(value: bool | None) -> str | None:
 
 
 def finding(total: dict[str, Any]) -> str:
-    """What a scene's total says: '87 min, under 90'."""
+    """A scene's total in words: '87 min, under 90'."""
     so_far = "" if total["complete"] else " so far"
     return f"{total['seconds'] / 60:.1f} min{so_far}, {'under' if total['under_90_minutes'] else 'not under'} 90"
 
