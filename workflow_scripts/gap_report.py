@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from drivesplat.workflow.job import job
-from drivesplat.report.files import ReportFiles, write_report
+from drivesplat.report.files import write_report
 from drivesplat.settings.report import ReportJob
 
 with job(snakemake, check_inputs=False) as current:
-    made = current.output
-    files = ReportFiles(Path(made.page), Path(made.report), Path(made.table), Path(current.log[0]).parent)
-    write_report(files, current.settings(ReportJob), current.input.metrics, current.input.pictures, current.input.links)
+    results, found = Path(current.output.page).parent, current.input
+    write_report(results, current.settings(ReportJob), found.metrics, found.pictures, found.links)

@@ -50,28 +50,37 @@ def remove_actor(drive: TrainedDrive, job: RemovalJob) -> tuple[RemovalPair, dic
     If no moving vehicle is visible, both images are those of the middle key frame, and the figures are None, with the
     reason.
     """
+    scene, reason = drive.recording.scene, no_subject_reason(job.eval_camera)
     subject = choose_subject(drive.recording, job.eval_camera, job.subject)
+    view = RenderedView(drive, subject.index if subject else scene.middle_key_frame(job.eval_camera))
+    record = {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "key_frame": view.frame.sample_index,
+        "subject": None,
+        "why_null": reason,
+        "removed_by": None,
+        "margin_m": job.removal.margin,
+        "gaussians_removed": 0,
+        **dict.fromkeys(("box", "holes", "edge", "outside", "outside_footprint", "ghosts")),
+    }
     if subject is None:
-        return _nothing_to_remove(drive, job)
-    view = RenderedView(drive, subject.index)
+        log.warning("%s: nothing to remove: %s", scene.name, reason)
+        return _unchanged(view), record
     removal = removal_of(drive.model, view.gaussians, subject.box, job.removal.margin)
     pair = _pair(view, subject, removal)
     count = int(removal.removed.sum())
-    log.info("%s: %d Gaussians removed by %s", drive.recording.scene.name, count, removal.by)
+    log.info("%s: %d Gaussians removed by %s", scene.name, count, removal.by)
     if removal.by == "box":
         log.info(
             "the Gaussians in the box are removed; the vehicle's shadow and its ghosts along its path remain. With a "
             "learned decomposition (Street Gaussians, the method 'street') the vehicle has its own Gaussians: without "
             "them the rendering shows the background as other images observed it"
         )
-    return pair, {
-        "schema": SCHEMA,
-        "scene": drive.recording.scene.name,
-        "key_frame": view.frame.sample_index,
+    return pair, record | {
         "subject": subject_record(subject, drive.recording),
         "why_null": None,
         "removed_by": removal.by,
-        "margin_m": job.removal.margin,
         "gaussians_removed": count,
         **figures(pair),
         "ghosts": _ghost_figures(view, subject, pair, job),
@@ -153,23 +162,11 @@ def _ghost_figures(view: RenderedView, subject: Subject, pair: RemovalPair, job:
     }
 
 
-def _nothing_to_remove(drive: TrainedDrive, job: RemovalJob) -> tuple[RemovalPair, dict[str, Any]]:
-    view = RenderedView(drive, drive.recording.scene.middle_key_frame(job.eval_camera))
+def _unchanged(view: RenderedView) -> RemovalPair:
     picture = view.render()
     image, alpha = colors_of(picture.image), colors_of(picture.alpha)
     empty = np.zeros(alpha.shape, dtype=bool)
-    nulls = ("subject", "removed_by", "box", "holes", "edge", "outside", "outside_footprint", "ghosts")
-    reason = no_subject_reason(job.eval_camera)
-    log.warning("%s: nothing to remove: %s", drive.recording.scene.name, reason)
-    return RemovalPair(image, image, alpha, alpha, empty, empty, ~empty, np.zeros((0, 2))), {
-        "schema": SCHEMA,
-        "scene": drive.recording.scene.name,
-        "key_frame": view.frame.sample_index,
-        "why_null": reason,
-        "margin_m": job.removal.margin,
-        "gaussians_removed": 0,
-        **dict.fromkeys(nulls),
-    }
+    return RemovalPair(image, image, alpha, alpha, empty, empty, ~empty, np.zeros((0, 2)))
 
 
 def _mean(values: np.ndarray, mask: np.ndarray) -> float | None:

@@ -23,14 +23,8 @@ class PointCloud:
 
 
 def write_ply(path: str | Path, points: PointCloud) -> None:
-    vertices = np.empty(
-        len(points.positions),
-        dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")],
-    )
-    for i, name in enumerate("xyz"):
-        vertices[name] = points.positions[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        vertices[name] = points.colors[:, i]
+    columns = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    vertices = np.rec.fromarrays([*points.positions.T, *points.colors.T], dtype=columns)
     element = PlyElement.describe(vertices, "vertex")
     with atomic_write(path) as file:
         PlyData([element], byte_order="<", comments=[_NOTE + canonical_json(points.note)]).write(file)

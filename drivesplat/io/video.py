@@ -103,14 +103,14 @@ def _encode(path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], com
             if frame.shape != (size[1], size[0], 3) or frame.dtype != np.uint8:
                 raise ValueError(f"a frame of {frame.shape} {frame.dtype} in a film of {size[0]}x{size[1]}")
             if not _taken(process, frame):
-                _ended(process, min(10.0, PATIENCE))
+                _wait(process, min(10.0, PATIENCE))
                 raise _failed(path, f"took no more than {count} frames", process, messages)
             count += 1
         process.stdin.close()
-        if not _ended(process, PATIENCE):
-            raise _failed(path, "did not come to an end", process, messages)
+        _wait(process, PATIENCE)
         if process.returncode != 0:
-            raise _failed(path, f"failed after {count} frames", process, messages)
+            how = "did not come to an end" if process.returncode is None else f"failed after {count} frames"
+            raise _failed(path, how, process, messages)
     return count
 
 
@@ -143,12 +143,9 @@ def _taken(process: subprocess.Popen, frame: np.ndarray) -> bool:
     return True
 
 
-def _ended(process: subprocess.Popen, seconds: float) -> bool:
-    try:
+def _wait(process: subprocess.Popen, seconds: float) -> None:
+    with suppress(subprocess.TimeoutExpired):
         process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
 
 
 def _not_started(path: Path, error: Exception) -> ResultError:

@@ -1,7 +1,6 @@
 """The report as files: HTML page, JSON record and CSV table."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +12,21 @@ from drivesplat.report.media import collect_media
 from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
-
-
-@dataclass(frozen=True)
-class ReportFiles:
-    """The paths of a report in the results folder, and the folder of the jobs' `logs`."""
-
-    page: Path
-    record: Path
-    table: Path
-    logs: Path
+from drivesplat.workflow.report_plan import REPORT_FILES
 
 
 def write_report(
-    files: ReportFiles, job: ReportJob, metrics: Sequence[str], pictures: Sequence[str], links: Sequence[str]
+    results: Path, job: ReportJob, metrics: Sequence[str], pictures: Sequence[str], links: Sequence[str]
 ) -> None:
-    """Writes the report of these metrics.json files, with these images and links in its page, and prints its table."""
-    report = gap_report(list(metrics), job, files.logs)
-    media = collect_media([*pictures, *links], files.page.parent)
-    write_json(files.record, report)
-    write_csv(files.table, report)
-    with atomic_write(files.page) as page:
-        page.write(report_page(report, media, _costs(files.page.parent, job)).encode())
+    """Writes the REPORT_FILES of these metrics.json files into the results folder, with these images and links in the
+    page, and prints the table."""
+    page, record, table = (results / name for name in REPORT_FILES)
+    report = gap_report(list(metrics), job, results / "logs")
+    media = collect_media([*pictures, *links], results)
+    write_json(record, report)
+    write_csv(table, report)
+    with atomic_write(page) as file:
+        file.write(report_page(report, media, _costs(results, job)).encode())
     print(console_table(report), flush=True)
 
 

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.report.files import ReportFiles, write_report
+from drivesplat.report.files import write_report
 from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.report_plan import REPORT_FILES, REPORT_RULES
@@ -14,10 +14,10 @@ def write_partial_report(plan: Plan) -> None:
     """Writes a report of the finished scenes that names the missing ones; the rule replaces it in a later run. Prints
     its path, or why it cannot be written."""
     inputs, results = plan.report([*REPORT_RULES]), Path(plan.config.results_dir)
-    page, record, table = (results / name for name in REPORT_FILES)
-    files, job = ReportFiles(page, record, table, results / "logs"), ReportJob.model_validate_json(inputs.settings())
+    page = results / REPORT_FILES[0]
+    job = ReportJob.model_validate_json(inputs.settings())
     try:
-        write_report(files, job, inputs.metrics(), inputs.pictures(), inputs.links())
+        write_report(results, job, inputs.metrics(), inputs.pictures(), inputs.links())
     except (DriveSplatError, OSError) as error:
         print(f"drivesplat: the report of the finished scenes cannot be written: {error}", file=sys.stderr, flush=True)
         return
