@@ -1,17 +1,18 @@
-"""Light on surfaces, compiled: sun, shadows and sky by day; lamps, headlights and lit windows by night."""
+"""Shading, compiled: sun, shadows and sky by day; street lamps, headlights and lit windows by night."""
 
 import math
 from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from drivesplat.demo.materials import LEAVES, compiled, mottle, noise, surface
+from drivesplat.demo.materials import LEAVES, compiled, fractal, surface, value_noise
 
 
 class Light(NamedTuple):
-    """What shines, in linear units; directions are unit vectors in street coordinates, places metres.
+    """Light sources in linear units, in the street frame (metres, unit vectors).
 
-    `sun_direction` points to the sun. `lamps` (m, 3). `headlight_at`, `headlight_along`: the own car's.
+    `sun_direction` points to the sun; `bounce` is light from below; `lamps` (m, 3) are positions. `headlight_origin`
+    and `headlight_direction` are those of the ego vehicle. `emission` scales the emission of surfaces.
     """
 
     sun_direction: np.ndarray
@@ -23,14 +24,14 @@ class Light(NamedTuple):
     clouds: float
     lamps: np.ndarray
     lamp: np.ndarray
-    headlight_at: np.ndarray
-    headlight_along: np.ndarray
+    headlight_origin: np.ndarray
+    headlight_direction: np.ndarray
     headlight: float
-    glow: float
+    emission: float
 
 
 def daylight(random: np.random.Generator) -> Light:
-    """A sunny day with some clouds."""
+    """Sunlight and some clouds."""
     azimuth, height = random.uniform(0.2, 0.4), math.radians(random.uniform(38, 52))
     sun = np.array([-math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)])
     return Light(
@@ -41,19 +42,19 @@ def daylight(random: np.random.Generator) -> Light:
 
 
 def lamplight(lamps: np.ndarray, ego_to_street: np.ndarray) -> Light:
-    """A night under `lamps` (m, 3), with the headlights of the own car."""
-    headlight_at = ego_to_street[:3, 3] + ego_to_street[:3, :3] @ np.array([3.6, 0.0, 0.7])
+    """Street lamps at `lamps` (m, 3) and the headlights of the ego vehicle."""
+    headlight_origin = ego_to_street[:3, 3] + ego_to_street[:3, :3] @ np.array([3.6, 0.0, 0.7])
     return Light(
         np.array([0.0, 0.0, 1.0]), np.zeros(3), np.array([0.035, 0.04, 0.06]), np.array([0.02, 0.02, 0.02]),
         np.array([0.006, 0.008, 0.02]), np.array([0.05, 0.045, 0.05]), 0.2, lamps, np.array([26.0, 19.0, 11.0]),
-        headlight_at, ego_to_street[:3, 0].copy(), 90.0, 1.0,
+        headlight_origin, ego_to_street[:3, 0].copy(), 90.0, 1.0,
     )  # fmt: skip
 
 
 @compiled
 @no_type_check
 def sky_color(dx, dy, dz, light):
-    """The radiance r, g, b of the sky in a direction."""
+    """Radiance r, g, b of the sky in a direction."""
     up = max(dz, 0.0)
     blend = 1.0 - math.exp(-4.0 * up)
     r = light.horizon[0] + blend * (light.zenith[0] - light.horizon[0])
@@ -61,21 +62,20 @@ def sky_color(dx, dy, dz, light):
     b = light.horizon[2] + blend * (light.zenith[2] - light.horizon[2])
     if up > 0.0:
         u, v = dx / (up + 0.15), dy / (up + 0.15)
-        cover = 0.6 * noise(1.3 * u, 1.3 * v, 3.0) + 0.4 * noise(3.1 * u, 3.1 * v, 9.0)
+        cover = 0.6 * value_noise(1.3 * u, 1.3 * v, 3.0) + 0.4 * value_noise(3.1 * u, 3.1 * v, 9.0)
         cloud = light.clouds * min(1.0, max(0.0, 3.0 * (cover - 0.5))) * min(1.0, 6.0 * up)
         white = light.horizon[0] + light.horizon[1] + light.horizon[2]
         r += cloud * (0.4 * white - r)
         g += cloud * (0.4 * white - g)
         b += cloud * (0.4 * white - b)
-    toward = dx * light.sun_direction[0] + dy * light.sun_direction[1] + dz * light.sun_direction[2]
-    halo = max(0.0, toward) ** 60
+    halo = max(0.0, dot(light.sun_direction, dx, dy, dz)) ** 60
     return r + 0.3 * halo * light.sun[0], g + 0.3 * halo * light.sun[1], b + 0.3 * halo * light.sun[2]
 
 
 @compiled
 @no_type_check
-def lamps_at(px, py, pz, nx, ny, nz, light):
-    """The irradiance r, g, b of street lamps (shining down) and headlights at a point."""
+def lamp_irradiance(px, py, pz, nx, ny, nz, light):
+    """Irradiance r, g, b of street lamps, which shine down, and headlights at a point p with normal n."""
     r = g = b = 0.0
     for i in range(len(light.lamps)):
         lx, ly, lz = light.lamps[i, 0] - px, light.lamps[i, 1] - py, light.lamps[i, 2] - pz
@@ -86,12 +86,11 @@ def lamps_at(px, py, pz, nx, ny, nz, light):
         g += light.lamp[1] * facing / squared
         b += light.lamp[2] * facing / squared
     if light.headlight > 0.0:
-        lx, ly, lz = light.headlight_at[0] - px, light.headlight_at[1] - py, light.headlight_at[2] - pz
+        at = light.headlight_origin
+        lx, ly, lz = at[0] - px, at[1] - py, at[2] - pz
         squared = lx * lx + ly * ly + lz * lz + 1.0
         length = math.sqrt(squared)
-        along = (
-            -(lx * light.headlight_along[0] + ly * light.headlight_along[1] + lz * light.headlight_along[2]) / length
-        )
+        along = -dot(light.headlight_direction, lx, ly, lz) / length
         beam = max(0.0, along) ** 24 * max(0.0, (lx * nx + ly * ny + lz * nz) / length)
         r += light.headlight * beam / squared
         g += light.headlight * beam / squared
@@ -101,55 +100,58 @@ def lamps_at(px, py, pz, nx, ny, nz, light):
 
 @compiled
 @no_type_check
-def shade(directions, origin, distance, thing, face, normal, lit, to_body, material, color, pixel_angle, light, out):
-    """Fills `out` (n, 3) with the radiance that comes along rays `directions` (n, 3) to `origin` (3,).
+def shade(
+    directions, origin, distance, objects, face, normal, lit, to_object, material, color, pixel_angle, light, out
+):
+    """Fills `out` (n, 3) with the radiance that arrives at `origin` (3,) along rays `directions` (n, 3).
 
-    `distance`, `thing`, `face`, `normal`: as in `raycast.Hits`; `lit` (n,): whether the sun's light comes there;
-    `to_body`, `material`, `color`: as in `raycast.Stage`. `pixel_angle` is the angle in radians between the rays.
+    `distance`, `objects`, `face`, `normal`: see `raycast.RayHits`. `to_object`, `material`, `color`: see
+    `raycast.StreetSnapshot`. `lit` (n,): whether the sun is visible from the hit. `pixel_angle`: radians between rays.
     """
     for i in range(len(directions)):
         d = directions[i]
-        if thing[i] < 0:
+        if objects[i] < 0:
             out[i, 0], out[i, 1], out[i, 2] = sky_color(d[0], d[1], d[2], light)
             continue
         far = distance[i]
         px, py, pz = origin[0] + far * d[0], origin[1] + far * d[1], origin[2] + far * d[2]
         nx, ny, nz, facing = facing_normal(normal[i], d)
-        m = to_body[thing[i]]
-        x, y, z = turned(m, px, py, pz)
+        m = to_object[objects[i]]
+        x, y, z = rotated(m, px, py, pz)
         x, y, z = x + m[0, 3], y + m[1, 3], z + m[2, 3]
         footprint = far * pixel_angle / math.sqrt(facing)
         kind, base = material[face[i]], color[face[i]]
-        r, g, b, mirror, glow = surface(kind, base[0], base[1], base[2], x, y, z, *turned(m, nx, ny, nz), footprint)
-        if kind == LEAVES:  # they face every way
-            nx += 0.9 * mottle(x, y, z + 5.0, 0.5, footprint)
-            ny += 0.9 * mottle(x + 5.0, y, z, 0.5, footprint)
-            nz += 0.9 * mottle(x, y + 5.0, z, 0.5, footprint)
-        toward_sun = nx * light.sun_direction[0] + ny * light.sun_direction[1] + nz * light.sun_direction[2]
-        sunny = max(0.0, toward_sun) if lit[i] else 0.0
-        lamp = lamps_at(px, py, pz, nx, ny, nz, light)
-        up, gleam = 0.5 + 0.5 * nz, (0.0, 0.0, 0.0)
-        share = 0.0
-        if mirror > 0.0:  # Schlick's Fresnel term, of the sky alone
-            share = mirror * (0.05 + 0.95 * (1 - facing) ** 5)
+        r, g, b, mirror, emission = surface(
+            kind, base[0], base[1], base[2], x, y, z, *rotated(m, nx, ny, nz), footprint
+        )
+        if kind == LEAVES:  # leaves have all orientations
+            nx += 0.9 * fractal(x, y, z + 5.0, 0.5, footprint)
+            ny += 0.9 * fractal(x + 5.0, y, z, 0.5, footprint)
+            nz += 0.9 * fractal(x, y + 5.0, z, 0.5, footprint)
+        sunny = max(0.0, dot(light.sun_direction, nx, ny, nz)) if lit[i] else 0.0
+        lamp = lamp_irradiance(px, py, pz, nx, ny, nz, light)
+        up, reflection, fresnel = 0.5 + 0.5 * nz, (0.0, 0.0, 0.0), 0.0
+        if mirror > 0.0:  # Schlick's approximation; only the sky is reflected
+            fresnel = mirror * (0.05 + 0.95 * (1 - facing) ** 5)
             rx, ry, rz = d[0] + 2 * facing * nx, d[1] + 2 * facing * ny, d[2] + 2 * facing * nz
-            gleam = sky_color(rx, ry, rz, light)
-            share *= 1.0 if rz > 0 else 0.3
+            reflection = sky_color(rx, ry, rz, light)
+            fresnel *= 1.0 if rz > 0 else 0.3
         haze = 1.0 - math.exp(-far / 900.0)
         albedo = (r, g, b)
         for c in range(3):
             ambient = up * light.sky[c] + (1 - up) * light.bounce[c]
-            value = albedo[c] * (sunny * light.sun[c] + ambient + lamp[c] + glow * light.glow) + share * gleam[c]
+            received = sunny * light.sun[c] + ambient + lamp[c] + emission * light.emission
+            value = albedo[c] * received + fresnel * reflection[c]
             out[i, c] = value + haze * (light.horizon[c] - value)
 
 
 @compiled
 @no_type_check
 def facing_normal(normal, direction):
-    """The unit normal turned to the viewer, x, y, z, and the cosine (at least 0.04) between the two."""
+    """The unit normal x, y, z on the viewer's side, and its cosine to the ray, at least 0.04."""
     length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2) + 1e-30
     nx, ny, nz = normal[0] / length, normal[1] / length, normal[2] / length
-    along = nx * direction[0] + ny * direction[1] + nz * direction[2]
+    along = dot(direction, nx, ny, nz)
     if along > 0:
         nx, ny, nz = -nx, -ny, -nz
     return nx, ny, nz, max(0.04, abs(along))
@@ -157,10 +159,13 @@ def facing_normal(normal, direction):
 
 @compiled
 @no_type_check
-def turned(m, x, y, z):
-    """A direction turned by the rotation in `m` (4, 4)."""
-    return (
-        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
-        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
-        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
-    )
+def rotated(m, x, y, z):
+    """A direction x, y, z rotated by the transform `m` (4, 4)."""
+    return dot(m[0], x, y, z), dot(m[1], x, y, z), dot(m[2], x, y, z)
+
+
+@compiled
+@no_type_check
+def dot(v, x, y, z):
+    """Scalar product of the first three elements of `v` with x, y, z."""
+    return v[0] * x + v[1] * y + v[2] * z

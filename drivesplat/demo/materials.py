@@ -1,7 +1,7 @@
-"""Surface textures as functions of position, compiled: what colour a point is, how mirror-like, whether it glows.
+"""Procedural textures, compiled: colour, mirror reflectance and emission of a surface as functions of position.
 
-Textures are filtered by the size of a pixel on the surface (`footprint`, metres), so that what is too fine to be
-resolved fades to its mean instead of flickering.
+Textures are filtered by the size of a pixel on the surface (`footprint`, metres): details below it fade to their mean
+and do not flicker.
 """
 
 import math
@@ -9,24 +9,24 @@ from typing import no_type_check
 
 import numpy as np
 
-from drivesplat.demo.bodies import Material
+from drivesplat.demo.meshes import Material
 from drivesplat.kernels.cache import kernel
 
 compiled = kernel(fastmath=True)
 
 LANE, ROAD, CURB, SIDEWALK = 3.5, 5.9, 6.15, 9.5
-"""Distances from the road's middle (metres): edge of the driving lane, of the road, of the curb, of the sidewalk."""
+"""Distances of outer edges from the centre line (metres)."""
 CROSSING = (46.0, 49.0)
 WINDOW = (3.2, 3.0)
-"""Width and height (metres) of a facade's window cells."""
+"""Width and height (metres) of the cells of a facade, one window each."""
 
 PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES = (int(m) for m in Material)
 
 
 @compiled
 @no_type_check
-def lattice(x, y, z):
-    """A number in [0, 1) for a whole-numbered place, without pattern to the eye."""
+def hash_noise(x, y, z):
+    """A pseudo-random number in [0, 1) for integer coordinates."""
     h = np.uint32(np.int64(x) * 73856093 ^ np.int64(y) * 19349663 ^ np.int64(z) * 83492791)
     h = (h ^ (h >> np.uint32(13))) * np.uint32(1274126177)
     return ((h ^ (h >> np.uint32(16))) & np.uint32(0xFFFFFF)) / 16777216.0
@@ -34,8 +34,8 @@ def lattice(x, y, z):
 
 @compiled
 @no_type_check
-def noise(x, y, z):
-    """Value noise in [0, 1), smooth over one unit."""
+def value_noise(x, y, z):
+    """Value noise in [0, 1) with a wavelength of one unit."""
     ix, iy, iz = math.floor(x), math.floor(y), math.floor(z)
     fx, fy, fz = x - ix, y - iy, z - iz
     fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
@@ -44,21 +44,21 @@ def noise(x, y, z):
         wz = fz if dz else 1 - fz
         for dy in range(2):
             wy = fy if dy else 1 - fy
-            row = lattice(ix, iy + dy, iz + dz) * (1 - fx) + lattice(ix + 1, iy + dy, iz + dz) * fx
+            row = hash_noise(ix, iy + dy, iz + dz) * (1 - fx) + hash_noise(ix + 1, iy + dy, iz + dz) * fx
             value += wz * wy * row
     return value
 
 
 @compiled
 @no_type_check
-def mottle(x, y, z, wavelength, footprint):
-    """Three octaves of noise around 0 (about +-0.5), without those finer than the footprint."""
+def fractal(x, y, z, wavelength, footprint):
+    """Three octaves of noise around 0 (about +-0.5); those finer than the footprint fade out."""
     total, amplitude = 0.0, 0.5
     for octave in range(3):
         visible = min(1.0, max(0.0, wavelength / (2.0 * footprint + 1e-6) - 0.5))
         if visible > 0.0:
             shift = 17.3 * octave
-            at = noise(x / wavelength + shift, y / wavelength + shift, z / wavelength - shift)
+            at = value_noise(x / wavelength + shift, y / wavelength + shift, z / wavelength - shift)
             total += visible * amplitude * (2 * at - 1)
         amplitude *= 0.5
         wavelength *= 0.37
@@ -67,8 +67,8 @@ def mottle(x, y, z, wavelength, footprint):
 
 @compiled
 @no_type_check
-def band(value, low, high, footprint):
-    """How much of a pixel lies between two lines: 1 inside, 0 outside, a ramp as wide as the footprint."""
+def coverage(value, low, high, footprint):
+    """Fraction of a pixel at `value` that lies between `low` and `high`."""
     width = footprint + 1e-4
     return min(1.0, max(0.0, (value - low) / width + 0.5)) - min(1.0, max(0.0, (value - high) / width + 0.5))
 
@@ -79,32 +79,32 @@ def ground(x, y, footprint):
     """Linear reflectance of road, markings, curb, sidewalk and grass."""
     a = abs(y)
     if a > SIDEWALK:
-        tone = 1.0 + 0.7 * mottle(x, y, 0.0, 3.0, footprint)
+        tone = 1.0 + 0.7 * fractal(x, y, 0.0, 3.0, footprint)
         return 0.11 * tone, 0.17 * tone, 0.05 * tone
     if a > CURB:
         row, column = math.floor(x / 0.9), math.floor(y / 0.9)
-        joint = max(band(x - 0.9 * row, -0.02, 0.02, footprint), band(y - 0.9 * column, -0.02, 0.02, footprint))
+        joint = max(coverage(x - 0.9 * row, -0.02, 0.02, footprint), coverage(y - 0.9 * column, -0.02, 0.02, footprint))
         fade = min(1.0, 0.5 / (footprint + 1e-6))
-        tone = 0.3 * (1 + fade * 0.25 * (lattice(row, column, 7) - 0.5) + 0.2 * mottle(x, y, 1.0, 1.5, footprint))
+        tone = 0.3 * (1 + fade * 0.25 * (hash_noise(row, column, 7) - 0.5) + 0.2 * fractal(x, y, 1.0, 1.5, footprint))
         tone *= 1 - 0.6 * joint
         return tone, 0.97 * tone, 0.92 * tone
     if a > ROAD:
-        tone = 0.36 * (1 + 0.2 * mottle(x, y, 2.0, 1.0, footprint))
+        tone = 0.36 * (1 + 0.2 * fractal(x, y, 2.0, 1.0, footprint))
         return tone, tone, 0.98 * tone
-    tone = 0.085 * (1 + 0.5 * mottle(x, y, 3.0, 3.0, footprint) + 0.5 * mottle(x, y, 4.0, 0.5, footprint))
+    tone = 0.085 * (1 + 0.5 * fractal(x, y, 3.0, 3.0, footprint) + 0.5 * fractal(x, y, 4.0, 0.5, footprint))
     cell = math.floor(x / 11.0)
-    if lattice(cell, 0, 11) < 0.5:  # a repaired patch
-        at = 11.0 * cell + 6.0 * lattice(cell, 1, 11)
-        side = 5.0 * lattice(cell, 2, 11) - 3.5
-        patch = band(x, at, at + 2.5, footprint) * band(y, side, side + 1.7, footprint)
+    if hash_noise(cell, 0, 11) < 0.5:  # a repaired patch
+        at = 11.0 * cell + 6.0 * hash_noise(cell, 1, 11)
+        side = 5.0 * hash_noise(cell, 2, 11) - 3.5
+        patch = coverage(x, at, at + 2.5, footprint) * coverage(y, side, side + 1.7, footprint)
         tone *= 1 - 0.4 * patch
-    white = band(a, LANE - 0.08, LANE + 0.08, footprint)
+    white = coverage(a, LANE - 0.08, LANE + 0.08, footprint)
     dash = x - 6.0 * math.floor(x / 6.0)
-    white = max(white, band(a, -0.08, 0.08, footprint) * band(dash, 0.0, 3.0, footprint))
+    white = max(white, coverage(a, -0.08, 0.08, footprint) * coverage(dash, 0.0, 3.0, footprint))
     if CROSSING[0] - 1 < x < CROSSING[1] + 1:
         stripe = y - math.floor(y)
-        white = max(white, band(x, CROSSING[0], CROSSING[1], footprint) * band(stripe, 0.0, 0.5, footprint))
-    worn = white * (0.85 + 0.25 * mottle(x, y, 5.0, 0.6, footprint))
+        white = max(white, coverage(x, CROSSING[0], CROSSING[1], footprint) * coverage(stripe, 0.0, 0.5, footprint))
+    worn = white * (0.85 + 0.25 * fractal(x, y, 5.0, 0.6, footprint))
     tone = tone * (1 - worn) + 0.6 * worn
     return tone, tone, 1.03 * tone
 
@@ -112,42 +112,42 @@ def ground(x, y, footprint):
 @compiled
 @no_type_check
 def facade(r, g, b, along, z, footprint):
-    """A wall with windows: colour, mirror share, and how brightly its windows are lit at night."""
+    """A wall with windows: reflectance r, g, b, mirror reflectance, emission at night."""
     column, floor = math.floor(along / WINDOW[0]), math.floor(z / WINDOW[1])
     u, v = along / WINDOW[0] - column, z / WINDOW[1] - floor
     shop = floor == 0
     low, high, sill, top = (0.08, 0.92, 0.12, 0.85) if shop else (0.25, 0.75, 0.3, 0.82)
     fu, fv = footprint / WINDOW[0], footprint / WINDOW[1]
-    frame = band(u, low - 0.05, high + 0.05, fu) * band(v, sill - 0.05, top + 0.05, fv)
-    pane = band(u, low, high, fu) * band(v, sill, top, fv)
-    pane *= 1 - 0.8 * band(u, 0.49, 0.51, fu)
-    wall = 1 + 0.3 * mottle(along, z, 9.0, 2.0, footprint) + 0.15 * mottle(along, 4 * z, 8.0, 0.4, footprint)
+    frame = coverage(u, low - 0.05, high + 0.05, fu) * coverage(v, sill - 0.05, top + 0.05, fv)
+    pane = coverage(u, low, high, fu) * coverage(v, sill, top, fv)
+    pane *= 1 - 0.8 * coverage(u, 0.49, 0.51, fu)
+    wall = 1 + 0.3 * fractal(along, z, 9.0, 2.0, footprint) + 0.15 * fractal(along, 4 * z, 8.0, 0.4, footprint)
     trim = frame - pane * frame
-    inside = 0.03 + 0.1 * lattice(column, floor, 5)
+    inside = 0.03 + 0.1 * hash_noise(column, floor, 5)
     r = r * wall * (1 - frame) + 0.55 * trim + inside * pane
     g = g * wall * (1 - frame) + 0.54 * trim + inside * pane
     b = b * wall * (1 - frame) + 0.5 * trim + 1.2 * inside * pane
-    lit = 0.5 * pane if shop or lattice(column, floor, 6) < 0.3 else 0.0
+    lit = 0.5 * pane if shop or hash_noise(column, floor, 6) < 0.3 else 0.0
     return r, g, b, pane, lit
 
 
 @compiled
 @no_type_check
 def surface(material, r, g, b, x, y, z, nx, ny, nz, footprint):
-    """Reflectance r, g, b of a point (in its body's frame, normal n), its mirror share, and its glow at night."""
+    """Reflectance r, g, b, mirror reflectance and emission at night of a point with normal n in the object's frame."""
     if material == ROAD_:
         r, g, b = ground(x, y, footprint)
         return r, g, b, 0.0, 0.0
     if material == FACADE:
         return facade(r, g, b, y if abs(nx) > abs(ny) else x, z, footprint)
     if material == LEAVES:
-        tone = max(0.15, 1.0 + 1.1 * mottle(x, y, z, 0.9, footprint))
+        tone = max(0.15, 1.0 + 1.1 * fractal(x, y, z, 0.9, footprint))
         return r * tone, g * tone, b * tone, 0.0, 0.0
     if material == PAINT:
         seam = 0.0
         if abs(ny) > 0.6:
             for at in (-0.95, 0.0, 0.85):
-                seam = max(seam, band(x, at - 0.012, at + 0.012, footprint))
+                seam = max(seam, coverage(x, at - 0.012, at + 0.012, footprint))
         tone = 1 - 0.7 * seam
         return r * tone, g * tone, b * tone, 1.0, 0.0
     if material == GLASS:
@@ -155,9 +155,9 @@ def surface(material, r, g, b, x, y, z, nx, ny, nz, footprint):
     if material == LAMP:
         return r, g, b, 0.3, 1.5
     if material == CLOTH:
-        tone = 1.0 + 0.5 * mottle(x, y, z, 0.25, footprint)
+        tone = 1.0 + 0.5 * fractal(x, y, z, 0.25, footprint)
         return r * tone, g * tone, b * tone, 0.0, 0.0
     if material == STRIPES and 0.25 < z < 0.42:
         return 0.75, 0.75, 0.75, 0.0, 0.0
-    tone = 1.0 + 0.2 * mottle(x, y, z, 0.7, footprint)
+    tone = 1.0 + 0.2 * fractal(x, y, z, 0.7, footprint)
     return r * tone, g * tone, b * tone, 0.0, 0.0

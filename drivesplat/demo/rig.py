@@ -1,7 +1,7 @@
-"""The sensors of a nuScenes car: where they sit, when they fire, how they image.
+"""The sensors of a nuScenes vehicle: mounts, trigger times and intrinsics.
 
-Figures: the calibration of a nuScenes car of Singapore (Caesar et al. 2020), rounded to millimetres, hundredths of a
-degree and tenths of a pixel.
+Source: the calibration of a vehicle in Singapore (Caesar et al. 2020), rounded to millimetres, hundredths of a degree
+and tenths of a pixel.
 """
 
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ KEY_FRAME_US = 500_000
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """`translation` (metres) and `rotation` (w, x, y, z) take the sensor's frame to the ego frame (x forward, y left).
+class DemoSensor:
+    """A camera or LiDAR. `translation` (metres) and `rotation` (w, x, y, z): sensor to ego (x forward, y left).
 
-    `delay_us` after a key frame's time; `between` recordings from one key frame to the next. For cameras `focal` and
+    `delay_us`: trigger time relative to the key frame; `per_key_frame`: recordings per key frame. Cameras: `focal` and
     `center` in pixels of a 1600x900 image, OpenCV's convention.
     """
 
@@ -27,7 +27,7 @@ class Sensor:
     translation: tuple[float, float, float]
     rotation: tuple[float, float, float, float]
     delay_us: int
-    between: int
+    per_key_frame: int
     focal: float = 0.0
     center: tuple[float, float] = (0.0, 0.0)
 
@@ -37,11 +37,11 @@ class Sensor:
 
     @property
     def sensor_to_ego(self) -> np.ndarray:
-        """(4, 4)."""
+        """Mount (4, 4)."""
         return rigid(Rotation.from_quat(np.roll(self.rotation, -1)).as_matrix(), np.array(self.translation))
 
     def intrinsics(self, width: int) -> np.ndarray:
-        """K (3, 3) of images `width` pixels wide, OpenCV's convention (integer coordinates at pixel centres)."""
+        """K (3, 3) for images `width` pixels wide, OpenCV's convention (integer coordinates at pixel centres)."""
         scale = width / FULL_WIDTH
         cx, cy = ((c + 0.5) * scale - 0.5 for c in self.center)
         return np.array([[self.focal * scale, 0.0, cx], [0.0, self.focal * scale, cy], [0.0, 0.0, 1.0]])
@@ -53,40 +53,40 @@ def _unit(w: float, x: float, y: float, z: float) -> tuple[float, float, float, 
 
 
 SENSORS = (
-    Sensor("LIDAR_TOP", (0.944, 0.0, 1.84), _unit(0.7078, -0.0065, 0.0106, -0.7063), 0, 10),
-    Sensor(
+    DemoSensor("LIDAR_TOP", (0.944, 0.0, 1.84), _unit(0.7078, -0.0065, 0.0106, -0.7063), 0, 10),
+    DemoSensor(
         "CAM_FRONT_LEFT", (1.524, 0.495, 1.509), _unit(0.6757, -0.6736, 0.2121, -0.2112), -43_100, 6,
         1272.6, (826.6, 479.8),
     ),
-    Sensor(
+    DemoSensor(
         "CAM_FRONT", (1.701, 0.016, 1.511), _unit(0.4998, -0.5030, 0.4998, -0.4974), -35_500, 6, 1266.4, (816.3, 491.5)
     ),
-    Sensor(
+    DemoSensor(
         "CAM_FRONT_RIGHT", (1.551, -0.493, 1.496), _unit(0.2060, -0.2027, 0.6825, -0.6714), -27_600, 6,
         1260.8, (808.0, 495.3),
     ),
-    Sensor(
+    DemoSensor(
         "CAM_BACK_RIGHT", (1.015, -0.481, 1.562), _unit(0.1228, -0.1324, -0.7004, 0.6905), -20_100, 6,
         1259.5, (807.3, 501.2),
     ),
-    Sensor(
+    DemoSensor(
         "CAM_BACK", (0.028, 0.003, 1.579), _unit(0.5038, -0.4974, -0.4942, 0.5045), -10_400, 6, 809.2, (829.2, 481.8)
     ),
-    Sensor(
+    DemoSensor(
         "CAM_BACK_LEFT", (1.036, 0.485, 1.591), _unit(0.6924, -0.7032, -0.1165, 0.1120), -500, 6, 1256.7, (792.1, 492.8)
     ),
 )  # fmt: skip
 
 
-def height_of(width: int) -> int:
+def image_height(width: int) -> int:
     """The height of images `width` pixels wide."""
     return round(width * FULL_HEIGHT / FULL_WIDTH)
 
 
-def firing_times(sensor: Sensor, key_frames: int, sweeps: bool) -> list[tuple[int, bool, int]]:
-    """(microseconds since the drive's start, whether a key frame, number of the key frame it belongs to) of each
-    recording."""
-    steps = sensor.between if sweeps else 1
+def trigger_times(sensor: DemoSensor, key_frames: int, sweeps: bool) -> list[tuple[int, bool, int]]:
+    """For each recording: microseconds since the start of the drive, whether it is a key frame, and the index of the
+    key frame it belongs to."""
+    steps = sensor.per_key_frame if sweeps else 1
     return [
         (round(i * KEY_FRAME_US / steps) + sensor.delay_us, i % steps == 0, -(-i // steps))
         for i in range((key_frames - 1) * steps + 1)

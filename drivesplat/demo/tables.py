@@ -1,4 +1,4 @@
-"""The tables of nuScenes v1.0, filled row by row, every link kept.
+"""Writer for the tables of nuScenes v1.0.
 
 Schema: https://www.nuscenes.org/nuscenes (nuScenes schema), as nuscenes-devkit 1.2 reads it.
 """
@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.rig import Sensor
+from drivesplat.demo.rig import DemoSensor
 from drivesplat.io.storage import write_json
 from drivesplat.readers.nuscenes.layout import TABLES
 
@@ -21,24 +21,24 @@ VISIBILITY = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
 
 
 def token(*name: Any) -> str:
-    """The token of a record: 32 hexadecimal digits that depend on its name alone."""
+    """The token of a record: 32 hexadecimal digits of a hash of its name."""
     return hashlib.sha256(" ".join(map(str, name)).encode()).hexdigest()[:32]
 
 
 def visibility_level(fraction: float) -> str:
-    """nuScenes' level of a visible fraction in [0, 1]: '1' up to 40 %, '2' to 60, '3' to 80, '4' beyond."""
+    """nuScenes' level of a visible fraction in [0, 1]: '1' up to 40 %, '2' up to 60, '3' up to 80, '4' above."""
     return str(1 + sum(fraction > bound for bound in (0.4, 0.6, 0.8)))
 
 
 class NuScenesTables:
-    """The tables of one drive, `scene` its number; `made_from` (any text) stands in the log's name."""
+    """The tables of one drive. `scene` is its name without `scene-`; `source` becomes part of the log's name."""
 
     def __init__(
-        self, scene: str, description: str, made_from: str, start_us: int, sensors: tuple[Sensor, ...], width: int
+        self, scene: str, description: str, source: str, start_us: int, sensors: tuple[DemoSensor, ...], width: int
     ):
         self.scene = scene
         self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
-        log = {"logfile": f"demo-{made_from}", "vehicle": "demo", "date_captured": "2026-01-01", "location": "demo"}
+        log = {"logfile": f"demo-{source}", "vehicle": "demo", "date_captured": "2026-01-01", "location": "demo"}
         self._add("log", token(scene, "log"), **log)
         self._add("map", token("map"), category="semantic_prior", filename=MAP, log_tokens=[token(scene, "log")])
         for level, name in VISIBILITY.items():
@@ -60,7 +60,7 @@ class NuScenesTables:
         return row
 
     def _add_linked(self, table: str, chain: tuple, token: str, **values: Any) -> dict[str, Any]:
-        """A row that knows the one before and after it in its `chain`."""
+        """Adds a row that is linked to the one before it in the same `chain`."""
         before = self._last.get((table, *chain))
         row = self._add(table, token, prev=before["token"] if before else "", next="", **values)
         if before:
@@ -68,7 +68,7 @@ class NuScenesTables:
         self._last[(table, *chain)] = row
         return row
 
-    def _sensor(self, sensor: Sensor, width: int) -> None:
+    def _sensor(self, sensor: DemoSensor, width: int) -> None:
         modality = "camera" if sensor.is_camera else "lidar"
         self._add("sensor", token("sensor", sensor.channel), channel=sensor.channel, modality=modality)
         self._add(
@@ -77,8 +77,8 @@ class NuScenesTables:
             camera_intrinsic=sensor.intrinsics(width).tolist() if sensor.is_camera else [],
         )  # fmt: skip
 
-    def sample(self, index: int, time_us: int) -> None:
-        """A key frame, `time_us` after the drive's start."""
+    def add_sample(self, index: int, time_us: int) -> None:
+        """Adds a key frame, `time_us` after the start of the drive."""
         row = self._add_linked(
             "sample", (), token(self.scene, "sample", index), timestamp=self._start_us + time_us,
             scene_token=token(self.scene),
@@ -87,19 +87,20 @@ class NuScenesTables:
         self._scene_row["first_sample_token"] = self._scene_row["first_sample_token"] or row["token"]
         self._scene_row["last_sample_token"] = row["token"]
 
-    def data(
-        self, sensor: Sensor, index: int, time_us: int, is_key: bool, ego_to_global: np.ndarray, size: tuple[int, int]
-    ) -> tuple[str, str]:
-        """A recording of key frame `index`, its ego pose (4, 4); `size` = width, height, (0, 0) for LiDAR.
+    def add_data(
+        self, sensor: DemoSensor, index: int, time_us: int, is_key: bool, ego_to_global: np.ndarray,
+        size: tuple[int, int],
+    ) -> tuple[str, str]:  # fmt: skip
+        """Adds a recording of key frame `index`, with its ego pose (4, 4). `size`: width, height; (0, 0) for LiDAR.
 
-        Returns its token and the path of its file, relative to the dataset's root.
+        Returns its token and the path of its file relative to the dataset's root.
         """
         timestamp = self._start_us + time_us
         name = token(self.scene, sensor.channel, time_us)
         suffix = "jpg" if sensor.is_camera else "pcd.bin"
         folder = "samples" if is_key else "sweeps"
         path = f"{folder}/{sensor.channel}/{self.scene}__{sensor.channel}__{timestamp}.{suffix}"
-        self._add("ego_pose", name, timestamp=timestamp, **_placed(ego_to_global))
+        self._add("ego_pose", name, timestamp=timestamp, **_pose_of(ego_to_global))
         self._add_linked(
             "sample_data", (sensor.channel,), name, sample_token=token(self.scene, "sample", index),
             ego_pose_token=name, calibrated_sensor_token=token("calibrated", sensor.channel), timestamp=timestamp,
@@ -107,38 +108,35 @@ class NuScenesTables:
         )  # fmt: skip
         return name, path
 
-    def annotation(
-        self, thing: str, category: str, attribute: str | None, index: int, box_to_global: np.ndarray, size: np.ndarray,
+    def add_annotation(
+        self, name: str, category: str, attribute: str | None, index: int, box_to_global: np.ndarray, size: np.ndarray,
         visible: float, lidar_points: int,
     ) -> None:  # fmt: skip
-        """A box at key frame `index`: pose (4, 4) of its centre, `size` (3,) = length, width, height in metres."""
-        instance = token(self.scene, "instance", thing)
+        """Adds a box at key frame `index`: pose (4, 4) of its centre; `size` (3,): length, width, height in metres."""
+        instance = token(self.scene, "instance", name)
         row = self._add_linked(
-            "sample_annotation", (thing,), token(self.scene, "annotation", thing, index),
+            "sample_annotation", (name,), token(self.scene, "annotation", name, index),
             sample_token=token(self.scene, "sample", index), instance_token=instance,
             visibility_token=visibility_level(visible), attribute_tokens=[token(attribute)] if attribute else [],
-            size=[size[1], size[0], size[2]], num_lidar_pts=lidar_points, num_radar_pts=0, **_placed(box_to_global),
+            size=[size[1], size[0], size[2]], num_lidar_pts=lidar_points, num_radar_pts=0, **_pose_of(box_to_global),
         )  # fmt: skip
         if not any(r["name"] == category for r in self.rows["category"]):
             self._add("category", token("category", category), name=category, description="")
-        known = next((r for r in self.rows["instance"] if r["token"] == instance), None)
-        if known is None:
-            self._add(
-                "instance", instance, category_token=token("category", category), nbr_annotations=1,
-                first_annotation_token=row["token"], last_annotation_token=row["token"],
-            )  # fmt: skip
-        else:
-            known["nbr_annotations"] += 1
-            known["last_annotation_token"] = row["token"]
+        known = next((r for r in self.rows["instance"] if r["token"] == instance), None) or self._add(
+            "instance", instance, category_token=token("category", category), nbr_annotations=0,
+            first_annotation_token=row["token"],
+        )  # fmt: skip
+        known["nbr_annotations"] += 1
+        known["last_annotation_token"] = row["token"]
 
     def write(self, root: Path, version: str) -> None:
-        """Writes `root`/`version`/*.json and the map that the devkit insists on."""
+        """Writes `root`/`version`/*.json and the map image that nuscenes-devkit requires."""
         (root / MAP).parent.mkdir(parents=True, exist_ok=True)
         Image.new("L", (8, 8)).save(root / MAP)
         for name, rows in self.rows.items():
             write_json(root / version / f"{name}.json", rows)
 
 
-def _placed(pose: np.ndarray) -> dict[str, list[float]]:
+def _pose_of(pose: np.ndarray) -> dict[str, list[float]]:
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
     return {"translation": pose[:3, 3].tolist(), "rotation": [w, x, y, z]}

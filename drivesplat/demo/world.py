@@ -1,4 +1,4 @@
-"""The rule `demo_world`: a synthetic street in nuScenes format, with the truth that real logs lack beside it."""
+"""The rule `demo_world`: a synthetic street in nuScenes format, with ground truth that recorded drives lack."""
 
 import logging
 import multiprocessing
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from drivesplat.demo.mark import begin
+from drivesplat.demo.marker import prepare_folder
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
-from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor, firing_times, height_of
+from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor, image_height, trigger_times
 from drivesplat.demo.tables import NuScenesTables
 from drivesplat.demo.truth import write_truth, write_truth_frame
 from drivesplat.io.storage import atomic_write, canonical_json, sha256_text
@@ -23,16 +23,16 @@ log = logging.getLogger(__name__)
 
 START_US = 1_767_225_600_000_000
 ANNOTATED_RANGE = 80.0
-"""Things further away than this (metres) from the own car carry no box."""
+"""Objects farther from the ego vehicle than this (metres) have no box."""
 TRUTH_CAMERA = "CAM_FRONT"
 JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
-class RecordedFile:
-    """One file to record: `path` relative to the dataset's root, `time_us` since the drive's start."""
+class SensorFile:
+    """An image or sweep to write. `path` is relative to the dataset's root; `time_us` counts from the drive's start."""
 
-    sensor: Sensor
+    sensor: DemoSensor
     time_us: int
     is_key_frame: bool
     index: int
@@ -41,92 +41,93 @@ class RecordedFile:
 
 
 def make_world(root: Path, job: WorldJob, provenance: dict[str, Any], workers: int = 1) -> None:
-    """Writes the dataset below `root`: tables, images, sweeps, and truth/. The tables come last.
+    """Writes the dataset below `root`: images, sweeps, truth/, and last the tables.
 
-    They name the provenance, so that what is made from them is remade whenever the images are. The same settings give
-    the same bytes, whatever `workers`, the number of processes. Raises ConfigError where `root` holds other things,
-    ResultError where the disk is full.
+    The tables contain a digest of the provenance, so results are remade when the images are. Equal settings give equal
+    bytes for any number of processes (`workers`). Raises ConfigError where `root` holds other files, ResultError where
+    the disk is full.
     """
-    begin(root, provenance)
+    prepare_folder(root, provenance)
     world, recorder = job.world, Recorder(job.world)
-    made_from = sha256_text(canonical_json(provenance["stages"]))
-    tables = NuScenesTables(job.scene, _description(world), made_from, START_US, SENSORS, world.width)
+    source = sha256_text(canonical_json(provenance["stages"]))
+    tables = NuScenesTables(job.scene, _description(world), source, START_US, SENSORS, world.width)
     for index in range(world.key_frames):
-        tables.sample(index, index * KEY_FRAME_US)
-    recordings = [recording for sensor in SENSORS for recording in _recordings(tables, recorder, sensor)]
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _prepare, (world, root)) as pool:
-        counts = pool.map(_record, recordings)
-        visible = pool.map(_visible, range(world.key_frames))
-        truths = pool.map(_truth, [r for r in recordings if r.sensor.channel == TRUTH_CAMERA and r.is_key_frame])
-        lidar = {r.index: n for r, n in zip(recordings, counts, strict=True) if n is not None and r.is_key_frame}
+        tables.add_sample(index, index * KEY_FRAME_US)
+    files = [file for sensor in SENSORS for file in _sensor_files(tables, recorder, sensor)]
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _start_worker, (world, root)) as pool:
+        counts = pool.map(_write_file, files)
+        visible = pool.map(_visible_fractions, range(world.key_frames))
+        truths = pool.map(_write_truth, [f for f in files if f.sensor.channel == TRUTH_CAMERA and f.is_key_frame])
+        lidar = {f.index: n for f, n in zip(files, counts, strict=True) if n is not None and f.is_key_frame}
         for index, fractions in enumerate(visible):
             _annotate(tables, recorder, index, fractions, lidar[index])
         write_truth(root, recorder, job.scene, TRUTH_CAMERA, list(truths))
     tables.write(root, job.version)
-    log.info("%d recordings, %d boxes in %s", len(recordings), len(tables.rows["sample_annotation"]), root)
+    log.info("%d recordings, %d boxes in %s", len(files), len(tables.rows["sample_annotation"]), root)
 
 
 def _description(world: WorldSettings) -> str:
     light = "night" if world.night else "day"
-    ego = "own car drives" if world.ego == "drives" else "own car stands"
-    return f"Synthetic street, {light}, {ego}, {world.vehicles} moving vehicles, {world.pedestrians} pedestrians"
+    return (
+        f"Synthetic street, {light}, own car {world.ego}, {world.vehicles} moving vehicles, "
+        f"{world.pedestrians} pedestrians"
+    )
 
 
-def _recordings(tables: NuScenesTables, recorder: Recorder, sensor: Sensor) -> list[RecordedFile]:
+def _sensor_files(tables: NuScenesTables, recorder: Recorder, sensor: DemoSensor) -> list[SensorFile]:
+    """Adds the recordings of a sensor to the tables."""
     world = recorder.world
-    size = (world.width, height_of(world.width)) if sensor.is_camera else (0, 0)
-    recordings = []
-    for time_us, is_key, index in firing_times(sensor, world.key_frames, sensor.channel in world.sweeps):
+    size = (world.width, image_height(world.width)) if sensor.is_camera else (0, 0)
+    files = []
+    for time_us, is_key, index in trigger_times(sensor, world.key_frames, sensor.channel in world.sweeps):
         pose = recorder.ego_to_global(time_us * 1e-6)
-        recordings.append(
-            RecordedFile(sensor, time_us, is_key, index, *tables.data(sensor, index, time_us, is_key, pose, size))
-        )
-    return recordings
+        row = tables.add_data(sensor, index, time_us, is_key, pose, size)
+        files.append(SensorFile(sensor, time_us, is_key, index, *row))
+    return files
 
 
 def _annotate(
     tables: NuScenesTables, recorder: Recorder, index: int, visible: np.ndarray, lidar_points: np.ndarray
 ) -> None:
+    """Adds the boxes of key frame `index`: objects in range that a camera or the LiDAR sees."""
     seconds = index * KEY_FRAME_US * 1e-6
     ego = STREET_TO_GLOBAL @ recorder.ego_to_street(seconds)
-    for number, thing in enumerate(recorder.things):
-        if thing.category is None or not (visible[number] or lidar_points[number]):
+    for item, fraction, points in zip(recorder.objects, visible.tolist(), lidar_points.tolist(), strict=True):
+        if item.category is None or not (fraction or points):
             continue
-        box = recorder.box_to_global(thing, seconds)
+        box = recorder.box_to_global(item, seconds)
         if np.linalg.norm((box - ego)[:2, 3]) <= ANNOTATED_RANGE:
-            tables.annotation(
-                thing.name, thing.category, thing.attribute, index, box, thing.body.size, float(visible[number]),
-                int(lidar_points[number]),
-            )  # fmt: skip
+            tables.add_annotation(
+                item.name, item.category, item.attribute, index, box, item.mesh.size, fraction, points
+            )
 
 
-_at_work: tuple[Recorder, Path]
-"""In a worker process: what it records, and where to."""
+_worker: tuple[Recorder, Path]
+"""In a worker process: the recorder and the dataset's root."""
 
 
-def _prepare(world: WorldSettings, root: Path) -> None:
-    global _at_work
-    _at_work = Recorder(world), root
+def _start_worker(world: WorldSettings, root: Path) -> None:
+    global _worker
+    _worker = Recorder(world), root
 
 
-def _record(recording: RecordedFile) -> np.ndarray | None:
-    """Writes one file; how many LiDAR returns each thing got, None for images."""
-    recorder, root = _at_work
-    counts = None
-    with atomic_write(root / recording.path) as file:
-        if recording.sensor.is_camera:
-            image = recorder.image(recording.sensor, recording.time_us)
-            Image.fromarray(image).save(file, "JPEG", quality=JPEG_QUALITY)
-        else:
-            points, counts = recorder.sweep(recording.sensor, recording.time_us)
-            file.write(points.tobytes())
-    return counts
+def _write_file(file: SensorFile) -> np.ndarray | None:
+    """Writes an image or a sweep. Returns the number of LiDAR returns per object, None for images."""
+    recorder, root = _worker
+    with atomic_write(root / file.path) as target:
+        if file.sensor.is_camera:
+            image = recorder.image(file.sensor, file.time_us)
+            Image.fromarray(image).save(target, "JPEG", quality=JPEG_QUALITY)
+            return None
+        points, counts = recorder.sweep(file.sensor, file.time_us)
+        target.write(points.tobytes())
+        return counts
 
 
-def _visible(index: int) -> np.ndarray:
-    return _at_work[0].visible_fractions(index)
+def _visible_fractions(index: int) -> np.ndarray:
+    return _worker[0].visible_fractions(index)
 
 
-def _truth(recording: RecordedFile) -> TruthFrame:
-    recorder, root = _at_work
-    return write_truth_frame(root, recorder, recording.sensor, recording.index, recording.time_us, recording.token)
+def _write_truth(file: SensorFile) -> TruthFrame:
+    recorder, root = _worker
+    return write_truth_frame(root, recorder, file.sensor, file.index, file.time_us, file.token)

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from drivesplat.demo.mark import refuse_foreign_data
+from drivesplat.demo.marker import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.file_lock import LockHeldError, locked_file
 from drivesplat.io.storage import canonical_json

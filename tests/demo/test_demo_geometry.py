@@ -8,7 +8,7 @@ from nuscenes.utils.data_classes import Box, LidarPointCloud
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.lidar import revolution
+from drivesplat.demo.lidar import scan
 from drivesplat.demo.rig import SENSORS
 from drivesplat.demo.tables import token
 
@@ -66,11 +66,11 @@ def test_lidar_returns_fall_on_pixels_of_the_same_depth(demo_tables, demo_root, 
 @pytest.mark.parametrize("index", [0, 2, 4])
 def test_the_leading_cars_box_holds_the_lidar_returns_that_came_from_it(demo_tables, demo_root, demo_recorder, index):
     seconds = index * 0.5
-    stage = demo_recorder.stage(seconds)
+    stage = demo_recorder.snapshot(seconds)
     random = demo_recorder._random("LIDAR_TOP", index * 500_000)
-    points, thing = revolution(stage, demo_recorder.ego_to_street(seconds) @ LIDAR.sensor_to_ego, random)
+    points, thing = scan(stage, demo_recorder.ego_to_street(seconds) @ LIDAR.sensor_to_ego, random)
     np.testing.assert_array_equal(points[:, :3].astype(np.float64), returns(demo_tables, demo_root, index))
-    names = [t.name for t in demo_recorder.things]
+    names = [t.name for t in demo_recorder.objects]
     own = points[thing == names.index("vehicle 0"), :3].astype(np.float64)
     row = annotation(demo_tables, index, "vehicle 0")
     assert len(own) == row["num_lidar_pts"] > 20
@@ -93,7 +93,7 @@ def annotation(tables, index: int, name: str) -> dict:
 
 @pytest.mark.parametrize("name", ["vehicle 0", "vehicle 1", "pedestrian 0"])
 def test_the_tables_speed_of_a_box_is_that_of_its_motion(demo_tables, demo_recorder, name):
-    motion = next(thing.motion for thing in demo_recorder.things if thing.name == name)
+    motion = next(thing.path for thing in demo_recorder.objects if thing.name == name)
     rows = [row for row in demo_tables.sample_annotation if row["instance_token"] == token("demo", "instance", name)]
     inner = [row for row in rows if row["prev"] and row["next"]]
     assert inner
@@ -118,7 +118,7 @@ def test_boxes_head_where_things_go(demo_tables):
 
 def test_boxes_stand_on_the_road_and_bound_the_mesh(demo_tables, demo_recorder):
     for index in (0, 5):
-        for thing in demo_recorder.things:
+        for thing in demo_recorder.objects:
             if thing.category is None:
                 continue
             try:
@@ -127,7 +127,7 @@ def test_boxes_stand_on_the_road_and_bound_the_mesh(demo_tables, demo_recorder):
                 continue
             width, length, height = row["size"]
             assert row["translation"][2] == pytest.approx(height / 2)
-            low, high = thing.body.vertices.min(axis=0), thing.body.vertices.max(axis=0)
+            low, high = thing.mesh.vertices.min(axis=0), thing.mesh.vertices.max(axis=0)
             reach = 2 * np.maximum(-low[:2], high[:2])
             np.testing.assert_allclose([length, width, height], [*reach, high[2]], atol=1e-9)
 
@@ -138,7 +138,7 @@ def test_what_the_front_camera_shows_within_80_metres_carries_a_box(demo_tables,
     rows = [demo_tables.get("sample_annotation", t) for t in demo_tables.sample[index]["anns"]]
     boxed = {row["instance_token"] for row in rows}
     shown = np.bincount(png(demo_root, "instances", index).ravel(), minlength=256)
-    for number, thing in enumerate((t for t in demo_recorder.things if t.category), start=1):
+    for number, thing in enumerate((t for t in demo_recorder.objects if t.category), start=1):
         distance = np.linalg.norm((demo_recorder.box_to_global(thing, index * 0.5) - ego)[:2, 3])
         if distance > 80.0:
             assert token("demo", "instance", thing.name) not in boxed
@@ -147,7 +147,7 @@ def test_what_the_front_camera_shows_within_80_metres_carries_a_box(demo_tables,
 
 
 def test_the_devkits_box_in_the_image_surrounds_the_cars_pixels(demo_tables, demo_root, demo_recorder):
-    numbers = {thing: n for n, thing in enumerate((t.name for t in demo_recorder.things if t.category), start=1)}
+    numbers = {thing: n for n, thing in enumerate((t.name for t in demo_recorder.objects if t.category), start=1)}
     camera = recording(demo_tables, 2, "CAM_FRONT")
     boxes: list[Box] = demo_tables.get_boxes(camera["token"])  # interpolated to the image's time
     at = annotation(demo_tables, 2, "vehicle 0")["translation"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from drivesplat.demo.imaging import central_hits
+from drivesplat.demo.imaging import depth_and_objects
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.rig import SENSORS
 from drivesplat.demo.tables import token
@@ -36,28 +36,28 @@ def seen(request, scene, recorder):
     """An image (also one between key frames) and which thing (h, w) each of its pixels shows."""
     frame = scene.frames[request.param]
     seconds = (frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6
-    return frame, central_hits(recorder.stage(seconds), recorder.camera(FRONT, seconds))[1]
+    return frame, depth_and_objects(recorder.snapshot(seconds), recorder.camera(FRONT, seconds))[1]
 
 
-def vehicles(scene, recorder, frame, things):
+def vehicles(scene, recorder, frame, objects):
     """Per vehicle in clear view: its name, its hull's pixels, its own pixels."""
-    tokens = {token("demo", "instance", thing.name): n for n, thing in enumerate(recorder.things)}
+    tokens = {token("demo", "instance", thing.name): n for n, thing in enumerate(recorder.objects)}
     for hull in hulls_in(scene, frame, SIZE):
-        own = things == tokens[hull.box.track_id]
+        own = objects == tokens[hull.box.track_id]
         if hull.box.category.startswith("vehicle.") and hull.box.visibility == 4 and own.sum() >= MIN_PIXELS:
-            yield recorder.things[tokens[hull.box.track_id]].name, fill(hull.polygon, SIZE), own
+            yield recorder.objects[tokens[hull.box.track_id]].name, fill(hull.polygon, SIZE), own
 
 
 def test_vehicles_lie_within_their_hulls_at_the_images_own_time(scene, recorder, seen):
-    frame, things = seen
-    for name, hull, own in vehicles(scene, recorder, frame, things):
+    frame, objects = seen
+    for name, hull, own in vehicles(scene, recorder, frame, objects):
         assert not (own & ~binary_dilation(hull, np.ones((3, 3)))).any(), f"{name} sticks out of its hull"
 
 
 def test_hulls_at_the_images_own_time_cover_the_vehicles_and_little_else(scene, recorder, seen):
-    frame, things = seen
+    frame, objects = seen
     found = {}
-    for name, hull, own in vehicles(scene, recorder, frame, things):
+    for name, hull, own in vehicles(scene, recorder, frame, objects):
         if not hull[:, [0, -1]].any():  # of a vehicle that the border cuts, the hull holds a corner of air
             found[name] = float((hull & own).sum() / (hull | own).sum())
     print(f"key frame {frame.sample_index}:", {name: round(iou, 3) for name, iou in found.items()})
@@ -66,13 +66,13 @@ def test_hulls_at_the_images_own_time_cover_the_vehicles_and_little_else(scene, 
 
 
 def test_the_label_image_calls_moving_what_moves_and_parked_what_is_parked(scene, recorder, seen):
-    frame, things = seen
+    frame, objects = seen
     labels = label_image(scene, frame, SIZE)
-    names = np.array([thing.name for thing in recorder.things])
-    for name, _, own in vehicles(scene, recorder, frame, things):
+    names = np.array([thing.name for thing in recorder.objects])
+    for name, _, own in vehicles(scene, recorder, frame, objects):
         kind = "parked" if name.startswith("parked") else "moving"
         expected = [LABELS[f"{kind}_car"], LABELS[f"{kind}_other_vehicle"]]
         assert np.isin(labels[own], expected).mean() > 0.8, name
-    walker = things == list(names).index("pedestrian 0")
+    walker = objects == list(names).index("pedestrian 0")
     if walker.sum() >= MIN_PIXELS:
         assert (labels[walker] == LABELS["moving_human"]).mean() > 0.8

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.rig import SENSORS, firing_times
+from drivesplat.demo.rig import SENSORS, trigger_times
 from drivesplat.settings.world import WorldSettings
 
 LIDAR = SENSORS[0]
@@ -88,15 +88,15 @@ def test_every_sweep_has_its_own_noise_and_the_same_one_every_time(standing):
 
 def test_returns_are_counted_by_the_thing_they_come_from(standing):
     points, counts = standing.sweep(LIDAR, 0)
-    assert counts.shape == (len(standing.things),) and counts.sum() == len(points)
-    scenery = [thing.name for thing in standing.things].index("scenery")
+    assert counts.shape == (len(standing.objects),) and counts.sum() == len(points)
+    scenery = [thing.name for thing in standing.objects].index("scenery")
     assert counts[scenery] > 0.8 * len(points)
     assert (counts > 0).sum() > 3, "parked cars return some"
 
 
 def test_between_key_frames_the_lidar_turns_at_20_hz():
-    times = firing_times(LIDAR, 3, sweeps=True)
+    times = trigger_times(LIDAR, 3, sweeps=True)
     assert [time for time, _, _ in times] == list(range(0, 1_000_001, 50_000))
     assert [index for _, _, index in times] == [0] + [1] * 10 + [2] * 10
     assert [time for time, is_key, _ in times if is_key] == [0, 500_000, 1_000_000]
-    assert firing_times(LIDAR, 3, sweeps=False) == [(0, True, 0), (500_000, True, 1), (1_000_000, True, 2)]
+    assert trigger_times(LIDAR, 3, sweeps=False) == [(0, True, 0), (500_000, True, 1), (1_000_000, True, 2)]

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from drivesplat.demo import bodies
-from drivesplat.demo.bodies import Material
-from drivesplat.demo.imaging import Camera, central_hits, developed, photograph
+from drivesplat.demo import meshes
+from drivesplat.demo.imaging import DemoCamera, depth_and_objects, render, to_bytes
 from drivesplat.demo.lighting import daylight, lamplight
-from drivesplat.demo.raycast import Stage
-from drivesplat.demo.street import Thing
-from drivesplat.demo.traffic import StreetMotion
+from drivesplat.demo.meshes import Material
+from drivesplat.demo.raycast import StreetSnapshot
+from drivesplat.demo.street import StreetObject
+from drivesplat.demo.traffic import StreetPath
 
 SUN_HEIGHT = math.radians(50)
 SUN = np.array([math.cos(SUN_HEIGHT), 0.0, math.sin(SUN_HEIGHT)])
@@ -21,26 +21,26 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 """An OpenCV camera that looks down: its x along the street's."""
 
 
-def floor(top: float = 0.0) -> Thing:
-    """A white plane; PLAIN's mottle fades where one pixel sees metres of it."""
-    body = bodies.box((-50.0, -50.0, top - 1.0), (50.0, 50.0, top), Material.PLAIN, (1.0, 1.0, 1.0))
-    return Thing("floor", body, StreetMotion(0.0, 0.0))
+def floor(top: float = 0.0) -> StreetObject:
+    """A white plane; the texture of PLAIN fades where a pixel covers metres of it."""
+    mesh = meshes.box((-50.0, -50.0, top - 1.0), (50.0, 50.0, top), Material.PLAIN, (1.0, 1.0, 1.0))
+    return StreetObject("floor", mesh, StreetPath(0.0, 0.0))
 
 
-def roof(at: float) -> Thing:
-    body = bodies.box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0))
-    return Thing("roof", body, StreetMotion(0.0, 0.0))
+def roof(at: float) -> StreetObject:
+    mesh = meshes.box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0))
+    return StreetObject("roof", mesh, StreetPath(0.0, 0.0))
 
 
-def one_pixel(rotation: np.ndarray, height: float, focal: float = 0.1) -> Camera:
+def one_pixel(rotation: np.ndarray, height: float, focal: float = 0.1) -> DemoCamera:
     """A camera of one pixel above the origin that looks straight along its axis."""
     pose = np.eye(4)
     pose[:3, :3], pose[2, 3] = rotation, height
-    return Camera(np.diag([focal, focal, 1.0]), pose, 1, 1)
+    return DemoCamera(np.diag([focal, focal, 1.0]), pose, 1, 1)
 
 
-def radiance(things: list[Thing], light, camera: Camera) -> np.ndarray:
-    return photograph(Stage(things, 0.0), light, camera, 1)[0, 0]
+def radiance(objects: list[StreetObject], light, camera: DemoCamera) -> np.ndarray:
+    return render(StreetSnapshot(objects, 0.0), light, camera, 1)[0, 0]
 
 
 def hazy(value: np.ndarray, distance: float) -> np.ndarray:
@@ -79,8 +79,9 @@ def test_without_a_surface_there_is_the_sky_of_that_direction(elevation):
 
 
 def test_by_day_clouds_whiten_some_of_the_sky():
-    camera = Camera(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), np.eye(4), 41, 41)
-    clear, cloudy = (photograph(Stage([floor(-100.0)], 0.0), DARK._replace(clouds=c), camera, 1) for c in (0.0, 0.8))
+    camera = DemoCamera(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), np.eye(4), 41, 41)
+    snapshot = StreetSnapshot([floor(-100.0)], 0.0)
+    clear, cloudy = (render(snapshot, DARK._replace(clouds=c), camera, 1) for c in (0.0, 0.8))
     changed = np.abs(clear - cloudy).max(axis=2) > 0.01
     assert 0.05 < changed.mean() < 0.95
     assert (cloudy[changed].std(axis=1) < clear[changed].std(axis=1)).all()
@@ -100,12 +101,8 @@ def test_a_street_lamp_lights_what_lies_below_it_by_the_inverse_square():
 def test_headlights_shine_ahead_and_not_behind():
     ego = np.eye(4)
     night = lamplight(np.zeros((0, 3)), ego)
-    wall = {
-        x: Thing(
-            "wall", bodies.box((x, -9.0, -9.0), (x + 1.0, 9.0, 9.0), Material.PLAIN, (1.0,) * 3), StreetMotion(0.0, 0.0)
-        )
-        for x in (20.0, -21.0)
-    }
+    boxes = {x: meshes.box((x, -9, -9), (x + 1.0, 9, 9), Material.PLAIN, (1.0,) * 3) for x in (20.0, -21.0)}
+    wall = {x: StreetObject("wall", mesh, StreetPath(0.0, 0.0)) for x, mesh in boxes.items()}
     forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     backward = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     ahead = radiance([wall[20.0]], night, one_pixel(forward, 0.7))
@@ -117,30 +114,31 @@ def test_headlights_shine_ahead_and_not_behind():
 def test_development_is_a_gamma_of_the_exposed_radiance():
     radiances = np.array([[[0.0, 0.5, 1.0]], [[-0.1, 5.0, 1.0 / 0.62]]])
     expected = [0.0, 255 * 0.31 ** (1 / 2.2), 255 * 0.62 ** (1 / 2.2), 0.0, 255.0, 255.0]
-    found = developed(radiances)
+    found = to_bytes(radiances)
     assert found.dtype == np.uint8
     np.testing.assert_allclose(found.ravel(), expected, atol=0.51)
 
 
 def test_sensor_noise_has_the_stated_strength():
     grey = np.full((60, 60, 3), 0.4)
-    noisy = developed(grey, 0.02, np.random.default_rng(0)).astype(float)
-    assert noisy.mean() == pytest.approx(float(developed(grey)[0, 0, 0]), abs=0.6)
+    noisy = to_bytes(grey, 0.02, np.random.default_rng(0)).astype(float)
+    assert noisy.mean() == pytest.approx(float(to_bytes(grey)[0, 0, 0]), abs=0.6)
     assert noisy.std() == pytest.approx(0.02 * 255, rel=0.05)
 
 
 def test_depth_is_along_the_axis_and_infinite_in_the_sky():
-    camera = Camera(np.array([[10.0, 0, 10], [0, 10.0, 10], [0, 0, 1]]), one_pixel(DOWN, 4.0).camera_to_street, 21, 21)
-    depth, things = central_hits(Stage([floor()], 0.0), camera)
+    intrinsics = np.array([[10.0, 0, 10], [0, 10.0, 10], [0, 0, 1]])
+    camera = DemoCamera(intrinsics, one_pixel(DOWN, 4.0).camera_to_street, 21, 21)
+    depth, objects = depth_and_objects(StreetSnapshot([floor()], 0.0), camera)
     np.testing.assert_allclose(depth, 4.0, rtol=1e-5)
-    assert (things == 0).all()
-    upward = Camera(camera.intrinsics, one_pixel(np.eye(3), 4.0).camera_to_street, 21, 21)
-    depth, things = central_hits(Stage([floor()], 0.0), upward)
-    assert np.isinf(depth).all() and (things == -1).all()
+    assert (objects == 0).all()
+    upward = DemoCamera(camera.intrinsics, one_pixel(np.eye(3), 4.0).camera_to_street, 21, 21)
+    depth, objects = depth_and_objects(StreetSnapshot([floor()], 0.0), upward)
+    assert np.isinf(depth).all() and (objects == -1).all()
 
 
 def test_one_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
-    camera = Camera(np.array([[50.0, 0, 2], [0, 50.0, 1], [0, 0, 1]]), np.eye(4), 5, 3)
+    camera = DemoCamera(np.array([[50.0, 0, 2], [0, 50.0, 1], [0, 0, 1]]), np.eye(4), 5, 3)
 
     def pixels(samples: int) -> np.ndarray:
         rays = camera.rays(slice(0, 3), samples)
@@ -156,9 +154,10 @@ def test_one_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
 
 
 def test_more_samples_smooth_edges_and_keep_the_mean():
-    wall = bodies.box((-50.0, 0.3, -9.0), (50.0, 20.0, 9.0), Material.PLAIN, (0.0, 0.0, 0.0))
-    things = [Thing("wall", wall, StreetMotion(0.0, 0.0))]
-    camera = Camera(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), one_pixel(DOWN, 30.0).camera_to_street, 41, 41)
-    sharp, smooth = (photograph(Stage(things, 0.0), LIGHT, camera, samples)[..., 0] for samples in (1, 16))
+    wall = meshes.box((-50.0, 0.3, -9.0), (50.0, 20.0, 9.0), Material.PLAIN, (0.0, 0.0, 0.0))
+    objects = [StreetObject("wall", wall, StreetPath(0.0, 0.0))]
+    intrinsics = np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]])
+    camera = DemoCamera(intrinsics, one_pixel(DOWN, 30.0).camera_to_street, 41, 41)
+    sharp, smooth = (render(StreetSnapshot(objects, 0.0), LIGHT, camera, samples)[..., 0] for samples in (1, 16))
     assert len(np.unique(smooth.round(2))) > len(np.unique(sharp.round(2)))
     assert smooth.mean() == pytest.approx(sharp.mean(), rel=0.1)

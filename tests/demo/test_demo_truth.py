@@ -8,7 +8,8 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.imaging import Camera, central_hits, developed, photograph
+from drivesplat.demo.imaging import DemoCamera, depth_and_objects, render, to_bytes
+from drivesplat.demo.raycast import StreetSnapshot
 from drivesplat.demo.rig import SENSORS
 from drivesplat.demo.tables import token
 
@@ -35,7 +36,13 @@ def seconds_of(index: int) -> float:
     return (index * 500_000 - 35_500) * 1e-6
 
 
-def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
+def view(recorder, index: int) -> tuple[StreetSnapshot, DemoCamera]:
+    """The street and the front camera at a key frame."""
+    seconds = seconds_of(index)
+    return recorder.snapshot(seconds), recorder.camera(FRONT, seconds)
+
+
+def points_of(depth: np.ndarray, camera: DemoCamera) -> np.ndarray:
     """The street coordinates (h, w, 3) of what each pixel's centre shows."""
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.intrinsics).T
@@ -72,20 +79,20 @@ def test_instances_name_the_annotated_things(record, demo_root, demo_recorder, d
 
 
 def test_instance_pixels_are_those_of_the_thing_that_is_named(record, demo_root, demo_recorder, index):
-    _, things = central_hits(demo_recorder.stage(seconds_of(index)), demo_recorder.camera(FRONT, seconds_of(index)))
+    _, objects = depth_and_objects(*view(demo_recorder, index))
     shown = png(demo_root, record, index, "instances")
     numbers = {name: int(n) for n, name in record["instances"].items()}
-    for n, thing in enumerate(demo_recorder.things):
+    for n, thing in enumerate(demo_recorder.objects):
         number = numbers.get(token("demo", "instance", thing.name), 0)
         assert (number > 0) == (thing.category is not None)
         if number:
-            np.testing.assert_array_equal(shown == number, things == n)
+            np.testing.assert_array_equal(shown == number, objects == n)
 
 
 def test_the_depth_image_decodes_to_metres(record, demo_root, demo_recorder, index):
-    depth, things = central_hits(demo_recorder.stage(seconds_of(index)), demo_recorder.camera(FRONT, seconds_of(index)))
+    depth, objects = depth_and_objects(*view(demo_recorder, index))
     decoded = png(demo_root, record, index, "depth") / 256.0
-    sky = things < 0
+    sky = objects < 0
     assert (decoded[sky] == 0).all() and 0.02 < sky.mean() < 0.9
     near = ~sky & (depth < 255.0)
     assert np.abs(decoded[near] - depth[near]).max() <= 0.5 / 256 + 1e-6
@@ -96,9 +103,9 @@ def test_the_depth_image_decodes_to_metres(record, demo_root, demo_recorder, ind
 
 def sunlit_without(points: np.ndarray, sun: np.ndarray, thing, seconds: float) -> np.ndarray:
     """Which points (n, 3) have the box of `thing`, a little larger, between them and the sun."""
-    to_body = np.linalg.inv(thing.motion.pose_at(seconds))
-    start, ray = points @ to_body[:3, :3].T + to_body[:3, 3], to_body[:3, :3] @ sun
-    length, width, height = thing.body.size
+    to_object = np.linalg.inv(thing.path.pose_at(seconds))
+    start, ray = points @ to_object[:3, :3].T + to_object[:3, 3], to_object[:3, :3] @ sun
+    length, width, height = thing.mesh.size
     low, high = np.array([-length / 2, -width / 2, 0.0]) - 0.05, np.array([length / 2, width / 2, height]) + 0.05
     with np.errstate(divide="ignore"):
         a, b = (low - start) / ray, (high - start) / ray
@@ -115,12 +122,12 @@ def removal(record, demo_root, demo_recorder, index):
     number = next(int(n) for n, name in record["instances"].items() if name == record["leading"])
     own = png(demo_root, record, index, "instances") == number
     camera = demo_recorder.camera(FRONT, seconds)
-    depth, things = central_hits(demo_recorder.stage(seconds), camera)
-    leading = next(t for t in demo_recorder.things if t.name == "vehicle 0")
+    depth, objects = depth_and_objects(demo_recorder.snapshot(seconds), camera)
+    leading = next(t for t in demo_recorder.objects if t.name == "vehicle 0")
     shaded = sunlit_without(
         points_of(depth, camera).reshape(-1, 3), demo_recorder.light(seconds).sun_direction, leading, seconds
     )
-    return image, without, own, shaded.reshape(own.shape) & (things >= 0) & ~own
+    return image, without, own, shaded.reshape(own.shape) & (objects >= 0) & ~own
 
 
 def test_without_the_leading_car_only_its_pixels_and_its_shadow_change(removal):
@@ -175,19 +182,19 @@ def test_recorded_camera_poses_are_those_of_the_tables_and_two_metres_to_the_own
         np.testing.assert_allclose(there[:3, :3], here[:3, :3], atol=1e-12)
 
 
-def lateral_camera(record, demo_recorder, index: int) -> Camera:
+def lateral_camera(record, demo_recorder, index: int) -> DemoCamera:
     """The camera that truth.json states, brought to the street by the own car's known place there."""
     frame = record["frames"][index]
     camera = demo_recorder.camera(FRONT, seconds_of(index))
     to_street = camera.camera_to_street @ np.linalg.inv(frame["camera_to_global"])
     pose = to_street @ np.array(frame["lateral_camera_to_global"])
-    return Camera(camera.intrinsics, pose, WIDTH, HEIGHT)
+    return DemoCamera(camera.intrinsics, pose, WIDTH, HEIGHT)
 
 
 def test_the_lateral_view_is_what_a_camera_at_its_recorded_pose_sees(record, demo_root, demo_recorder, index):
     seconds = seconds_of(index)
     camera = lateral_camera(record, demo_recorder, index)
-    expected = developed(photograph(demo_recorder.stage(seconds), demo_recorder.light(seconds), camera, 1))
+    expected = to_bytes(render(demo_recorder.snapshot(seconds), demo_recorder.light(seconds), camera, 1))
     found = png(demo_root, record, index, "lateral")
     assert (np.abs(found.astype(int) - expected) <= 2).all(axis=2).mean() > 0.99
     assert (found != demo_recorder.image(FRONT, index * 500_000 - 35_500)).any(axis=2).mean() > 0.3
@@ -202,7 +209,7 @@ def test_depth_and_lateral_view_agree_by_reprojection(record, demo_root, demo_re
     pixels = in_lateral @ lateral.intrinsics.T
     x, y = np.round(pixels[:, :2] / pixels[:, 2:]).astype(int).T
     inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
-    there = central_hits(demo_recorder.stage(seconds_of(index)), lateral)[0][y[inside], x[inside]]
+    there = depth_and_objects(demo_recorder.snapshot(seconds_of(index)), lateral)[0][y[inside], x[inside]]
     error = np.abs(in_lateral[inside, 2] / there - 1.0)
     assert inside.sum() > 3000
     assert np.median(error) < 0.01 and (error < 0.05).mean() > 0.8

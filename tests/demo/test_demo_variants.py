@@ -112,7 +112,7 @@ def test_night_is_darker_than_day(night):
 
 def test_images_by_night_have_sensor_noise_and_the_truth_has_none(night):
     image, truth = night.image(FRONT, 500_000).astype(float), night.truth(FRONT, 500_000, 2.0)
-    away = ~binary_dilation(truth["things"] == [t.name for t in night.things].index("vehicle 0"), iterations=2)
+    away = ~binary_dilation(truth["objects"] == [t.name for t in night.objects].index("vehicle 0"), iterations=2)
     lit = away & (image.min(axis=2) > 20) & (image.max(axis=2) < 235)
     difference = (image - truth["without_leading"])[lit]
     assert lit.sum() > 1000
@@ -173,11 +173,11 @@ def test_pose_noise_leaves_images_and_sweeps_alone():
 def test_as_many_things_are_on_the_street_as_asked_for(vehicles, pedestrians, parked, ego):
     settings = {"vehicles": vehicles, "pedestrians": pedestrians, "parked": parked, "ego": ego}
     recorder = Recorder(WorldSettings(**settings))
-    kinds = [(thing.category or "").split(".")[0] for thing in recorder.things if thing.moves]
+    kinds = [(thing.category or "").split(".")[0] for thing in recorder.objects if thing.moves]
     assert (kinds.count("vehicle"), kinds.count("human")) == (vehicles, pedestrians)
-    assert sum(thing.attribute == "vehicle.parked" for thing in recorder.things) == parked
+    assert sum(thing.attribute == "vehicle.parked" for thing in recorder.objects) == parked
     assert recorder.street.leading == ("vehicle 0" if vehicles else None)
-    names = [thing.name for thing in recorder.things]
+    names = [thing.name for thing in recorder.objects]
     assert len(set(names)) == len(names)
 
 
@@ -188,11 +188,11 @@ def test_as_many_things_are_on_the_street_as_asked_for(vehicles, pedestrians, pa
 def test_nothing_goes_or_stands_in_anything_else(ego, random_seed, vehicles, pedestrians, parked):
     counts = {"vehicles": vehicles, "pedestrians": pedestrians, "parked": parked}
     recorder = Recorder(WorldSettings(random_seed=random_seed, ego=ego, **counts))
-    boxed = [thing for thing in recorder.things if thing.category]
+    boxed = [thing for thing in recorder.objects if thing.category]
     for seconds in np.arange(0.0, 9.6, 0.25):
         ego_pose = recorder.ego_to_street(float(seconds))
-        places = [*(thing.motion.pose_at(float(seconds))[:2, 3] for thing in boxed), ego_pose[:2, 3] + [1.4, 0.0]]
-        halves = [*(thing.body.size[:2] / 2 for thing in boxed), np.array([2.3, 0.95])]
+        places = [*(thing.path.pose_at(float(seconds))[:2, 3] for thing in boxed), ego_pose[:2, 3] + [1.4, 0.0]]
+        halves = [*(thing.mesh.size[:2] / 2 for thing in boxed), np.array([2.3, 0.95])]
         for i in range(len(places)):
             for j in range(i):
                 gap = np.abs(places[i] - places[j]) - halves[i] - halves[j]
@@ -202,9 +202,9 @@ def test_nothing_goes_or_stands_in_anything_else(ego, random_seed, vehicles, ped
 def test_the_leading_car_leads():
     for ego in ("drives", "stands"):
         recorder = Recorder(WorldSettings(ego=ego))
-        leading = next(thing for thing in recorder.things if thing.name == recorder.street.leading)
+        leading = next(thing for thing in recorder.objects if thing.name == recorder.street.leading)
         for seconds in (0.0, 4.0, 9.5):
-            ahead = np.linalg.inv(recorder.ego_to_street(seconds)) @ leading.motion.pose_at(seconds)
+            ahead = np.linalg.inv(recorder.ego_to_street(seconds)) @ leading.path.pose_at(seconds)
             assert ahead[0, 3] > 5.0 and abs(ahead[1, 3]) < 1.0
 
 
@@ -220,17 +220,17 @@ def test_width_sets_the_images_size_and_scales_the_intrinsics(width):
 def test_walkers_keep_clear_of_lamps_bins_and_trees():
     for seed in range(6):
         recorder = Recorder(WorldSettings(random_seed=seed, pedestrians=6, vehicles=0))
-        scenery = recorder.things[0].body.vertices
+        scenery = recorder.objects[0].mesh.vertices
         feet = scenery[(scenery[:, 2] > -0.01) & (scenery[:, 2] < 0.01)][:, :2]
-        walkers = [thing for thing in recorder.things if thing.walks]
+        walkers = [thing for thing in recorder.objects if thing.walks]
         assert len(walkers) == 6
         for walker in walkers:
             for seconds in np.arange(0.0, 20.0, 0.2):
-                beside = np.abs(feet - walker.motion.pose_at(float(seconds))[:2, 3]) < walker.body.size[:2] / 2
+                beside = np.abs(feet - walker.path.pose_at(float(seconds))[:2, 3]) < walker.mesh.size[:2] / 2
                 assert not beside.all(axis=1).any(), (seed, walker.name, seconds)
 
 
 def test_walkers_that_nothing_hides_are_wholly_visible():
     recorder = Recorder(WorldSettings(pedestrians=6, vehicles=0, parked=0, key_frames=8, **SMALL))
-    walkers = [number for number, thing in enumerate(recorder.things) if thing.walks]
+    walkers = [number for number, thing in enumerate(recorder.objects) if thing.walks]
     assert np.median([recorder.visible_fractions(index)[walkers] for index in (1, 4, 7)]) > 0.95

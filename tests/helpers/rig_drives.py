@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from drivesplat.demo.imaging import central_hits
+from drivesplat.demo.imaging import depth_and_objects
 from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, Sensor
-from drivesplat.demo.street import OWN_CAR
+from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor
+from drivesplat.demo.street import EGO_VEHICLE
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.settings.world import WorldSettings
 
@@ -48,7 +48,7 @@ def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = KEY_FRAMES
     )
 
 
-def _frame(folder: Path, recorder: Recorder, sensor: Sensor, index: int) -> Frame:
+def _frame(folder: Path, recorder: Recorder, sensor: DemoSensor, index: int) -> Frame:
     time_us = index * KEY_FRAME_US + sensor.delay_us
     camera = recorder.camera(sensor, time_us * 1e-6)
     path = folder / f"{sensor.channel}_{index:02}.png"
@@ -72,5 +72,5 @@ def _sweep(folder: Path, recorder: Recorder, index: int) -> Sweep:
 def true_body(camera: str, width: int = 160, seconds: float = 1.0) -> np.ndarray:
     """The pixels (h, w) bool in which a camera sees the own car."""
     recorder = recorder_of(width=width, own_car=True)
-    number = [thing.name for thing in recorder.things].index(OWN_CAR)
-    return central_hits(recorder.stage(seconds), recorder.camera(RIG[camera], seconds))[1] == number
+    number = [thing.name for thing in recorder.objects].index(EGO_VEHICLE)
+    return depth_and_objects(recorder.snapshot(seconds), recorder.camera(RIG[camera], seconds))[1] == number

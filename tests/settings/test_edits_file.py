@@ -194,10 +194,10 @@ def demo_actors() -> list[EditedActor]:
     recorder, times = Recorder(WorldSettings()), 0.5 * np.arange(20)
     return [
         EditedActor.recorded(
-            token("demo", "instance", thing.name), thing.category, np.asarray(thing.body.size),
+            token("demo", "instance", thing.name), thing.category, np.asarray(thing.mesh.size),
             Motion(times, np.stack([recorder.box_to_global(thing, t) for t in times]), ((0, 19),), 0.25),
         )
-        for thing in recorder.things
+        for thing in recorder.objects
         if thing.moves and thing.category == "vehicle.car"
     ]  # fmt: skip
 

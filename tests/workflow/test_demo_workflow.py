@@ -121,6 +121,6 @@ def test_a_world_at_a_recorded_datasets_folder_is_refused_before_any_job(finishe
         finished.write_config()
     assert done.returncode != 0
     line = next(line for line in done.stdout.splitlines() if line.startswith("drivesplat:"))
-    assert "data is to hold a synthetic world, but holds other files" in line
+    assert "data is configured for a synthetic world, but holds other files" in line
     assert "Traceback" not in done.stdout and tables
     assert {path: path.read_bytes() for path in tables} == tables

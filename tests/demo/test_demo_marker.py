@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.demo.mark import WORLD_MARK, begin, refuse_foreign_data
+from drivesplat.demo.marker import WORLD_MARKER, prepare_folder, refuse_foreign_data
 from drivesplat.demo.world import make_world
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import load
@@ -33,7 +33,9 @@ def recorded(tmp_path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("write", [lambda root: begin(root, {}), lambda root: make_world(root, TINY, {"stages": {}})])
+@pytest.mark.parametrize(
+    "write", [lambda root: prepare_folder(root, {}), lambda root: make_world(root, TINY, {"stages": {}})]
+)
 def test_a_recorded_dataset_is_refused_and_left_as_it_is(recorded, write):
     before = content(recorded)
     with pytest.raises(ConfigError, match=REPLY) as refused:
@@ -54,20 +56,20 @@ def test_absent_and_empty_folders_and_earlier_worlds_are_welcome(tmp_path):
     refuse_foreign_data(tmp_path / "absent")
     (tmp_path / "empty" / "v1.0-mini").mkdir(parents=True)
     refuse_foreign_data(tmp_path / "empty")
-    begin(tmp_path / "empty", {"stages": {}})
+    prepare_folder(tmp_path / "empty", {"stages": {}})
     (tmp_path / "empty" / "samples").mkdir()
     (tmp_path / "empty" / "samples" / "x.jpg").write_text("")
     refuse_foreign_data(tmp_path / "empty")
 
 
 def test_beginning_removes_an_earlier_worlds_recordings_and_notes_where_the_new_one_comes_from(tmp_path):
-    begin(tmp_path, {"stages": {"demo_world": {"code": "old"}}})
+    prepare_folder(tmp_path, {"stages": {"demo_world": {"code": "old"}}})
     for folder in ("samples", "sweeps", "maps", "truth"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "old").write_text("")
-    begin(tmp_path, {"stages": {"demo_world": {"code": "new"}}})
-    assert list(content(tmp_path)) == [WORLD_MARK]
-    assert json.loads((tmp_path / WORLD_MARK).read_text())["provenance"]["stages"]["demo_world"]["code"] == "new"
+    prepare_folder(tmp_path, {"stages": {"demo_world": {"code": "new"}}})
+    assert list(content(tmp_path)) == [WORLD_MARKER]
+    assert json.loads((tmp_path / WORLD_MARKER).read_text())["provenance"]["stages"]["demo_world"]["code"] == "new"
 
 
 def plan(**config) -> Plan:

@@ -6,30 +6,30 @@ import numpy as np
 import pytest
 import trimesh
 
-from drivesplat.demo import bodies
-from drivesplat.demo.bodies import Body, Material
+from drivesplat.demo import meshes
+from drivesplat.demo.meshes import ColoredMesh, Material
 
 RED = (0.5, 0.1, 0.1)
 GREY = (0.3, 0.3, 0.3)
 CAR_SIZE, VAN_SIZE = (4.5, 1.85, 1.5), (5.4, 2.05, 2.5)
-SHAPES: dict[str, Callable[[], Body]] = {
-    "box": lambda: bodies.box((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0), Material.PLAIN, RED),
-    "cylinder": lambda: bodies.cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 2.0), 0.5, Material.PLAIN, RED),
-    "ball": lambda: bodies.ball((0.0, 0.0, 1.0), (1.0, 0.5, 1.0), Material.PLAIN, RED),
-    "car": lambda: bodies.car(CAR_SIZE, RED),
-    "van": lambda: bodies.van(VAN_SIZE, RED),
-    "pedestrian": lambda: bodies.pedestrian(1.75, RED, GREY, 1.0),
-    "standing pedestrian": lambda: bodies.pedestrian(1.6, RED, GREY, 0.0),
-    "tree": lambda: bodies.tree(7.0, np.random.default_rng(3)),
-    "building": lambda: bodies.building((0.0, 10.0, 0.0), (12.0, 22.0, 9.0), GREY),
-    "street lamp": lambda: bodies.street_lamp(6.5, -1.5),
-    "sign": lambda: bodies.sign(RED),
-    "cone": bodies.cone,
+SHAPES: dict[str, Callable[[], ColoredMesh]] = {
+    "box": lambda: meshes.box((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0), Material.PLAIN, RED),
+    "cylinder": lambda: meshes.cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 2.0), 0.5, Material.PLAIN, RED),
+    "ball": lambda: meshes.ellipsoid((0.0, 0.0, 1.0), (1.0, 0.5, 1.0), Material.PLAIN, RED),
+    "car": lambda: meshes.car(CAR_SIZE, RED),
+    "van": lambda: meshes.van(VAN_SIZE, RED),
+    "pedestrian": lambda: meshes.pedestrian(1.75, RED, GREY, 1.0),
+    "standing pedestrian": lambda: meshes.pedestrian(1.6, RED, GREY, 0.0),
+    "tree": lambda: meshes.tree(7.0, np.random.default_rng(3)),
+    "building": lambda: meshes.building((0.0, 10.0, 0.0), (12.0, 22.0, 9.0), GREY),
+    "street lamp": lambda: meshes.street_lamp(6.5, -1.5),
+    "sign": lambda: meshes.sign(RED),
+    "cone": meshes.cone,
 }  # fmt: skip
 
 
 @pytest.fixture(params=SHAPES)
-def body(request) -> Body:
+def body(request) -> ColoredMesh:
     return SHAPES[request.param]()
 
 
@@ -71,27 +71,27 @@ def test_solids_hold_their_volume(shape, volume):
     assert 0.9 * volume < found <= volume + 1e-9, "round things are polyhedra within"
 
 
-@pytest.mark.parametrize(("make", "size"), [(bodies.car, CAR_SIZE), (bodies.van, VAN_SIZE)])
+@pytest.mark.parametrize(("make", "size"), [(meshes.car, CAR_SIZE), (meshes.van, VAN_SIZE)])
 def test_vehicles_have_the_size_asked_for_but_for_lights_that_stick_out_two_centimetres(make, size):
     found = make(size, RED).size
     assert size[0] <= found[0] <= size[0] + 0.04 + 1e-9
     np.testing.assert_allclose(found[1:], size[1:], atol=1e-9)
 
 
-@pytest.mark.parametrize("make", [bodies.car, bodies.van])
+@pytest.mark.parametrize("make", [meshes.car, meshes.van])
 def test_vehicles_have_paint_glass_lights_and_tyres(make):
     body = make((4.6, 1.9, 1.8), RED)
     for material in (Material.PAINT, Material.GLASS, Material.LAMP, Material.PLAIN):
         assert (body.material == material).any()
     assert (body.color[body.material == Material.PAINT] == RED).all()
     lights, rear = body.material == Material.LAMP, body.triangles[:, :, 0].max(axis=1) < 0
-    assert (body.color[lights & rear] == bodies.TAIL_LIGHT).all()
-    assert (body.color[lights & ~rear] == bodies.HEADLIGHT).all()
+    assert (body.color[lights & rear] == meshes.TAIL_LIGHT).all()
+    assert (body.color[lights & ~rear] == meshes.HEADLIGHT).all()
 
 
 def test_joined_keeps_every_part_and_points_at_its_own_vertices():
-    a, b = SHAPES["box"](), bodies.ball((5.0, 0.0, 1.0), (1.0, 1.0, 1.0), Material.LEAVES, GREY)
-    both = bodies.joined([a, b])
+    a, b = SHAPES["box"](), meshes.ellipsoid((5.0, 0.0, 1.0), (1.0, 1.0, 1.0), Material.LEAVES, GREY)
+    both = meshes.concatenate([a, b])
     np.testing.assert_array_equal(both.triangles, np.concatenate([a.triangles, b.triangles]))
     np.testing.assert_array_equal(both.material, [*a.material, *b.material])
     np.testing.assert_array_equal(both.color, np.concatenate([a.color, b.color]))
@@ -106,6 +106,6 @@ def test_moved_turns_about_z_first_and_then_shifts():
 
 
 def test_a_stride_swings_the_legs_apart():
-    standing, walking = (bodies.pedestrian(1.75, RED, GREY, stride) for stride in (0.0, 1.0))
+    standing, walking = (meshes.pedestrian(1.75, RED, GREY, stride) for stride in (0.0, 1.0))
     assert walking.size[0] > standing.size[0] + 0.4
-    assert bodies.pedestrian(1.75, RED, GREY, -1.0).size[0] == pytest.approx(walking.size[0], abs=0.02)
+    assert meshes.pedestrian(1.75, RED, GREY, -1.0).size[0] == pytest.approx(walking.size[0], abs=0.02)
