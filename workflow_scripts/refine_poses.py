@@ -4,7 +4,7 @@ import dataclasses
 
 from drivesplat.workflow.job import job
 from drivesplat.io.storage import write_json
-from drivesplat.poses.refinement import refined_or_kept
+from drivesplat.poses.refinement import refine_or_keep
 from drivesplat.poses.triangulated import write_triangulated
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene, write_scene
@@ -12,7 +12,7 @@ from drivesplat.settings.refine_poses import RefinePosesJob
 
 with job(snakemake, dataset=("images", "sweeps")) as current:
     scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
-    refinement = refined_or_kept(scene, current.settings(RefinePosesJob), ego_mask, current.threads)
+    refinement = refine_or_keep(scene, current.settings(RefinePosesJob), ego_mask, current.threads)
     provenance = current.provenance(scene.provenance, upstream)
     write_json(current.output.poses, {**refinement.record, "provenance": provenance})
     write_triangulated(current.output.points, dataclasses.replace(refinement.points, provenance=provenance))

@@ -1,6 +1,6 @@
-"""Poses of a recorded drive, corrected by what its images show, or made from these.
+"""Camera and ego poses refined with the images of a drive, or estimated from them.
 
-Frames as in `drivesplat.scene.scene`. A correction is a rigid transform in the own car's frame: refined ego_to_world =
-given ego_to_world @ correction. What is wrong with recorded poses (no height, roll and pitch off by half a degree)
-belongs to the car and changes slowly, so corrections carry over to the times between images.
+Frames as in `drivesplat.scene.scene`. A correction is a rigid transform in the ego frame: refined ego_to_world = given
+ego_to_world @ correction. The errors of recorded poses (no height, roll and pitch off by half a degree) are those of
+the vehicle and change slowly, so corrections are interpolated between images.
 """

@@ -1,4 +1,4 @@
-"""What comes of a refinement of poses: the scene, poses.json and triangulated points."""
+"""The result of a refinement of poses: the scene, poses.json and triangulated points."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,14 +12,14 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Refinement:
-    """`scene`: with refined poses, or as it was; `record`: the content of poses.json; `points`: of triangulated.npz."""
+    """`scene` with refined or unchanged poses; `record`, the content of poses.json; `points`, of triangulated.npz."""
 
     scene: Scene
     record: dict[str, Any]
     points: TriangulatedPoints
 
 
-def verdict(scene: Scene, job: RefinePosesJob, fault: str | None) -> dict[str, Any]:
-    """The head of poses.json; `fault` says why poses stay as they are, None where they do not."""
+def record_header(scene: Scene, job: RefinePosesJob, reason: str | None) -> dict[str, Any]:
+    """The first keys of poses.json. `reason`: why the given poses are kept, None where they are not."""
     start = job.refine_poses.start
-    return {"schema": SCHEMA, "scene": scene.name, "start": start, "refined": fault is None, "kept_because": fault}
+    return {"schema": SCHEMA, "scene": scene.name, "start": start, "refined": reason is None, "kept_because": reason}

@@ -1,7 +1,7 @@
-"""A scene's images as pycolmap knows them: cameras with fixed intrinsics on one rig, the own car; a pose per image.
+"""A scene's images in pycolmap's terms: one rig, the ego vehicle, of cameras with fixed intrinsics; a pose per image.
 
-The cameras of a key frame fire at different times, up to 0.8 m of driving apart, so each image is a moment of its own:
-a frame of the rig in which one of its cameras took a picture.
+The cameras of a key frame trigger at different times, up to 0.8 m of driving apart, so each image is a frame of the rig
+of its own, with data of one camera.
 """
 
 from collections.abc import Sequence
@@ -16,17 +16,17 @@ from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
 
-CAR = pycolmap.sensor_t(pycolmap.SensorType.IMU, 1)
-"""The rig's own frame: ego."""
+EGO = pycolmap.sensor_t(pycolmap.SensorType.IMU, 1)
+"""The reference sensor of the rig: the ego frame."""
 _RIG = 1
-_SAME_MOUNT = 1e-3
-"""Metres and radians by which a camera's mount may differ from image to image."""
+_CALIBRATION_TOLERANCE = 1e-3
+"""Maximum change of mounts (metres, radians) and intrinsics (pixels) within a drive."""
 
 
 @dataclass(frozen=True)
 class RigImages:
-    """Images `indices` (of `scene.frames`) in the order of their times; image i is i + 1 to pycolmap. `cameras` are
-    their cameras' names, camera c is c + 1 there. `own_car` says where they see its body."""
+    """Images with `indices` in `scene.frames`, ordered by time. pycolmap's numbers start at 1: image i has number i +
+    1, and camera c of `cameras`, their names, c + 1. `ego_mask`: pixels of the ego vehicle."""
 
     scene: Scene
     indices: tuple[int, ...]
@@ -46,64 +46,65 @@ class RigImages:
         return [self.scene.frames[i] for i in self.indices]
 
     @property
+    def ego_to_world(self) -> np.ndarray:
+        """Poses (n, 4, 4) in the scene."""
+        return np.stack([frame.ego_to_world for frame in self.frames])
+
+    @property
     def seconds(self) -> np.ndarray:
-        """(n,)."""
+        """Times (n,) in the scene's seconds."""
         return np.array([self.scene.seconds(frame.timestamp) for frame in self.frames])
 
     @property
     def timestamps(self) -> np.ndarray:
-        """(n,), microseconds."""
+        """Times (n,) in microseconds."""
         return np.array([frame.timestamp for frame in self.frames], dtype=np.int64)
 
     def camera_id(self, frame: Frame) -> int:
         return self.cameras.index(frame.camera) + 1
 
-    def first_of(self, camera: str) -> Frame:
-        return next(frame for frame in self.frames if frame.camera == camera)
+    def of_camera(self, camera: str) -> list[Frame]:
+        return [frame for frame in self.frames if frame.camera == camera]
 
     def rig(self) -> pycolmap.Rig:
-        """The own car with its cameras. Raises DatasetError where a camera is not mounted rigidly."""
+        """The ego vehicle with its cameras. Raises DatasetError where the mount of a camera changes."""
         rig = pycolmap.Rig(rig_id=_RIG)
-        rig.add_ref_sensor(CAR)
-        for camera in self.cameras:
-            mounts = np.stack([_mount(frame) for frame in self.frames if frame.camera == camera])
-            if np.abs(mounts - mounts[0]).max() > _SAME_MOUNT:
-                raise DatasetError(f"scene {self.scene.name}: {camera} moves on the car, poses cannot be refined")
-            rig.add_sensor(sensor(self.cameras.index(camera) + 1), to_pycolmap(mounts[0]))
+        rig.add_ref_sensor(EGO)
+        for number, camera in enumerate(self.cameras, start=1):
+            mounts = np.stack([ego_to_camera(frame) for frame in self.of_camera(camera)])
+            self._require_constant(mounts, f"{camera} moves on the car, poses cannot be refined")
+            rig.add_sensor(sensor(number), to_pycolmap(mounts[0]))
         return rig
 
     def pycolmap_cameras(self) -> list[pycolmap.Camera]:
-        """The cameras, at the size of the recorded images. Raises DatasetError where one changes within the drive."""
+        """The cameras at the size of recorded images. Raises DatasetError where intrinsics change within the drive."""
         cameras = []
         for number, name in enumerate(self.cameras, start=1):
-            frame = self.first_of(name)
-            size = (frame.width, frame.height)
-            k = continuous_intrinsics(frame, size)
-            for other in self.frames:
-                if other.camera == name and np.abs(continuous_intrinsics(other, size) - k).max() > _SAME_MOUNT:
-                    raise DatasetError(f"scene {self.scene.name}: the intrinsics of {name} change within the drive")
-            cameras.append(
-                pycolmap.Camera(
-                    camera_id=number,
-                    model="PINHOLE",
-                    width=frame.width,
-                    height=frame.height,
-                    params=[k[0, 0], k[1, 1], k[0, 2], k[1, 2]],
-                    has_prior_focal_length=True,
-                )
-            )
+            frames = self.of_camera(name)
+            width, height = frames[0].width, frames[0].height
+            intrinsics = np.stack([continuous_intrinsics(frame, (width, height)) for frame in frames])
+            self._require_constant(intrinsics, f"the intrinsics of {name} change within the drive")
+            k = intrinsics[0]
+            camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height)
+            camera.params = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+            camera.has_prior_focal_length = True
+            cameras.append(camera)
         return cameras
 
-    def moment(self, number: int) -> pycolmap.Frame:
-        """Image `number` (counted from 1) as a frame of the rig, its pose as given."""
+    def _require_constant(self, matrices: np.ndarray, message: str) -> None:
+        if np.abs(matrices - matrices[0]).max() > _CALIBRATION_TOLERANCE:
+            raise DatasetError(f"scene {self.scene.name}: {message}")
+
+    def rig_frame(self, number: int) -> pycolmap.Frame:
+        """Image `number` (from 1) as a frame of the rig with its given pose."""
         frame = self.frames[number - 1]
-        moment = pycolmap.Frame(frame_id=number, rig_id=_RIG)
-        moment.add_data_id(pycolmap.data_t(sensor(self.camera_id(frame)), number))
-        moment.rig_from_world = to_pycolmap(inverse(frame.ego_to_world))
-        return moment
+        rig_frame = pycolmap.Frame(frame_id=number, rig_id=_RIG)
+        rig_frame.add_data_id(pycolmap.data_t(sensor(self.camera_id(frame)), number))
+        rig_frame.rig_from_world = to_pycolmap(inverse(frame.ego_to_world))
+        return rig_frame
 
     def key_frames(self) -> dict[str, dict[int, int]]:
-        """By camera: the images' numbers (counted from 1) by their key frame."""
+        """By camera: image numbers (from 1) by key frame."""
         numbers: dict[str, dict[int, int]] = {camera: {} for camera in self.cameras}
         for number, frame in enumerate(self.frames, start=1):
             numbers[frame.camera][frame.sample_index] = number
@@ -115,15 +116,15 @@ def sensor(camera_id: int) -> pycolmap.sensor_t:
 
 
 def to_pycolmap(transform: np.ndarray) -> pycolmap.Rigid3d:
-    """A rigid transform (4, 4) as pycolmap's."""
+    """A rigid transform (4, 4) in pycolmap's type."""
     return pycolmap.Rigid3d(np.ascontiguousarray(transform[:3]))
 
 
 def from_pycolmap(transform: pycolmap.Rigid3d) -> np.ndarray:
-    """pycolmap's rigid transform as a matrix (4, 4)."""
+    """A rigid transform of pycolmap as a matrix (4, 4)."""
     return np.vstack([transform.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
-def _mount(frame: Frame) -> np.ndarray:
-    """Ego to camera (4, 4)."""
+def ego_to_camera(frame: Frame) -> np.ndarray:
+    """The mount (4, 4) of a frame's camera."""
     return inverse(frame.camera_to_world) @ frame.ego_to_world

@@ -1,4 +1,4 @@
-"""Points that the refinement of poses has triangulated, and which images see them, as triangulated.npz holds them."""
+"""Points triangulated by the refinement of poses, their observations, and triangulated.npz, which stores both."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from drivesplat.io.array_file import read_arrays, write_arrays
 from drivesplat.io.storage import Provenance, unreadable
 from drivesplat.io.typed_record import typed_record
-from drivesplat.poses.observations import Observations
 
 RULE = "refine_poses"
 MAX_MEAN_ERROR = 2.0
@@ -20,9 +19,22 @@ MIN_VIEWS = 2
 
 
 @dataclass(frozen=True)
+class Observations:
+    """The o observations of p points. Per observation: `image` and `point` (o,), indices in the order of pycolmap's
+    numbers, and the reprojection `error` (o,) in pixels, infinite behind the camera. Per point: `positions` (p, 3),
+    world metres, and pycolmap's `numbers` (p,)."""
+
+    image: np.ndarray
+    point: np.ndarray
+    error: np.ndarray
+    positions: np.ndarray
+    numbers: np.ndarray
+
+
+@dataclass(frozen=True)
 class TriangulatedPoints:
-    """The content of triangulated.npz: p `points` in world metres, and for each of o observations the index of the
-    frame, among the scene's, that makes it (`seen_by`) and of the point (`seen_point`)."""
+    """The content of triangulated.npz: p `points` in world metres, and for each of o observations the index of its
+    frame in the scene (`seen_by`) and of its point (`seen_point`)."""
 
     points: Float[np.ndarray, "p 3"]
     seen_by: Int[np.ndarray, " o"]
@@ -34,8 +46,8 @@ class TriangulatedPoints:
         return self._views(images) >= MIN_VIEWS
 
     def mean_over_views(self, images: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " p"]:
-        """For each point the mean of `values` (n,), one per frame of the scene, over those of `images` that see it; 0
-        where none does."""
+        """For each point the mean of `values` (n,), one per frame of the scene, over those of `images` that see it, 0
+        without any."""
         chosen = np.isin(self.seen_by, images)
         weights = values[self.seen_by[chosen]]
         sums = np.bincount(self.seen_point[chosen], weights, minlength=len(self.points))
@@ -46,23 +58,23 @@ class TriangulatedPoints:
         return np.bincount(self.seen_point[np.isin(self.seen_by, images)], minlength=len(self.points))
 
 
-def triangulated_points(frames: Sequence[int], seen: Observations) -> TriangulatedPoints:
-    """The triangulated points, where `frames` (n,) are the indices of the images among the scene's frames. Points with
-    a mean error of MAX_MEAN_ERROR or more are left out."""
-    count = np.bincount(seen.point, minlength=len(seen.positions))
-    mean = np.bincount(seen.point, seen.error, minlength=len(seen.positions)) / np.maximum(count, 1)
-    kept = (mean < MAX_MEAN_ERROR) & (count > 0)
+def triangulated_points(frames: Sequence[int], observations: Observations) -> TriangulatedPoints:
+    """The points with a mean error below MAX_MEAN_ERROR. `frames` (n,): the index of each image in the scene."""
+    number = len(observations.positions)
+    count = np.bincount(observations.point, minlength=number)
+    total_error = np.bincount(observations.point, observations.error, minlength=number)
+    kept = (total_error / np.maximum(count, 1) < MAX_MEAN_ERROR) & (count > 0)
     renumbered = np.cumsum(kept) - 1
-    of_kept = kept[seen.point]
+    of_kept = kept[observations.point]
     return TriangulatedPoints(
-        points=seen.positions[kept],
-        seen_by=np.array(frames, dtype=np.int64)[seen.image[of_kept]],
-        seen_point=renumbered[seen.point[of_kept]],
+        points=observations.positions[kept],
+        seen_by=np.array(frames, dtype=np.int64)[observations.image[of_kept]],
+        seen_point=renumbered[observations.point[of_kept]],
     )
 
 
 def no_points() -> TriangulatedPoints:
-    """The record of poses that stay as they were."""
+    """The record of a refinement that was rejected."""
     none = np.empty(0, dtype=np.int64)
     return TriangulatedPoints(np.empty((0, 3)), none, none)
 

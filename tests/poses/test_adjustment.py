@@ -21,8 +21,8 @@ from helpers.hand_made_views import (
 )  # fmt: skip
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.adjustment import Priors, adjust, observations, priors_of, triangulated, with_poses_of
-from drivesplat.poses.refine import poses_of, refined_by_matches
+from drivesplat.poses.adjustment import Priors, bundle_adjust, observations_of, priors_of, triangulate, with_poses
+from drivesplat.poses.refine import poses_of, refine_from_matches
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages, from_pycolmap, sensor, to_pycolmap
 from drivesplat.scene.rigid import inverse, rigid
@@ -49,7 +49,7 @@ class Case:
     start: pycolmap.Reconstruction
 
     def refined(self, threads: int = 1, **settings) -> Refinement:
-        return refined_by_matches(self.images, self.start, self.database, job_of(**settings), threads)
+        return refine_from_matches(self.images, self.start, self.database, job_of(**settings), threads)
 
     def wobble(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         """How much what is wrong with a scene's poses changes: standard deviations over the images of the rotation (3,)
@@ -106,14 +106,14 @@ def test_six_cameras_are_one_rig(tmp_path):
 def test_points_come_to_lie_where_they_are_and_errors_fall_to_the_features_noise(front, tmp_path):
     """The median of an error with deviation s in x and y is 1.18 s; points follow their features a little."""
     case = case_of(tmp_path, drive_of(10, way=flat, error=lambda _: np.eye(4)), noise=0.3)
-    reconstruction = triangulated(case.start, case.database, job_of(), 1)
-    seen = observations(reconstruction)
+    reconstruction = triangulate(case.start, case.database, job_of(), 1)
+    seen = observations_of(reconstruction)
     truth = street_points(400)
     nearest = np.linalg.norm(seen.positions[:, None] - truth, axis=2).min(axis=1)
     assert len(seen.positions) > 100 and np.median(nearest) < 0.3
     assert 0.2 < np.median(seen.error) < 0.36
-    given = triangulated(front.start, front.database, job_of(), 1)
-    assert np.median(observations(given).error) > 3 * np.median(seen.error)
+    given = triangulate(front.start, front.database, job_of(), 1)
+    assert np.median(observations_of(given).error) > 3 * np.median(seen.error)
 
 
 def flat(seconds: float) -> np.ndarray:
@@ -125,7 +125,7 @@ def flat(seconds: float) -> np.ndarray:
 def test_pycolmap_sees_points_where_the_library_projects_them(front):
     """Camera frames, intrinsics and the pixel convention are the same on both sides."""
     images, truth = front.images, street_points(400)
-    reconstruction = with_poses_of(front.start, front.drive.truth[list(images.indices)])
+    reconstruction = with_poses(front.start, front.drive.truth[list(images.indices)])
     exact = views(front.drive, images, truth, noise=0.0)
     for number, seen in enumerate(exact, start=1):
         assert len(seen.points) > 30
@@ -177,17 +177,17 @@ def test_images_without_points_follow_their_neighbours_and_stay_rigid(tmp_path, 
 
 def test_adjusting_leaves_an_image_without_points_where_it_was(tmp_path, front):
     case = case_of(tmp_path, front.drive, without=(4,))
-    reconstruction = triangulated(case.start, case.database, job_of(), 1)
+    reconstruction = triangulate(case.start, case.database, job_of(), 1)
     before = poses_of(reconstruction)
-    adjust(reconstruction, priors_of(case.images, job_of().refine_poses), 1.0, 1)
+    bundle_adjust(reconstruction, priors_of(case.images, job_of().refine_poses), 1.0, 1)
     moved = np.abs(poses_of(reconstruction) - before).max(axis=(1, 2))
     assert moved[4] < 1e-12 and (np.delete(moved, 4) > 1e-3).all()
 
 
 def test_adjusting_leaves_cameras_and_their_mounts_as_calibrated(tmp_path):
     case = case_of(tmp_path, drive_of(4, ("CAM_FRONT", "CAM_FRONT_LEFT")), points=800)
-    reconstruction = triangulated(case.start, case.database, job_of(), 1)
-    adjust(reconstruction, priors_of(case.images, job_of().refine_poses), 1.0, 1)
+    reconstruction = triangulate(case.start, case.database, job_of(), 1)
+    bundle_adjust(reconstruction, priors_of(case.images, job_of().refine_poses), 1.0, 1)
     rig, made = case.images.rig(), reconstruction.rigs[1]
     for camera in case.images.pycolmap_cameras():
         mounts = (r.sensor_from_rig(sensor(camera.camera_id)).matrix() for r in (rig, made))
@@ -199,11 +199,11 @@ def test_the_absolute_prior_holds_the_whole_drive_in_place(front):
     """Points and poses that are moved together fit as well as before: only the prior knows where they belong."""
     images = front.images
     given = priors_of(images, job_of().refine_poses)
-    aside = with_poses_of(front.start, rigid(np.eye(3), np.array([0.5, -0.4, 0.3])) @ given.given)
-    reconstruction = triangulated(aside, front.database, job_of(), 1)
+    aside = with_poses(front.start, rigid(np.eye(3), np.array([0.5, -0.4, 0.3])) @ given.given)
+    reconstruction = triangulate(aside, front.database, job_of(), 1)
     before = (poses_of(reconstruction) - given.given)[:, :3, 3].mean(axis=0)
     np.testing.assert_allclose(before, [0.5, -0.4, 0.3], atol=1e-6)
-    adjust(reconstruction, given, 1.0, 1)
+    bundle_adjust(reconstruction, given, 1.0, 1)
     assert np.linalg.norm((poses_of(reconstruction) - given.given)[:, :3, 3].mean(axis=0)) < 0.05
 
 

@@ -9,7 +9,7 @@ from helpers.hand_made_views import drive_of, ego_at
 from scipy.spatial.transform import Rotation
 
 from drivesplat.io.point_cloud import PointCloud
-from drivesplat.poses.corrections import Corrections, corrected
+from drivesplat.poses.corrections import Corrections, apply_corrections
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep, Track, read_scene, write_scene
@@ -34,7 +34,7 @@ STEPS = np.stack(
         correction((0.2, 0.2, 0.1), (0.0, 0.0, -0.2)),
     ]
 )
-CORRECTIONS = Corrections.between(TIMES, GIVEN, GIVEN @ STEPS)
+CORRECTIONS = Corrections.from_poses(TIMES, GIVEN, GIVEN @ STEPS)
 
 
 def vector(transform: np.ndarray) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_between_images_they_change_steadily(share):
 def test_a_large_turn_goes_the_shorter_way():
     """From 170 degrees to 190: rotation vectors, linear in time, would pass 0."""
     turned = np.stack([correction((0.0, 0.0, 170.0)), correction((0.0, 0.0, -170.0))])
-    (middle,) = Corrections.between(TIMES[:2], GIVEN[:2], GIVEN[:2] @ turned).at(TIMES[:2].mean(keepdims=True))
+    (middle,) = Corrections.from_poses(TIMES[:2], GIVEN[:2], GIVEN[:2] @ turned).at(TIMES[:2].mean(keepdims=True))
     np.testing.assert_allclose(middle[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-9)
 
 
@@ -67,10 +67,10 @@ def test_where_given_poses_stand_still_motion_goes_on_beyond_the_ends():
     times = np.array([0, 500_000, 1_000_000, 1_010_000])
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = [0.0, 4.0, 8.0, 9.08]
-    still = Corrections.between(times, np.tile(np.eye(4), (4, 1, 1)), poses)
-    there = still.continued(500_000.0).at(np.array([-900_000, -250_000, 250_000, 1_260_000]))[:, 0, 3]
+    still = Corrections.from_poses(times, np.tile(np.eye(4), (4, 1, 1)), poses)
+    there = still.extrapolated(500_000.0).at(np.array([-900_000, -250_000, 250_000, 1_260_000]))[:, 0, 3]
     np.testing.assert_allclose(there, [-4.0, -2.0, 2.0, 9.08 + 0.25 * 5.08 / 0.51], atol=1e-6)
-    assert still.continued(2_000_000.0) is still
+    assert still.extrapolated(2_000_000.0) is still
 
 
 def test_beyond_the_ends_they_stay():
@@ -79,9 +79,9 @@ def test_beyond_the_ends_they_stay():
 
 
 def test_images_of_one_time_count_once_and_a_single_one_holds_everywhere():
-    twice = Corrections.between(TIMES[[0, 0, 1]], GIVEN[[0, 0, 1]], (GIVEN @ STEPS)[[0, 0, 1]])
+    twice = Corrections.from_poses(TIMES[[0, 0, 1]], GIVEN[[0, 0, 1]], (GIVEN @ STEPS)[[0, 0, 1]])
     np.testing.assert_allclose(twice.at(TIMES[:2]), STEPS[:2], atol=1e-9)
-    single = Corrections.between(TIMES[:1], GIVEN[:1], (GIVEN @ STEPS)[:1])
+    single = Corrections.from_poses(TIMES[:1], GIVEN[:1], (GIVEN @ STEPS)[:1])
     at = np.array([0, 100_000, 5_000_000])
     np.testing.assert_allclose(single.at(at), np.stack([STEPS[0]] * 3), atol=1e-9)
     assert np.isfinite(single.in_world(at)).all()
@@ -119,7 +119,7 @@ def scene_of() -> Scene:
 
 
 SCENE = scene_of()
-REFINED = corrected(SCENE, CORRECTIONS)
+REFINED = apply_corrections(SCENE, CORRECTIONS)
 
 
 def test_images_turn_with_the_car_that_carries_them():
@@ -179,6 +179,6 @@ def test_the_measuring_protocol_says_refined():
 
 
 def test_no_corrections_change_nothing():
-    same = corrected(SCENE, Corrections.between(TIMES, GIVEN, GIVEN))
+    same = apply_corrections(SCENE, Corrections.from_poses(TIMES, GIVEN, GIVEN))
     np.testing.assert_allclose(same.frames[2].camera_to_world, SCENE.frames[2].camera_to_world, atol=1e-9)
     np.testing.assert_allclose(same.tracks[0].object_to_world, SCENE.tracks[0].object_to_world, atol=1e-9)

@@ -48,11 +48,11 @@ def filmed(recorder: Recorder, folder: Path) -> tuple[Scene, np.ndarray]:
         truth.append(to_world @ STREET_TO_GLOBAL @ recorder.ego_to_street(time * 1e-6))
     tracks = [
         Track(
-            thing.name, *classed(thing.category), np.array(thing.body.size), times, np.arange(KEY_FRAMES),
+            thing.name, *classed(thing.category), np.array(thing.mesh.size), times, np.arange(KEY_FRAMES),
             np.stack([to_world @ recorder.box_to_global(thing, time * 1e-6) for time in times]),
             np.full(KEY_FRAMES, 4),
         )
-        for thing in recorder.things if thing.category
+        for thing in recorder.objects if thing.category
     ]  # fmt: skip
     scene = Scene(
         "demo", "demo", "v1.0-mini", "", np.zeros(3), times, tuple(frames), (), tuple(tracks), "nuscenes", 2.0
@@ -67,7 +67,7 @@ def wobble(scene: Scene, truth: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(errors[:, :3, :3]).as_rotvec(degrees=True).std(axis=0)
 
 
-def test_images_of_a_street_bring_poses_nearer_to_the_truth(noisy, tmp_path):
+def test_images_of_a_street_reduce_the_errors_of_noisy_poses(noisy, tmp_path):
     scene, truth = filmed(noisy, tmp_path)
     refined = refine_poses(scene, JOB, threads=2)
     assert refined.record["refined"], refined.record["kept_because"]
@@ -81,13 +81,13 @@ def test_images_of_a_street_bring_poses_nearer_to_the_truth(noisy, tmp_path):
 
 
 @pytest.mark.parametrize("pose_noise", [False, True])
-def test_boxes_are_annotated_as_seen_from_the_own_car(pose_noise):
-    """With noisy poses they are off as the car is: seen from it, they are where things are."""
+def test_boxes_are_annotated_relative_to_the_ego_vehicle(pose_noise):
+    """Under noisy poses they are still exact relative to the ego vehicle."""
     recorder = Recorder(WorldSettings(pose_noise=pose_noise, **SMALL))
-    for thing in (thing for thing in recorder.things if thing.category):
+    for thing in (thing for thing in recorder.objects if thing.category):
         for seconds in (0.0, 1.3):
-            center = rigid(np.eye(3), np.array([0.0, 0.0, thing.body.size[2] / 2]))
-            on_street = thing.motion.pose_at(seconds) @ center
+            center = rigid(np.eye(3), np.array([0.0, 0.0, thing.mesh.size[2] / 2]))
+            on_street = thing.path.pose_at(seconds) @ center
             seen = inverse(recorder.ego_to_global(seconds)) @ recorder.box_to_global(thing, seconds)
             np.testing.assert_allclose(seen, inverse(recorder.ego_to_street(seconds)) @ on_street, atol=1e-8)
             if not pose_noise:
@@ -113,7 +113,7 @@ def seeded(tmp_path_factory) -> WorkflowCopy:
 class TestAmongTheOtherStages:
     def test_it_keeps_poses_that_it_cannot_improve_and_says_so(self, seeded):
         record = seeded.read("results/0001/poses.json")
-        assert record["refined"] is False and "images see 30 points" in record["kept_because"]
+        assert record["refined"] is False and "images see 30 triangulated points" in record["kept_because"]
         given, kept = (read_scene(seeded.folder / f"results/0001/{name}.json") for name in ("scene", "scene_refined"))
         for a, b in zip(given.frames, kept.frames, strict=True):
             np.testing.assert_array_equal(a.camera_to_world, b.camera_to_world)

@@ -1,4 +1,4 @@
-"""Which images are matched, and which of their pixels show what stands still."""
+"""Selection of image pairs, and of features on static content."""
 
 import dataclasses
 
@@ -9,7 +9,14 @@ from helpers.hand_made_views import HEADINGS, SIZE, drive_of, job_of
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.features import find_features, image_pairs, largest, meets_box, shows_what_stands, views_overlap
+from drivesplat.poses.features import (
+    detect_features,
+    image_pairs,
+    largest_scales,
+    rays_hit_box,
+    static_pixels,
+    views_overlap,
+)
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, project
@@ -79,19 +86,19 @@ def margin(origin: np.ndarray, direction: np.ndarray, reach: np.ndarray) -> bool
     "origin", [(8.0, 1.0, 0.5), (0.3, -0.4, 0.2), (2.2, 0.0, 0.0), (0.0, 6.0, 0.0), (-5.0, -4.0, 3.0)],
     ids=["before", "inside", "beside, close", "beside", "diagonally"],
 )  # fmt: skip
-def test_rays_meet_a_box_where_points_along_them_lie_in_it(origin):
+def test_rays_hit_a_box_where_points_along_them_lie_in_it(origin):
     origin, reach, rng = np.array(origin), np.array([2.0, 1.0, 0.8]), np.random.default_rng(0)
     towards = np.concatenate([rng.normal(size=(60, 3)), rng.uniform(-1.5, 1.5, (60, 3)) * reach - origin, np.eye(3),
                               -np.eye(3)])  # fmt: skip
     told = np.array([margin(origin, ray, reach) for ray in towards])
     expected = np.array([brute(origin, ray, reach) for ray in towards])
     assert told.sum() > 90 and expected.any()
-    np.testing.assert_array_equal(meets_box(origin, towards, reach)[told], expected[told])
+    np.testing.assert_array_equal(rays_hit_box(origin, towards, reach)[told], expected[told])
 
 
-def test_what_lies_behind_the_camera_is_not_met():
+def test_boxes_behind_the_camera_are_not_hit():
     rays = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    assert meets_box(np.array([-5.0, 0.0, 0.0]), rays, np.ones(3)).tolist() == [True, False]
+    assert rays_hit_box(np.array([-5.0, 0.0, 0.0]), rays, np.ones(3)).tolist() == [True, False]
 
 
 def car(speed: float, ahead: float = 12.0, category: str = "vehicle.car") -> Track:
@@ -101,14 +108,14 @@ def car(speed: float, ahead: float = 12.0, category: str = "vehicle.car") -> Tra
     return Track("it", *classed(category), np.array([4.0, 2.0, 1.6]), times, np.arange(3), poses, np.full(3, 4))
 
 
-def stands_of(
+def static_of(
     track: Track | None, job: RefinePosesJob, camera: str = "CAM_FRONT", ego_mask: EgoMask = NO_EGO_MASK
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) spread over the image of the first key frame, and which of them show what stands."""
+    """Pixels (n, 2) spread over the image of the first key frame, and which of them are static."""
     drive = drive_of(1, (camera,), way=lambda _: np.eye(4), error=lambda _: np.eye(4))
     scene = dataclasses.replace(drive.scene, tracks=() if track is None else (track,))
     pixels = np.stack(np.meshgrid(np.arange(5.0, SIZE[0], 10.0), np.arange(5.0, SIZE[1], 10.0)), axis=-1).reshape(-1, 2)
-    return pixels, shows_what_stands(scene, scene.frames[0], pixels, ego_mask, margin_of(job))
+    return pixels, static_pixels(scene, scene.frames[0], pixels, ego_mask, margin_of(job))
 
 
 def margin_of(job: RefinePosesJob) -> float:
@@ -129,20 +136,20 @@ def box_pixels(track: Track, margin: float) -> np.ndarray:
 def test_pixels_of_a_box_that_moves_are_left_out(margin):
     """The camera stands lower than the car's roof, right behind it: its face is all that is seen of the box."""
     job = job_of(features={"box_margin": margin})
-    pixels, stands = stands_of(car(3.0), job)
+    pixels, static = static_of(car(3.0), job)
     least, greatest = box_pixels(car(3.0), margin)
     inside = ((pixels > least) & (pixels < greatest)).all(axis=1)
     assert 50 < inside.sum() < 2000
-    np.testing.assert_array_equal(stands, ~inside)
+    np.testing.assert_array_equal(static, ~inside)
 
 
-def test_what_stands_what_is_behind_and_what_only_moves_elsewhere_stays():
+def test_parked_cars_cars_behind_and_barriers_are_kept():
     for track in (car(0.0), car(3.0, ahead=-12.0), car(3.0, category="movable_object.barrier"), None):
-        assert stands_of(track, job_of())[1].all()
+        assert static_of(track, job_of())[1].all()
 
 
-def test_a_camera_inside_a_moving_box_sees_nothing_that_stands():
-    assert not stands_of(car(0.9, ahead=1.6, category="human.pedestrian.adult"), job_of())[1].any()
+def test_a_camera_inside_a_moving_box_sees_nothing_static():
+    assert not static_of(car(0.9, ahead=1.6, category="human.pedestrian.adult"), job_of())[1].any()
 
 
 def test_a_box_beside_the_camera_is_left_out_where_it_passes_the_image_plane():
@@ -150,23 +157,24 @@ def test_a_box_beside_the_camera_is_left_out_where_it_passes_the_image_plane():
     lorry = dataclasses.replace(car(3.0, ahead=5.0), size=np.array([30.0, 2.0, 3.0]))
     poses = lorry.object_to_world.copy()
     poses[:, 1, 3], poses[:, 2, 3] = 3.0, 1.5
-    pixels, stands = stands_of(dataclasses.replace(lorry, object_to_world=poses), job_of())
+    pixels, static = static_of(dataclasses.replace(lorry, object_to_world=poses), job_of())
     level = np.abs(pixels[:, 1] - SIZE[1] / 2) < 20
-    assert not stands[level & (pixels[:, 0] < 100)].any() and stands[pixels[:, 0] > SIZE[0] / 2 + 20].all()
+    assert not static[level & (pixels[:, 0] < 100)].any() and static[pixels[:, 0] > SIZE[0] / 2 + 20].all()
 
 
-def test_the_own_cars_body_is_left_out():
+def test_the_ego_vehicle_is_left_out():
     outline = {"CAM_BACK": ((0.0, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0))}
     ego_mask = EgoMask({camera: (corners,) for camera, corners in outline.items()})
-    pixels, stands = stands_of(None, job_of(), "CAM_BACK", ego_mask)
+    pixels, static = static_of(None, job_of(), "CAM_BACK", ego_mask)
     clear = np.abs(pixels[:, 1] - 0.8 * SIZE[1]) > 2
-    np.testing.assert_array_equal(stands[clear], pixels[clear, 1] < 0.8 * SIZE[1])
-    assert stands_of(None, job_of(), ego_mask=ego_mask)[1].all()
+    np.testing.assert_array_equal(static[clear], pixels[clear, 1] < 0.8 * SIZE[1])
+    assert static_of(None, job_of(), ego_mask=ego_mask)[1].all()
 
 
-def test_of_too_many_features_those_of_the_largest_scale_stay_in_their_order():
+def test_the_features_of_the_largest_scale_are_kept_in_their_order():
     keypoints = np.array([[0, 0, 2, 0], [1, 0, 5, 0], [2, 0, 1, 0], [3, 0, 5, 0], [4, 0, 3, 0]], dtype=np.float32)
-    assert largest(keypoints, 3).tolist() == [1, 3, 4] and largest(keypoints, 9).tolist() == [0, 1, 2, 3, 4]
+    assert largest_scales(keypoints, 3).tolist() == [1, 3, 4]
+    assert largest_scales(keypoints, 9).tolist() == [0, 1, 2, 3, 4]
 
 
 @pytest.fixture(scope="module")
@@ -187,31 +195,31 @@ def dotted(tmp_path_factory):
 
 
 @pytest.mark.parametrize("max_image_size", [1600, 200])
-def test_features_lie_where_things_are_in_the_recorded_image_and_not_on_what_moves(tmp_path, dotted, max_image_size):
+def test_features_lie_where_things_are_in_the_recorded_image_and_on_static_content(tmp_path, dotted, max_image_size):
     """Pixel centres included: a shift by half a pixel shows. A reduced image gives the same places."""
     scene, places = dotted
     job = job_of(features={"max_image_size": max_image_size})
-    found = find_features(RigImages.of(scene, [0]), job, tmp_path / "f.db", 1)
+    found = detect_features(RigImages.of(scene, [0]), job, tmp_path / "f.db", 1)
     pixels = np.stack([point.xy for point in found.images[1].points2D])
-    still = shows_what_stands(scene, scene.frames[0], places, NO_EGO_MASK, margin_of(job))
+    still = static_pixels(scene, scene.frames[0], places, NO_EGO_MASK, margin_of(job))
     assert 5 < (~still).sum() < still.sum()
     apart = np.linalg.norm(pixels[:, None] - places, axis=2)
     near = apart.min(axis=1) < 1.5
     offsets = (pixels - places[apart.argmin(axis=1)])[near]
     assert near.sum() > 40 and (np.abs(np.median(offsets, axis=0)) < 0.15).all()
-    assert shows_what_stands(scene, scene.frames[0], pixels, NO_EGO_MASK, margin_of(job)).all()
+    assert static_pixels(scene, scene.frames[0], pixels, NO_EGO_MASK, margin_of(job)).all()
     inside = ((places > 30) & (places < np.array([290, 150]))).all(axis=1)
     assert (apart.min(axis=0)[still & inside] < 1.5).mean() > 0.8
 
 
-def test_where_poses_come_from_images_every_box_is_left_out(tmp_path, dotted):
+def test_for_poses_from_images_every_box_is_left_out(tmp_path, dotted):
     """No pose says which of them move."""
     scene, _ = dotted
     images = RigImages.of(dataclasses.replace(scene, tracks=(car(0.0),)), [0])
     middle = np.array([scene.frames[0].width, scene.frames[0].height]) / 2
     near = {}
     for start in ("recorded", "images"):
-        found = find_features(images, job_of(start=start), tmp_path / f"{start}.db", 1).images[1]
+        found = detect_features(images, job_of(start=start), tmp_path / f"{start}.db", 1).images[1]
         near[start] = sum(np.abs(point.xy - middle).max() < 10 for point in found.points2D)
         assert found.num_points2D() > 40
     assert near["recorded"] > 0 == near["images"]
@@ -220,4 +228,4 @@ def test_where_poses_come_from_images_every_box_is_left_out(tmp_path, dotted):
 def test_features_are_no_more_than_asked_for(tmp_path, dotted):
     scene, _ = dotted
     job = job_of(features={"max_features": 64})
-    assert find_features(RigImages.of(scene, [0]), job, tmp_path / "f.db", 1).images[1].num_points2D() == 64
+    assert detect_features(RigImages.of(scene, [0]), job, tmp_path / "f.db", 1).images[1].num_points2D() == 64

@@ -1,4 +1,4 @@
-"""Poses from images alone: synthetic matches of drives whose truth is known; and drives that do not tell them."""
+"""Poses from images alone: synthetic matches with known poses, and drives that do not determine their poses."""
 
 import dataclasses
 from pathlib import Path
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import canonical_json
-from drivesplat.poses.from_images import aligned
-from drivesplat.poses.refine import made_by_matches
+from drivesplat.poses.from_images import align_poses
+from drivesplat.poses.refine import estimate_from_matches
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.rigid import apply, inverse, rigid
@@ -59,7 +59,7 @@ class Case:
     start: pycolmap.Reconstruction
 
     def made(self, threads: int = 1, lidar: bool = True, **settings) -> Refinement:
-        return made_by_matches(self.images, self.start, self.database, job_of(lidar, **settings), threads)
+        return estimate_from_matches(self.images, self.start, self.database, job_of(lidar, **settings), threads)
 
 
 def job_of(lidar: bool = True, **settings) -> RefinePosesJob:
@@ -129,17 +129,17 @@ def test_a_drive_without_recorded_poses_is_recovered_in_metres(unlocated, unloca
     np.testing.assert_allclose(poses_of(unlocated_made)[0], np.eye(4), atol=0.01)
 
 
-def test_what_was_done_is_told(unlocated_made):
+def test_the_record_describes_the_placement(unlocated_made):
     record = unlocated_made.record
-    told = record["placement"]
+    placement = record["placement"]
     assert (record["start"], record["refined"], record["kept_because"]) == ("images", True, None)
-    assert told["images_placed"] == 10 and told["models"] == [10] and told["camera"] == "CAM_FRONT"
-    assert told["scale_from"] == "LiDAR" and told["aligned_to"] == "first image"
-    assert 1.0 <= told["scale_drift"] < 1.001 and told["scale"] > 0
+    assert placement["images_placed"] == 10 and placement["models"] == [10] and placement["camera"] == "CAM_FRONT"
+    assert placement["scale_from"] == "LiDAR" and placement["aligned_to"] == "first image"
+    assert 1.0 <= placement["scale_drift"] < 1.001 and placement["scale"] > 0
     assert record["trial"] is record["shift_m"] is record["turn_deg"] is None and canonical_json(record)
 
 
-def test_its_points_may_join_the_seed(unlocated, unlocated_made):
+def test_its_points_lie_at_true_positions(unlocated, unlocated_made):
     """They lie where the truth has them, as seen from the first image."""
     truth = apply(inverse(unlocated.drive.truth[0]), points_along(curve))
     found = unlocated_made.points.points
@@ -147,7 +147,7 @@ def test_its_points_may_join_the_seed(unlocated, unlocated_made):
     assert np.median(np.linalg.norm(found[:, None] - truth, axis=2).min(axis=1)) < 0.04
 
 
-def test_lidar_follows(unlocated, unlocated_made):
+def test_sweeps_take_interpolated_poses(unlocated, unlocated_made):
     """A sweep lies where the car was at its time, between two images, or a little after the last one."""
     first = unlocated.drive.truth[0]
     for sweep in unlocated_made.scene.sweeps:
@@ -161,7 +161,7 @@ def test_two_runs_agree_whatever_the_threads(unlocated, unlocated_made):
         np.testing.assert_allclose(poses_of(again), poses_of(unlocated_made), atol=1e-9 if threads == 1 else 1e-3)
 
 
-def test_other_cameras_follow_the_one_that_gets_farthest(tmp_path):
+def test_the_best_camera_places_the_others(tmp_path):
     case = case_of(tmp_path, cameras=tuple(HEADINGS), key_frames=6)
     made = case.made()
     truth = case.drive.truth
@@ -173,13 +173,13 @@ def test_other_cameras_follow_the_one_that_gets_farthest(tmp_path):
         np.testing.assert_allclose(mounts[1], mounts[0], atol=1e-9)
 
 
-def test_recorded_poses_that_move_are_what_it_is_aligned_to(tmp_path):
-    """They are noisy, as nuScenes' are, and nothing but their mean enters."""
+def test_estimated_poses_are_aligned_to_recorded_poses_that_move(tmp_path):
+    """They are as noisy as nuScenes' poses; only their best fit is used."""
     case = case_of(tmp_path, error=error_at, noise=0.1)
     made, truth = case.made(), case.drive.truth
     place, turn = apart(truth, poses_of(made))
     assert place < 0.3 and turn < 1.0 and made.record["placement"]["aligned_to"] == "recorded poses"
-    best = aligned(truth, poses_of(made), PriorSettings())
+    best = align_poses(truth, poses_of(made), PriorSettings())
     assert apart(truth, best)[0] < 0.05 and apart(truth, best)[1] < 0.1
     told = [made.record[key]["median"] for key in ("shift_m", "turn_deg")]
     recorded = np.stack([frame.ego_to_world for frame in case.drive.scene.frames])
@@ -196,7 +196,7 @@ def test_without_lidar_recorded_positions_give_the_scale(tmp_path):
 
 
 def test_without_either_there_is_no_scale(unlocated):
-    with pytest.raises(DatasetError, match=r"scene made: images alone give no poses in metres: .*start: recorded"):
+    with pytest.raises(DatasetError, match=r"scene made: .* alone, because their scale is unknown: .*start: recorded"):
         unlocated.made(lidar=False)
 
 
@@ -211,21 +211,21 @@ def turns_on_the_spot(seconds: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("way", [stands, turns_on_the_spot])
-def test_a_car_that_does_not_get_on_is_told_so(tmp_path, way):
+def test_a_vehicle_without_translation_is_refused(tmp_path, way):
     case = case_of(tmp_path, way, noise=0.3, points=points_along(curve, 400, 5.0))
-    with pytest.raises(DatasetError, match=r"scene made: .*far enough apart, as where the car stands.*start: recorded"):
+    with pytest.raises(DatasetError, match=r"scene made: .*far enough apart, as where the vehicle.*start: recorded"):
         case.made()
 
 
-def test_drives_that_come_apart_are_told_with_their_parts(tmp_path):
+def test_disconnected_models_are_listed(tmp_path):
     """Images before the sixth see other points than those after it."""
     case = case_of(tmp_path, shows=lambda i, points: points % 2 == (i > 5), points=points_along(curve, 1400))
-    with pytest.raises(DatasetError, match=r"CAM_FRONT.* 2 models \(6, 4 images\), so that 6 of 10 key frames.*0\.7; "):
+    with pytest.raises(DatasetError, match=r"CAM_FRONT.* 2 models \(6, 4 images\); .* 6 of 10 key frames.*0\.7; "):
         case.made()
     assert case.made(limits={"min_images": 0.6}).record["placement"]["models"] == [6, 4]
 
 
-def test_images_that_were_not_placed_follow_their_neighbours(tmp_path):
+def test_unplaced_images_are_interpolated(tmp_path):
     case = case_of(tmp_path, shows=lambda i, points: np.full(len(points), i not in (4, 5)))
     made = case.made()
     assert made.record["placement"]["images_placed"] == 8
@@ -237,20 +237,20 @@ def test_images_that_were_not_placed_follow_their_neighbours(tmp_path):
     np.testing.assert_allclose(poses[4:6, :3, 3], thirds, atol=1e-6)
 
 
-def test_a_scale_that_drifts_is_followed_up_to_a_limit(tmp_path):
+def test_scale_drift_is_followed_up_to_a_limit(tmp_path):
     """LiDAR finds all things 4 % farther off at every key frame, as if the images' scale shrank."""
     case = case_of(tmp_path, stretch=lambda i: 1.04**i)
-    with pytest.raises(DatasetError, match=r"by LiDAR their scale changes by a factor of 1\.\d\d .*drift.*recorded"):
+    with pytest.raises(DatasetError, match=r"LiDAR, the scale changes by a factor of 1\.\d\d .*drift.*recorded"):
         case.made(limits={"max_scale_drift": 1.1})
     made = case.made(limits={"max_scale_drift": 2.0})
     assert 1.15 < made.record["placement"]["scale_drift"] < 1.45
 
 
-def test_an_image_that_was_misplaced_follows_its_neighbours(tmp_path):
-    """By LiDAR the last one is at half its distance: it does not count, and the adjustment brings it home."""
+def test_a_misplaced_image_is_interpolated(tmp_path):
+    """LiDAR halves the distances of the last image: it is left out, and the adjustment corrects it."""
     case = case_of(tmp_path, stretch=lambda i: 0.5 if i == 9 else 1.0)
     made, truth = case.made(), case.drive.truth
     assert made.record["placement"]["images_placed"] == 9 and made.record["placement"]["models"] == [10]
     assert apart(inverse(truth[0]) @ truth, poses_of(made))[0] < 0.15
-    with pytest.raises(DatasetError, match=r"by LiDAR 1 of 10 images are misplaced \(min_images\), .*start: recorded"):
+    with pytest.raises(DatasetError, match=r"LiDAR, 1 of 10 images are misplaced \(min_images\), .*start: recorded"):
         case.made(limits={"min_images": 0.95})

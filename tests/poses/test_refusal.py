@@ -1,4 +1,4 @@
-"""When a refinement is not believed: too little to hold on to, too large a correction, points that say otherwise."""
+"""Rejection of a refinement: too few points, too large a correction, no gain on withheld points."""
 
 import dataclasses
 import logging
@@ -25,23 +25,23 @@ from scipy.spatial.transform import Rotation
 from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.io.storage import canonical_json
 from drivesplat.poses import refine
-from drivesplat.poses.adjustment import adjust, priors_of, triangulated
-from drivesplat.poses.observations import Observations
-from drivesplat.poses.refine import Trial, doubt, refine_poses, refined_by_matches
-from drivesplat.poses.refinement import refined_or_kept
+from drivesplat.poses.adjustment import bundle_adjust, priors_of, triangulate
+from drivesplat.poses.refine import WithheldTrial, refine_from_matches, refine_poses, rejection_reason
+from drivesplat.poses.refinement import refine_or_keep
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
+from drivesplat.poses.triangulated import Observations
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.refine_poses import LimitSettings
 
-GOOD = Trial(points=10, observations=50, before=1.5, after=0.4)
+GOOD = WithheldTrial(points=10, observations=50, before=1.5, after=0.4)
 
 
 def refined_of(folder, drive: Drive, points: int = 400, noise: float = 0.3, **settings) -> Refinement:
     images, job = RigImages.of(drive.scene, range(len(drive.scene.frames))), job_of(**settings)
     seen = views(drive, images, street_points(points), noise)
     start = write_database(folder / "features.db", images, seen, job)
-    return refined_by_matches(images, start, folder / "features.db", job)
+    return refine_from_matches(images, start, folder / "features.db", job)
 
 
 def flat(seconds: float) -> np.ndarray:
@@ -88,24 +88,24 @@ def shift(metres: float) -> np.ndarray:
     [
         ([30, 30, 30, 30], NONE, GOOD, None),
         ([30, 30, 30, 29], NONE, GOOD, None),
-        ([30, 30, 29, 29], NONE, GOOD, "2 of 4 images see 30 points or more"),
-        ([0, 0, 0, 0], NONE, None, "0 of 4 images see 30 points or more"),
+        ([30, 30, 29, 29], NONE, GOOD, "2 of 4 images see 30 triangulated points or more"),
+        ([0, 0, 0, 0], NONE, None, "0 of 4 images see 30 triangulated points or more"),
         ([30, 30, 30, 30], moved(2, shift(0.49)), GOOD, None),
         ([30, 30, 30, 30], moved(2, shift(0.52)), GOOD, "moved by 0.52 m, more than 0.5"),
         ([30, 30, 30, 30], moved(1, turn(2.9)), GOOD, None),
         ([30, 30, 30, 30], moved(1, turn(-3.1, "x")), GOOD, "moved by 3.10 degrees, more than 3"),
         ([30, 30, 30, 30], moved(1, np.full((4, 4), np.nan)), GOOD, "moved by nan m"),
-        ([30, 30, 30, 30], NONE, dataclasses.replace(GOOD, after=1.5), "off by 1.50 pixels with the refined"),
+        ([30, 30, 30, 30], NONE, dataclasses.replace(GOOD, after=1.5), "is 1.50 pixels with refined"),
         ([30, 30, 30, 30], NONE, dataclasses.replace(GOOD, after=1.43), "a gain of less than 5%"),
         ([30, 30, 30, 30], NONE, dataclasses.replace(GOOD, after=1.42), None),
-        ([30, 30, 30, 30], NONE, dataclasses.replace(GOOD, after=np.inf), "off by inf pixels"),
+        ([30, 30, 30, 30], NONE, dataclasses.replace(GOOD, after=np.inf), "is inf pixels"),
     ],
 )  # fmt: skip
 def test_each_limit_has_its_sentence(points, changes, trial, words):
     if np.isnan(changes).any():
         changes = moved(1, np.block([[np.eye(3), np.full((3, 1), np.nan)], [np.zeros((1, 3)), np.ones((1, 1))]]))
-    fault = doubt(FOUR, seen_of(points), changes, trial, LimitSettings())
-    assert fault is None if words is None else words in fault and "\n" not in fault
+    reason = rejection_reason(FOUR, seen_of(points), changes, trial, LimitSettings())
+    assert reason is None if words is None else words in reason and "\n" not in reason
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_each_limit_has_its_sentence(points, changes, trial, words):
     [
         ({"max_shift": 0.02}, "m, more than 0.02"),
         ({"max_turn": 0.2}, "degrees, more than 0.2"),
-        ({"min_points": 400}, "0 of 8 images see 400 points or more"),
+        ({"min_points": 400}, "0 of 8 images see 400 triangulated points or more"),
     ],
 )
 def test_limits_keep_the_given_poses_with_a_warning(tmp_path, caplog, limits, words):
@@ -125,45 +125,44 @@ def test_limits_keep_the_given_poses_with_a_warning(tmp_path, caplog, limits, wo
     assert refined.record["refined"] is False and words in refined.record["kept_because"]
     assert refined.scene is drive.scene and refined.scene.poses == "nuscenes"
     assert all(len(values) == 0 for values in refined.points.values())
-    assert refined.record["shift_m"]["largest"] > 0.02, "what it would have done is told"
+    assert refined.record["shift_m"]["largest"] > 0.02, "the rejected corrections are recorded"
 
 
-def test_a_share_of_images_without_points_is_borne(tmp_path):
+def test_a_fraction_of_images_may_lack_points(tmp_path):
     """The last images look where there are no points any more."""
     drive = drive_of(14, way=lambda s: ego_at(2 * s), error=error_at)
     few = {"min_points": 20}
     held = refined_of(tmp_path, drive, rounds=1, limits={**few, "min_images": 0.5}).record
-    share = np.mean([item["points"] >= 20 for item in held["corrections"]])
-    assert held["refined"] and 0.5 < share < 0.95
+    fraction = np.mean([item["points"] >= 20 for item in held["corrections"]])
+    assert held["refined"] and 0.5 < fraction < 0.95
     (tmp_path / "again").mkdir()
-    limits = {**few, "min_images": share + 0.02}
+    limits = {**few, "min_images": fraction + 0.02}
     assert refined_of(tmp_path / "again", drive, rounds=1, limits=limits).record["refined"] is False
 
 
-def test_a_refinement_that_only_follows_the_features_noise_is_refused(tmp_path):
-    """Exact poses that hardly any prior holds, and features that are found badly: what was withheld tells."""
+def test_a_refinement_that_only_fits_feature_noise_is_rejected(tmp_path):
+    """Exact poses with weak priors, and noisy features: withheld points show it."""
     drive = drive_of(10, way=flat, error=exact)
     refined = refined_of(tmp_path, drive, 150, 2.0, feature_noise=0.05, robust_pixels=5.0, withheld=0.3)
-    assert "points that took no part are off by" in refined.record["kept_because"]
+    assert "the error of withheld points is" in refined.record["kept_because"]
     assert refined.record["trial"]["after_px"] > refined.record["trial"]["before_px"] > 0
 
 
-def test_points_that_judge_take_no_part(tmp_path, monkeypatch):
-    """The trial adjusts poses without them, and judges given and refined poses by them alone, points free, poses
-    fixed."""
+def test_withheld_points_take_no_part_in_the_trial_adjustment(tmp_path, monkeypatch):
+    """The trial adjusts poses without them, then fits all points to given and refined poses, which are fixed."""
     drive = drive_of(8)
     images, job = RigImages.of(drive.scene, range(8)), job_of(withheld=0.25)
     seen = views(drive, images, street_points(300))
-    start = triangulated(write_database(tmp_path / "f.db", images, seen, job), tmp_path / "f.db", job, 1)
+    start = triangulate(write_database(tmp_path / "f.db", images, seen, job), tmp_path / "f.db", job, 1)
     calls = []
 
     def watched(reconstruction, priors, *rest):
         before = refine.poses_of(reconstruction)
-        adjust(reconstruction, priors, *rest)
+        bundle_adjust(reconstruction, priors, *rest)
         moves = np.abs(refine.poses_of(reconstruction) - before).max()
         calls.append((set(reconstruction.points3D), priors is not None, moves > 1e-4))
 
-    monkeypatch.setattr(refine, "adjust", watched)
+    monkeypatch.setattr(refine, "bundle_adjust", watched)
     trial = refine._trial(start, priors_of(images, job.refine_poses), job, 1)
     everything = set(start.points3D)
     (fitted, *judged) = calls
@@ -174,14 +173,14 @@ def test_points_that_judge_take_no_part(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("key_frames", [1, 2])
 @pytest.mark.parametrize("cameras", [1, 6])
-def test_short_drives_are_told_apart_from_broken_ones(tmp_path, key_frames, cameras):
+def test_short_drives_are_recorded_without_nan(tmp_path, key_frames, cameras):
     """One key frame has no motion to triangulate from; poses.json holds no NaN."""
     drive = drive_of(key_frames, tuple(HEADINGS)[:cameras])
     record = refined_of(tmp_path, drive).record
     assert record["images"] == key_frames * cameras == len(record["corrections"])
     assert canonical_json(record)
     if key_frames == 1:
-        assert record["refined"] is False and "images see 30 points" in record["kept_because"]
+        assert record["refined"] is False and "images see 30 triangulated points" in record["kept_because"]
 
 
 def test_a_camera_may_miss_key_frames_and_have_images_of_its_own_size(tmp_path):
@@ -271,11 +270,11 @@ def camera_that_moves(folder, monkeypatch) -> tuple[Drive, str]:
 
 
 @pytest.mark.parametrize("obstacle", [without_pycolmap, camera_that_moves])
-class TestWhatCannotBeRefined:
-    def test_it_keeps_its_poses_where_nobody_insists(self, obstacle, tmp_path, monkeypatch, caplog):
+class TestImpossibleRefinement:
+    def test_keeps_the_poses_where_refinement_is_optional(self, obstacle, tmp_path, monkeypatch, caplog):
         drive, words = obstacle(tmp_path, monkeypatch)
         with caplog.at_level(logging.WARNING):
-            kept = refined_or_kept(drive.scene, job_of(enabled="auto"))
+            kept = refine_or_keep(drive.scene, job_of(enabled="auto"))
         assert kept.scene is drive.scene and words in kept.record["kept_because"] and not kept.record["refined"]
         assert [words in record.message for record in caplog.records] == [True]
         assert all(len(values) == 0 for values in kept.points.values())
@@ -284,16 +283,16 @@ class TestWhatCannotBeRefined:
         assert kept.record.keys() == refine_poses(tried.scene, job_of()).record.keys()
 
     @pytest.mark.parametrize("settings", [{"enabled": True}, {"enabled": "auto", "start": "images"}])
-    def test_it_fails_where_somebody_does(self, obstacle, tmp_path, monkeypatch, settings):
+    def test_fails_where_refinement_is_required(self, obstacle, tmp_path, monkeypatch, settings):
         drive, words = obstacle(tmp_path, monkeypatch)
         with pytest.raises(DriveSplatError, match=words) as failure:
-            refined_or_kept(drive.scene, job_of(**settings))
+            refine_or_keep(drive.scene, job_of(**settings))
         assert "\n" not in str(failure.value) and "made" in str(failure.value)
 
 
-def test_what_can_be_refined_is(tmp_path):
+def test_a_possible_refinement_is_done(tmp_path):
     drive = painted(tmp_path, drive_of(3, size=SMALL), pattern)
-    assert refined_or_kept(drive.scene, job_of()).record == refine_poses(drive.scene, job_of()).record
+    assert refine_or_keep(drive.scene, job_of()).record == refine_poses(drive.scene, job_of()).record
 
 
 def test_nothing_is_left_in_the_folder_for_temporary_files(tmp_path, monkeypatch):

@@ -1,44 +1,44 @@
-"""The scale of what images alone have made, along a drive; and how it is laid onto recorded poses."""
+"""Scale of a model made from images along a drive, and its alignment to recorded poses."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.from_images import aligned, in_metres
-from drivesplat.poses.scale import depth_at, drift, strays, told_by_lidar
+from drivesplat.poses.from_images import align_poses, metric_poses
+from drivesplat.poses.scale import depth_at, enough_from_lidar, scale_drift, scale_outliers
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.refine_poses import PriorSettings
 
 
-def test_drift_is_that_of_stretches_and_not_of_single_images():
+def test_drift_compares_segments_and_ignores_single_images():
     steady = np.full(40, 5.0)
-    assert drift(steady) == 1.0
+    assert scale_drift(steady) == 1.0
     steady[[3, 17, 30]] = [50.0, np.nan, 0.1]
-    assert drift(steady) == 1.0
-    assert drift(5.0 * np.linspace(1.0, 1.5, 40)) == pytest.approx((1.5 - 0.5 * 2 / 39) / (1 + 0.5 * 2 / 39))
-    assert drift(np.array([2.0, 3.0])) == 1.0
+    assert scale_drift(steady) == 1.0
+    assert scale_drift(5.0 * np.linspace(1.0, 1.5, 40)) == pytest.approx((1.5 - 0.5 * 2 / 39) / (1 + 0.5 * 2 / 39))
+    assert scale_drift(np.array([2.0, 3.0])) == 1.0
 
 
-def test_single_images_stray_from_those_around_them_at_the_ends_too():
+def test_outliers_are_found_at_the_ends_too():
     scales = np.linspace(1.0, 1.15, 40)
-    assert not strays(scales, 1.2).any()
+    assert not scale_outliers(scales, 1.2).any()
     scales[[0, 20, 38, 39]] = [0.7, 1.5, 0.5, 0.5]
     scales[11] = np.nan
-    assert np.flatnonzero(strays(scales, 1.2)).tolist() == [0, 20, 38, 39]
-    assert not strays(np.full(3, np.nan), 1.2).any()
+    assert np.flatnonzero(scale_outliers(scales, 1.2)).tolist() == [0, 20, 38, 39]
+    assert not scale_outliers(np.full(3, np.nan), 1.2).any()
 
 
-def test_lidar_of_a_few_images_tells_no_scale():
-    assert told_by_lidar(np.array([1.0, np.nan, np.nan, np.nan]))
-    assert not told_by_lidar(np.array([1.0, *[np.nan] * 4]))
+def test_lidar_needs_a_minimum_fraction_of_images():
+    assert enough_from_lidar(np.array([1.0, np.nan, np.nan, np.nan]))
+    assert not enough_from_lidar(np.array([1.0, *[np.nan] * 4]))
 
 
-def test_every_step_is_scaled_as_its_stretch():
+def test_every_step_has_the_scale_of_its_segment():
     along = np.tile(np.eye(4), (40, 1, 1))
     along[:, 0, 3] = np.arange(40.0)
     scales = np.where(np.arange(40) < 20, 2.0, 3.0)
     scales[[0, 7, 33]] = [np.nan, 100.0, np.nan]
-    places = in_metres(along, scales)[:, 0, 3]
+    places = metric_poses(along, scales)[:, 0, 3]
     np.testing.assert_allclose(np.diff(places), [*[2.0] * 19, 2.5, *[3.0] * 19])
 
 
@@ -47,7 +47,7 @@ def plane(pixels: np.ndarray) -> np.ndarray:
     return 0.02 + pixels @ np.array([0.001, 0.0005])
 
 
-def test_depth_between_returns_is_that_of_the_plane_they_lie_on():
+def test_depth_between_returns_on_a_plane_is_exact():
     """Depth z of a plane n x = d at the pixel u, v is d / (n (u, v, 1)): its inverse is linear in the pixels."""
     rng = np.random.default_rng(0)
     pixels, wanted = rng.uniform(0.0, 100.0, (300, 2)), rng.uniform(20.0, 80.0, (50, 2))
@@ -66,7 +66,7 @@ def test_alignment_takes_the_roll_from_rotations_and_the_rest_from_positions():
     straight = np.tile(np.eye(4), (20, 1, 1))
     straight[:, 0, 3] = 8.0 * np.arange(20)
     away = rigid(Rotation.from_euler("zyx", [70.0, 10.0, -25.0], degrees=True).as_matrix(), np.array([5.0, -80.0, 3.0]))
-    assert np.abs(aligned(straight, away @ straight, PriorSettings()) - straight).max() < 1e-9
+    assert np.abs(align_poses(straight, away @ straight, PriorSettings()) - straight).max() < 1e-9
     pitched = straight @ rigid(Rotation.from_euler("y", 1.0, degrees=True).as_matrix(), np.zeros(3))
-    pose = aligned(pitched, away @ straight, PriorSettings())
+    pose = align_poses(pitched, away @ straight, PriorSettings())
     assert np.abs(pose - straight).max() < 0.01, "its far end is not lifted"

@@ -11,10 +11,10 @@ from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
-from drivesplat.poses.observations import Observations
 from drivesplat.poses.triangulated import (
     MAX_MEAN_ERROR,
     MIN_VIEWS,
+    Observations,
     TriangulatedPoints,
     no_points,
     read_triangulated,
