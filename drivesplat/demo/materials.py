@@ -140,24 +140,22 @@ def surface(material, r, g, b, x, y, z, nx, ny, nz, footprint):
         return r, g, b, 0.0, 0.0
     if material == FACADE:
         return facade(r, g, b, y if abs(nx) > abs(ny) else x, z, footprint)
-    if material == LEAVES:
-        tone = max(0.15, 1.0 + 1.1 * fractal(x, y, z, 0.9, footprint))
-        return r * tone, g * tone, b * tone, 0.0, 0.0
-    if material == PAINT:
-        seam = 0.0
-        if abs(ny) > 0.6:
-            for at in (-0.95, 0.0, 0.85):
-                seam = max(seam, coverage(x, at - 0.012, at + 0.012, footprint))
-        tone = 1 - 0.7 * seam
-        return r * tone, g * tone, b * tone, 1.0, 0.0
-    if material == GLASS:
-        return r, g, b, 1.0, 0.0
-    if material == LAMP:
-        return r, g, b, 0.3, 1.5
-    if material == CLOTH:
-        tone = 1.0 + 0.5 * fractal(x, y, z, 0.25, footprint)
-        return r * tone, g * tone, b * tone, 0.0, 0.0
     if material == STRIPES and 0.25 < z < 0.42:
         return 0.75, 0.75, 0.75, 0.0, 0.0
-    tone = 1.0 + 0.2 * fractal(x, y, z, 0.7, footprint)
-    return r * tone, g * tone, b * tone, 0.0, 0.0
+    tone, mirror, emission = 1.0, 0.0, 0.0
+    if material == LEAVES:
+        tone = max(0.15, 1.0 + 1.1 * fractal(x, y, z, 0.9, footprint))
+    elif material == PAINT:
+        mirror = 1.0
+        if abs(ny) > 0.6:  # the seams of doors
+            for at in (-0.95, 0.0, 0.85):
+                tone = min(tone, 1 - 0.7 * coverage(x, at - 0.012, at + 0.012, footprint))
+    elif material == GLASS:
+        mirror = 1.0
+    elif material == LAMP:
+        mirror, emission = 0.3, 1.5
+    elif material == CLOTH:
+        tone = 1.0 + 0.5 * fractal(x, y, z, 0.25, footprint)
+    else:
+        tone = 1.0 + 0.2 * fractal(x, y, z, 0.7, footprint)
+    return r * tone, g * tone, b * tone, mirror, emission

@@ -17,19 +17,23 @@ KEY_FRAME_US = 500_000
 
 @dataclass(frozen=True)
 class DemoSensor:
-    """A camera or LiDAR. `translation` (metres) and `rotation` (w, x, y, z): sensor to ego (x forward, y left).
-
-    `delay_us`: trigger time relative to the key frame; `per_key_frame`: recordings per key frame. Cameras: `focal` and
-    `center` in pixels of a 1600x900 image, OpenCV's convention.
-    """
+    """A camera or LiDAR. `translation` (metres) and `quaternion` (w, x, y, z; any length): sensor to ego (x forward, y
+    left). `delay_us`: trigger time relative to the key frame. Cameras: `focal` and `center` in pixels of a 1600x900
+    image, OpenCV's convention."""
 
     channel: str
     translation: tuple[float, float, float]
-    rotation: tuple[float, float, float, float]
+    quaternion: tuple[float, float, float, float]
     delay_us: int
-    per_key_frame: int
     focal: float = 0.0
     center: tuple[float, float] = (0.0, 0.0)
+    per_key_frame: int = 6
+    """Recordings per key frame."""
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """Unit quaternion (4,): w, x, y, z."""
+        return np.array(self.quaternion) / np.linalg.norm(self.quaternion)
 
     @property
     def is_camera(self) -> bool:
@@ -47,34 +51,18 @@ class DemoSensor:
         return np.array([[self.focal * scale, 0.0, cx], [0.0, self.focal * scale, cy], [0.0, 0.0, 1.0]])
 
 
-def _unit(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    q = np.array([w, x, y, z])
-    return tuple((q / np.linalg.norm(q)).tolist())
-
-
 SENSORS = (
-    DemoSensor("LIDAR_TOP", (0.944, 0.0, 1.84), _unit(0.7078, -0.0065, 0.0106, -0.7063), 0, 10),
-    DemoSensor(
-        "CAM_FRONT_LEFT", (1.524, 0.495, 1.509), _unit(0.6757, -0.6736, 0.2121, -0.2112), -43_100, 6,
-        1272.6, (826.6, 479.8),
-    ),
-    DemoSensor(
-        "CAM_FRONT", (1.701, 0.016, 1.511), _unit(0.4998, -0.5030, 0.4998, -0.4974), -35_500, 6, 1266.4, (816.3, 491.5)
-    ),
-    DemoSensor(
-        "CAM_FRONT_RIGHT", (1.551, -0.493, 1.496), _unit(0.2060, -0.2027, 0.6825, -0.6714), -27_600, 6,
-        1260.8, (808.0, 495.3),
-    ),
-    DemoSensor(
-        "CAM_BACK_RIGHT", (1.015, -0.481, 1.562), _unit(0.1228, -0.1324, -0.7004, 0.6905), -20_100, 6,
-        1259.5, (807.3, 501.2),
-    ),
-    DemoSensor(
-        "CAM_BACK", (0.028, 0.003, 1.579), _unit(0.5038, -0.4974, -0.4942, 0.5045), -10_400, 6, 809.2, (829.2, 481.8)
-    ),
-    DemoSensor(
-        "CAM_BACK_LEFT", (1.036, 0.485, 1.591), _unit(0.6924, -0.7032, -0.1165, 0.1120), -500, 6, 1256.7, (792.1, 492.8)
-    ),
+    DemoSensor("LIDAR_TOP", (0.944, 0.0, 1.84), (0.7078, -0.0065, 0.0106, -0.7063), 0, per_key_frame=10),
+    DemoSensor("CAM_FRONT_LEFT", (1.524, 0.495, 1.509), (0.6757, -0.6736, 0.2121, -0.2112), -43_100, 1272.6,
+               (826.6, 479.8)),
+    DemoSensor("CAM_FRONT", (1.701, 0.016, 1.511), (0.4998, -0.5030, 0.4998, -0.4974), -35_500, 1266.4, (816.3, 491.5)),
+    DemoSensor("CAM_FRONT_RIGHT", (1.551, -0.493, 1.496), (0.2060, -0.2027, 0.6825, -0.6714), -27_600, 1260.8,
+               (808.0, 495.3)),
+    DemoSensor("CAM_BACK_RIGHT", (1.015, -0.481, 1.562), (0.1228, -0.1324, -0.7004, 0.6905), -20_100, 1259.5,
+               (807.3, 501.2)),
+    DemoSensor("CAM_BACK", (0.028, 0.003, 1.579), (0.5038, -0.4974, -0.4942, 0.5045), -10_400, 809.2, (829.2, 481.8)),
+    DemoSensor("CAM_BACK_LEFT", (1.036, 0.485, 1.591), (0.6924, -0.7032, -0.1165, 0.1120), -500, 1256.7,
+               (792.1, 492.8)),
 )  # fmt: skip
 
 

@@ -73,7 +73,7 @@ class NuScenesTables:
         self._add("sensor", token("sensor", sensor.channel), channel=sensor.channel, modality=modality)
         self._add(
             "calibrated_sensor", token("calibrated", sensor.channel), sensor_token=token("sensor", sensor.channel),
-            translation=list(sensor.translation), rotation=list(sensor.rotation),
+            translation=list(sensor.translation), rotation=sensor.rotation.tolist(),
             camera_intrinsic=sensor.intrinsics(width).tolist() if sensor.is_camera else [],
         )  # fmt: skip
 

@@ -5,7 +5,6 @@ of the motion between successive images from the given one. The latter two are i
 translation of refined @ inverse(given), of world to ego and of ego to ego (pycolmap.cost_functions).
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -107,14 +106,6 @@ def with_poses(reconstruction: pycolmap.Reconstruction, ego_to_world: np.ndarray
     copy = pycolmap.Reconstruction(reconstruction)
     for number, pose in zip(sorted(copy.frames), ego_to_world, strict=True):
         copy.frames[number].rig_from_world = to_pycolmap(inverse(pose))
-    return copy
-
-
-def without_points(reconstruction: pycolmap.Reconstruction, points: Iterable[int]) -> pycolmap.Reconstruction:
-    """A copy without the points of these numbers."""
-    copy = pycolmap.Reconstruction(reconstruction)
-    for point in points:
-        copy.delete_point3D(point)
     return copy
 
 

@@ -1,6 +1,6 @@
 """Features of static content in images, and their matches, in a pycolmap database."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from pathlib import Path
@@ -81,7 +81,11 @@ def image_pairs(images: RigImages, settings: FeatureSettings) -> list[tuple[int,
     """Pairs of image numbers (from 1, the smaller first) to match: neighbours of one camera, and images of cameras
     whose views overlap."""
     numbers = images.key_frames()
-    pairs = {pair for camera in images.cameras for pair in _neighbours(numbers[camera], settings.neighbours)}
+    pairs: set[tuple[int, int]] = set()
+    for by_key_frame in numbers.values():
+        ordered = [by_key_frame[key] for key in sorted(by_key_frame)]
+        for step in range(1, settings.neighbours + 1):
+            pairs.update((min(pair), max(pair)) for pair in zip(ordered, ordered[step:], strict=False))
     for a, b in combinations(images.cameras, 2):
         if views_overlap(images.of_camera(a)[0], images.of_camera(b)[0]):
             pairs.update(
@@ -91,13 +95,6 @@ def image_pairs(images: RigImages, settings: FeatureSettings) -> list[tuple[int,
                 if abs(key - other) <= settings.across
             )
     return sorted(pairs)
-
-
-def _neighbours(numbers: dict[int, int], count: int) -> Iterator[tuple[int, int]]:
-    keys = sorted(numbers)
-    for position, key in enumerate(keys):
-        for other in keys[position + 1 : position + 1 + count]:
-            yield min(numbers[key], numbers[other]), max(numbers[key], numbers[other])
 
 
 def views_overlap(a: Frame, b: Frame) -> bool:

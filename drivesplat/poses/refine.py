@@ -15,15 +15,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from drivesplat.poses.adjustment import (
-    Priors,
-    bundle_adjust,
-    observations_of,
-    priors_of,
-    triangulate,
-    with_poses,
-    without_points,
-)
+from drivesplat.poses.adjustment import Priors, bundle_adjust, observations_of, priors_of, triangulate, with_poses
 from drivesplat.poses.corrections import Corrections, apply_corrections
 from drivesplat.poses.features import detect_features, match_features
 from drivesplat.poses.from_images import estimate_poses
@@ -141,7 +133,9 @@ def _trial(start: pycolmap.Reconstruction, priors: Priors, job: RefinePosesJob, 
     settings, numbers = job.refine_poses, sorted(start.points3D)
     random = np.random.default_rng(job.random_seed)
     withheld = random.choice(numbers, max(1, round(settings.withheld * len(numbers))), replace=False)
-    reduced = without_points(start, withheld.tolist())
+    reduced = pycolmap.Reconstruction(start)
+    for point in withheld.tolist():
+        reduced.delete_point3D(point)
     bundle_adjust(reduced, priors, settings.robust_pixels, threads)
     medians = []
     for poses in (priors.given, poses_of(reduced)):

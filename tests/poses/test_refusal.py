@@ -124,7 +124,7 @@ def test_limits_keep_the_given_poses_with_a_warning(tmp_path, caplog, limits, wo
     assert words in record.message and "scene made: poses stay as they are" in record.message
     assert refined.record["refined"] is False and words in refined.record["kept_because"]
     assert refined.scene is drive.scene and refined.scene.poses == "nuscenes"
-    assert all(len(values) == 0 for values in refined.points.values())
+    assert len(refined.points.points) == len(refined.points.seen_by) == 0
     assert refined.record["shift_m"]["largest"] > 0.02, "the rejected corrections are recorded"
 
 
@@ -277,7 +277,7 @@ class TestImpossibleRefinement:
             kept = refine_or_keep(drive.scene, job_of(enabled="auto"))
         assert kept.scene is drive.scene and words in kept.record["kept_because"] and not kept.record["refined"]
         assert [words in record.message for record in caplog.records] == [True]
-        assert all(len(values) == 0 for values in kept.points.values())
+        assert len(kept.points.points) == len(kept.points.seen_by) == 0
         tried = painted(tmp_path, drive_of(1, size=SMALL), black)
         monkeypatch.undo()
         assert kept.record.keys() == refine_poses(tried.scene, job_of()).record.keys()
