@@ -86,7 +86,7 @@ def test_every_recording_has_its_file_of_the_stated_size_and_an_ego_pose_of_its_
             assert path.stat().st_size % 20 == 0
 
 
-def test_annotations_of_a_thing_are_one_chain(demo_tables):
+def test_annotations_of_an_object_are_one_chain(demo_tables):
     for instance in demo_tables.instance:
         rows = chain(demo_tables, "sample_annotation", instance["first_annotation_token"])
         assert len(rows) == instance["nbr_annotations"]

@@ -68,17 +68,17 @@ def test_the_leading_cars_box_holds_the_lidar_returns_that_came_from_it(demo_tab
     seconds = index * 0.5
     stage = demo_recorder.snapshot(seconds)
     random = demo_recorder._random("LIDAR_TOP", index * 500_000)
-    points, thing = scan(stage, demo_recorder.ego_to_street(seconds) @ LIDAR.sensor_to_ego, random)
+    points, item = scan(stage, demo_recorder.ego_to_street(seconds) @ LIDAR.sensor_to_ego, random)
     np.testing.assert_array_equal(points[:, :3].astype(np.float64), returns(demo_tables, demo_root, index))
     names = [t.name for t in demo_recorder.objects]
-    own = points[thing == names.index("vehicle 0"), :3].astype(np.float64)
+    own = points[item == names.index("vehicle 0"), :3].astype(np.float64)
     row = annotation(demo_tables, index, "vehicle 0")
     assert len(own) == row["num_lidar_pts"] > 20
     to_box = np.linalg.inv(pose_of(row)) @ sensor_to_global(demo_tables, recording(demo_tables, index, "LIDAR_TOP"))
     width, length, height = row["size"]
     in_box = own @ to_box[:3, :3].T + to_box[:3, 3]
     assert (np.abs(in_box) < np.array([length, width, height]) / 2 + 5 * RANGE_NOISE).all()
-    assert in_box[:, 0].min() < -length / 2 + 0.3, "its rear is what the own car sees"
+    assert in_box[:, 0].min() < -length / 2 + 0.3, "the ego vehicle sees its rear"
     everything = returns(demo_tables, demo_root, index) @ to_box[:3, :3].T + to_box[:3, 3]
     above_the_road = everything[:, 2] > -height / 2 + 5 * RANGE_NOISE
     held = above_the_road & (np.abs(everything) < np.array([length, width, height]) / 2 + 5 * RANGE_NOISE).all(axis=1)
@@ -93,7 +93,7 @@ def annotation(tables, index: int, name: str) -> dict:
 
 @pytest.mark.parametrize("name", ["vehicle 0", "vehicle 1", "pedestrian 0"])
 def test_the_tables_speed_of_a_box_is_that_of_its_motion(demo_tables, demo_recorder, name):
-    motion = next(thing.path for thing in demo_recorder.objects if thing.name == name)
+    motion = next(item.path for item in demo_recorder.objects if item.name == name)
     rows = [row for row in demo_tables.sample_annotation if row["instance_token"] == token("demo", "instance", name)]
     inner = [row for row in rows if row["prev"] and row["next"]]
     assert inner
@@ -106,7 +106,7 @@ def test_the_tables_speed_of_a_box_is_that_of_its_motion(demo_tables, demo_recor
         assert np.linalg.norm(velocity[:2]) == pytest.approx(math.hypot(forward, sideways), abs=0.06)
 
 
-def test_boxes_head_where_things_go(demo_tables):
+def test_boxes_face_along_their_motion(demo_tables):
     for index in range(1, 5):
         for t in demo_tables.sample[index]["anns"]:
             velocity = demo_tables.box_velocity(t)
@@ -118,36 +118,36 @@ def test_boxes_head_where_things_go(demo_tables):
 
 def test_boxes_stand_on_the_road_and_bound_the_mesh(demo_tables, demo_recorder):
     for index in (0, 5):
-        for thing in demo_recorder.objects:
-            if thing.category is None:
+        for item in demo_recorder.objects:
+            if item.category is None:
                 continue
             try:
-                row = annotation(demo_tables, index, thing.name)
+                row = annotation(demo_tables, index, item.name)
             except StopIteration:
                 continue
             width, length, height = row["size"]
             assert row["translation"][2] == pytest.approx(height / 2)
-            low, high = thing.mesh.vertices.min(axis=0), thing.mesh.vertices.max(axis=0)
+            low, high = item.mesh.vertices.min(axis=0), item.mesh.vertices.max(axis=0)
             reach = 2 * np.maximum(-low[:2], high[:2])
             np.testing.assert_allclose([length, width, height], [*reach, high[2]], atol=1e-9)
 
 
 @pytest.mark.parametrize("index", range(6))
-def test_what_the_front_camera_shows_within_80_metres_carries_a_box(demo_tables, demo_root, demo_recorder, index):
+def test_objects_that_the_front_camera_shows_within_80_metres_have_a_box(demo_tables, demo_root, demo_recorder, index):
     ego = pose_of(demo_tables.get("ego_pose", recording(demo_tables, index, "LIDAR_TOP")["ego_pose_token"]))
     rows = [demo_tables.get("sample_annotation", t) for t in demo_tables.sample[index]["anns"]]
     boxed = {row["instance_token"] for row in rows}
     shown = np.bincount(png(demo_root, "instances", index).ravel(), minlength=256)
-    for number, thing in enumerate((t for t in demo_recorder.objects if t.category), start=1):
-        distance = np.linalg.norm((demo_recorder.box_to_global(thing, index * 0.5) - ego)[:2, 3])
+    for number, item in enumerate((t for t in demo_recorder.objects if t.category), start=1):
+        distance = np.linalg.norm((demo_recorder.box_to_global(item, index * 0.5) - ego)[:2, 3])
         if distance > 80.0:
-            assert token("demo", "instance", thing.name) not in boxed
+            assert token("demo", "instance", item.name) not in boxed
         elif shown[number] >= 20:
-            assert token("demo", "instance", thing.name) in boxed
+            assert token("demo", "instance", item.name) in boxed
 
 
 def test_the_devkits_box_in_the_image_surrounds_the_cars_pixels(demo_tables, demo_root, demo_recorder):
-    numbers = {thing: n for n, thing in enumerate((t.name for t in demo_recorder.objects if t.category), start=1)}
+    numbers = {item: n for n, item in enumerate((t.name for t in demo_recorder.objects if t.category), start=1)}
     camera = recording(demo_tables, 2, "CAM_FRONT")
     boxes: list[Box] = demo_tables.get_boxes(camera["token"])  # interpolated to the image's time
     at = annotation(demo_tables, 2, "vehicle 0")["translation"]

@@ -33,7 +33,7 @@ def recorder(demo_job) -> Recorder:
 
 @pytest.fixture(scope="module", params=[0, 8, 15, 23, 30])
 def seen(request, scene, recorder):
-    """An image (also one between key frames) and which thing (h, w) each of its pixels shows."""
+    """An image (also one between key frames) and the object (h, w) that each pixel shows."""
     frame = scene.frames[request.param]
     seconds = (frame.timestamp - scene.key_frame_timestamps[0]) * 1e-6
     return frame, depth_and_objects(recorder.snapshot(seconds), recorder.camera(FRONT, seconds))[1]
@@ -41,20 +41,20 @@ def seen(request, scene, recorder):
 
 def vehicles(scene, recorder, frame, objects):
     """Per vehicle in clear view: its name, its hull's pixels, its own pixels."""
-    tokens = {token("demo", "instance", thing.name): n for n, thing in enumerate(recorder.objects)}
+    tokens = {token("demo", "instance", item.name): n for n, item in enumerate(recorder.objects)}
     for hull in hulls_in(scene, frame, SIZE):
         own = objects == tokens[hull.box.track_id]
         if hull.box.category.startswith("vehicle.") and hull.box.visibility == 4 and own.sum() >= MIN_PIXELS:
             yield recorder.objects[tokens[hull.box.track_id]].name, fill(hull.polygon, SIZE), own
 
 
-def test_vehicles_lie_within_their_hulls_at_the_images_own_time(scene, recorder, seen):
+def test_vehicles_lie_within_their_hulls_at_the_image_time(scene, recorder, seen):
     frame, objects = seen
     for name, hull, own in vehicles(scene, recorder, frame, objects):
         assert not (own & ~binary_dilation(hull, np.ones((3, 3)))).any(), f"{name} sticks out of its hull"
 
 
-def test_hulls_at_the_images_own_time_cover_the_vehicles_and_little_else(scene, recorder, seen):
+def test_hulls_at_the_image_time_fit_the_vehicles_tightly(scene, recorder, seen):
     frame, objects = seen
     found = {}
     for name, hull, own in vehicles(scene, recorder, frame, objects):
@@ -65,10 +65,10 @@ def test_hulls_at_the_images_own_time_cover_the_vehicles_and_little_else(scene, 
     assert min(found.values()) > 0.6, found
 
 
-def test_the_label_image_calls_moving_what_moves_and_parked_what_is_parked(scene, recorder, seen):
+def test_the_label_image_separates_moving_and_parked_vehicles(scene, recorder, seen):
     frame, objects = seen
     labels = label_image(scene, frame, SIZE)
-    names = np.array([thing.name for thing in recorder.objects])
+    names = np.array([item.name for item in recorder.objects])
     for name, _, own in vehicles(scene, recorder, frame, objects):
         kind = "parked" if name.startswith("parked") else "moving"
         expected = [LABELS[f"{kind}_car"], LABELS[f"{kind}_other_vehicle"]]

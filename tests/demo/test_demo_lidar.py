@@ -1,4 +1,4 @@
-"""The demo world's LiDAR: 32 beams like nuScenes', within its range, each sweep with noise of its own."""
+"""The demo world's LiDAR: 32 beams as in nuScenes, range limits, independent noise per sweep."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ LIDAR = SENSORS[0]
 
 @pytest.fixture(scope="module")
 def standing() -> Recorder:
-    """Nothing moves: sweeps differ by their noise alone."""
+    """A static street: sweeps differ only in noise."""
     return Recorder(WorldSettings(ego="stands", vehicles=0, pedestrians=0))
 
 
@@ -44,7 +44,7 @@ def test_beams_go_round_the_car_in_1085_firings(points):
     assert len(np.unique(np.round(firing - offset) % 1085)) == 1085
 
 
-def test_ranges_lie_between_the_cars_own_body_and_a_hundred_metres(points):
+def test_ranges_lie_between_the_ego_vehicle_and_a_hundred_metres(points):
     ranges = np.linalg.norm(points[:, :3], axis=1)
     assert ranges.min() > 0.9 - 0.1 and ranges.max() < 100.0 + 0.1
     assert ranges.max() > 50.0
@@ -80,16 +80,16 @@ def test_the_range_noise_is_two_centimetres(standing):
     assert abs(difference.mean()) < 0.001
 
 
-def test_every_sweep_has_its_own_noise_and_the_same_one_every_time(standing):
+def test_noise_differs_between_sweeps_and_is_reproducible(standing):
     first, again, later = (standing.sweep(LIDAR, time)[0] for time in (0, 0, 50_000))
     np.testing.assert_array_equal(first, again)
     assert len(first) != len(later) or not np.array_equal(first, later)
 
 
-def test_returns_are_counted_by_the_thing_they_come_from(standing):
+def test_returns_are_counted_per_object(standing):
     points, counts = standing.sweep(LIDAR, 0)
     assert counts.shape == (len(standing.objects),) and counts.sum() == len(points)
-    scenery = [thing.name for thing in standing.objects].index("scenery")
+    scenery = [item.name for item in standing.objects].index("scenery")
     assert counts[scenery] > 0.8 * len(points)
     assert (counts > 0).sum() > 3, "parked cars return some"
 

@@ -59,14 +59,14 @@ def test_in_the_shadow_the_sky_alone_is_left():
     np.testing.assert_allclose(radiance([floor(), shading], LIGHT, one_pixel(DOWN, 4.0)), expected, rtol=1e-5)
 
 
-def test_what_stands_on_the_other_side_of_the_sun_shades_nothing():
+def test_objects_on_the_far_side_from_the_sun_cast_no_shadow():
     lit = radiance([floor()], LIGHT, one_pixel(DOWN, 4.0))
     beside = roof(-5.0 / math.tan(SUN_HEIGHT))
     np.testing.assert_array_equal(radiance([floor(), beside], LIGHT, one_pixel(DOWN, 4.0)), lit)
 
 
 @pytest.mark.parametrize("elevation", [0.0, 10.0, 35.0, 90.0])
-def test_without_a_surface_there_is_the_sky_of_that_direction(elevation):
+def test_rays_without_a_hit_show_the_sky(elevation):
     up = math.sin(math.radians(elevation))
     direction = np.array([0.0, math.sqrt(1 - up * up), up])
     side = np.array([1.0, 0.0, 0.0])
@@ -87,7 +87,7 @@ def test_by_day_clouds_whiten_some_of_the_sky():
     assert (cloudy[changed].std(axis=1) < clear[changed].std(axis=1)).all()
 
 
-def test_a_street_lamp_lights_what_lies_below_it_by_the_inverse_square():
+def test_a_street_lamp_follows_the_inverse_square_law():
     lamps = np.array([[0.0, 0.0, 6.0]])
     night = lamplight(lamps, np.eye(4))._replace(headlight=0.0)
     found = radiance([floor()], night, one_pixel(DOWN, 4.0))

@@ -1,4 +1,4 @@
-"""Making a synthetic world never harms a recorded dataset."""
+"""A synthetic world never overwrites a recorded dataset."""
 
 import json
 from pathlib import Path
@@ -45,14 +45,14 @@ def test_a_recorded_dataset_is_refused_and_left_as_it_is(recorded, write):
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "samples/CAM_FRONT/a.jpg", "deep/er/still/x"])
-def test_a_single_file_of_someone_elses_is_enough_to_refuse(tmp_path, name):
+def test_a_single_foreign_file_is_refused(tmp_path, name):
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text("mine")
     with pytest.raises(ConfigError, match=REPLY):
         refuse_foreign_data(tmp_path)
 
 
-def test_absent_and_empty_folders_and_earlier_worlds_are_welcome(tmp_path):
+def test_absent_and_empty_folders_and_earlier_worlds_are_accepted(tmp_path):
     refuse_foreign_data(tmp_path / "absent")
     (tmp_path / "empty" / "v1.0-mini").mkdir(parents=True)
     refuse_foreign_data(tmp_path / "empty")
@@ -62,7 +62,7 @@ def test_absent_and_empty_folders_and_earlier_worlds_are_welcome(tmp_path):
     refuse_foreign_data(tmp_path / "empty")
 
 
-def test_beginning_removes_an_earlier_worlds_recordings_and_notes_where_the_new_one_comes_from(tmp_path):
+def test_preparing_removes_an_earlier_world_and_records_the_new_provenance(tmp_path):
     prepare_folder(tmp_path, {"stages": {"demo_world": {"code": "old"}}})
     for folder in ("samples", "sweeps", "maps", "truth"):
         (tmp_path / folder).mkdir()

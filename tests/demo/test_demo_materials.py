@@ -1,4 +1,4 @@
-"""Textures: within the range of reflectances, filtered by a pixel's size, the same every time."""
+"""Textures: range of reflectances, filtering by pixel size, reproducibility."""
 
 from itertools import pairwise
 
@@ -71,7 +71,7 @@ def test_fractal_noise_is_centred_and_bounded():
 
 @pytest.mark.parametrize("material", list(Material))
 @pytest.mark.parametrize("footprint", [0.002, 0.1, 2.0])
-def test_surfaces_reflect_between_nothing_and_half_more_than_everything(material, footprint):
+def test_reflectances_are_in_range(material, footprint):
     random = np.random.default_rng(int(material))
     for _ in range(400):
         x, y, z = random.uniform((-60, -15, 0), (120, 15, 12))

@@ -1,4 +1,4 @@
-"""The shapes of the demo world: closed, facing outward, standing on the ground, as large as they say."""
+"""Meshes of the demo world: closed, oriented outward, on the ground, of the stated size."""
 
 from collections.abc import Callable
 
@@ -41,7 +41,7 @@ def test_every_part_is_closed_and_faces_outward(body):
         assert part.is_watertight and part.volume > 0
 
 
-def test_bodies_stand_on_the_ground(body):
+def test_meshes_stand_on_the_ground(body):
     assert body.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-9)
     assert body.vertices[:, 2].min() >= -1e-9
 
@@ -65,10 +65,10 @@ def test_every_face_has_a_material_and_a_colour(body):
     ("shape", "volume"),
     [("box", 2.0 * 4.0 * 3.0), ("cylinder", np.pi * 0.25 * 2.0), ("ball", 4 / 3 * np.pi * 0.5)],
 )
-def test_solids_hold_their_volume(shape, volume):
+def test_primitives_have_their_volume(shape, volume):
     body = SHAPES[shape]()
     found = trimesh.Trimesh(body.vertices, body.faces).volume
-    assert 0.9 * volume < found <= volume + 1e-9, "round things are polyhedra within"
+    assert 0.9 * volume < found <= volume + 1e-9, "round solids are inscribed polyhedra"
 
 
 @pytest.mark.parametrize(("make", "size"), [(meshes.car, CAR_SIZE), (meshes.van, VAN_SIZE)])
@@ -89,7 +89,7 @@ def test_vehicles_have_paint_glass_lights_and_tyres(make):
     assert (body.color[lights & ~rear] == meshes.HEADLIGHT).all()
 
 
-def test_joined_keeps_every_part_and_points_at_its_own_vertices():
+def test_concatenate_keeps_every_part_and_offsets_faces():
     a, b = SHAPES["box"](), meshes.ellipsoid((5.0, 0.0, 1.0), (1.0, 1.0, 1.0), Material.LEAVES, GREY)
     both = meshes.concatenate([a, b])
     np.testing.assert_array_equal(both.triangles, np.concatenate([a.triangles, b.triangles]))
@@ -97,7 +97,7 @@ def test_joined_keeps_every_part_and_points_at_its_own_vertices():
     np.testing.assert_array_equal(both.color, np.concatenate([a.color, b.color]))
 
 
-def test_moved_turns_about_z_first_and_then_shifts():
+def test_moved_rotates_about_z_and_then_translates():
     body = SHAPES["box"]()
     moved = body.moved((10.0, 20.0, 1.0), np.pi / 2)
     x, y, z = body.vertices.T

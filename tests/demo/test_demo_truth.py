@@ -69,7 +69,7 @@ def test_every_file_of_truth_json_is_there_in_the_images_size(record, demo_root,
             assert (image.size, image.mode) == ((WIDTH, HEIGHT), mode)
 
 
-def test_instances_name_the_annotated_things(record, demo_root, demo_recorder, demo_tables):
+def test_instances_list_the_annotated_objects(record, demo_root, demo_recorder, demo_tables):
     assert {instance["token"] for instance in demo_tables.instance} <= set(record["instances"].values())
     shown = set()
     for index in range(KEY_FRAMES):
@@ -78,13 +78,13 @@ def test_instances_name_the_annotated_things(record, demo_root, demo_recorder, d
     assert {str(n) for n in shown - {0}} <= record["instances"].keys()
 
 
-def test_instance_pixels_are_those_of_the_thing_that_is_named(record, demo_root, demo_recorder, index):
+def test_instance_pixels_show_the_listed_object(record, demo_root, demo_recorder, index):
     _, objects = depth_and_objects(*view(demo_recorder, index))
     shown = png(demo_root, record, index, "instances")
     numbers = {name: int(n) for n, name in record["instances"].items()}
-    for n, thing in enumerate(demo_recorder.objects):
-        number = numbers.get(token("demo", "instance", thing.name), 0)
-        assert (number > 0) == (thing.category is not None)
+    for n, item in enumerate(demo_recorder.objects):
+        number = numbers.get(token("demo", "instance", item.name), 0)
+        assert (number > 0) == (item.category is not None)
         if number:
             np.testing.assert_array_equal(shown == number, objects == n)
 
@@ -101,11 +101,11 @@ def test_the_depth_image_decodes_to_metres(record, demo_root, demo_recorder, ind
     assert np.abs(np.median(heights)) < 0.02, "the lower rows show the road"
 
 
-def sunlit_without(points: np.ndarray, sun: np.ndarray, thing, seconds: float) -> np.ndarray:
-    """Which points (n, 3) have the box of `thing`, a little larger, between them and the sun."""
-    to_object = np.linalg.inv(thing.path.pose_at(seconds))
+def sunlit_without(points: np.ndarray, sun: np.ndarray, item, seconds: float) -> np.ndarray:
+    """Which points (n, 3) have the box of `item`, a little larger, between them and the sun."""
+    to_object = np.linalg.inv(item.path.pose_at(seconds))
     start, ray = points @ to_object[:3, :3].T + to_object[:3, 3], to_object[:3, :3] @ sun
-    length, width, height = thing.mesh.size
+    length, width, height = item.mesh.size
     low, high = np.array([-length / 2, -width / 2, 0.0]) - 0.05, np.array([length / 2, width / 2, height]) + 0.05
     with np.errstate(divide="ignore"):
         a, b = (low - start) / ray, (high - start) / ray
@@ -137,7 +137,7 @@ def test_without_the_leading_car_only_its_pixels_and_its_shadow_change(removal):
     assert not (changed & ~own & ~shaded).any()
 
 
-def test_the_leading_cars_own_pixels_are_gone(removal):
+def test_the_pixels_of_the_leading_car_change(removal):
     image, without, own, _ = removal
     assert own.sum() > 100
     assert (image != without).any(axis=2)[own].mean() > 0.9
@@ -171,7 +171,7 @@ def ego_to_global(tables, sample_data: str) -> np.ndarray:
     return matrix
 
 
-def test_recorded_camera_poses_are_those_of_the_tables_and_two_metres_to_the_own_cars_left(record, demo_tables):
+def test_camera_poses_agree_with_the_tables_and_lateral_ones_lie_two_metres_left(record, demo_tables):
     for frame in record["frames"]:
         ego = ego_to_global(demo_tables, frame["sample_data"])
         here, there = np.array(frame["camera_to_global"]), np.array(frame["lateral_camera_to_global"])
@@ -183,7 +183,7 @@ def test_recorded_camera_poses_are_those_of_the_tables_and_two_metres_to_the_own
 
 
 def lateral_camera(record, demo_recorder, index: int) -> DemoCamera:
-    """The camera that truth.json states, brought to the street by the own car's known place there."""
+    """The camera that truth.json states, brought to the street by the known ego pose."""
     frame = record["frames"][index]
     camera = demo_recorder.camera(FRONT, seconds_of(index))
     to_street = camera.camera_to_street @ np.linalg.inv(frame["camera_to_global"])
@@ -191,7 +191,7 @@ def lateral_camera(record, demo_recorder, index: int) -> DemoCamera:
     return DemoCamera(camera.intrinsics, pose, WIDTH, HEIGHT)
 
 
-def test_the_lateral_view_is_what_a_camera_at_its_recorded_pose_sees(record, demo_root, demo_recorder, index):
+def test_the_lateral_view_agrees_with_its_stated_pose(record, demo_root, demo_recorder, index):
     seconds = seconds_of(index)
     camera = lateral_camera(record, demo_recorder, index)
     expected = to_bytes(render(demo_recorder.snapshot(seconds), demo_recorder.light(seconds), camera, 1))

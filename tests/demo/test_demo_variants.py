@@ -1,4 +1,4 @@
-"""What the settings of a synthetic world change, and what they leave alone; the same settings give the same bytes."""
+"""Effects of the settings of a synthetic world; equal settings give equal bytes."""
 
 import json
 import shutil
@@ -36,7 +36,7 @@ def table(root: Path, name: str) -> list[dict]:
 
 @pytest.fixture(scope="module")
 def still_street(tmp_path_factory) -> Path:
-    """A world where nothing moves, the LiDAR recording between key frames too."""
+    """A static world with LiDAR sweeps between key frames."""
     root = tmp_path_factory.mktemp("still")
     make_world(root, STILL, {"stages": {}}, workers=2)
     return root
@@ -70,7 +70,7 @@ def test_making_a_world_anew_replaces_the_old_one(tmp_path, still_street):
     assert table(root, "log") != table(still_street, "log"), "what is made from the tables is to be remade"
 
 
-def test_without_movers_nothing_moves_and_nothing_leads(still_street):
+def test_without_moving_objects_no_vehicle_leads(still_street):
     attributes = {row["token"]: row["name"] for row in table(still_street, "attribute")}
     used = {attributes[token] for row in table(still_street, "sample_annotation") for token in row["attribute_tokens"]}
     assert used == {"vehicle.parked"}
@@ -80,12 +80,12 @@ def test_without_movers_nothing_moves_and_nothing_leads(still_street):
     assert {path.name for path in (still_street / "truth").iterdir()} == {"truth.json", "lateral", "depth", "instances"}
 
 
-def test_an_own_car_that_stands_has_one_pose(still_street):
+def test_a_standing_ego_vehicle_has_one_pose(still_street):
     poses = {json.dumps([row["translation"], row["rotation"]]) for row in table(still_street, "ego_pose")}
     assert len(poses) == 1
 
 
-def test_where_nothing_moves_images_of_different_times_are_the_same(still_street):
+def test_images_of_a_static_street_are_equal_at_all_times(still_street):
     first, last = (np.asarray(Image.open(path)) for path in sorted(still_street.glob("samples/CAM_BACK/*")))
     np.testing.assert_array_equal(first, last)
 
@@ -134,15 +134,15 @@ def test_noise_differs_from_image_to_image():
 
 
 @pytest.fixture(scope="module", params=[0, 1, 7])
-def shipped(request):
-    """Poses as shipped, exact ones, at 12 Hz over a drive of 20 key frames."""
+def noisy_and_exact(request):
+    """Noisy and exact poses at 12 Hz over a drive of 20 key frames."""
     times = np.arange(0.0, 9.5, 1 / 12)
     noisy, exact = (Recorder(WorldSettings(pose_noise=n, random_seed=request.param, **SMALL)) for n in (True, False))
     return [np.array([recorder.ego_to_global(float(t)) for t in times]) for recorder in (noisy, exact)]
 
 
-def test_poses_as_shipped_lie_flat_and_tilt_by_half_a_degree(shipped):
-    noisy, exact = shipped
+def test_noisy_poses_are_flat_and_tilted_by_half_a_degree(noisy_and_exact):
+    noisy, exact = noisy_and_exact
     assert (noisy[:, 2, 3] == 0.0).all() and np.ptp(exact[:, 2, 3]) > 0.005
     turn = Rotation.from_matrix(np.swapaxes(exact[:, :3, :3], 1, 2) @ noisy[:, :3, :3])
     roll, pitch, yaw = np.degrees(turn.as_euler("xyz")).T
@@ -151,8 +151,8 @@ def test_poses_as_shipped_lie_flat_and_tilt_by_half_a_degree(shipped):
     assert np.abs(yaw).max() < 0.05
 
 
-def test_poses_as_shipped_are_off_by_centimetres_smoothly(shipped):
-    noisy, exact = shipped
+def test_position_errors_are_centimetres_and_smooth(noisy_and_exact):
+    noisy, exact = noisy_and_exact
     offset = (noisy - exact)[:, :2, 3]
     distance = np.linalg.norm(offset, axis=1)
     assert 0.01 < np.median(distance) < 0.08 and distance.max() < 0.1
@@ -170,14 +170,14 @@ def test_pose_noise_leaves_images_and_sweeps_alone():
 
 @pytest.mark.parametrize(("vehicles", "pedestrians", "parked"), [(0, 0, 0), (1, 2, 3), (6, 6, 16)])
 @pytest.mark.parametrize("ego", ["drives", "stands"])
-def test_as_many_things_are_on_the_street_as_asked_for(vehicles, pedestrians, parked, ego):
+def test_the_street_has_the_configured_number_of_objects(vehicles, pedestrians, parked, ego):
     settings = {"vehicles": vehicles, "pedestrians": pedestrians, "parked": parked, "ego": ego}
     recorder = Recorder(WorldSettings(**settings))
-    kinds = [(thing.category or "").split(".")[0] for thing in recorder.objects if thing.moves]
+    kinds = [(item.category or "").split(".")[0] for item in recorder.objects if item.moves]
     assert (kinds.count("vehicle"), kinds.count("human")) == (vehicles, pedestrians)
-    assert sum(thing.attribute == "vehicle.parked" for thing in recorder.objects) == parked
+    assert sum(item.attribute == "vehicle.parked" for item in recorder.objects) == parked
     assert recorder.street.leading == ("vehicle 0" if vehicles else None)
-    names = [thing.name for thing in recorder.objects]
+    names = [item.name for item in recorder.objects]
     assert len(set(names)) == len(names)
 
 
@@ -185,14 +185,14 @@ def test_as_many_things_are_on_the_street_as_asked_for(vehicles, pedestrians, pa
     ("random_seed", "vehicles", "pedestrians", "parked"), [(0, 2, 1, 9), (1, 6, 6, 16), (2, 2, 6, 9)]
 )
 @pytest.mark.parametrize("ego", ["drives", "stands"])
-def test_nothing_goes_or_stands_in_anything_else(ego, random_seed, vehicles, pedestrians, parked):
+def test_objects_do_not_intersect(ego, random_seed, vehicles, pedestrians, parked):
     counts = {"vehicles": vehicles, "pedestrians": pedestrians, "parked": parked}
     recorder = Recorder(WorldSettings(random_seed=random_seed, ego=ego, **counts))
-    boxed = [thing for thing in recorder.objects if thing.category]
+    boxed = [item for item in recorder.objects if item.category]
     for seconds in np.arange(0.0, 9.6, 0.25):
         ego_pose = recorder.ego_to_street(float(seconds))
-        places = [*(thing.path.pose_at(float(seconds))[:2, 3] for thing in boxed), ego_pose[:2, 3] + [1.4, 0.0]]
-        halves = [*(thing.mesh.size[:2] / 2 for thing in boxed), np.array([2.3, 0.95])]
+        places = [*(item.path.pose_at(float(seconds))[:2, 3] for item in boxed), ego_pose[:2, 3] + [1.4, 0.0]]
+        halves = [*(item.mesh.size[:2] / 2 for item in boxed), np.array([2.3, 0.95])]
         for i in range(len(places)):
             for j in range(i):
                 gap = np.abs(places[i] - places[j]) - halves[i] - halves[j]
@@ -202,7 +202,7 @@ def test_nothing_goes_or_stands_in_anything_else(ego, random_seed, vehicles, ped
 def test_the_leading_car_leads():
     for ego in ("drives", "stands"):
         recorder = Recorder(WorldSettings(ego=ego))
-        leading = next(thing for thing in recorder.objects if thing.name == recorder.street.leading)
+        leading = next(item for item in recorder.objects if item.name == recorder.street.leading)
         for seconds in (0.0, 4.0, 9.5):
             ahead = np.linalg.inv(recorder.ego_to_street(seconds)) @ leading.path.pose_at(seconds)
             assert ahead[0, 3] > 5.0 and abs(ahead[1, 3]) < 1.0
@@ -217,12 +217,12 @@ def test_width_sets_the_images_size_and_scales_the_intrinsics(width):
     np.testing.assert_allclose(camera.intrinsics[:2, 2] + 0.5, np.array([816.8, 492.0]) * scale)
 
 
-def test_walkers_keep_clear_of_lamps_bins_and_trees():
+def test_pedestrians_avoid_lamps_bins_and_trees():
     for seed in range(6):
         recorder = Recorder(WorldSettings(random_seed=seed, pedestrians=6, vehicles=0))
         scenery = recorder.objects[0].mesh.vertices
         feet = scenery[(scenery[:, 2] > -0.01) & (scenery[:, 2] < 0.01)][:, :2]
-        walkers = [thing for thing in recorder.objects if thing.walks]
+        walkers = [item for item in recorder.objects if item.walks]
         assert len(walkers) == 6
         for walker in walkers:
             for seconds in np.arange(0.0, 20.0, 0.2):
@@ -230,7 +230,7 @@ def test_walkers_keep_clear_of_lamps_bins_and_trees():
                 assert not beside.all(axis=1).any(), (seed, walker.name, seconds)
 
 
-def test_walkers_that_nothing_hides_are_wholly_visible():
+def test_unoccluded_pedestrians_are_wholly_visible():
     recorder = Recorder(WorldSettings(pedestrians=6, vehicles=0, parked=0, key_frames=8, **SMALL))
-    walkers = [number for number, thing in enumerate(recorder.objects) if thing.walks]
+    walkers = [number for number, item in enumerate(recorder.objects) if item.walks]
     assert np.median([recorder.visible_fractions(index)[walkers] for index in (1, 4, 7)]) > 0.95

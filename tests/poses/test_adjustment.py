@@ -1,4 +1,4 @@
-"""Points and poses adjusted to what is seen: synthetic matches, so that the truth is known."""
+"""Triangulation and bundle adjustment on synthetic matches with known poses and points."""
 
 import dataclasses
 from pathlib import Path
@@ -142,14 +142,14 @@ def test_two_runs_agree_whatever_the_threads(front, front_refined):
     np.testing.assert_allclose(again.points.points, front_refined.points.points, atol=1e-6)
 
 
-def test_wrong_matches_do_no_harm(tmp_path, front):
+def test_wrong_matches_are_rejected(tmp_path, front):
     """A fifth of all matches join what is not the same."""
     case = case_of(tmp_path, front.drive, wrong=0.2)
     tilt, _ = case.wobble(case.refined().scene)
     assert (tilt[:2] < 0.12 * case.wobble(front.drive.scene)[0][:2]).all()
 
 
-def test_features_far_off_hardly_count(tmp_path, front):
+def test_the_robust_loss_downweights_outliers(tmp_path, front):
     """Errors that are small enough to pass for the same point; without a robust loss they turn the poses."""
     images, job = front.images, job_of()
     seen, rng = views(front.drive, images, street_points(400)), np.random.default_rng(5)
@@ -195,7 +195,7 @@ def test_adjusting_leaves_cameras_and_their_mounts_as_calibrated(tmp_path):
         np.testing.assert_array_equal(reconstruction.cameras[camera.camera_id].params, camera.params)
 
 
-def test_the_absolute_prior_holds_the_whole_drive_in_place(front):
+def test_the_absolute_prior_fixes_the_whole_drive(front):
     """Points and poses that are moved together fit as well as before: only the prior knows where they belong."""
     images = front.images
     given = priors_of(images, job_of().refine_poses)
@@ -233,7 +233,7 @@ def parameters(pose: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("axis", DEVIATIONS)
-def test_each_axis_of_the_car_has_its_own_deviation(axis):
+def test_each_axis_of_the_ego_frame_has_its_own_deviation(axis):
     """A pose that is off by one deviation about or along one axis of the car has one residual of `feature_noise`."""
     priors = Priors(TURNED[None], np.zeros(1), SETTINGS, feature_noise=0.3)
     problem = pyceres.Problem()
@@ -246,7 +246,7 @@ def test_each_axis_of_the_car_has_its_own_deviation(axis):
 
 @pytest.mark.parametrize("axis", DEVIATIONS)
 @pytest.mark.parametrize("seconds", [0.5, 2.0])
-def test_a_pose_that_nothing_else_holds_follows_its_neighbours(axis, seconds):
+def test_a_pose_without_points_follows_its_neighbours(axis, seconds):
     """Between neighbours off by c, x minimises (x / s)^2 + 2 (x - c)^2 / (drift^2 s^2 t): x = c k / (1 + k) where k =
     2 / (drift^2 t). The car stands at the origin, so that turns move nothing."""
     times = seconds * np.arange(3)
@@ -270,7 +270,7 @@ def test_a_pose_that_nothing_else_holds_follows_its_neighbours(axis, seconds):
     np.testing.assert_allclose(found, expected, atol=1e-3 * off + 1e-9)
 
 
-def test_images_of_one_moment_are_one_pose(tmp_path):
+def test_images_of_equal_time_get_one_correction(tmp_path):
     """Cameras of some rigs fire together: both images get the same correction."""
     drive = drive_of(5, ("CAM_FRONT", "CAM_FRONT_LEFT"))
     together = tuple(

@@ -1,4 +1,4 @@
-"""Corrections of the own car's pose, carried to all that it has placed: images, LiDAR sweeps, annotated boxes."""
+"""Pose corrections applied to images, LiDAR sweeps and boxes."""
 
 import dataclasses
 
@@ -42,27 +42,27 @@ def vector(transform: np.ndarray) -> np.ndarray:
     return np.concatenate([Rotation.from_matrix(transform[:3, :3]).as_rotvec(degrees=True), transform[:3, 3]])
 
 
-def test_at_the_images_corrections_are_theirs():
+def test_corrections_are_exact_at_images():
     np.testing.assert_allclose(CORRECTIONS.at(TIMES), STEPS, atol=1e-9)
     np.testing.assert_allclose(GIVEN @ CORRECTIONS.at(TIMES), GIVEN @ STEPS, atol=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.9])
-def test_between_images_they_change_steadily(share):
+def test_corrections_are_interpolated_between_images(share):
     (between,) = CORRECTIONS.at(np.array([TIMES[0] + share * 500_000]))
     expected = (1 - share) * vector(STEPS[0]) + share * vector(STEPS[1])
     np.testing.assert_allclose(vector(between), expected, atol=1e-6)
     np.testing.assert_allclose(between[:3, :3] @ between[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_a_large_turn_goes_the_shorter_way():
+def test_large_rotations_are_interpolated_the_shorter_way():
     """From 170 degrees to 190: rotation vectors, linear in time, would pass 0."""
     turned = np.stack([correction((0.0, 0.0, 170.0)), correction((0.0, 0.0, -170.0))])
     (middle,) = Corrections.from_poses(TIMES[:2], GIVEN[:2], GIVEN[:2] @ turned).at(TIMES[:2].mean(keepdims=True))
     np.testing.assert_allclose(middle[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-9)
 
 
-def test_where_given_poses_stand_still_motion_goes_on_beyond_the_ends():
+def test_extrapolation_continues_the_motion_beyond_both_ends():
     """8 m/s ahead, an image every half second and one 10 ms after the last, which is 1 m off: no motion of 100 m/s."""
     times = np.array([0, 500_000, 1_000_000, 1_010_000])
     poses = np.tile(np.eye(4), (4, 1, 1))
@@ -73,12 +73,12 @@ def test_where_given_poses_stand_still_motion_goes_on_beyond_the_ends():
     assert still.extrapolated(2_000_000.0) is still
 
 
-def test_beyond_the_ends_they_stay():
+def test_corrections_are_constant_beyond_the_ends():
     early, late = CORRECTIONS.at(np.array([0, 9_000_000]))
     np.testing.assert_allclose([early, late], STEPS[[0, 2]], atol=1e-9)
 
 
-def test_images_of_one_time_count_once_and_a_single_one_holds_everywhere():
+def test_equal_timestamps_count_once_and_a_single_image_applies_everywhere():
     twice = Corrections.from_poses(TIMES[[0, 0, 1]], GIVEN[[0, 0, 1]], (GIVEN @ STEPS)[[0, 0, 1]])
     np.testing.assert_allclose(twice.at(TIMES[:2]), STEPS[:2], atol=1e-9)
     single = Corrections.from_poses(TIMES[:1], GIVEN[:1], (GIVEN @ STEPS)[:1])
@@ -87,7 +87,7 @@ def test_images_of_one_time_count_once_and_a_single_one_holds_everywhere():
     assert np.isfinite(single.in_world(at)).all()
 
 
-def test_in_the_world_they_move_what_the_car_has_placed():
+def test_in_world_moves_objects_placed_by_the_ego_pose():
     """A thing at a place before the given car lies at the same place before the refined one."""
     moved = CORRECTIONS.in_world(TIMES)
     before_the_car = np.array([[12.0, -3.0, 1.0]])
@@ -122,7 +122,7 @@ SCENE = scene_of()
 REFINED = apply_corrections(SCENE, CORRECTIONS)
 
 
-def test_images_turn_with_the_car_that_carries_them():
+def test_images_rotate_with_the_ego_vehicle():
     times = np.array([frame.timestamp for frame in SCENE.frames])
     for before, after, delta in zip(SCENE.frames, REFINED.frames, CORRECTIONS.at(times), strict=True):
         np.testing.assert_allclose(after.ego_to_world, before.ego_to_world @ delta, atol=1e-9)
@@ -133,14 +133,14 @@ def test_images_turn_with_the_car_that_carries_them():
         np.testing.assert_array_equal(after.intrinsics, before.intrinsics)
 
 
-def test_what_lies_between_key_frames_is_corrected_as_its_time_says():
+def test_images_between_key_frames_take_interpolated_corrections():
     frame = REFINED.frames[-1]
     share = (frame.timestamp - TIMES[0]) / 500_000
     change = vector(inverse(SCENE.frames[-1].ego_to_world) @ frame.ego_to_world)
     np.testing.assert_allclose(change, (1 - share) * vector(STEPS[0]) + share * vector(STEPS[1]), atol=1e-6)
 
 
-def test_sweeps_and_boxes_stay_where_the_car_saw_them():
+def test_sweeps_and_boxes_keep_their_poses_relative_to_the_ego_vehicle():
     """As seen from the car at their times, nothing has moved: neither returns, nor boxes, nor returns in boxes."""
     refined = GIVEN @ STEPS
     for i, (before, after) in enumerate(zip(SCENE.sweeps, REFINED.sweeps, strict=True)):
@@ -159,7 +159,7 @@ def test_sweeps_and_boxes_stay_where_the_car_saw_them():
         assert not np.allclose(box, moved, atol=1e-3)
 
 
-def test_nothing_else_of_the_scene_changes_and_it_is_told(tmp_path):
+def test_only_poses_of_the_scene_change_and_their_source_is_recorded(tmp_path):
     assert REFINED.poses == "refined" and SCENE.poses == "nuscenes"
     same = ("name", "dataset", "version", "key_frame_range", "missing_images", "provenance")
     assert all(getattr(REFINED, name) == getattr(SCENE, name) for name in same)
@@ -171,14 +171,14 @@ def test_nothing_else_of_the_scene_changes_and_it_is_told(tmp_path):
     assert frame_groups(again, holdout) == frame_groups(SCENE, holdout)
 
 
-def test_the_measuring_protocol_says_refined():
+def test_the_training_record_says_refined():
     """Evaluation takes protocol.poses from here."""
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
     job = ParserJob(holdout=HoldoutSettings(every_nth=0, last_block=1), images=ImageSettings())
     assert [training_record(scene, seed, job).scene.poses for scene in (SCENE, REFINED)] == ["nuscenes", "refined"]
 
 
-def test_no_corrections_change_nothing():
+def test_identity_corrections_change_nothing():
     same = apply_corrections(SCENE, Corrections.from_poses(TIMES, GIVEN, GIVEN))
     np.testing.assert_allclose(same.frames[2].camera_to_world, SCENE.frames[2].camera_to_world, atol=1e-9)
     np.testing.assert_allclose(same.tracks[0].object_to_world, SCENE.tracks[0].object_to_world, atol=1e-9)
