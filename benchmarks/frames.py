@@ -17,7 +17,7 @@ import torch
 
 from benchmarks.command import argument_parser, run_command
 from drivesplat.machine.device import device_name
-from drivesplat.model.checkpoint import open_model, read_checkpoint
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
 from drivesplat.rendering.film import Shot, recorded_shot, render_film
 from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.scene import Scene, read_scene
@@ -28,7 +28,9 @@ WARM_UP = 0.1
 """The share of the frames before timing starts."""
 
 
-def measure(scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_settings: DeviceSettings) -> dict[str, Any]:
+def measure(
+    scene: Scene, checkpoint: TrainedCheckpoint, job: FilmJob, device_settings: DeviceSettings
+) -> dict[str, Any]:
     """Frames per second and the film's seconds, with device, image size, number of frames and Gaussians."""
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)

@@ -12,7 +12,7 @@ from drivesplat.settings.render import EditJob
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)
     checkpoint = read_checkpoint(current.input.checkpoint)
-    provenance = current.provenance(scene.provenance, checkpoint["provenance"])
+    provenance = current.provenance(scene.provenance, checkpoint.provenance)
     files = EditFiles(Path(current.output.film), Path(current.output.still))
     record = render_edit(scene, checkpoint, current.settings(EditJob), current.device(), files)
     write_json(current.output.labels, {**record, "provenance": provenance})

@@ -21,7 +21,7 @@ with job(snakemake, dataset=("images", "sweeps")) as current:
     truth = Path(files.truth[0]) if files.truth else None
     inputs = EvaluationInputs(checkpoint, summary, recording, record, lpips, truth)
     digests = {"truth": sha256_file(truth)} if truth else {}
-    provenance = current.provenance(*upstream, checkpoint["provenance"], inputs=digests)
+    provenance = current.provenance(*upstream, checkpoint.provenance, inputs=digests)
     evaluation = evaluate_method(inputs, current.settings(EvaluateJob), current.device())
     write_image(current.output.recorded, evaluation.sample.recorded)
     write_image(current.output.rendered, evaluation.sample.rendered)

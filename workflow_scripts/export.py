@@ -9,6 +9,6 @@ from drivesplat.scene.training_record import read_training_record
 with job(snakemake) as current:
     scene, record = read_scene(current.input.scene), read_training_record(current.input.parser)
     checkpoint = read_checkpoint(current.input.checkpoint)
-    provenance = current.provenance(scene.provenance, record.provenance, checkpoint["provenance"])
+    provenance = current.provenance(scene.provenance, record.provenance, checkpoint.provenance)
     files = SplatFiles(current.output.splat, current.output.cameras, current.output.parts)
     export_splat(files, checkpoint, record, scene, provenance)

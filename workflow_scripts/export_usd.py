@@ -8,5 +8,5 @@ from drivesplat.settings.export import ExportJob
 
 with job(snakemake) as current:
     scene, checkpoint = read_scene(current.input.scene), read_checkpoint(current.input.checkpoint)
-    provenance = current.provenance(scene.provenance, checkpoint["provenance"])
+    provenance = current.provenance(scene.provenance, checkpoint.provenance)
     export_usd(current.output.usd, checkpoint, scene, current.settings(ExportJob), provenance)

@@ -8,6 +8,6 @@ from drivesplat.settings.export import ExportJob
 
 with job(snakemake) as current:
     scene, checkpoint = read_scene(current.input.scene), read_checkpoint(current.input.checkpoint)
-    provenance = current.provenance(scene.provenance, checkpoint["provenance"])
+    provenance = current.provenance(scene.provenance, checkpoint.provenance)
     settings, method = current.settings(ExportJob), current.wildcards.method
     export_viewer(current.output.viewer, checkpoint, scene, settings, method, provenance)

@@ -12,6 +12,6 @@ from drivesplat.settings.render import FilmFormat
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)
     checkpoint = read_checkpoint(current.input.checkpoint)
-    provenance = current.provenance(scene.provenance, checkpoint["provenance"])
+    provenance = current.provenance(scene.provenance, checkpoint.provenance)
     record = render_parts(scene, checkpoint, current.settings(FilmFormat), current.device(), Path(current.output.film))
     write_json(current.output.cameras, {**record, "provenance": provenance})

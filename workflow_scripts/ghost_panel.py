@@ -13,7 +13,7 @@ from drivesplat.settings.inspection import PanelJob
 with job(snakemake, dataset=("images",)) as current:
     files, checkpoint = current.input, read_checkpoint(current.input.checkpoint)
     recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
-    provenance = current.provenance(*upstream, checkpoint["provenance"])
+    provenance = current.provenance(*upstream, checkpoint.provenance)
     panel, figures = ghost_panel(
         open_trained_drive(checkpoint, recording, current.device()), current.settings(PanelJob)
     )

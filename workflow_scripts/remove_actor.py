@@ -14,7 +14,7 @@ from drivesplat.settings.inspection import RemovalJob
 with job(snakemake, dataset=("images",)) as current:
     files, made, checkpoint = current.input, current.output, read_checkpoint(current.input.checkpoint)
     recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
-    provenance = current.provenance(*upstream, checkpoint["provenance"])
+    provenance = current.provenance(*upstream, checkpoint.provenance)
     pair, record = remove_actor(
         open_trained_drive(checkpoint, recording, current.device()), current.settings(RemovalJob)
     )

@@ -99,7 +99,7 @@ def ours(task: Task, device: torch.device) -> tuple[Times, SplatModel]:
     files = training_files(task)
     run_training(inputs, task.train, task.device, files, made, task.label)
     whole, summary = time.monotonic() - began, read_json(files.summary, rule="train")
-    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    model = trained_model(read_checkpoint(files.checkpoint))
     costs = {key: summary[key] for key in ("gaussians", "peak_gpu_memory_gb")}
     return {"loop": summary["seconds"], "whole": whole, **costs}, model
 
@@ -130,7 +130,7 @@ def _profile_plain(task: Task, device: torch.device, iterations: int, clock: Sta
 
 
 def _profile_ours(task: Task, device: torch.device, iterations: int, clock: StageClock) -> None:
-    model, _ = trained_model(read_checkpoint(training_files(task).checkpoint))
+    model = trained_model(read_checkpoint(training_files(task).checkpoint))
     _continue(task, device, iterations, model, clock)
 
 

@@ -12,7 +12,7 @@ from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
-from drivesplat.model.checkpoint import open_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -44,13 +44,13 @@ class EditFiles:
 
 
 def render_edit(
-    scene: Scene, checkpoint: dict[str, Any], job: EditJob, device_settings: DeviceSettings, files: EditFiles
+    scene: Scene, checkpoint: TrainedCheckpoint, job: EditJob, device_settings: DeviceSettings, files: EditFiles
 ) -> dict[str, Any]:
     """Writes the film and the still, both with the recorded drive on the left and the edited one on the right, and, if
     `job.frames`, the frames of the edited one.
 
     Returns the content of the edit's JSON without provenance: cameras of the edited drive at the size of the frames,
-    and the poses of all objects. `checkpoint` is the content of checkpoint.npz. Raises ConfigError if the edit does not
+    and the poses of all objects. Raises ConfigError if the edit does not
     fit the scene or the model has no actors; DatasetError, DeviceError and ResultError as `render_film` does.
     """
     model, device = open_model(checkpoint, device_settings)

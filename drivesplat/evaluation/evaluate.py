@@ -22,7 +22,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.depth import clouds_of, depths_in
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.machine.device import explain_out_of_memory
-from drivesplat.model.checkpoint import open_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.readers.truth import read_truth
@@ -44,7 +44,7 @@ class EvaluationInputs:
     (None if LPIPS is disabled), the recording, and the path `truth` of a synthetic world's truth.json (None for a
     recorded drive)."""
 
-    checkpoint: dict[str, Any]
+    checkpoint: TrainedCheckpoint
     summary: dict[str, Any]
     recording: PreparedDrive
     masks_record: dict[str, Any]

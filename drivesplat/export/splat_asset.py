@@ -13,7 +13,7 @@ from drivesplat.export.parts_json import write_parts
 from drivesplat.export.splat_ply import write_splat_ply
 from drivesplat.export.trained_parts import digests, trained_gaussians, trained_groups
 from drivesplat.io.storage import write_json
-from drivesplat.model.checkpoint import trained_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
 
@@ -30,14 +30,14 @@ class SplatFiles:
 
 
 def export_splat(
-    files: SplatFiles, checkpoint: dict[str, Any], record: TrainingRecord, scene: Scene, provenance: dict[str, Any]
+    files: SplatFiles, checkpoint: TrainedCheckpoint, record: TrainingRecord, scene: Scene, provenance: dict[str, Any]
 ) -> None:
-    """Writes all Gaussians of a checkpoint (its content): together at the time of the middle image, and group by group;
+    """Writes all Gaussians of a checkpoint: together at the time of the middle image, and group by group;
     and the recorded cameras.
 
     PLY headers contain only the digests of `provenance`, since viewers limit their length; JSON files contain all.
     """
-    model, _ = trained_model(checkpoint)
+    model = trained_model(checkpoint)
     gaussians = trained_gaussians(model, scene)
     groups = trained_groups(model, scene, np.array([frame.timestamp for frame in scene.frames]))
     note = {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)}

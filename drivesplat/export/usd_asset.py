@@ -11,7 +11,7 @@ from drivesplat.export.thinning import thinned_groups
 from drivesplat.export.trained_parts import digests, trained_groups
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND
-from drivesplat.model.checkpoint import trained_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, smooth_poses
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Scene
@@ -21,11 +21,11 @@ log = logging.getLogger(__name__)
 
 
 def export_usd(
-    path: str | Path, checkpoint: dict[str, Any], scene: Scene, job: ExportJob, provenance: dict[str, Any]
+    path: str | Path, checkpoint: TrainedCheckpoint, scene: Scene, job: ExportJob, provenance: dict[str, Any]
 ) -> None:
-    """Writes the `job.gaussians` Gaussians of a checkpoint (its content) with the largest coverage, and the recorded
+    """Writes the `job.gaussians` Gaussians of a checkpoint with the largest coverage, and the recorded
     `job.eval_camera`. Raises DatasetError if the scene lacks that camera."""
-    model, _ = trained_model(checkpoint)
+    model = trained_model(checkpoint)
     cameras = recorded_cameras(scene, job.eval_camera)
     groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera))
     kept = thinned_groups(groups, job.gaussians)

@@ -24,7 +24,7 @@ from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import atomic_write
-from drivesplat.model.checkpoint import trained_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
 from drivesplat.rendering.color_bytes import to_uint8
@@ -40,20 +40,20 @@ SKY_SIZE = 256
 
 def export_viewer(
     path: str | Path,
-    checkpoint: dict[str, Any],
+    checkpoint: TrainedCheckpoint,
     scene: Scene,
     job: ExportJob,
     method: str,
     provenance: dict[str, Any],
 ) -> None:
-    """Writes the page with the `job.gaussians` Gaussians of a checkpoint (its content) that have the largest coverage,
+    """Writes the page with the `job.gaussians` Gaussians of a checkpoint that have the largest coverage,
     viewed from `job.eval_camera`.
 
     Objects are shown at the time of the drive's middle image. Raises DatasetError if the scene has no key frame of that
     camera.
     """
     start = scene.frames[scene.middle_key_frame(job.eval_camera)]
-    model, _ = trained_model(checkpoint)
+    model = trained_model(checkpoint)
     gaussians = trained_gaussians(model, scene)
     kept = thinned(gaussians, job.gaussians)
     page = viewer_page(kept, model.sky, model.antialiased, start, f"{scene.name} · {method}", provenance)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.machine.device import explain_out_of_memory
-from drivesplat.model.checkpoint import open_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View, view_of
@@ -30,9 +29,9 @@ class TrainedDrive:
 
 
 def open_trained_drive(
-    checkpoint: dict[str, Any], recording: PreparedDrive, device_settings: DeviceSettings
+    checkpoint: TrainedCheckpoint, recording: PreparedDrive, device_settings: DeviceSettings
 ) -> TrainedDrive:
-    """The model of a checkpoint (its content) on the device, with its recording. Raises DeviceError."""
+    """The model of a checkpoint on the device, with its recording. Raises DeviceError."""
     model, device = open_model(checkpoint, device_settings)
     return TrainedDrive(model, recording, device)
 

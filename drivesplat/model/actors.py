@@ -7,7 +7,6 @@ of the direction in the object's frame: their spherical harmonics rotate with it
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_w
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
-from drivesplat.model.part import ActorPlacement, Part, RigidGroup
+from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings
@@ -179,8 +178,8 @@ class Actors(Part):
         own = learning_rates(self._gaussians, self.extent)
         return {**own, "translation": tracks.lr_translation, "yaw": tracks.lr_yaw}
 
-    def definition(self) -> dict[str, Any]:
-        return {"tracks": [track.plain() for track in self.timeline.tracks]}
+    def definition(self) -> PartDefinition:
+        return PartDefinition(self.name, self.extent, self.timeline.tracks)
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
         tracks = self._settings.tracks

@@ -1,7 +1,6 @@
 """The static world: one set of Gaussians, fixed in world coordinates."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -47,6 +46,3 @@ class Background(Part):
 
     def learning_rates(self) -> dict[str, float]:
         return learning_rates(self._settings, self.extent)
-
-    def definition(self) -> dict[str, Any]:
-        return {"extent": self.extent}

@@ -11,7 +11,7 @@ from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.camera_poses import TIMES, CameraPoses
 from drivesplat.model.exposure import Exposures
-from drivesplat.model.part import Part, Sky
+from drivesplat.model.part import Part, PartDefinition, Sky
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -63,13 +63,13 @@ def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, sett
     )
 
 
-def definitions(model: SplatModel) -> list[dict[str, Any]]:
-    """What `rebuild_model` needs of a model's parts beside parameters: plain data and tensors."""
-    return [{"part": part.name, **part.definition()} for part in model.parts]
+def definitions(model: SplatModel) -> list[PartDefinition]:
+    """What `rebuild_model` needs of a model's parts beside parameters."""
+    return [part.definition() for part in model.parts]
 
 
 def rebuild_model(
-    state: Mapping[str, torch.Tensor], parts: list[dict[str, Any]], sky: SkyKind, settings: TrainSettings
+    state: Mapping[str, torch.Tensor], parts: list[PartDefinition], sky: SkyKind, settings: TrainSettings
 ) -> SplatModel:
     """The model whose `state_dict` is `state` and whose `definitions` are `parts`."""
     makers = {"background": _restore_background, "actors": _restore_actors}
@@ -77,7 +77,7 @@ def rebuild_model(
     for i, definition in enumerate(parts):
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-        made.append(makers[definition["part"]](params, definition, settings))
+        made.append(makers[definition.part](params, definition, settings))
     exposed = {
         key.removeprefix(EXPOSURE_PREFIX): gains for key, gains in state.items() if key.startswith(EXPOSURE_PREFIX)
     }
@@ -100,8 +100,8 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
     return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes)
 
 
-def _restore_background(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
-    return Background(params, settings.gaussians, definition["extent"])
+def _restore_background(params: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
+    return Background(params, settings.gaussians, definition.extent)
 
 
 def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
@@ -145,9 +145,8 @@ def random_subset(count: int, limit: int) -> np.ndarray:
     return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
 
 
-def _restore_actors(params: dict[str, torch.Tensor], definition: dict[str, Any], settings: TrainSettings) -> Part:
-    tracks = [ActorTrack.from_plain(plain) for plain in definition["tracks"]]
-    return Actors(params, tracks, settings.actors, settings.gaussians)
+def _restore_actors(params: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
+    return Actors(params, definition.tracks, settings.actors, settings.gaussians)
 
 
 def _exposures(first: Mapping[str, Any], settings: TrainSettings) -> Exposures | None:

@@ -1,36 +1,69 @@
-"""Reading checkpoint.npz and opening the trained model in it."""
+"""The content of checkpoint.npz, and the trained model in it.
 
+The stage `train` makes it (`drivesplat.training.run`).
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from drivesplat.io import checkpoint_file
-from drivesplat.io.storage import unreadable
+from drivesplat.io.array_file import read_arrays, write_arrays
+from drivesplat.io.storage import Provenance, unreadable
+from drivesplat.io.typed_record import typed_record
 from drivesplat.machine.device import choose_device, explain_out_of_memory
-from drivesplat.model.build import rebuild_model
+from drivesplat.model.build import definitions, rebuild_model
+from drivesplat.model.part import PartDefinition
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob
 
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Reads `checkpoint.npz`. Raises ResultError for any other file, and for anything but tensors and plain data in
-    it."""
-    content = checkpoint_file.load(Path(path), rule="train")
-    if not {"model", "job", "parts", "provenance"} <= content.keys():
-        raise unreadable(path, "train", "not a checkpoint of a finished training")
-    return content
+RULE = "train"
 
 
-def trained_model(content: dict[str, Any]) -> tuple[SplatModel, TrainJob]:
-    """The model in a checkpoint's content, on the CPU, and the settings that it was trained with."""
-    job = TrainJob.model_validate_json(content["job"])
-    return rebuild_model(content["model"], content["parts"], job.sky, job.train), job
+@dataclass(frozen=True)
+class TrainedCheckpoint:
+    """The content of checkpoint.npz: the `state_dict` of the `model` on the CPU, the settings that it was trained with
+    and the definitions of its parts."""
+
+    model: dict[str, torch.Tensor]
+    job: TrainJob
+    parts: list[PartDefinition]
+    provenance: Provenance
+
+    @classmethod
+    def of(cls, model: SplatModel, job: TrainJob, provenance: Provenance) -> "TrainedCheckpoint":
+        """The checkpoint of a trained model. It shares the memory of a model on the CPU."""
+        state = {name: value.detach().cpu() for name, value in model.state_dict().items()}
+        return cls(state, job, definitions(model), provenance)
 
 
-def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> tuple[SplatModel, torch.device]:
-    """The model in a checkpoint's content, without gradients, on the device that the settings choose.
+def write_checkpoint(path: str | Path, checkpoint: TrainedCheckpoint) -> None:
+    """Writes checkpoint.npz, atomically. Raises ResultError naming `path` where the disk is full."""
+    state = {name: value.numpy() for name, value in checkpoint.model.items()}
+    parts = [part.to_plain() for part in checkpoint.parts]
+    write_arrays(path, {**vars(checkpoint), "model": state, "job": checkpoint.job.model_dump_json(), "parts": parts})
+
+
+def read_checkpoint(path: str | Path) -> TrainedCheckpoint:
+    """Reads checkpoint.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    content = read_arrays(path, RULE)
+    try:
+        state = {name: torch.from_numpy(value) for name, value in content["model"].items()}
+        job = TrainJob.model_validate_json(content["job"])
+        parts = [PartDefinition.from_plain(part) for part in content["parts"]]
+        return typed_record(TrainedCheckpoint, {**content, "model": state, "job": job, "parts": parts})
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise unreadable(path, RULE, "not a checkpoint of a finished training") from error
+
+
+def trained_model(checkpoint: TrainedCheckpoint) -> SplatModel:
+    """The model in a checkpoint, on the CPU."""
+    return rebuild_model(checkpoint.model, checkpoint.parts, checkpoint.job.sky, checkpoint.job.train)
+
+
+def open_model(checkpoint: TrainedCheckpoint, device_settings: DeviceSettings) -> tuple[SplatModel, torch.device]:
+    """The model in a checkpoint, without gradients, on the device that the settings choose.
 
     Raises DeviceError where that device is missing or its memory is exhausted.
 
@@ -44,6 +77,6 @@ def open_model(checkpoint: dict[str, Any], device_settings: DeviceSettings) -> t
     (torch.Size([360, 640, 3]), torch.Size([360, 640]))
     """
     device = choose_device(device_settings, min_free_gb=0.0)
-    model, _ = trained_model(checkpoint)
+    model = trained_model(checkpoint)
     with explain_out_of_memory(lambda: len(model)):
         return model.to(device).requires_grad_(False), device

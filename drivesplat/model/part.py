@@ -13,7 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from drivesplat.io.typed_record import typed_record
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
 from drivesplat.scene.motion import Motion
 
@@ -29,6 +31,25 @@ class ActorPlacement:
     source: str
     object_to_world: np.ndarray | None = None
     scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class PartDefinition:
+    """What a checkpoint needs of the part named `part` beside parameters and settings: its extent in metres, and the
+    tracks that own its Gaussians."""
+
+    part: str
+    extent: float
+    tracks: tuple[ActorTrack, ...] = ()
+
+    def to_plain(self) -> dict[str, Any]:
+        """As plain data and arrays."""
+        return {**vars(self), "tracks": [track.to_plain() for track in self.tracks]}
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> "PartDefinition":
+        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError where `plain` is none."""
+        return typed_record(cls, {**plain, "tracks": tuple(map(ActorTrack.from_plain, plain["tracks"]))})
 
 
 @dataclass(frozen=True)
@@ -95,9 +116,9 @@ class Part(nn.Module, ABC):
     def learning_rates(self) -> dict[str, float]:
         """The initial learning rate of every entry of `params` and `shared` that is learned."""
 
-    @abstractmethod
-    def definition(self) -> dict[str, Any]:
-        """What the checkpoint needs beside parameters and settings: plain data and tensors."""
+    def definition(self) -> PartDefinition:
+        """What the checkpoint needs beside parameters and settings."""
+        return PartDefinition(self.name, self.extent)
 
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         """Its Gaussians with the colours of a time as rigid groups: one static group, or one for every track. Names are

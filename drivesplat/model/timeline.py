@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.motion import Motion
 
 MAX_CACHED_TIMES = 8192
@@ -22,26 +23,17 @@ class ActorTrack:
     """The track that owns a set of Gaussians: `size` (3,) length, width, height in metres, and the annotated motion."""
 
     id: str
-    size: np.ndarray
+    size: Float[np.ndarray, "3"]
     motion: Motion
 
-    def plain(self) -> dict[str, Any]:
-        """As plain data and tensors, for a checkpoint."""
-        return {
-            "id": self.id,
-            "size": torch.from_numpy(self.size),
-            "times": torch.from_numpy(self.motion.times),
-            "object_to_world": torch.from_numpy(self.motion.object_to_world),
-            "runs": [list(run) for run in self.motion.runs],
-            "reach": self.motion.reach,
-        }
+    def to_plain(self) -> dict[str, Any]:
+        """As plain data and arrays."""
+        return {"id": self.id, "size": self.size, **self.motion.to_plain()}
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> "ActorTrack":
-        """The inverse of `plain`."""
-        runs = tuple((first, last) for first, last in plain["runs"])
-        motion = Motion(plain["times"].numpy(), plain["object_to_world"].numpy(), runs, plain["reach"])
-        return cls(plain["id"], plain["size"].numpy(), motion)
+        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError where `plain` is none."""
+        return typed_record(cls, {**plain, "motion": Motion.from_plain(plain)})
 
 
 class TimeState(NamedTuple):

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.video import write_video
 from drivesplat.machine.device import explain_out_of_memory
-from drivesplat.model.checkpoint import open_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.frames import film_frame, film_frames, uint8_image
@@ -81,12 +81,12 @@ class Shot:
 
 
 def render_film(
-    scene: Scene, checkpoint: dict[str, Any], job: FilmJob, device_settings: DeviceSettings, path: Path
+    scene: Scene, checkpoint: TrainedCheckpoint, job: FilmJob, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
     """Writes the MP4 `path`; returns the content of the record of its cameras without provenance: that of the shot, the
     `offset` from the recorded path in metres and degrees, `render_seconds` and `bytes`.
 
-    `checkpoint` is the content of checkpoint.npz. Raises DatasetError where the scene lacks the camera, DeviceError,
+    Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or a rendering contains NaN or Inf.
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
@@ -96,7 +96,7 @@ def render_film(
 
 
 def render_parts(
-    scene: Scene, checkpoint: dict[str, Any], job: FilmFormat, device_settings: DeviceSettings, path: Path
+    scene: Scene, checkpoint: TrainedCheckpoint, job: FilmFormat, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
     """Writes the MP4 `path` of three images side by side along the recorded path: the scene, its static parts, and its
     dynamic parts on plain grey. Returns the record of its cameras as `render_film` does, with the size of one image.

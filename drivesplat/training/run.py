@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.io import checkpoint_file
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import canonical_json, read_record, sha256_text, write_json
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.machine.device import choose_device, explain_out_of_memory
-from drivesplat.model.build import ModelInit, build_model, definitions, gaussian_cap
+from drivesplat.model.build import ModelInit, build_model, gaussian_cap
+from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.actor_record import ActorRecord, read_actors
 from drivesplat.scene.masks import read_classes, read_labels, read_masks_record, read_sky_mask
@@ -178,13 +178,7 @@ def run_training(
         folders = TrainingFolders(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
         model, seed = begun.model, job.random_seed
         summary = train(model, begun.views, begun.settings, seed, device, folders, begun.priors)
-        content = {
-            "model": {key: value.detach().cpu() for key, value in model.state_dict().items()},
-            "job": job.model_dump_json(),
-            "parts": definitions(model),
-            "provenance": provenance,
-        }
-        checkpoint_file.save(files.checkpoint, content)
+        write_checkpoint(files.checkpoint, TrainedCheckpoint.of(model, job, provenance))
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
     if os.getppid() == started_by:
         shutil.rmtree(files.resume)

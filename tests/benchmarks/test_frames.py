@@ -10,7 +10,7 @@ import torch
 from helpers.hand_made_street import checkpoint_of, street_model, street_scene
 
 import benchmarks.frames as command
-from drivesplat.io import checkpoint_file
+from drivesplat.model.checkpoint import write_checkpoint
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.render import FilmJob, TrajectorySettings
 
@@ -51,7 +51,7 @@ def test_frames_are_counted_after_the_first_and_the_film_with_all_it_takes(scene
 
 def test_the_command_measures_a_trained_scene(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "read_scene", lambda path: scene)
-    checkpoint_file.save(tmp_path / "checkpoint.npz", checkpoint_of(street_model()))
+    write_checkpoint(tmp_path / "checkpoint.npz", checkpoint_of(street_model()))
     threads, began = torch.get_num_threads(), time.monotonic()
     words = [str(tmp_path / "checkpoint.npz"), "scene.json", "--width", "32", "--height", "18", "--fps", "4"]
     try:

@@ -319,11 +319,9 @@ def test_what_is_timed_is_what_the_rule_trains(measured, tmp_path, monkeypatch):
     timed = read_checkpoint(task.folder / "checkpoint.npz")
     inputs, _ = read_inputs(task.files.parser, task.files.masks, (), (), ())
     files = TrainingFiles(tmp_path / "again/checkpoint.npz", tmp_path / "again/train.json")
-    run_training(inputs, task.train, task.device, files, timed["provenance"], "again")
+    run_training(inputs, task.train, task.device, files, timed.provenance, "again")
     again = read_checkpoint(files.checkpoint)
-    assert again["job"] == timed["job"] and all(
-        torch.equal(value, again["model"][name]) for name, value in timed["model"].items()
-    )
+    assert again.job == timed.job and all(torch.equal(value, again.model[name]) for name, value in timed.model.items())
 
 
 def test_where_snakemake_only_plans_or_fails_nothing_is_trained(tmp_path, monkeypatch):

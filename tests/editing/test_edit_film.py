@@ -278,8 +278,8 @@ def test_an_edit_does_not_change_the_checkpoint(scene, model, tmp_path, monkeypa
     monkeypatch.setattr("drivesplat.rendering.film.write_video", Reels())
     checkpoint, before = checkpoint_of(model), checkpoint_of(model)
     render_edit(scene, checkpoint, a_job(*BUSY, width=16, height=16, fps=1), CPU, files_in(tmp_path))
-    assert checkpoint["model"].keys() == before["model"].keys()
-    assert all(bool((value == checkpoint["model"][key]).all()) for key, value in before["model"].items())
+    assert checkpoint.model.keys() == before.model.keys()
+    assert all(bool((value == checkpoint.model[key]).all()) for key, value in before.model.items())
 
 
 def test_few_frames_are_rendered_ahead_of_the_encoder(scene, model, tmp_path, monkeypatch):

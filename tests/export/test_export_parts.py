@@ -18,6 +18,7 @@ from helpers.hand_made_traffic import (
     some_gaussians,
     with_turning_track,
 )
+from helpers.records import EMPTY_CHECKPOINT
 
 from drivesplat.export import splat_asset
 from drivesplat.export.parts_json import write_parts
@@ -44,9 +45,9 @@ def street() -> SplatModel:
 
 def export_all(folder, model, scene, monkeypatch):
     """What the stage writes into `folder` for a model; returns parts.json's content."""
-    monkeypatch.setattr(splat_asset, "trained_model", lambda _: (model, None))
+    monkeypatch.setattr(splat_asset, "trained_model", lambda _: model)
     files = SplatFiles(folder / "splat.ply", folder / "cameras.json", folder / "parts/parts.json")
-    export_splat(files, {}, recording_of(scene).record, scene, PROVENANCE)
+    export_splat(files, EMPTY_CHECKPOINT, recording_of(scene).record, scene, PROVENANCE)
     return json.loads((folder / "parts/parts.json").read_text())
 
 

@@ -14,8 +14,7 @@ from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.model.background import Background
-from drivesplat.model.build import definitions
-from drivesplat.model.checkpoint import trained_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.parser import training_record
@@ -42,12 +41,11 @@ def some_gaussians(count: int = 30, sh_degree: int = 3, seed: int = 0) -> Gaussi
     )
 
 
-def checkpoint_of(params: dict[str, torch.Tensor], settings: TrainSettings) -> dict:
+def checkpoint_of(params: dict[str, torch.Tensor], settings: TrainSettings) -> TrainedCheckpoint:
     """What a training of a background with these parameters would have left."""
     model = SplatModel([Background(params, settings.gaussians, 1.0)], None)
     job = TrainJob(parts=("background",), sky="none", train=settings, random_seed=0)
-    state = {key: value.detach() for key, value in model.state_dict().items()}
-    return {"model": state, "job": job.model_dump_json(), "parts": definitions(model), "provenance": PROVENANCE}
+    return TrainedCheckpoint.of(model, job, PROVENANCE)
 
 
 def trained_params(count: int, sh_degree: int) -> dict[str, torch.Tensor]:
@@ -246,6 +244,6 @@ def test_gaussians_with_nan_or_inf_are_dropped(tiny_scene, name):
     params = trained_params(10, sh_degree=1)
     params[name][4] = torch.nan
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1))
-    model, _ = trained_model(checkpoint_of(params, settings))
+    model = trained_model(checkpoint_of(params, settings))
     kept = trained_gaussians(model, tiny_scene)
     assert torch.equal(kept.means, torch.cat([params["means"][:4], params["means"][5:]]))

@@ -15,7 +15,7 @@ from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
 from drivesplat.export.usd_asset import export_usd, recorded_cameras
 from drivesplat.model.background import Background
-from drivesplat.model.build import definitions
+from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.rigid import rigid
@@ -51,8 +51,7 @@ def checkpoint():
     }  # fmt: skip
     model = SplatModel([Background(params, settings.gaussians, 1.0)], None)
     job = TrainJob(parts=("background",), sky="none", train=settings, random_seed=0)
-    state = {key: value.detach() for key, value in model.state_dict().items()}
-    return {"model": state, "job": job.model_dump_json(), "parts": definitions(model), "provenance": PROVENANCE}
+    return TrainedCheckpoint.of(model, job, PROVENANCE)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from helpers.hand_made_traffic import (
     some_gaussians,
     with_turning_track,
 )
+from helpers.records import EMPTY_CHECKPOINT
 from pxr import Gf, Kind, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 from scipy.spatial.transform import Rotation
 
@@ -42,8 +43,8 @@ def scene(tiny_scene):
 def package(tmp_path_factory, scene):
     path = tmp_path_factory.mktemp("usd") / "scene.usdz"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(usd_asset, "trained_model", lambda _: (street(), None))
-        export_usd(path, {}, scene, ExportJob(eval_camera="CAM_FRONT", gaussians=1000), PROVENANCE)
+        monkeypatch.setattr(usd_asset, "trained_model", lambda _: street())
+        export_usd(path, EMPTY_CHECKPOINT, scene, ExportJob(eval_camera="CAM_FRONT", gaussians=1000), PROVENANCE)
     return path
 
 
@@ -240,10 +241,10 @@ def test_an_object_may_have_the_name_of_the_camera():
 
 def test_the_budget_is_shared_by_all_groups_and_an_empty_object_is_valid(tmp_path, scene, monkeypatch):
     """The two wide, opaque Gaussians of the background cover most."""
-    monkeypatch.setattr(usd_asset, "trained_model", lambda _: (street(), None))
+    monkeypatch.setattr(usd_asset, "trained_model", lambda _: street())
     monkeypatch.setattr("helpers.hand_made_traffic.own_gaussians", lambda *_: some_gaussians(12, 1, 0)[slice(0, 1)])
     job = ExportJob(eval_camera="CAM_FRONT", gaussians=2)
-    export_usd(tmp_path / "scene.usdz", {}, scene, job, PROVENANCE)
+    export_usd(tmp_path / "scene.usdz", EMPTY_CHECKPOINT, scene, job, PROVENANCE)
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
     assert sum(counts(stage).values()) == 2 and counts(stage).keys() == {"/World/background", *PATHS.values()}
     assert 0 in counts(stage).values()

@@ -12,13 +12,14 @@ import torch
 from helpers.chromium import CHROMIUM, chromium
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import COURSES, TURNING, Traffic, own_gaussians, placed
+from helpers.records import EMPTY_CHECKPOINT
 from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.export import viewer
 from drivesplat.export.viewer import export_viewer, packed, sky_faces, viewer_page
 from drivesplat.model.background import Background
-from drivesplat.model.build import definitions
+from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
 from drivesplat.model.sky import CubemapSky
@@ -84,8 +85,7 @@ def checkpoint():
     model = a_model(splats(), CubemapSky(8, torch.tensor([0.4, 0.6, 0.8]), 0.01))
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2), sky_resolution=8)
     job = TrainJob(parts=("background",), sky="cubemap", train=settings, random_seed=0)
-    state = {key: value.detach() for key, value in model.state_dict().items()}
-    return {"model": state, "job": job.model_dump_json(), "parts": definitions(model), "provenance": PROVENANCE}
+    return TrainedCheckpoint.of(model, job, PROVENANCE)
 
 
 @pytest.fixture(scope="module")
@@ -138,9 +138,9 @@ def test_the_payload_has_the_gaussians_of_largest_coverage(page):
 def test_objects_present_at_the_middle_image_are_placed_there(tmp_path, tiny_scene, monkeypatch):
     """Two vehicles, of which one is absent then; beside a background without view dependence."""
     model = SplatModel([round_gaussians([[1.0, 2.0, 3.0]]), Traffic()], None)
-    monkeypatch.setattr(viewer, "trained_model", lambda _: (model, None))
+    monkeypatch.setattr(viewer, "trained_model", lambda _: model)
     job = ExportJob(eval_camera="CAM_FRONT", gaussians=1000)
-    export_viewer(tmp_path / "viewer.html", {}, tiny_scene, job, "street", PROVENANCE)
+    export_viewer(tmp_path / "viewer.html", EMPTY_CHECKPOINT, tiny_scene, job, "street", PROVENANCE)
     scene, arrays = decoded((tmp_path / "viewer.html").read_text(encoding="utf-8"))
     there = placed(own_gaussians(TURNING, 2.25), COURSES[TURNING].pose(2.25))
     assert (scene["count"], scene["coefficients"]) == (1 + len(there), 4)

@@ -31,6 +31,7 @@ from helpers.trainings import (
 from drivesplat.workflow.job import job
 from drivesplat.errors import ResultError, TrainingError
 from drivesplat.io import checkpoint_file
+from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.training.monitor import Monitor
 from drivesplat.training.run import run_training
@@ -75,15 +76,12 @@ def test_a_kill_during_a_checkpoint_write_leaves_the_earlier_one_to_go_on_from(t
 def test_only_the_same_settings_code_and_inputs_resume(tmp_path, caplog, other):
     """The digests of a training's provenance are what tells its resume state from another's."""
     files, inputs = files_in(tmp_path / "it"), inputs_in(tmp_path)
-    checkpoint_save, ends = checkpoint_file.save, iter([False, True])
 
-    def save(path: Path, content: dict[str, Any]) -> None:
-        if next(ends, False):
-            raise EndedError
-        checkpoint_save(path, content)
+    def ended(path: Path, checkpoint: TrainedCheckpoint) -> None:
+        raise EndedError
 
     with pytest.MonkeyPatch.context() as patched, pytest.raises(EndedError):
-        patched.setattr(checkpoint_file, "save", save)
+        patched.setattr("drivesplat.training.run.write_checkpoint", ended)
         run_training(inputs, RESUMABLE, CPU, files, PROVENANCE, "train")
     assert checkpoint_file.load(files.resume / "state.npz", "train")["step"] == 10
     provenance = {**PROVENANCE, **({other: "other"} if other else {})}

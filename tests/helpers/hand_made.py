@@ -63,9 +63,6 @@ class Own(Part):
     def learning_rates(self) -> dict[str, float]:
         return self._still.learning_rates()
 
-    def definition(self) -> dict[str, Any]:
-        return {}
-
     def of_track(self, track_id: str) -> torch.Tensor | None:
         return torch.ones(len(self), dtype=torch.bool) if track_id == self._track_id else None
 

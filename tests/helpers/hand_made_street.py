@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from drivesplat.model.actors import Actors
-from drivesplat.model.build import definitions
+from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
@@ -106,12 +106,12 @@ def street_model(*parts: Part) -> SplatModel:
     return SplatModel(made, ConstantSky(torch.tensor(SKY), 1e-2)).requires_grad_(False)
 
 
-def checkpoint_of(model: SplatModel, settings: TrainSettings = SETTINGS) -> dict[str, Any]:
+def checkpoint_of(model: SplatModel, settings: TrainSettings = SETTINGS) -> TrainedCheckpoint:
     """What a training that ends with this model leaves."""
-    state = {key: value.detach().clone() for key, value in model.state_dict().items()}
     parts = tuple(part.name for part in model.parts)
     job = TrainJob(parts=parts, sky="mask" if model.sky else "none", train=settings, random_seed=0)
-    return {"model": state, "job": job.model_dump_json(), "parts": definitions(model), "provenance": {}}
+    checkpoint = TrainedCheckpoint.of(model, job, {})
+    return replace(checkpoint, model={name: value.clone() for name, value in checkpoint.model.items()})
 
 
 def a_format(**changes: Any) -> FilmFormat:

@@ -1,7 +1,6 @@
 """A part of two vehicles that drive, turn and are absent at times; where they are at a time is known in closed form."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -113,9 +112,6 @@ class Traffic(Part):
         }
 
     def learning_rates(self) -> dict[str, float]:
-        return {}
-
-    def definition(self) -> dict[str, Any]:
         return {}
 
 

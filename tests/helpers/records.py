@@ -4,7 +4,14 @@ from typing import Any
 
 import numpy as np
 
+from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
+from drivesplat.settings.train import TrainJob, TrainSettings
+
+EMPTY_CHECKPOINT = TrainedCheckpoint(
+    {}, TrainJob(parts=("background",), sky="none", train=TrainSettings(), random_seed=0), [], {}
+)
+"""For functions whose model a test sets."""
 
 
 def training_record_of(images: int, **fields: Any) -> TrainingRecord:

@@ -231,7 +231,7 @@ def test_a_training_corrects_its_cameras_where_the_settings_say_so(tmp_path, cor
     inputs = TrainingInputs(parser_record(tmp_path, recorded_views(6)), tmp_path, [], [])
     files = TrainingFiles(tmp_path / "it/checkpoint.npz", tmp_path / "it/train.json")
     run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
-    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    model = trained_model(read_checkpoint(files.checkpoint))
     told = json.loads(files.summary.read_text())["of_cameras"]
     if not corrected:
         assert model.camera_poses is None and told == {}

@@ -4,7 +4,6 @@ import doctest
 
 from helpers.hand_made_street import checkpoint_of, street_model
 
-from drivesplat.io import checkpoint_file
 from drivesplat.model import checkpoint
 from drivesplat.model.view import View
 
@@ -12,7 +11,7 @@ from drivesplat.model.view import View
 def test_the_example_of_open_model_renders_a_view(tmp_path, monkeypatch):
     folder = tmp_path / "results/0103/street"
     folder.mkdir(parents=True)
-    checkpoint_file.save(folder / "checkpoint.npz", checkpoint_of(street_model()))
+    checkpoint.write_checkpoint(folder / "checkpoint.npz", checkpoint_of(street_model()))
     monkeypatch.chdir(tmp_path)
     names = {**vars(checkpoint), "View": View}
     (example,) = doctest.DocTestFinder(recurse=False).find(checkpoint.open_model, "open_model", globs=names)

@@ -246,7 +246,7 @@ def test_a_training_starts_from_the_estimated_gains_and_saves_them(rig, tmp_path
     job = TrainJob(parts=("background",), sky="none", train=train, random_seed=0, reference_camera="CAM_FRONT")
     files = TrainingFiles(tmp_path / "it/checkpoint.npz", tmp_path / "it/train.json")
     run_training(rig, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
-    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    model = trained_model(read_checkpoint(files.checkpoint))
     told = json.loads(files.summary.read_text())["of_cameras"]
     figures = {f"exposure/{name}": value for name, value in model.exposure.figures().items()}
     assert told == pytest.approx(figures) and told["exposure/CAM_BACK/gain_red"] > 1.1

@@ -1,7 +1,6 @@
 """Cameras, Gaussians from seed points, composition over a sky, and a model saved and rebuilt."""
 
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.errors import ResultError
-from drivesplat.io import checkpoint_file
 from drivesplat.model.actors import Actors
 from drivesplat.model.background import Background
 from drivesplat.model.build import ModelInit, actor_cap, build_model, definitions, gaussian_cap, rebuild_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, read_checkpoint, trained_model, write_checkpoint
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Part
 from drivesplat.model.sky import ConstantSky, CubemapSky
@@ -25,7 +24,7 @@ from drivesplat.model.view import View
 from drivesplat.scene.actor_record import ActorRecord
 from drivesplat.scene.images import pixel_rays
 from drivesplat.scene.training_record import TrainingRecord
-from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainSettings
+from drivesplat.settings.train import ActorSettings, GaussianSettings, TrainJob, TrainSettings
 
 SH_C0 = 0.5 / np.sqrt(np.pi)
 SKY_COLOR = np.array([0.2, 0.4, 0.8])
@@ -186,9 +185,6 @@ class Riding(Part):
     def learning_rates(self) -> dict[str, float]:
         return self._still.learning_rates()
 
-    def definition(self) -> dict[str, Any]:
-        return {}
-
 
 def test_a_model_renders_all_parts_at_the_time_of_the_view():
     first = Background.from_points(*seed_points(20, seed=1), GaussianSettings(), 1.0)
@@ -328,9 +324,9 @@ def test_a_street_saved_and_rebuilt_is_the_same_to_the_bit(sky, tmp_path):
     model = shaken(build_model(model_init(parser_record(20), *records), parts, sky, settings))
     for value in model.parts[1].params.values():
         value.data = value.data[3:]
-    checkpoint_file.save(tmp_path / "a.npz", {"model": model.state_dict(), "parts": definitions(model)})
-    content = checkpoint_file.load(tmp_path / "a.npz", "train")
-    rebuilt = rebuild_model(content["model"], content["parts"], sky, settings)
+    job = TrainJob(parts=parts, sky=sky, train=settings, random_seed=0)
+    write_checkpoint(tmp_path / "a.npz", TrainedCheckpoint.of(model, job, {}))
+    rebuilt = trained_model(read_checkpoint(tmp_path / "a.npz"))
     assert [part.name for part in rebuilt.parts] == list(parts) and rebuilt.moving().sum() == 14
     for time in (-0.2, 0.0, 0.61, 1.0, 1.8, 2.7, 5.0):
         ours, again = model.gaussians_at(time), rebuilt.gaussians_at(time)

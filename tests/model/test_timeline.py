@@ -6,7 +6,7 @@ import torch
 from helpers.hand_made import about_z, motion_through, track_of
 from scipy.spatial.transform import Rotation
 
-from drivesplat.io import checkpoint_file
+from drivesplat.io.array_file import read_arrays, write_arrays
 from drivesplat.model import timeline as timeline_module
 from drivesplat.model.timeline import ActorTrack, Timeline
 
@@ -90,8 +90,8 @@ def test_two_annotations_have_no_neighbours():
 
 
 def test_a_track_survives_a_checkpoint(tmp_path):
-    checkpoint_file.save(tmp_path / "a.npz", {"track": a_car().plain()})
-    again = ActorTrack.from_plain(checkpoint_file.load(tmp_path / "a.npz", "train")["track"])
+    write_arrays(tmp_path / "a.npz", a_car().to_plain())
+    again = ActorTrack.from_plain(read_arrays(tmp_path / "a.npz", "train"))
     assert (again.id, again.motion.runs, again.motion.reach) == ("car", ((0, 2), (3, 6)), 0.25)
     np.testing.assert_array_equal(again.size, a_car().size)
     at = np.linspace(-0.5, 4.5, 33)

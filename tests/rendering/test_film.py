@@ -22,6 +22,7 @@ from drivesplat.errors import DatasetError, ResultError
 from drivesplat.io import video
 from drivesplat.io.video import Footage, read_footage, write_video
 from drivesplat.model.background import Background
+from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -314,13 +315,13 @@ BALL = np.array([30.0, 1.0, 1.5])
 """Where the models of these tests have their one white Gaussian: world coordinates, ahead of the tiny drive."""
 
 
-def a_checkpoint(**changes: Any) -> dict[str, Any]:
+def a_checkpoint(**changes: Any) -> TrainedCheckpoint:
     """What a training leaves: one white ball in the dark."""
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=1, init_opacity=0.9))
     part = Background.from_points(BALL[None].astype(np.float32), np.ones((1, 3)), settings.gaussians, 1.0)
     part.params["scales"].data.fill_(np.log(0.4))
     content = checkpoint_of(SplatModel([part], None), settings)
-    return {**content, "model": {**content["model"], **changes}}
+    return dataclasses.replace(content, model={**content.model, **changes})
 
 
 def a_job(**changes: Any) -> FilmJob:

@@ -11,6 +11,7 @@ from helpers.hand_made_street import Reels, a_format, checkpoint_of, street_acto
 
 from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import read_footage
+from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import BACKDROP, render_film, render_parts
 from drivesplat.rendering.frames import film_frame
@@ -33,7 +34,7 @@ def reels(monkeypatch) -> Reels:
     return made
 
 
-def parts_film(scene: Scene, folder: Path, checkpoint: dict[str, Any], **changes: Any) -> dict[str, Any]:
+def parts_film(scene: Scene, folder: Path, checkpoint: TrainedCheckpoint, **changes: Any) -> dict[str, Any]:
     return render_parts(scene, checkpoint, a_format(**changes), CPU, folder / "parts.mp4")
 
 

@@ -172,6 +172,6 @@ def test_a_body_that_was_found_reaches_the_training_of_its_camera(prepared, monk
     assert len({view.ego_mask.data_ptr() for view in views if view.ego_mask is not None}) == 1
     files = files_in(tmp_path / "trained")
     run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
-    model, _ = trained_model(read_checkpoint(files.checkpoint))
+    model = trained_model(read_checkpoint(files.checkpoint))
     with torch.no_grad():
         assert torch.isfinite(model.render(view_of(inputs.record, 0, CPU)).image).all()

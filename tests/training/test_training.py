@@ -678,9 +678,9 @@ def test_a_finished_training_leaves_a_checkpoint_and_a_summary(tmp_path):
     assert {path.name for path in files.checkpoint.parent.iterdir()} == {"checkpoint.npz", "train.json", "tensorboard"}
     summary = json.loads(files.summary.read_text())
     content = read_checkpoint(files.checkpoint)
-    model, job = trained_model(content)
-    assert content["provenance"] == summary["provenance"] == PROVENANCE
-    assert job == job_of()
+    model = trained_model(content)
+    assert content.provenance == summary["provenance"] == PROVENANCE
+    assert content.job == job_of()
     assert summary["gaussians"] == len(model) and summary["iterations"] == 20 and summary["random_seed"] == 3
     assert summary["peak_gpu_memory_gb"] is None and summary["resumed_at"] == []
     views = recorded_views()
@@ -708,8 +708,9 @@ def test_the_terms_about_surfaces_are_logged(tmp_path):
 
 def test_a_finished_training_of_actors_can_be_rendered_from_its_checkpoint_alone(tmp_path):
     job = job_of(("background", "actors"), "cubemap", sky_resolution=4, **ALL_TERMS)
-    model, again = trained_model(read_checkpoint(run(tmp_path, job, actors=True).checkpoint))
-    assert again == job and [part.name for part in model.parts] == ["background", "actors"]
+    checkpoint = read_checkpoint(run(tmp_path, job, actors=True).checkpoint)
+    model = trained_model(checkpoint)
+    assert checkpoint.job == job and [part.name for part in model.parts] == ["background", "actors"]
     assert [track.id for track in model.parts[1].timeline.tracks] == ["early", "late"]
     assert model.parts[1].shared["translation"].any(), "tracks were corrected"
     views = recorded_views()
