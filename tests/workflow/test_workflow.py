@@ -169,7 +169,7 @@ def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
     pictures |= {"gap_report.html"}
     assert pictures | {"parts.mp4", "stop.mp4", "stop.png", "gone.mp4", "gone.png"} < names
     assert "Scene 0001" in page and "Across scenes" in page and "the moving vehicle that fills most pixels" in page
-    assert "what moves, before plain grey" in page and "the frame in which both differ most" in page
+    assert "the moving parts on grey" in page and "the frame with the largest difference" in page
 
 
 OF_ACTORS = {"film_parts": 1, "edit": 2}
