@@ -17,8 +17,7 @@ from benchmarks.files import BenchmarkFile, error_prefix
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import atomic_write
 from drivesplat.settings.config import DATASET_OVERRIDES, load
-from drivesplat.settings.method import MethodSettings, with_seed, with_seeds
-from drivesplat.settings.overrides import merged
+from drivesplat.settings.method import MethodSettings, merged, with_seed, with_seeds
 from drivesplat.settings.yaml_file import read_yaml
 from drivesplat.workflow.plan import Plan
 

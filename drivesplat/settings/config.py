@@ -28,9 +28,8 @@ from drivesplat.settings.inspection import GhostSettings, RemovalSettings, Subje
 from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
-from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings
+from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, merged
 from drivesplat.settings.names import require_name
-from drivesplat.settings.overrides import merged
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.train import SkyKind, TrainSettings

@@ -6,8 +6,16 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.overrides import merged
 from drivesplat.settings.train import STAGE_OF_PART, PartName, Parts
+
+
+def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with `overrides` laid over it; mappings are merged key by key."""
+    result = dict(base)
+    for key, value in overrides.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
+        result[key] = merged(result[key], value) if both else value
+    return result
 
 
 class MethodSettings(Settings):
