@@ -102,3 +102,18 @@ def test_imports_are_found_in_every_form():
     source = "import a.b\nfrom a import b, c\nfrom a.b import d\ndef f():\n    from e import g\n"
     assert imported(ast.parse(source), {"a", "a.b", "e"}) == {"a", "a.b", "e"}
     assert longest_chain({"x": {"y"}, "y": {"z"}, "z": set(), "w": {"z"}}) == ["x", "y", "z"]
+
+
+JSON_DOCUMENTS = {"read_backbone", "read_evaluations", "read_record", "read_summary", "read_scene_tables"}
+"""Readers of JSON for users (train.json, eval.json, backbone.json), of the dataset's tables, and the one they share."""
+
+
+def test_readers_of_intermediates_return_typed_records():
+    untyped = {
+        node.name
+        for path in modules().values()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("read_") and node.returns
+        if "dict[str, Any]" in ast.unparse(node.returns)
+    }
+    assert untyped == JSON_DOCUMENTS | {"read_arrays"}, "a reader returns a dict; io/typed_record.py makes records"

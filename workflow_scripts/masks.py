@@ -12,4 +12,4 @@ from drivesplat.settings.masks import MaskJob
 with job(snakemake, dataset=("images", "sweeps")) as current:
     scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
     record = make_masks(scene, current.settings(MaskJob), Path(current.output.masks).parent, ego_mask)
-    write_json(current.output.masks, {**record, "provenance": current.provenance(scene.provenance, upstream)})
+    write_json(current.output.masks, {**vars(record), "provenance": current.provenance(scene.provenance, upstream)})

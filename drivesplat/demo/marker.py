@@ -2,10 +2,9 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 from drivesplat.errors import ConfigError
-from drivesplat.io.storage import write_json
+from drivesplat.io.storage import Provenance, write_json
 
 WORLD_MARKER = "world.json"
 """Holds the provenance of the world in the same folder."""
@@ -20,7 +19,7 @@ def refuse_foreign_data(root: Path) -> None:
         )
 
 
-def prepare_folder(root: Path, provenance: dict[str, Any]) -> None:
+def prepare_folder(root: Path, provenance: Provenance) -> None:
     """Deletes an earlier world in `root` and writes the marker. Raises ConfigError where `root` holds anything else."""
     refuse_foreign_data(root)
     for folder in ("samples", "sweeps", "maps", "truth"):

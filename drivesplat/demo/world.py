@@ -5,7 +5,6 @@ import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -15,7 +14,7 @@ from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor, image_height, trigger_times
 from drivesplat.demo.tables import NuScenesTables
 from drivesplat.demo.truth import write_truth, write_truth_frame
-from drivesplat.io.storage import atomic_write, canonical_json, sha256_text
+from drivesplat.io.storage import Provenance, atomic_write, canonical_json, sha256_text
 from drivesplat.readers.truth import TruthFrame
 from drivesplat.settings.world import WorldJob, WorldSettings
 
@@ -40,7 +39,7 @@ class SensorFile:
     path: str
 
 
-def make_world(root: Path, job: WorldJob, provenance: dict[str, Any], workers: int = 1) -> None:
+def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int = 1) -> None:
     """Writes the dataset below `root`: images, sweeps, truth/, and last the tables.
 
     The tables contain a digest of the provenance, so results are remade when the images are. Equal settings give equal

@@ -26,6 +26,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.readers.truth import read_truth
+from drivesplat.scene.masks import MasksRecord
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import REGIONS, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS
@@ -47,7 +48,7 @@ class EvaluationInputs:
     checkpoint: TrainedCheckpoint
     summary: dict[str, Any]
     recording: PreparedDrive
-    masks_record: dict[str, Any]
+    masks_record: MasksRecord
     lpips_record: dict[str, Any] | None
     truth: Path | None
 
@@ -105,7 +106,7 @@ def truth_metrics(
     return {**({"lateral": lateral} if lateral else {}), **({"removal": removal} if removal else {})}
 
 
-def protocol(record: TrainingRecord, masks_record: dict[str, Any], job: EvaluateJob) -> dict[str, Any]:
+def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob) -> dict[str, Any]:
     """The protocol of every figure."""
     measured = [i for images in measured_images(record, job.eval_camera).values() for i in images]
     width, height = record.image_size(measured[0] if measured else 0)
@@ -120,8 +121,8 @@ def protocol(record: TrainingRecord, masks_record: dict[str, Any], job: Evaluate
         "held_out_frames": record.held_out_frames,
         "train_images": len(record.train_images),
         "poses": record.scene.poses,
-        "regions": masks_record["regions"],
-        "own_car": masks_record["own_car"].get(job.eval_camera),
+        "regions": masks_record.regions,
+        "own_car": masks_record.own_car.get(job.eval_camera),
         "extra_points": record.seed.extra_points,
         "lidar_missing": record.seed.lidar_missing,
         "images_missing": record.scene.missing_images,

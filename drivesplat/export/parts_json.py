@@ -15,7 +15,7 @@ from drivesplat.export.scene_header import scene_header
 from drivesplat.export.splat_ply import note_of, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, digests, middle_timestamp
 from drivesplat.export.unique_names import unique_names
-from drivesplat.io.storage import write_json
+from drivesplat.io.storage import Provenance, write_json
 from drivesplat.scene.scene import Scene
 
 SCHEMA = 1
@@ -35,7 +35,7 @@ CONVENTIONS = {
 }
 
 
-def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Scene, provenance: dict[str, Any]) -> None:
+def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Scene, provenance: Provenance) -> None:
     """Writes every group as a PLY beside `path`, then their record to `path`.
 
     PLYs of groups of earlier calls that are not written again are removed; other files stay.

@@ -4,7 +4,6 @@ cameras.json and the motions of objects in parts.json."""
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from drivesplat.export.cameras_json import cameras_record
 from drivesplat.export.parts_json import write_parts
 from drivesplat.export.splat_ply import write_splat_ply
 from drivesplat.export.trained_parts import digests, trained_gaussians, trained_groups
-from drivesplat.io.storage import write_json
+from drivesplat.io.storage import Provenance, write_json
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.training_record import TrainingRecord
@@ -30,7 +29,7 @@ class SplatFiles:
 
 
 def export_splat(
-    files: SplatFiles, checkpoint: TrainedCheckpoint, record: TrainingRecord, scene: Scene, provenance: dict[str, Any]
+    files: SplatFiles, checkpoint: TrainedCheckpoint, record: TrainingRecord, scene: Scene, provenance: Provenance
 ) -> None:
     """Writes all Gaussians of a checkpoint: together at the time of the middle image, and group by group;
     and the recorded cameras.

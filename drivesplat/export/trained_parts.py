@@ -6,12 +6,12 @@ treat them differently.
 
 import logging
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
 from drivesplat.export.sampled_motion import SampledMotion, sample_motion
+from drivesplat.io.storage import Provenance
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scene import Scene, Track
@@ -57,7 +57,7 @@ def trained_groups(model: SplatModel, scene: Scene, timestamps: np.ndarray) -> d
     return result
 
 
-def digests(provenance: dict[str, Any]) -> dict[str, str]:
+def digests(provenance: Provenance) -> dict[str, str]:
     """The digests of a provenance, for files with little space."""
     return {name: provenance[name] for name in ("settings_sha256", "code_sha256", "inputs_sha256")}
 

@@ -2,7 +2,6 @@
 
 import logging
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pxr import Gf
@@ -11,6 +10,7 @@ from drivesplat.export.thinning import thinned_groups
 from drivesplat.export.trained_parts import digests, trained_groups
 from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND
+from drivesplat.io.storage import Provenance
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, smooth_poses
 from drivesplat.scene.images import continuous_intrinsics
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def export_usd(
-    path: str | Path, checkpoint: TrainedCheckpoint, scene: Scene, job: ExportJob, provenance: dict[str, Any]
+    path: str | Path, checkpoint: TrainedCheckpoint, scene: Scene, job: ExportJob, provenance: Provenance
 ) -> None:
     """Writes the `job.gaussians` Gaussians of a checkpoint with the largest coverage, and the recorded
     `job.eval_camera`. Raises DatasetError if the scene lacks that camera."""

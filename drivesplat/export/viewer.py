@@ -23,7 +23,7 @@ from drivesplat.export import viewer_page as template
 from drivesplat.export.thinning import thinned
 from drivesplat.export.trained_parts import trained_gaussians
 from drivesplat.io.html_page import filled_page
-from drivesplat.io.storage import atomic_write
+from drivesplat.io.storage import Provenance, atomic_write
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import Sky
@@ -44,7 +44,7 @@ def export_viewer(
     scene: Scene,
     job: ExportJob,
     method: str,
-    provenance: dict[str, Any],
+    provenance: Provenance,
 ) -> None:
     """Writes the page with the `job.gaussians` Gaussians of a checkpoint that have the largest coverage,
     viewed from `job.eval_camera`.
@@ -63,7 +63,7 @@ def export_viewer(
 
 
 def viewer_page(
-    gaussians: Gaussians, sky: Sky | None, antialiased: bool, start: Frame, title: str, provenance: dict[str, Any]
+    gaussians: Gaussians, sky: Sky | None, antialiased: bool, start: Frame, title: str, provenance: Provenance
 ) -> str:
     """The text of the page, deterministic. Its first view is that of `start`; without a sky the background is black."""
     arrays, sh_range = splat_arrays(gaussians)

@@ -10,7 +10,6 @@ import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from drivesplat.lidar.sweeps import training_sweeps
 from drivesplat.preprocess.sky_mask import sky_mask
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
-from drivesplat.scene.masks import UNLABELLED, mask_name
+from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import Group, frame_groups
@@ -36,8 +35,8 @@ NO_SKY = (
 )
 
 
-def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_EGO_MASK) -> dict[str, Any]:
-    """Writes the masks of every image below `folder`; returns the record for masks.json. The own car's body is a region
+def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_EGO_MASK) -> MasksRecord:
+    """Writes the masks of every image below `folder`; returns the record of masks.json. The own car's body is a region
     of its own, no sky, and of no class. The sky of a training image is told by sweeps that a training may see alone.
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
@@ -61,16 +60,16 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
     sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= MIN_SKY
     if not sky_known:
         log.warning(NO_SKY, scene.name)
-    return {
-        "labels": LABELS,
-        "images": len(scene.frames),
-        "regions": "masks" if job.masks.regions_folder else "boxes",
-        "sky": "masks" if job.masks.sky_folder else "heuristic",
-        "sky_share": float(np.mean(sky_shares)),
-        "sky_known": sky_known,
-        "semantic_classes": max(classes),
-        "own_car": {camera: ego_mask.source.get(camera, "masks") for camera in sorted(seeing)},
-    }
+    return MasksRecord(
+        labels=LABELS,
+        images=len(scene.frames),
+        regions="masks" if job.masks.regions_folder else "boxes",
+        sky="masks" if job.masks.sky_folder else "heuristic",
+        sky_share=float(np.mean(sky_shares)),
+        sky_known=sky_known,
+        semantic_classes=max(classes),
+        own_car={camera: ego_mask.source.get(camera, "masks") for camera in sorted(seeing)},
+    )
 
 
 def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int:

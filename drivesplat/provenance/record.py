@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import canonical_json, sha256_file, sha256_text
+from drivesplat.io.storage import Provenance, canonical_json, sha256_file, sha256_text
 
 VERSIONS_OF = ("torch", "gsplat", "numpy", "nuscenes-devkit", "lpips", "pycolmap")
 
 
 def provenance(
-    stage: str, settings: dict[str, Any], code: str, upstream: Iterable[dict[str, Any]], inputs: dict[str, str]
-) -> dict[str, Any]:
+    stage: str, settings: dict[str, Any], code: str, upstream: Iterable[Provenance], inputs: dict[str, str]
+) -> Provenance:
     """The provenance of a result of `stage`, given those of the results it was made from.
 
     `inputs` are digests of files that no stage made (tables, a user's points file), by name. Raises ResultError if two
@@ -25,7 +25,7 @@ def provenance(
     return sealed(merged["stages"], merged["inputs"])
 
 
-def combine(records: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def combine(records: Iterable[Provenance]) -> Provenance:
     """Several provenances as one. Raises ResultError naming the stage and the difference if they contradict."""
     stages: dict[str, Any] = {}
     inputs: dict[str, str] = {}
@@ -42,7 +42,7 @@ def combine(records: Iterable[dict[str, Any]]) -> dict[str, Any]:
     return sealed(stages, inputs)
 
 
-def sealed(stages: dict[str, Any], inputs: dict[str, str]) -> dict[str, Any]:
+def sealed(stages: dict[str, Any], inputs: dict[str, str]) -> Provenance:
     """The record with the digests that `metrics.json` specifies."""
     return {
         "settings_sha256": sha256_text(canonical_json({name: stage["settings"] for name, stage in stages.items()})),

@@ -14,12 +14,11 @@ The stage `own_car` makes it (`drivesplat.preprocess.ego_mask`).
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from drivesplat.io.storage import read_json, unreadable
+from drivesplat.io.storage import Provenance, read_json, unreadable
 
 RULE = "own_car"
 Outline = tuple[tuple[float, float], ...]
@@ -50,7 +49,7 @@ def enclosed(outlines: tuple[Outline, ...], size: tuple[int, int]) -> np.ndarray
     return pixels.astype(bool)
 
 
-def read_ego_mask(path: str | Path) -> tuple[EgoMask, dict[str, Any]]:
+def read_ego_mask(path: str | Path) -> tuple[EgoMask, Provenance]:
     """Reads own_car.json, and the provenance in it. Raises ResultError where the file is not one, naming it and the
     rule that makes it."""
     content = read_json(path, RULE)

@@ -1,14 +1,16 @@
 """The masks of a scene, as files: region labels, sky and semantic classes of every image."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.storage import read_record, unreadable
+from drivesplat.io.storage import Provenance, read_json, unreadable
+from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.images import read_mask
 
+RULE = "masks"
 UNLABELLED = 255
 """The value of pixels that a user's map of classes says nothing of."""
 
@@ -18,9 +20,31 @@ def mask_name(kind: str, camera: str, timestamp: int) -> str:
     return f"{kind}/{camera}/{timestamp}.png"
 
 
-def read_masks_record(folder: Path) -> dict[str, Any]:
-    """Reads `masks.json`. Raises ResultError where it is not one."""
-    return read_record(folder / "masks.json", "masks", "regions", "sky_known", "semantic_classes", "own_car")
+@dataclass(frozen=True)
+class MasksRecord:
+    """The content of masks.json: the `labels` of regions, the number of `images`, whether regions come from 'boxes' or
+    'masks' and the sky from a 'heuristic' or 'masks', the mean share of sky pixels, whether any sky was found, the
+    number of semantic classes (0: none), and by camera that sees the ego vehicle where its mask comes from."""
+
+    labels: dict[str, int]
+    images: int
+    regions: str
+    sky: str
+    sky_share: float
+    sky_known: bool
+    semantic_classes: int
+    own_car: dict[str, str]
+    provenance: Provenance = field(default_factory=dict)
+
+
+def read_masks_record(folder: Path) -> MasksRecord:
+    """Reads masks.json. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    path = folder / "masks.json"
+    content = read_json(path, RULE)
+    try:
+        return typed_record(MasksRecord, content)
+    except ValueError as error:
+        raise unreadable(path, RULE, f"not a record of masks ({error})") from error
 
 
 def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
@@ -52,4 +76,4 @@ def _made_mask(folder: Path, kind: str, camera: str, timestamp: int, size: tuple
     try:
         return read_mask(path, size)
     except DatasetError as error:
-        raise unreadable(path, "masks", str(error), delete=folder / "masks.json") from error
+        raise unreadable(path, RULE, str(error), delete=folder / "masks.json") from error

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from drivesplat.io.storage import Provenance
 from drivesplat.scene.images import read_image
 from drivesplat.scene.masks import read_labels, read_masks_record
 from drivesplat.scene.regions import LABELS, label_image
@@ -51,8 +51,8 @@ class PreparedDrive:
 
 def read_prepared_drive(
     scene: str | Path, parser: str | Path, masks: str | Path
-) -> tuple[PreparedDrive, list[dict[str, Any]]]:
+) -> tuple[PreparedDrive, list[Provenance]]:
     """The recording of scene.json, parser.pkl and masks.json, and the provenances of these files."""
     recording = PreparedDrive(read_scene(scene), read_training_record(parser), Path(masks).parent)
     record = read_masks_record(recording.masks)
-    return recording, [recording.scene.provenance, recording.record.provenance, record["provenance"]]
+    return recording, [recording.scene.provenance, recording.record.provenance, record.provenance]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.io.storage import read_json, unreadable, write_json
+from drivesplat.io.storage import Provenance, read_json, unreadable, write_json
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.sensors import Camera, Lidar
 
@@ -99,7 +99,7 @@ class Scene:
     missing_images: int = 0
     cameras: tuple[Camera, ...] = ()
     lidars: tuple[Lidar, ...] = ()
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=dict)
 
     @property
     def key_frame_interval(self) -> float:

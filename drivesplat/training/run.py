@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from drivesplat.io.prefetch import prefetch
-from drivesplat.io.storage import canonical_json, read_record, sha256_text, write_json
+from drivesplat.io.storage import Provenance, canonical_json, read_record, sha256_text, write_json
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.machine.device import choose_device, explain_out_of_memory
@@ -93,7 +93,7 @@ class TrainingInputs:
 
 def read_inputs(
     parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str], free_space: Sequence[str]
-) -> tuple[TrainingInputs, list[dict[str, Any]]]:
+) -> tuple[TrainingInputs, list[Provenance]]:
     """Reads the inputs of a training from the files of the parser, of masks and, where given, of actors, LiDAR depth
     and free space; returns them with the provenances of these files."""
     folder = Path(masks).parent
@@ -106,12 +106,12 @@ def read_inputs(
         folder,
         [actor for it in moving for actor in it.actors],
         [image for it in depths for image in it.images],
-        made["semantic_classes"],
-        frozenset(made["own_car"]),
-        made["sky_known"],
+        made.semantic_classes,
+        frozenset(made.own_car),
+        made.sky_known,
         next(iter(spaces), None),
     )
-    upstream = [record.provenance, made["provenance"], *(it.provenance for it in (*moving, *depths, *spaces))]
+    upstream = [record.provenance, made.provenance, *(it.provenance for it in (*moving, *depths, *spaces))]
     return inputs, upstream
 
 
@@ -163,7 +163,7 @@ def run_training(
     job: TrainJob,
     device_settings: DeviceSettings,
     files: TrainingFiles,
-    provenance: dict[str, Any],
+    provenance: Provenance,
     label: str,
 ) -> None:
     """Trains and writes both files, or raises and writes neither. The resume state is kept after a failure, and where

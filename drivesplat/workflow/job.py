@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.io.storage import unwritable
+from drivesplat.io.storage import Provenance, unwritable
 from drivesplat.provenance.file_digests import (
     check_dataset,
     checked_digest,
@@ -74,7 +74,7 @@ class Job:
             self._card = hold_card(settings.jobs_per_card)
         return settings
 
-    def provenance(self, *upstream: dict[str, Any], inputs: dict[str, str] | None = None) -> dict[str, Any]:
+    def provenance(self, *upstream: Provenance, inputs: dict[str, str] | None = None) -> Provenance:
         """The provenance of this rule's result, made from results with the provenances `upstream`."""
         return provenance(self.stage, json.loads(self._params.settings), self._params.code, upstream, inputs or {})
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
-from helpers.records import EMPTY_CHECKPOINT
+from helpers.records import EMPTY_CHECKPOINT, EMPTY_MASKS
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
@@ -341,7 +341,7 @@ def test_of_another_camera_there_is_no_truth(known, camera):
 
 
 def inputs_of(known: DriveTruth, truth: Path | None) -> EvaluationInputs:
-    return EvaluationInputs(EMPTY_CHECKPOINT, {}, known.recording, masks_record={}, lpips_record=None, truth=truth)
+    return EvaluationInputs(EMPTY_CHECKPOINT, {}, known.recording, EMPTY_MASKS, lpips_record=None, truth=truth)
 
 
 def job_of(camera: str, synthetic: bool = True) -> EvaluateJob:

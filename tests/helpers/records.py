@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.model.checkpoint import TrainedCheckpoint
+from drivesplat.scene.masks import MasksRecord
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
 from drivesplat.settings.train import TrainJob, TrainSettings
 
@@ -12,6 +13,8 @@ EMPTY_CHECKPOINT = TrainedCheckpoint(
     {}, TrainJob(parts=("background",), sky="none", train=TrainSettings(), random_seed=0), [], {}
 )
 """For functions whose model a test sets."""
+
+EMPTY_MASKS = MasksRecord({}, 0, "boxes", "heuristic", 0.0, False, 0, {})
 
 
 def training_record_of(images: int, **fields: Any) -> TrainingRecord:

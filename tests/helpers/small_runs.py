@@ -77,7 +77,7 @@ def run(root: Path, folder: Path, **changes: Any) -> Finished:
     parser = training_record(scene, seed_points(scene, made.job("lidar_seed", SeedJob)), made.job("parser", ParserJob))
     actors = actors_record(scene, made.job("actors", ActorSeedJob)).actors
     depths = lidar_depths(scene, made.job("lidar_depth", LidarDepthJob))
-    recording, known = PreparedDrive(scene, parser, folder / "masks"), {"sky_known": masks["sky_known"]}
+    recording, known = PreparedDrive(scene, parser, folder / "masks"), {"sky_known": masks.sky_known}
     evals = {}
     for method, settings in made.config.methods.items():
         moving = (actors, depths) if "actors" in settings.parts else ([], [])

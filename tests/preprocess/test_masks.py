@@ -60,8 +60,8 @@ def test_every_image_gets_its_labels_and_its_sky(tiny_scene, made):
     folder, record = made
     expected = {f"{kind}/CAM_FRONT/{f.timestamp}.png" for kind in ("regions", "sky") for f in tiny_scene.frames}
     assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == expected
-    assert (record["images"], record["regions"], record["sky"]) == (19, "boxes", "heuristic")
-    assert record["labels"] == LABELS
+    assert (record.images, record.regions, record.sky) == (19, "boxes", "heuristic")
+    assert record.labels == LABELS
 
 
 def test_labels_return_as_they_were_made(tiny_scene, made):
@@ -92,7 +92,7 @@ def test_the_sky_of_the_tiny_drive_is_found(tiny_scene, made, index):
 
 def test_the_record_says_how_much_of_the_images_is_sky(tiny_scene, made):
     true = np.mean([true_sky(frame, SIZE).mean() for frame in tiny_scene.frames])
-    assert made[1]["sky_share"] == pytest.approx(true, abs=0.1)
+    assert made[1].sky_share == pytest.approx(true, abs=0.1)
 
 
 def test_no_sky_lies_where_lidar_returns(tiny_scene, made):
@@ -155,7 +155,7 @@ def test_a_bright_patch_that_does_not_reach_the_top_is_no_sky(tiny_scene):
 
 def test_masks_are_made_without_lidar(tiny_scene, tmp_path):
     scene = dataclasses.replace(tiny_scene, sweeps=(), frames=tiny_scene.frames[:2])
-    assert make_masks(scene, job(), tmp_path)["images"] == 2
+    assert make_masks(scene, job(), tmp_path).images == 2
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut"])
@@ -165,7 +165,7 @@ def test_masks_are_made_though_a_lidar_file_is_bad(tiny_root, tmp_path, damage):
     scene = extracted(root)
     path = Path(scene.sweeps[0].path)
     path.unlink() if damage == "missing" else path.write_bytes(path.read_bytes()[:-7])
-    assert make_masks(scene, job(), tmp_path / "masks")["images"] == len(scene.frames)
+    assert make_masks(scene, job(), tmp_path / "masks").images == len(scene.frames)
 
 
 def test_the_sky_of_a_training_image_is_told_by_no_held_out_sweep(tiny_scene, tmp_path):
@@ -217,10 +217,10 @@ def test_the_users_own_masks_are_used(two_images, tmp_path):
         sky_folder=str(users_masks(two_images, tmp_path / "sky", sky)),
     )
     record = make_masks(two_images, settings, tmp_path / "masks")
-    assert (record["regions"], record["sky"]) == ("masks", "masks")
+    assert (record.regions, record.sky) == ("masks", "masks")
     sky[labels == LABELS["own_car"]] = 0
-    assert record["sky_share"] == pytest.approx((sky > 0).mean())
-    assert record["own_car"] == {"CAM_FRONT": "masks"}
+    assert record.sky_share == pytest.approx((sky > 0).mean())
+    assert record.own_car == {"CAM_FRONT": "masks"}
     for frame in two_images.frames:
         np.testing.assert_array_equal(read_labels(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), labels)
         np.testing.assert_array_equal(read_sky_mask(tmp_path / "masks", "CAM_FRONT", frame.timestamp, SIZE), sky > 0)
@@ -241,7 +241,7 @@ def test_where_no_sky_is_found_none_is_known_unless_the_user_says_so(two_images,
     scene = dataclasses.replace(two_images, frames=tuple(dimmed))
     mine = None if sky is None else str(users_masks(scene, tmp_path / "mine", np.full((54, 96), sky, np.uint8)))
     record = make_masks(scene, job(sky_folder=mine), tmp_path / "masks")
-    assert record["sky_known"] is known
+    assert record.sky_known is known
     assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
 
 
@@ -281,7 +281,7 @@ def test_the_own_cars_outline_is_left_out_of_every_region(two_images, tmp_path):
     """The lower right quarter of the image, in fractions of its width and height; one pixel of rounding."""
     outline = ((0.5, 0.5), (1.0, 0.5), (1.0, 1.0), (0.5, 1.0))
     ego_mask = EgoMask({"CAM_FRONT": (outline,), "CAM_BACK": (WHOLE,)}, {"CAM_FRONT": "polygons", "CAM_BACK": "images"})
-    assert make_masks(two_images, job(), tmp_path, ego_mask)["own_car"] == {"CAM_FRONT": "polygons"}
+    assert make_masks(two_images, job(), tmp_path, ego_mask).own_car == {"CAM_FRONT": "polygons"}
     for frame in two_images.frames:
         labels = read_labels(tmp_path, "CAM_FRONT", frame.timestamp, SIZE)
         everything = region_mask(labels, "all")
@@ -310,7 +310,7 @@ def test_the_own_car_is_no_sky_and_of_no_class(two_images, tmp_path):
     settings = job(sky_folder=str(full), semantic_folder=str(classes))
     outline = ((0.0, 0.5), (1.0, 0.5), (1.0, 1.0), (0.0, 1.0))
     record = make_masks(two_images, settings, tmp_path / "masks", seen_in_front(outline))
-    assert (record["semantic_classes"], record["sky_share"]) == (4, 0.5)
+    assert (record.semantic_classes, record.sky_share) == (4, 0.5)
     at = (tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
     sky, found = read_sky_mask(*at), read_classes(*at)
     assert sky[:27].all() and not sky[27:].any()
@@ -318,7 +318,7 @@ def test_the_own_car_is_no_sky_and_of_no_class(two_images, tmp_path):
 
 
 def test_a_drive_that_shows_no_own_car_says_so(made):
-    assert made[1]["own_car"] == {}
+    assert made[1].own_car == {}
 
 
 @pytest.mark.parametrize("kind", ["sky", "regions"])
@@ -346,7 +346,7 @@ def test_a_record_of_masks_that_is_bad_is_named_with_its_rule(tmp_path, content)
 
 
 def test_a_record_of_masks_is_read(made, tmp_path):
-    (tmp_path / "masks.json").write_text(json.dumps(made[1]))
+    (tmp_path / "masks.json").write_text(json.dumps(vars(made[1])))
     assert read_masks_record(tmp_path) == made[1]
 
 
