@@ -62,9 +62,10 @@ def _sentence(item: Mapping[str, Any], document: str, keys: str) -> str:
     message = item["msg"].removeprefix("Value error, ")
     if not key:
         return message
+    if item["type"] == "extra_forbidden" and keys:
+        return f"unknown key '{key}'; there are: {keys}"
     if item["type"] == "extra_forbidden":
-        hint = f"; there are: {keys}" if keys else f" (value {value}): check its spelling against {document}"
-        return f"unknown key '{key}'{hint}"
+        return f"unknown key '{key}' (value {value}): check its spelling against {document}"
     if item["type"] == "missing":
-        return f"'{key}' is missing" + (f"; there are: {keys}" if keys else f": {document} says what it is")
+        return f"'{key}' is missing; there are: {keys}" if keys else f"'{key}' is missing: {document} says what it is"
     return f"'{key}' is {value}: {message[:1].lower()}{message[1:]}"
