@@ -149,7 +149,7 @@ def prepared(tmp_path_factory) -> Path:
     write_json(folder / "own_car.json", {**record, "provenance": {"made": "own_car"}})
     ego_mask, _ = read_ego_mask(folder / "own_car.json")
     made = make_masks(scene, MaskJob(masks=MaskSettings(), holdout=holdout, images=images), folder / "masks", ego_mask)
-    write_json(folder / "masks/masks.json", {**made, "provenance": {}})
+    write_json(folder / "masks/masks.json", vars(made))
     settings = LidarSeedSettings(max_points=2000, far_points=500)
     seed = seed_points(scene, SeedJob(lidar_seed=settings, holdout=holdout, images=images, random_seed=0), ego_mask)
     record = training_record(scene, seed, ParserJob(holdout=holdout, images=images))
