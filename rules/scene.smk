@@ -12,8 +12,8 @@ rule extract:
     frame, every image with the ego pose of its own timestamp.
     """
     input:
-        root=ancient(plan.table_of_scenes),
         tables=plan.tables,
+        scene_tables=plan.scene_tables,
     output:
         scene="<results>/{scene}/scene.json",
     log:
@@ -27,6 +27,7 @@ rule extract:
         runtime=30,
     params:
         settings=plan.settings("extract"),
+        root=plan.root,
         code=plan.code("extract"),
     script:
         "../workflow_scripts/extract.py"

@@ -10,11 +10,11 @@ from drivesplat.scene.scene import write_scene
 from drivesplat.settings.extract import SceneSource
 
 with job(snakemake) as current:
-    tables = current.input.tables
-    root, of_scene = Path(current.input.root).parents[1], Path(tables[0]) if len(tables) == 1 else None
+    tables, rows = current.input.tables, current.input.scene_tables
+    root, of_scene = Path(snakemake.params.root), Path(rows[0]) if rows else None
     scene = extract_scene(current.settings(SceneSource), root, of_scene)
     current.record_dataset(
         images=(frame.image_path for frame in scene.frames), sweeps=(sweep.path for sweep in scene.sweeps)
     )
-    provenance = current.provenance(inputs={"tables": digests_of(tables)})
+    provenance = current.provenance(inputs={"tables": digests_of([*tables, *rows])})
     write_scene(current.output.scene, dataclasses.replace(scene, provenance=provenance))

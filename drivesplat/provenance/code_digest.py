@@ -20,7 +20,8 @@ PAGE_FILES = (".html", ".js")
 def code_digest(script: str | Path) -> str:
     """A hash of the syntax of a script and of every module of this package that it imports, directly or indirectly.
 
-    Bare strings (docstrings, field comments) do not count, imports inside functions do. JavaScript and HTML files in a
+    Bare strings (docstrings, field comments) do not count, imports inside functions do, and so do the modules that a
+    string spells, all of them where it has a `*` for a name. JavaScript and HTML files in a
     package (the viewer's) are part of it, byte by byte.
     """
     path = Path(script)
@@ -51,13 +52,23 @@ def _content(path: Path) -> str:
 @cache
 def _imports(path: Path, package: str) -> frozenset[str]:
     """The modules of this package that a file names, with the packages that contain them."""
-    parts = [name.split(".") for name in _absolute(_syntax(path).names, package)]
+    names = _absolute(_syntax(path).names, package)
+    parts = [name.split(".") for pattern in names for name in expanded(pattern)]
     candidates = {".".join(p[: i + 1]) for p in parts if p[0] == PACKAGE for i in range(len(p))}
     return frozenset(name for name in candidates if _file_of(name) is not None)
 
 
 def _absolute(names: tuple[str, ...], package: str) -> Iterator[str]:
     return (resolve_name(name, package) if name.startswith(".") else name for name in names)
+
+
+def expanded(pattern: str) -> list[str]:
+    """The modules of this package that fit a pattern of dotted names; a name without `*` is itself."""
+    first, *rest = pattern.split(".")
+    if "*" not in pattern or first != PACKAGE:
+        return [pattern]
+    files = PACKAGE_FOLDER.glob("/".join(rest) + ".py")
+    return [".".join((PACKAGE, *file.relative_to(PACKAGE_FOLDER).with_suffix("").parts)) for file in files]
 
 
 @cache

@@ -25,7 +25,7 @@ class SyntaxDigest:
     """SHA-256 of the canonical syntax tree without bare strings."""
     names: tuple[str, ...]
     """Possible modules, sorted: imported names, relative to the file's package where they begin with dots, and string
-    constants that spell dotted names."""
+    constants that spell dotted names, where `*` stands for any name."""
 
 
 def cached_digest(file: Path) -> SyntaxDigest:
@@ -118,7 +118,7 @@ def _names(tree: ast.Module) -> Iterator[str]:
 
 def _is_dotted(text: str) -> bool:
     """Whether a string constant may be a module that is imported by its name."""
-    return "." in text and all(part.isidentifier() for part in text.split("."))
+    return "." in text and all(part.isidentifier() or part == "*" for part in text.split("."))
 
 
 def _is_bare_string(statement: ast.AST) -> bool:

@@ -24,17 +24,14 @@ def checked_pose(translation: Sequence[float], rotation_wxyz: Sequence[float], r
     return rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), values[:3])
 
 
-def checked_intrinsics(matrix: Sequence[Sequence[float]], token: str) -> np.ndarray:
-    """A pinhole K (3, 3).
-
-    Raises DatasetError naming the calibrated sensor's token where it is singular or malformed.
-    """
+def checked_intrinsics(matrix: Sequence[Sequence[float]], record: str) -> np.ndarray:
+    """A pinhole K (3, 3). Raises DatasetError naming `record` where it is singular or malformed."""
     try:
         k = np.array(matrix, dtype=np.float64)
     except ValueError:
         k = np.empty(0)
     if not (k.shape == (3, 3) and np.isfinite(k).all() and _is_pinhole(k)):
-        raise DatasetError(f"calibrated_sensor {token}: its camera_intrinsic is singular or not a pinhole matrix")
+        raise DatasetError(f"{record}: its camera matrix is singular or not a pinhole matrix")
     return k
 
 
@@ -43,10 +40,10 @@ def _is_pinhole(k: np.ndarray) -> bool:
     return bool(no_skew and k[0, 0] > 0 and k[1, 1] > 0 and np.allclose(k[2], [0, 0, 1]))
 
 
-def checked_size(width: int, height: int, token: str) -> tuple[int, int]:
-    """An image's width and height in pixels. Raises DatasetError naming the sample_data token."""
+def checked_size(width: int, height: int, record: str) -> tuple[int, int]:
+    """An image's width and height in pixels. Raises DatasetError naming `record`."""
     if not (width > 0 and height > 0):
-        raise DatasetError(f"sample_data {token}: its image size is {width}x{height}")
+        raise DatasetError(f"{record}: its image size is {width}x{height}")
     return int(width), int(height)
 
 

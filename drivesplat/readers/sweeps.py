@@ -1,15 +1,15 @@
 """LiDAR sweeps from the files of any dataset."""
 
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 from drivesplat.errors import DatasetError
+from drivesplat.readers.by_name import dataset_module
 from drivesplat.scene.scene import Sweep, place_of
 from drivesplat.scene.sensors import LidarReturns
 
-SWEEP_FILES = {"nuscenes": "drivesplat.readers.nuscenes.sweep_file"}
-"""By reader, the module with `read_file` and `file_fault`."""
+SWEEP_FILE = "drivesplat.readers.*.sweep_file"
+"""The module of a reader with `read_file` and `file_fault`."""
 
 
 def read_returns(sweep: Sweep) -> LidarReturns:
@@ -32,4 +32,4 @@ def sweep_fault(sweep: Sweep) -> str | None:
 
 
 def _files(sweep: Sweep) -> ModuleType:
-    return import_module(SWEEP_FILES[sweep.reader])
+    return dataset_module(SWEEP_FILE, sweep.reader)

@@ -43,7 +43,7 @@ class Frame:
 @dataclass(frozen=True)
 class Sweep:
     """One LiDAR revolution. `sensor_to_world` (4, 4) at the sweep's timestamp; `path` may be missing on disk. `lidar`
-    is a name in `Scene.lidars`; `reader` (a key of `drivesplat.readers.sweeps.SWEEP_FILES`) reads it."""
+    is a name in `Scene.lidars`; `reader` names the package of `drivesplat.readers` that reads it."""
 
     path: str
     timestamp: int

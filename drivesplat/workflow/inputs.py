@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 from drivesplat.errors import DriveSplatError
@@ -31,18 +32,27 @@ class Inputs:
         self._folders: dict[str, Path] = {}
 
     def tables(self, wildcards: Any) -> list[str]:
-        """The files that scene.json is made from: all tables of a synthetic world; for a recorded dataset, the file of
-        the scene's own rows, which planning keeps up to date, so that touched tables rerun nothing."""
+        """The tables that scene.json is made from; none where `scene_tables` gives the rows that it needs."""
         name = self.config.dataset_of(wildcards.scene)
         dataset = self.config.datasets[name]
         if dataset.world:
             return self.world_tables(name)
-        return [str(index(dataset.reader).scene_file(self._scene_tables(name), wildcards.scene))]
+        whole = index(dataset.reader) is None
+        return (
+            list(map(str, layout(dataset.reader).table_files(Path(self._root(name)), dataset.version))) if whole else []
+        )
 
-    def table_of_scenes(self, wildcards: Any) -> str:
-        """A table of a scene's dataset, which gives the dataset's root. A dataset that has moved reruns everything."""
+    def scene_tables(self, wildcards: Any) -> list[str]:
+        """The file of a scene's own rows of a recorded dataset's tables, where its reader splits them into scenes.
+        Planning keeps it up to date, so that touched tables rerun nothing."""
         name = self.config.dataset_of(wildcards.scene)
-        return f"{self._root(name)}/{self.config.datasets[name].version}/scene.json"
+        dataset = self.config.datasets[name]
+        tables = None if dataset.world else index(dataset.reader)
+        return [str(tables.scene_file(self._scene_tables(name, tables), wildcards.scene))] if tables else []
+
+    def root(self, wildcards: Any) -> str:
+        """The root of a scene's dataset. A dataset that has moved reruns everything."""
+        return self._root(self.config.dataset_of(wildcards.scene))
 
     def _root(self, name: str) -> str:
         if name not in self._roots:
@@ -52,7 +62,7 @@ class Inputs:
             self._roots[name] = str(found)
         return self._roots[name]
 
-    def _scene_tables(self, name: str) -> Path:
+    def _scene_tables(self, name: str, tables: ModuleType) -> Path:
         """The folder with the rows of each scene of a recorded dataset, brought up to date once."""
         if name not in self._folders:
             dataset, folder = self.config.datasets[name], Path(self.config.results_dir) / ".tables" / name
@@ -60,9 +70,9 @@ class Inputs:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise unwritable_results(self.config, error) from error
-            files = [index(dataset.reader).scene_file(folder, scene) for scene in dataset.scenes]
+            files = [tables.scene_file(folder, scene) for scene in dataset.scenes]
             before = [_modified(file) for file in files]
-            index(dataset.reader).index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder)
+            tables.index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder)
             for file, modified in zip(files, before, strict=True):
                 if _modified(file) != modified:
                     record_output(file, "extract", {}, {})

@@ -154,9 +154,10 @@ class Plan(Outputs):
         """Raises DatasetError if the dataset of a target's scene is not at the configured path."""
         needing = [target for target in targets if target != DOWNLOAD]
         for scene in self._scenes_of(needing) if needing or not targets else ():
-            tables = self.tables(SimpleNamespace(scene=scene))
+            of_scene = SimpleNamespace(scene=scene)
+            _ = self.tables(of_scene), self.scene_tables(of_scene)
             if self.config.datasets[self.config.dataset_of(scene)].world:
-                refuse_foreign_data(Path(tables[0]).parents[1])
+                refuse_foreign_data(Path(self.root(of_scene)))
 
     def _scenes_of(self, targets: list[str]) -> list[str]:
         """The scenes that targets need; those of the batch if a target names none."""

@@ -67,6 +67,7 @@ IMPORTS_LEAF = {
     "inside_an_imported_function": "from toy.late import later\n",
     "if_it_can": "try:\n    import toy.leaf\nexcept ImportError:\n    toy = None\n",
     "by_name": 'from importlib import import_module\n\nimport_module("toy.leaf")\n',
+    "by_pattern": 'MODULES = "toy.*.deep"\n',
     "by_name_elsewhere": "from toy.registry import load\n\nload('leaf')\n",
     "in_a_circle": "import toy.ring\n",
 }
@@ -75,6 +76,7 @@ IMPORTS_NO_LEAF = {
     "another": "from toy.apart import VALUE\n",
     "its_package": "import toy\n",
     "a_sibling_package": "import toy.sub\n",
+    "a_pattern_of_others": 'MODULES = "toy.*.absent", "other.*.deep"\n',
     "only_by_word": 'print("leaf", "toy leaf", "toy.leafs")\n',
 }
 

@@ -176,14 +176,14 @@ def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: b
     index_of_sample = {sample["token"]: i for i, sample in enumerate(samples)}
     for data in _records(tables, samples, camera, sweeps):
         ego_to_world, camera_to_world, sensor = _place(tables, data, scene)
-        width, height = checked_size(data["width"], data["height"], data["token"])
+        width, height = checked_size(data["width"], data["height"], f"sample_data {data['token']}")
         yield Frame(
             camera=camera,
             timestamp=data["timestamp"],
             image_path=str(root / data["filename"]),
             width=width,
             height=height,
-            intrinsics=checked_intrinsics(sensor["camera_intrinsic"], sensor["token"]),
+            intrinsics=checked_intrinsics(sensor["camera_intrinsic"], f"calibrated_sensor {sensor['token']}"),
             camera_to_world=camera_to_world,
             ego_to_world=ego_to_world,
             is_key_frame=data["is_key_frame"],

@@ -1,0 +1,40 @@
+"""Which modules read a dataset, and what is told where one lacks."""
+
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import drivesplat.readers
+from drivesplat.errors import DatasetError
+from drivesplat.provenance.code_digest import expanded
+from drivesplat.readers.datasets import LAYOUT, READER, index, layout, reader
+from drivesplat.readers.sweeps import SWEEP_FILE
+from drivesplat.settings.dataset import DatasetSettings
+
+ALLOWED = set(get_args(DatasetSettings.model_fields["reader"].annotation))
+
+
+def test_every_allowed_reader_has_a_package_with_all_modules_and_every_package_is_allowed():
+    packages = {path.parent.name for path in Path(drivesplat.readers.__file__).parent.glob("*/__init__.py")}
+    assert packages == ALLOWED
+    for pattern in (LAYOUT, READER, SWEEP_FILE):
+        assert set(expanded(pattern)) == {pattern.replace("*", name) for name in ALLOWED}
+
+
+@pytest.mark.parametrize("name", sorted(ALLOWED))
+def test_the_modules_of_a_reader_have_their_functions(name):
+    assert callable(layout(name).find_root) and callable(layout(name).table_files) and callable(reader(name).read)
+
+
+def test_the_tables_of_nuscenes_are_split_into_scenes_and_other_tables_are_read_whole():
+    assert callable(index("nuscenes").index_tables) and callable(index("nuscenes").scene_file)
+    assert index("unknown") is None
+
+
+@pytest.mark.parametrize("module", [layout, reader])
+def test_a_reader_that_is_missing_is_told_in_one_sentence(module):
+    with pytest.raises(
+        DatasetError, match=r"^no module drivesplat\.readers\.toy\.\w+ reads datasets of reader: toy; add"
+    ):
+        module("toy")
