@@ -177,7 +177,7 @@ def test_a_changed_package_alters_the_importers_of_its_modules(toy):
     (toy / "toy" / "sub" / "__init__.py").write_text("VALUE = 1\n")
     after = digests(toy)
     changed = {name for name in before if before[name] != after[name]}
-    assert changed == {"relatively_from_below", "relatively_from_beside", "a_sibling_package"}
+    assert changed == {"relatively_from_below", "relatively_from_beside", "a_sibling_package", "by_pattern"}
 
 
 @pytest.mark.parametrize(
