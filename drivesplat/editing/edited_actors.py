@@ -9,7 +9,7 @@ from drivesplat.editing.actor_path import ActorPath, recorded_path
 from drivesplat.editing.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
-from drivesplat.scene.tracks import beginnings
+from drivesplat.scene.tracks import short_ids
 from drivesplat.settings.edit import Duplicate, Edit, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 
 MIN_DISTANCE = 0.5
@@ -83,7 +83,7 @@ class _EditState:
         """The actor with that id, or the only one whose id starts with it."""
         known = [*self.actors, *self.removed]
         found = [name] if name in known else [other for other in known if other.startswith(name)]
-        short = beginnings(known)
+        short = short_ids(known)
         remaining = ", ".join(short[other] for other in self.actors) or "none"
         if not found:
             raise _StepError(f"no editable track has an id starting with {name!r}; editable tracks: {remaining}")
@@ -171,7 +171,7 @@ def _swapped(state: _EditState, actor: EditedActor, swap: Swap) -> _EditState:
 def _duplicated(state: _EditState, actor: EditedActor, duplicate: Duplicate) -> _EditState:
     taken = [*state.actors, *state.removed]
     if duplicate.name in taken:
-        used = ", ".join(beginnings(taken).values())
+        used = ", ".join(short_ids(taken).values())
         raise _StepError(f"the name {duplicate.name!r} in 'as' is already used; names in use: {used}")
     if duplicate.name in state.other_ids:
         raise _StepError(f"the name {duplicate.name!r} in 'as' is the id of another track; choose another name")

@@ -8,7 +8,7 @@ import numpy as np
 from drivesplat.evaluation.metrics import psnr
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import region_mask
-from drivesplat.scene.scene_warnings import REC_709, moved, seconds_long, standing
+from drivesplat.scene.scene_warnings import REC_709, duration, max_displacement, standing_time
 
 
 def summarize_drive(recording: PreparedDrive, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
@@ -19,7 +19,8 @@ def summarize_drive(recording: PreparedDrive, camera: str, measured: dict[str, l
     """
     scene = recording.scene
     groups = {group: _group(recording, camera, images) if images else None for group, images in measured.items()}
-    return {"moved_m": moved(scene), "seconds": seconds_long(scene), "standing_s": standing(scene), **groups}
+    times = {"seconds": duration(scene), "standing_s": standing_time(scene)}
+    return {"moved_m": max_displacement(scene), **times, **groups}
 
 
 def _group(recording: PreparedDrive, camera: str, images: list[int]) -> dict[str, float | None]:

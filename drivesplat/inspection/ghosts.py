@@ -51,7 +51,7 @@ def in_swept_volume(track: Track, interval: float, points: np.ndarray, floor: fl
     tree = cKDTree(points[near])
     for box in boxes:
         around = near[tree.query_ball_point(box.object_to_world[:3, 3], np.linalg.norm(box.size) / 2)]
-        inside[around] |= box.holds(points[around], floor=floor)
+        inside[around] |= box.contains(points[around], floor=floor)
     return inside
 
 
@@ -73,6 +73,6 @@ def ghosts_of(view: RenderedView, box: Box, settings: GhostSettings) -> Bool[Ten
     scene, gaussians = view.drive.recording.scene, view.gaussians
     track = scene.track(box.track_id)
     points = gaussians.means.cpu().double().numpy()
-    rows = in_swept_volume(track, scene.key_frame_interval, points, settings.clearance) & ~box.holds(points)
+    rows = in_swept_volume(track, scene.key_frame_interval, points, settings.clearance) & ~box.contains(points)
     moving = view.drive.model.moving()
     return torch.from_numpy(rows).to(moving.device) & ~moving

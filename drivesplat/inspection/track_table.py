@@ -14,7 +14,7 @@ from drivesplat.io.storage import write_csv
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import MIN_PIXELS
 from drivesplat.scene.scene import Track
-from drivesplat.scene.tracks import beginnings, box_at, ever_moves
+from drivesplat.scene.tracks import box_at, ever_moves, short_ids
 
 MAX_IMAGES = 6
 TITLE = "moving objects, labelled with the start of their ids in tracks.csv"
@@ -101,7 +101,7 @@ def draw_tracks(recording: PreparedDrive, subjects: SubjectsByImage, rows: Seque
     }
     chosen = covering_images(shown_well) or [recording.scene.middle_key_frame(camera)]
     title = f"Scene {recording.scene.name}: " + (TITLE if largest else "nothing moves")
-    names = beginnings(list(largest))
+    names = short_ids(list(largest))
     columns = min(2, len(chosen))
     shape = recording.labels(chosen[0]).shape
     figure, axes = image_grid(shape, rows=-(-len(chosen) // columns), columns=columns, title=title)

@@ -1,4 +1,4 @@
-"""Colours for points from the images that see them."""
+"""Point colours from the images that see the points."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,7 +10,8 @@ from drivesplat.io.prefetch import prefetch
 
 @dataclass(frozen=True)
 class ColorView:
-    """An image that may colour points: `pixels` (h, w, 3) uint8, `usable` (h, w) bool, `intrinsics` continuous."""
+    """An image that may colour points: `pixels` (h, w, 3) uint8, `usable` (h, w) bool, `intrinsics` (3, 3) in
+    continuous pixels, `world_to_camera` (4, 4), `timestamp` in microseconds."""
 
     pixels: np.ndarray
     intrinsics: np.ndarray
@@ -21,24 +22,24 @@ class ColorView:
 
 CELL = 4
 """Edge in pixels of the cells of the depth buffer that decides occlusion: LiDAR is sparser than the image."""
-NEAREST = 0.5
-"""Depth in metres up to which nothing is seen."""
-OCCLUSION = 1.05
-"""A point is hidden where something in its cell is nearer by this factor and half a metre."""
+MIN_DEPTH = 0.5
+"""Depth in metres up to which points are ignored."""
+OCCLUSION_FACTOR = 1.05
+"""A point is occluded if another point in its cell is nearer by this factor and half a metre."""
 
 
 def hidden_behind(depth: np.ndarray, nearest: np.ndarray) -> np.ndarray:
-    """Whether what is at `depth` (m,) metres is hidden where something is seen at `nearest` (m,): (m,) bool."""
-    return depth > nearest * OCCLUSION + 0.5
+    """Whether points at `depth` (m,) are occluded by points at `nearest` (m,), both in metres: (m,) bool."""
+    return depth > nearest * OCCLUSION_FACTOR + 0.5
 
 
 def color_by_visibility(
     points: np.ndarray, times: np.ndarray, views: Iterable[ColorView]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Each point's colour in the view nearest to it in time among those that see it unoccluded.
+    """Colours every point from the view nearest in time among those that see it unoccluded.
 
-    `points` (n, 3) world; `times` (n,) microseconds. Returns colours (n, 3) uint8 and the number of views that see each
-    point (n,): where it is 0 the colour is meaningless.
+    `points` (n, 3) world; `times` (n,) microseconds. Returns colours (n, 3) uint8, undefined for unseen points,
+    and the number (n,) of views that see each point.
     """
 
     def seen_by(view: ColorView) -> tuple[np.ndarray, np.ndarray, int]:
@@ -63,9 +64,9 @@ def visible(
     points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices (m,), pixel rows (m,) and columns (m,), and depths (m,) along the axis in metres, of the points (n, 3)
-    that an image of `shape` (h, w) sees.
+    that are visible in an image of `shape` (h, w).
 
-    A point is hidden where another of the points, in the same cell of CELL pixels, stands clearly before it.
+    Points occlude each other within cells of CELL x CELL pixels (`hidden_behind`).
     """
     index, rows, columns, depth = in_image(points, world_to_camera, intrinsics, shape)
     height, width = shape
@@ -80,12 +81,12 @@ def in_image(
     points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices (m,), pixel rows (m,) and columns (m,) and depths (m,) along the axis, in metres, of the points (n, 3)
-    that lie in an image of `shape` (h, w), farther before it than NEAREST; whether anything hides them is not asked."""
+    that project into an image of `shape` (h, w) from beyond MIN_DEPTH; occlusion is ignored."""
     height, width = shape
     to_image = intrinsics @ world_to_camera[:3]
-    rotation, translation = to_image[:, :3], to_image[:, 3]  # a row at a time: most points are behind the camera
+    rotation, translation = to_image[:, :3], to_image[:, 3]  # row by row: most points are behind the camera
     depth = points @ rotation[2] + translation[2]
-    before = np.flatnonzero(depth > NEAREST)
+    before = np.flatnonzero(depth > MIN_DEPTH)
     depth = depth[before]
     x, y = (((points @ rotation[i])[before] + translation[i]) / depth for i in range(2))
     inside = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))

@@ -1,4 +1,4 @@
-"""Depths of pixels from LiDAR: a sweep split into static and moving returns, and the returns that an image sees."""
+"""Pixel depths from LiDAR: sweeps split into static and dynamic returns, and their projection into images."""
 
 from dataclasses import dataclass
 
@@ -19,8 +19,8 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 
 @dataclass(frozen=True)
 class Cloud:
-    """A sweep taken apart: the sensor's place `origin` (3,), returns of the static world (n, 3) in world coordinates,
-    and what moves, each with its returns (m, 3) in its own frame."""
+    """A split sweep: the sensor's position `origin` (3,), static returns (n, 3) in world coordinates, and dynamic
+    objects, each with its returns (m, 3) in its own frame."""
 
     timestamp: int
     sample_index: int
@@ -30,51 +30,51 @@ class Cloud:
 
 
 def clouds_of(scene: Scene, job: LidarDepthJob, groups: tuple[Group, ...]) -> list[Cloud]:
-    """The key-frame sweeps of some groups, taken apart, in time order."""
-    moving = dynamic_objects(scene)
+    """The sweeps of the given groups, split into static and dynamic returns, in time order."""
+    objects = dynamic_objects(scene)
     return [
-        taken_apart(sweep, points, scene.seconds(sweep.timestamp), moving, job.box_margin)
+        split_sweep(sweep, points, scene.seconds(sweep.timestamp), objects, job.box_margin)
         for sweep, points in returns_of(scene, job.holdout, job.own_car_radius, groups)
     ]
 
 
-def taken_apart(sweep: Sweep, points: np.ndarray, seconds: float, moving: list[DynamicObject], margin: float) -> Cloud:
-    """A sweep's returns (n, 3) in world coordinates, at its time in `seconds`; what may be road as well as wheel is
-    left out."""
+def split_sweep(sweep: Sweep, points: np.ndarray, seconds: float, objects: list[DynamicObject], margin: float) -> Cloud:
+    """Splits a sweep's returns (n, 3) in world coordinates at its time in `seconds`. Drops returns that may belong to
+    the road as well as to an object."""
     static = np.ones(len(points), dtype=bool)
-    for mover in moving:
-        static &= ~mover.near(points, seconds, margin)
-    own = [(mover, mover.own(points, seconds, margin)) for mover in moving]
-    return Cloud(sweep.timestamp, sweep.sample_index, sweep.sensor_to_world[:3, 3], points[static], own)
+    for item in objects:
+        static &= ~item.near(points, seconds, margin)
+    dynamic = [(item, item.own(points, seconds, margin)) for item in objects]
+    return Cloud(sweep.timestamp, sweep.sample_index, sweep.sensor_to_world[:3, 3], points[static], dynamic)
 
 
 def nearest_cloud(clouds: list[Cloud], timestamp: int, interval: float) -> Cloud | None:
-    """The cloud nearest to a time (microseconds); None where none is within `interval`."""
+    """The cloud nearest in time to `timestamp`; None if none is within `interval`, both in microseconds."""
     nearest = min(clouds, key=lambda cloud: abs(cloud.timestamp - timestamp), default=None)
     return nearest if nearest and abs(nearest.timestamp - timestamp) < interval else None
 
 
 def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body: np.ndarray) -> PixelDepths:
-    """The returns of a cloud that a frame sees, the nearest of a pixel. What is absent by then is left out, and so is
-    what lies behind the own car's `body` (h, w) bool."""
+    """The nearest return of a cloud at each pixel of a frame. Returns of objects that are absent at the frame's time,
+    and pixels of the ego vehicle's `body` (h, w) bool, are left out."""
     size, seconds = target_size(frame, job.images), scene.seconds(frame.timestamp)
-    posed = [(mover.pose(seconds), own) for mover, own in cloud.dynamic]
-    carried = [apply(pose, own) for pose, own in posed if pose is not None]
-    points = np.concatenate([cloud.static, *carried])
+    posed = [(item.pose(seconds), returns) for item, returns in cloud.dynamic]
+    dynamic = [apply(pose, returns) for pose, returns in posed if pose is not None]
+    points = np.concatenate([cloud.static, *dynamic])
     shape, intrinsics = (size[1], size[0]), continuous_intrinsics(frame, size)
     index, rows, columns, depth = visible(points, inverse(frame.camera_to_world), intrinsics, shape)
     ranges = np.linalg.norm(points[index] - cloud.origin, axis=1)
     front = unhidden(rows, columns, depth, patches(ranges, depth, intrinsics, job.ray_spacing), shape)
     index, rows, columns, depth = index[front], rows[front], columns[front], depth[front]
-    boxes = box_depths(scene, frame, size, {mover.track.id for mover, _ in cloud.dynamic})
+    boxes = box_depths(scene, frame, size, {item.track.id for item, _ in cloud.dynamic})
     kept = (index >= len(cloud.static)) | (depth < boxes[rows, columns])
     kept &= ~body[rows, columns]
     return nearest_per_pixel(np.column_stack([rows, columns, depth])[kept])
 
 
 def box_depths(scene: Scene, frame: Frame, size: tuple[int, int], track_ids: set[str]) -> np.ndarray:
-    """How near, in metres along the axis, the boxes of some tracks come in every pixel (h, w) of a frame; inf where
-    there is none. LiDAR is too sparse to tell by its returns alone what a box hides that has moved since."""
+    """The smallest depth (h, w) in metres of the tracks' boxes at every pixel of a frame, inf without a box. Static
+    returns behind it are occluded: LiDAR returns of a moved object are too sparse to decide that."""
     nearest = np.full((size[1], size[0]), np.inf)
     for hull in hulls_in(scene, frame, size):
         if hull.box.track_id in track_ids:
@@ -85,7 +85,7 @@ def box_depths(scene: Scene, frame: Frame, size: tuple[int, int], track_ids: set
 
 
 def nearest_per_pixel(found: np.ndarray) -> PixelDepths:
-    """Rows, columns and depths (n, 3), of every pixel the nearest, row by row."""
+    """The nearest depth of every pixel among rows, columns and depths (n, 3), in row-major order."""
     found = found[np.lexsort(found.T[::-1])]
     first = np.ones(len(found), dtype=bool)
     first[1:] = (np.diff(found[:, :2], axis=0) != 0).any(axis=1)

@@ -1,6 +1,6 @@
-"""The depth that LiDAR gives some pixels of every training image, as lidar_depth.npz holds it.
+"""The content of lidar_depth.npz: sparse LiDAR depth of every training image.
 
-The stage `lidar_depth` makes it (`drivesplat.preprocess.lidar_depth`).
+The stage `lidar_depth` writes it (`drivesplat.preprocess.lidar_depth`).
 """
 
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ RULE = "lidar_depth"
 
 @dataclass(frozen=True)
 class PixelDepths:
-    """Depth of m pixels of an image, none twice: `depth` in metres along the camera's axis at `rows` and `columns`."""
+    """Depths of m distinct pixels of an image: `depth` in metres along the optical axis at `rows` and `columns`."""
 
     rows: Int[np.ndarray, " m"]
     columns: Int[np.ndarray, " m"]
@@ -30,8 +30,8 @@ class PixelDepths:
 
 @dataclass(frozen=True)
 class LidarDepthRecord:
-    """The content of lidar_depth.npz: one of `images` for each of the scene's frames, in their order, at the size of
-    training; without pixels where the frame is no training image."""
+    """The content of lidar_depth.npz: `images` in the order of the scene's frames, at training size, empty for frames
+    that are not training images."""
 
     images: list[PixelDepths]
     provenance: Provenance = field(default_factory=dict)
@@ -43,7 +43,7 @@ def write_lidar_depth(path: str | Path, record: LidarDepthRecord) -> None:
 
 
 def read_lidar_depth(path: str | Path) -> LidarDepthRecord:
-    """Reads lidar_depth.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    """Reads lidar_depth.npz. Raises ResultError, naming the file and its rule, if it is invalid."""
     content = read_arrays(path, RULE)
     try:
         images = [typed_record(PixelDepths, image) for image in content["images"]]

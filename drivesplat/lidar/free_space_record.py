@@ -1,6 +1,6 @@
-"""The voxels that rays prove empty, as free_space.npz holds them.
+"""The content of free_space.npz: the voxels that rays prove empty.
 
-The stage `free_space` makes it (`drivesplat.preprocess.free_space`).
+The stage `free_space` writes it (`drivesplat.preprocess.free_space`).
 """
 
 from dataclasses import dataclass, field
@@ -20,8 +20,8 @@ RULE = "free_space"
 class FreeSpace:
     """Empty voxels of a grid whose lower corner is `lower` in world metres.
 
-    `voxel` is a voxel's edge in metres, `shape` their number along x, y and z; `keys`, ascending, are the empty ones:
-    voxel (i, j, k) of the grid is (i ny + j) nz + k.
+    `voxel` is the edge of a voxel in metres, `shape` the number of voxels along x, y and z. `keys` are the empty voxels
+    in ascending order; the key of voxel (i, j, k) is (i ny + j) nz + k.
     """
 
     lower: Float[np.ndarray, "3"]
@@ -37,7 +37,7 @@ def write_free_space(path: str | Path, record: FreeSpace) -> None:
 
 
 def read_free_space(path: str | Path) -> FreeSpace:
-    """Reads free_space.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    """Reads free_space.npz. Raises ResultError, naming the file and its rule, if it is invalid."""
     content = read_arrays(path, RULE)
     try:
         record = typed_record(FreeSpace, content)

@@ -1,4 +1,4 @@
-"""What LiDAR met about the time of an image."""
+"""The LiDAR returns nearest in time to an image."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -15,11 +15,11 @@ from drivesplat.scene.scene import Sweep
 def nearest_returns(
     sweeps: Iterable[Sweep], timestamp: int, interval: float, own_car_radius: float = 0.0
 ) -> np.ndarray | None:
-    """World points (n, 3) of the readable sweep nearest to `timestamp`, those within `own_car_radius` metres of the
-    sensor left out; None where none is within `interval`, microseconds as the timestamp."""
+    """World points (n, 3) of the readable sweep nearest to `timestamp`, without those within `own_car_radius` metres of
+    the sensor; None if no sweep is within `interval`. Times are in microseconds."""
     for sweep in sorted(sweeps, key=lambda sweep: abs(sweep.timestamp - timestamp)):
         if abs(sweep.timestamp - timestamp) >= interval:
             break
-        with suppress(DatasetError):  # the stage lidar_seed is the one that complains
+        with suppress(DatasetError):  # the stage lidar_seed reports unreadable files
             return apply(sweep.sensor_to_world, without_ego_vehicle(read_returns(sweep).points, own_car_radius))
     return None

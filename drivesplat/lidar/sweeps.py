@@ -1,4 +1,4 @@
-"""LiDAR sweeps in world coordinates, without the own car and without what moves."""
+"""LiDAR sweeps in world coordinates, without returns of the ego vehicle or of boxes."""
 
 from contextlib import suppress
 
@@ -14,26 +14,26 @@ from drivesplat.settings.holdout import HoldoutSettings
 
 
 def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:
-    """The sweeps that a training may see, of key frames and, where the scene holds any, between them."""
+    """The training sweeps of a scene, at and between key frames."""
     return sweeps_of(scene, holdout, ("train",))
 
 
 def sweeps_of(scene: Scene, holdout: HoldoutSettings, groups: tuple[Group, ...]) -> list[Sweep]:
-    """The sweeps of some groups, of key frames and, where the scene holds any, between them."""
+    """The sweeps of the given groups, at and between key frames."""
     owners = sweep_groups(scene, holdout)
     return [sweep for sweep, group in zip(scene.sweeps, owners, strict=True) if group in groups]
 
 
 def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
-    """The sweeps that a training may see, as `returns_of` gives them."""
+    """The training sweeps with their returns, as `returns_of` gives them."""
     return returns_of(scene, holdout, own_car_radius, ("train",))
 
 
 def returns_of(
     scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...]
 ) -> list[tuple[Sweep, np.ndarray]]:
-    """The sweeps of some groups, each with its returns (n, 3) in world coordinates, the own car's left out. A sweep
-    whose file is missing or corrupt is left out: the stage lidar_seed is the one that complains."""
+    """The sweeps of the given groups, each with its returns (n, 3) in world coordinates, without those of the ego
+    vehicle. Sweeps with a missing or corrupt file are left out; the stage lidar_seed reports them."""
     found = []
     for sweep in sweeps_of(scene, holdout, groups):
         with suppress(DatasetError):
@@ -48,15 +48,15 @@ def without_ego_vehicle(points: np.ndarray, radius: float) -> np.ndarray:
 
 
 def outside_boxes(points: np.ndarray, boxes: list[Box], margin: float) -> np.ndarray:
-    """Which world points (n, 3) lie outside all boxes grown by `margin` metres on every side: (n,) bool."""
+    """Whether world points (n, 3) lie outside all boxes, expanded by `margin` metres on every side: (n,) bool."""
     outside = np.ones(len(points), dtype=bool)
     for box in boxes:
-        outside &= ~box.holds(points, margin, floor=-margin)
+        outside &= ~box.contains(points, margin, floor=-margin)
     return outside
 
 
 def thin(points: np.ndarray, voxel: float) -> np.ndarray:
-    """Indices (m,) of one point for every occupied voxel of edge `voxel` metres, in order; all for voxel 0."""
+    """Ascending indices (m,) of one point per occupied voxel of edge `voxel` metres; all indices for voxel 0."""
     if voxel == 0 or len(points) == 0:
         return np.arange(len(points))
     cells = np.floor(points / voxel).astype(np.int64)

@@ -1,8 +1,8 @@
-"""Which voxels rays pass: exact traversal of a grid.
+"""Exact traversal of a voxel grid by rays.
 
-Amanatides and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, Eurographics 1987. Where a ray crosses into the
-next voxel is computed anew for every voxel, and how many it crosses is known beforehand: no error adds up, and every
-ray ends in the voxel of its end.
+Amanatides and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, Eurographics 1987. Each crossing
+is computed from the ray's start, and the number of crossings is known at the start: no error accumulates, and every ray
+ends in the voxel of its end point.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from drivesplat.kernels.cache import callee, kernel
 
 OCCUPIED = 255
-"""In a grid of counts: something ends rays here. Counts stop below it."""
+"""Value of a voxel in which rays end; counts of passing rays saturate below it."""
 
 
 @callee
@@ -27,7 +27,7 @@ def _count(counts, cell):
 @callee
 @no_type_check
 def _next_crossing(start, along, cell, left):
-    """How far along a ray, as a fraction, it leaves `cell` on one axis; never where it has no cell `left` to enter."""
+    """The fraction of a ray at which it leaves `cell` on one axis; infinity if no cells are `left` to enter."""
     if left == 0:
         return math.inf
     return ((cell + 1 if along > 0 else cell) - start) / along
@@ -64,7 +64,7 @@ def count_passing(counts, starts, ends):
 @callee
 @no_type_check
 def _is_inside(counts, x, y, z):
-    """Whether rays passed all six voxels that share a face with one: a surface has a side that no ray reaches."""
+    """Whether rays passed all six face neighbours of a voxel: one side of a surface is reached by no ray."""
     return (
         counts[x - 1, y, z] > 0
         and counts[x + 1, y, z] > 0
@@ -78,7 +78,7 @@ def _is_inside(counts, x, y, z):
 @callee
 @no_type_check
 def _is_clear(counts, x, y, z):
-    """Whether neither a voxel nor any of the 26 around it is occupied."""
+    """Whether a voxel and its 26 neighbours are all unoccupied."""
     for i in range(x - 1, x + 2):
         for j in range(y - 1, y + 2):
             for k in range(z - 1, z + 2):
@@ -89,20 +89,24 @@ def _is_clear(counts, x, y, z):
 
 @kernel
 @no_type_check
-def empty_voxels(counts, least):
-    """The voxels, but for those at the grid's border, that `least` rays passed, that lie inside of what rays passed,
-    and are clear of what is occupied: ascending positions (k,) int64 in the flattened grid."""
+def empty_voxels(counts, min_rays):
+    """The voxels off the grid's border that at least `min_rays` rays passed, whose face neighbours rays passed, and
+    that have no occupied neighbour: ascending indices (k,) int64 into the flattened grid."""
     nx, ny, nz = counts.shape
     found = np.empty(1024, np.int64)
     n = 0
     for x in range(1, nx - 1):
         for y in range(1, ny - 1):
             for z in range(1, nz - 1):
-                if least <= counts[x, y, z] < OCCUPIED and _is_inside(counts, x, y, z) and _is_clear(counts, x, y, z):
+                if (
+                    min_rays <= counts[x, y, z] < OCCUPIED
+                    and _is_inside(counts, x, y, z)
+                    and _is_clear(counts, x, y, z)
+                ):
                     if n == len(found):
-                        more = np.empty(2 * n, np.int64)
-                        more[:n] = found
-                        found = more
+                        larger = np.empty(2 * n, np.int64)
+                        larger[:n] = found
+                        found = larger
                     found[n] = (x * ny + y) * nz + z
                     n += 1
     return found[:n].copy()

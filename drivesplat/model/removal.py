@@ -29,5 +29,5 @@ def removal_of(model: SplatModel, gaussians: Gaussians, box: Box, margin: float)
     own = model.of_track(box.track_id)
     if own is not None:
         return Removal(own, "actor")
-    inside = box.holds(gaussians.means.detach().cpu().double().numpy(), margin)
+    inside = box.contains(gaussians.means.detach().cpu().double().numpy(), margin)
     return Removal(torch.from_numpy(inside).to(gaussians.means.device), "box")

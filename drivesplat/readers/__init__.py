@@ -1,4 +1,5 @@
-"""Datasets into `Scene` records, one package each. Nothing downstream knows a dataset's files or class names.
+"""Readers of datasets, one package each, which return `Scene` records. No other package knows a dataset's files or
+class names.
 
-`datasets` and `sweeps` name the modules of each package that find its files, read its tables and read a sweep.
+`datasets` and `sweeps` name the modules that locate the files, read the tables and read the sweeps of each dataset.
 """

@@ -1,4 +1,4 @@
-"""What every reader checks of a dataset's numbers, with errors that name the record."""
+"""Checks of a dataset's values that all readers share; errors name the record."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from drivesplat.scene.rigid import rigid
 def checked_pose(translation: Sequence[float], rotation_wxyz: Sequence[float], record: str) -> np.ndarray:
     """The rigid transform (4, 4) of a translation in metres and a unit quaternion w, x, y, z.
 
-    Raises DatasetError naming `record` where a value is not finite or the quaternion is not of unit length (to 1e-3).
+    Raises DatasetError naming `record` if a value is not finite or the quaternion not of unit length (to 1e-3).
     """
     values = np.array([*translation, *rotation_wxyz], dtype=np.float64)
     if values.shape != (7,) or not np.isfinite(values).all():

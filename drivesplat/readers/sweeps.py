@@ -1,4 +1,4 @@
-"""LiDAR sweeps from the files of any dataset."""
+"""Reading LiDAR sweeps of any dataset."""
 
 from pathlib import Path
 from types import ModuleType
@@ -13,9 +13,9 @@ SWEEP_FILE = "drivesplat.readers.*.sweep_file"
 
 
 def read_returns(sweep: Sweep) -> LidarReturns:
-    """The returns of a sweep, those without finite coordinates left out.
+    """The returns of a sweep that have finite coordinates.
 
-    Raises DatasetError naming the sweep's token and path where the file is missing, truncated or empty.
+    Raises DatasetError naming the sweep's token and path if the file is missing, truncated or empty.
     """
     fault = sweep_fault(sweep)
     if fault:
@@ -25,7 +25,7 @@ def read_returns(sweep: Sweep) -> LidarReturns:
 
 
 def sweep_fault(sweep: Sweep) -> str | None:
-    """What is wrong with a sweep's file, with its token and path; None where nothing is."""
+    """The fault of a sweep's file, with its token and path; None if there is none."""
     path = Path(sweep.path)
     fault = _files(sweep).file_fault(path) if path.is_file() else "is missing"
     return f"{place_of(sweep)}: LiDAR file {path} {fault}" if fault else None

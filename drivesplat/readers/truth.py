@@ -1,7 +1,7 @@
-"""The truth that real logs lack and a synthetic world has: other views, an absent car, depth, instances.
+"""Ground truth of a synthetic world: views from beside the path, images without the leading car, depth, instances.
 
-`truth/truth.json` below a dataset's root lists per key frame of one camera the images beside it, lossless and free of
-sensor noise.
+`truth/truth.json` below a dataset's root lists these images for each key frame of one camera. They are lossless and
+free of sensor noise.
 """
 
 from dataclasses import asdict, dataclass
@@ -20,8 +20,8 @@ RULE = "demo_world"
 
 @dataclass(frozen=True)
 class TruthFrame:
-    """The truth of one key frame: the token of its image's sample_data, its number, file names, camera poses (4, 4) in
-    the dataset's global frame. `without_leading` is None where no car leads."""
+    """The truth of one key frame: the token of its image's sample_data, its index, file names, and camera poses (4, 4)
+    in the dataset's global frame. `without_leading` is None without a leading car."""
 
     sample_data: str
     sample_index: int
@@ -35,9 +35,9 @@ class TruthFrame:
 
 @dataclass(frozen=True)
 class Truth:
-    """What truth.json says. `lateral_left_m`: how far to the own car's left the other view lies; `leading`: the
-    instance that `without_leading` lacks, None where no car leads; `instances`: token by number in the instance images.
-    """
+    """The content of truth.json. `lateral_left_m`: offset in metres of the lateral view to the ego vehicle's left;
+    `leading`: the instance missing from `without_leading`, None without a leading car; `instances`: token by number in
+    the instance images."""
 
     scene: str
     camera: str
@@ -60,7 +60,7 @@ def write_truth_file(root: Path, truth: Truth) -> None:
 
 
 def read_truth(path: str | Path) -> Truth:
-    """Reads truth.json. Raises ResultError where the file is not one, naming it and the rule that makes it."""
+    """Reads truth.json. Raises ResultError that names the file and its rule if it is invalid."""
     content = read_json(path, RULE)
     try:
         if content.pop("schema") != SCHEMA:
@@ -75,7 +75,7 @@ def read_truth(path: str | Path) -> Truth:
 
 
 def truth_image(path: str | Path, name: str) -> Path:
-    """Where an image that the truth.json at `path` names lies. Raises ResultError where it is missing."""
+    """The path of image `name` beside the truth.json at `path`. Raises ResultError if it is missing."""
     image = Path(path).parent / name
     if not image.is_file():
         raise ResultError(

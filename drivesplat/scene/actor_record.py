@@ -1,6 +1,6 @@
-"""The objects that become actors, as actors.npz holds them: how they move and where their Gaussians start.
+"""The content of actors.npz: the motion and the seed points of every object that becomes an actor.
 
-The stage `actors` makes it (`drivesplat.preprocess.actor_seed`).
+The stage `actors` writes it (`drivesplat.preprocess.actor_seed`).
 """
 
 from dataclasses import dataclass, field
@@ -20,11 +20,11 @@ RULE = "actors"
 
 @dataclass(frozen=True)
 class ActorRecord:
-    """An actor of p seed points: `id` and `category` as annotated, `size` (length, width, height in metres), `motion`
-    in seconds since the scene's first image, `points` in the object's frame (metres) with their colours.
+    """An actor with p seed points: `id` and `category` as annotated, `size` (length, width, height in metres), `motion`
+    in seconds since the scene's first image, `points` in the object's frame (metres) and their colours.
 
-    The first `lidar_points` of the points are LiDAR returns; `pixels` of training images, at the size of training,
-    show the actor.
+    The first `lidar_points` points are LiDAR returns. `pixels` is the number of pixels that show the actor, over all
+    training images at training size.
     """
 
     id: str
@@ -37,18 +37,18 @@ class ActorRecord:
     pixels: int
 
     def to_plain(self) -> dict[str, Any]:
-        """As plain data and arrays."""
+        """The record as plain containers and arrays."""
         return {**vars(self), "motion": self.motion.to_plain()}
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> "ActorRecord":
-        """The inverse of `to_plain`. Raises AttributeError, KeyError, TypeError or ValueError where `plain` is none."""
+        """The inverse of `to_plain`. Raises AttributeError, KeyError, TypeError or ValueError if that fails."""
         return typed_record(cls, {**plain, "motion": Motion.from_plain(plain["motion"])})
 
 
 @dataclass(frozen=True)
 class ActorRecords:
-    """The content of actors.npz; `actors` by id."""
+    """The content of actors.npz."""
 
     actors: list[ActorRecord]
     provenance: Provenance = field(default_factory=dict)
@@ -60,7 +60,7 @@ def write_actors(path: str | Path, record: ActorRecords) -> None:
 
 
 def read_actors(path: str | Path) -> ActorRecords:
-    """Reads actors.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    """Reads actors.npz. Raises ResultError that names the file and its rule if it is invalid."""
     content = read_arrays(path, RULE)
     try:
         actors = [ActorRecord.from_plain(actor) for actor in content["actors"]]

@@ -1,14 +1,14 @@
-"""What own_car.json holds: where the recording car's own body is seen.
+"""The content of own_car.json: the image regions that show the body of the ego vehicle.
 
-    cameras         by name, all of the scene's
-        source      'polygons' (outlines that the user gave), 'images' (found in them), null: it is not known to be seen
-        outlines    lists of corners x, y in fractions of the image's width and height, as masks.own_car_polygons has
-                    one a camera
-        share       how much of the image they enclose
-        why_null    where the source is null, why
+    cameras         all cameras of the scene, by name
+        source      'polygons' (given by the user), 'images' (detected), null: no body is known in this camera
+        outlines    lists of corners x, y in fractions of the image's width and height, one outline per camera if given
+                    by masks.own_car_polygons
+        share       fraction of the image that the outlines enclose
+        why_null    the reason for a source of null
     provenance
 
-The stage `own_car` makes it (`drivesplat.preprocess.ego_mask`).
+The stage `own_car` writes it (`drivesplat.preprocess.ego_mask`).
 """
 
 from collections.abc import Mapping
@@ -27,14 +27,14 @@ Outline = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class EgoMask:
-    """The own car's body in the images of the cameras that see it: `outlines` in fractions of width and height, and
-    their `source`, 'polygons' or 'images', by camera."""
+    """The body of the ego vehicle in the images of each camera that sees it: `outlines` in fractions of width and
+    height, and their `source`, 'polygons' or 'images'."""
 
     outlines: Mapping[str, tuple[Outline, ...]] = field(default_factory=dict)
     source: Mapping[str, str] = field(default_factory=dict)
 
     def pixels(self, camera: str, size: tuple[int, int]) -> np.ndarray:
-        """The pixels (h, w) bool of the body in an image of `camera` at `size` (width, height)."""
+        """The pixels (h, w) bool that show the body in an image of `camera` at `size` (width, height)."""
         return enclosed(self.outlines.get(camera, ()), size)
 
 
@@ -61,4 +61,4 @@ def read_ego_mask(path: str | Path) -> tuple[EgoMask, Provenance]:
         }
         return EgoMask(outlines, {name: camera["source"] for name, camera in known.items()}), content["provenance"]
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, RULE, f"not a record of the own car ({error})") from error
+        raise unreadable(path, RULE, f"not a record of the ego vehicle's mask ({error})") from error

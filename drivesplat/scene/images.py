@@ -1,8 +1,8 @@
-"""Recorded images, read and resized; one place for the pixel conventions.
+"""Reading and resizing recorded images, and the pixel conventions.
 
-`Scene` intrinsics are OpenCV's (integer coordinates at pixel centres). Rasterizers, projections and masks use the
-continuous convention of COLMAP and gsplat (the image's corner is (0, 0), the first pixel's centre (0.5, 0.5)), in which
-resizing is a plain scaling.
+`Scene` intrinsics follow OpenCV (integer coordinates at pixel centres). Rasterizers, projections and masks use the
+continuous convention of COLMAP and gsplat (image corner at (0, 0), centre of the first pixel at (0.5, 0.5)), in which
+resizing scales all coordinates.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from drivesplat.settings.images import ImageSettings
 
 
 def target_size(frame: Frame, images: ImageSettings) -> tuple[int, int]:
-    """Width and height in pixels at which a frame is used."""
+    """Width and height in pixels of a frame after resizing."""
     if images.width is None:
         return frame.width, frame.height
     return images.width, max(1, round(frame.height * images.width / frame.width))
@@ -34,7 +34,7 @@ def continuous_intrinsics(frame: Frame, size: tuple[int, int]) -> np.ndarray:
 def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """An image as RGB (h, w, 3) uint8, at `size` (width, height) if given.
 
-    Raises DatasetError naming the path where the file is missing, truncated or no image.
+    Raises DatasetError that names the path if the file is missing, truncated or not an image.
     """
     try:
         with Image.open(path) as image:
@@ -47,20 +47,20 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
 
 
 def write_image(path: str | Path, colors: np.ndarray) -> None:
-    """Writes colours (h, w, 3) in [0, 1] as a PNG. Raises ResultError naming the path where that fails."""
+    """Writes colours (h, w, 3) in [0, 1] as a PNG. Raises ResultError that names the path on failure."""
     write_png(path, (colors.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> None:
-    """Writes bytes (h, w) or (h, w, 3) as a PNG. Raises ResultError naming the path where that fails."""
+    """Writes uint8 pixels (h, w) or (h, w, 3) as a PNG. Raises ResultError that names the path on failure."""
     with atomic_write(path) as file:
         Image.fromarray(pixels).save(file, format="PNG")
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """A label image (h, w) uint8, brought to `size` (width, height) by nearest neighbour.
+    """A label image (h, w) uint8, resized to `size` (width, height) by nearest neighbour.
 
-    Raises DatasetError naming the path.
+    Raises DatasetError that names the path if the file cannot be read.
     """
     try:
         with Image.open(path) as image:
@@ -73,9 +73,9 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def project(points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World points (n, 3) in an image: continuous pixels (n, 2) and depth along the axis (n,), metres.
+    """Projects world points (n, 3): continuous pixels (n, 2) and depth along the optical axis (n,) in metres.
 
-    Where depth is not positive the pixel is meaningless.
+    Pixels of points with a depth that is not positive are undefined.
     """
     in_camera = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     depth = in_camera[:, 2]
@@ -85,7 +85,7 @@ def project(points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndar
 
 
 def pixel_rays(size: tuple[int, int], intrinsics: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:
-    """The unit viewing direction (h, w, 3) of every pixel's centre, in world coordinates."""
+    """The unit viewing directions (h, w, 3) of the pixel centres, in world coordinates."""
     x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(intrinsics).T @ camera_to_world[:3, :3].T
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The masks of a scene, as files: region labels, sky and semantic classes of every image."""
+"""The mask files of a scene: region labels, sky and semantic classes of every image."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +12,7 @@ from drivesplat.scene.images import read_mask
 
 RULE = "masks"
 UNLABELLED = 255
-"""The value of pixels that a user's map of classes says nothing of."""
+"""The value of pixels that have no class in the user's label image."""
 
 
 def mask_name(kind: str, camera: str, timestamp: int) -> str:
@@ -50,7 +50,7 @@ def read_masks_record(folder: Path) -> MasksRecord:
 def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
     """The sky (h, w) bool of an image at `size` (width, height).
 
-    Raises ResultError where the mask is missing or unreadable.
+    Raises ResultError if the mask is missing or unreadable.
     """
     return _made_mask(folder, "sky", camera, timestamp, size) > 127
 
@@ -58,15 +58,15 @@ def read_sky_mask(folder: Path, camera: str, timestamp: int, size: tuple[int, in
 def read_labels(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
     """The label image (h, w) of an image at `size` (width, height).
 
-    Raises ResultError where it is missing or unreadable.
+    Raises ResultError if it is missing or unreadable.
     """
     return _made_mask(folder, "regions", camera, timestamp, size)
 
 
 def read_classes(folder: Path, camera: str, timestamp: int, size: tuple[int, int]) -> np.ndarray:
-    """The user's classes (h, w) of an image at `size` (width, height), UNLABELLED where there is none.
+    """The user's classes (h, w) of an image at `size` (width, height), UNLABELLED for pixels without one.
 
-    Raises ResultError where they are missing or unreadable.
+    Raises ResultError if they are missing or unreadable.
     """
     return _made_mask(folder, "semantic", camera, timestamp, size)
 

@@ -1,5 +1,4 @@
-"""The smooth motion of an annotated object: where it is at any time, without the jolts of straight lines between key
-frames.
+"""The smooth motion of an annotated object: its pose at any time, by splines through the annotations.
 
 Seconds count from the scene's first image. Frames as in `drivesplat.scene.scene`: object x forward, y left, z up, at
 the box centre; world metres.
@@ -24,9 +23,9 @@ class Motion:
     """A motion through the poses `object_to_world` (k, 4, 4) at increasing `times` (k,) in seconds.
 
     Within each of `runs` (first and last index of consecutive annotations) position and rotation are twice continuously
-    differentiable; up to `reach` seconds beyond a run's ends its velocity there continues; elsewhere the object is
-    absent. `turns` (k,) are corrections of the heading: radians about the object's vertical axis, interpolated as
-    positions are.
+    differentiable; up to `reach` seconds beyond a run's ends the object continues at constant velocity; elsewhere it
+    is absent. `turns` (k,) are corrections of the heading: radians about the object's vertical axis, interpolated
+    like positions.
     """
 
     times: Float[np.ndarray, " k"]
@@ -37,34 +36,34 @@ class Motion:
 
     @classmethod
     def of_track(cls, scene: Scene, track: Track) -> "Motion":
-        """The motion through a track's annotations; it reaches as far beyond them as the measuring protocol says."""
+        """The motion through a track's annotations; its reach is half a key-frame interval."""
         times = np.array([scene.seconds(timestamp) for timestamp in track.timestamps])
         reach = scene.key_frame_interval * 0.5e-6
         return cls(times, track.object_to_world, tuple(runs(track.sample_indices)), reach)
 
     def to_plain(self) -> dict[str, Any]:
-        """As plain data and arrays; corrections of the heading are left out."""
+        """The motion as plain containers and arrays, without `turns`."""
         runs = [list(run) for run in self.runs]
         return {"times": self.times, "object_to_world": self.object_to_world, "runs": runs, "reach": self.reach}
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> "Motion":
-        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError where `plain` is none."""
+        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError if `plain` is invalid."""
         runs = tuple((first, last) for first, last in plain["runs"])
         return typed_record(cls, {**plain, "runs": runs})
 
     @property
     def span(self) -> tuple[float, float]:
-        """The first and the last second at which the object is there."""
+        """The first and the last second at which the object is present."""
         return float(self.times[0] - self.reach), float(self.times[-1] + self.reach)
 
     def present(self, at: np.ndarray) -> np.ndarray:
-        """Whether the object is there at the seconds `at` (n,): (n,) bool."""
+        """Whether the object is present at the seconds `at` (n,): (n,) bool."""
         spans = (self.times[[first, last]] + [-self.reach, self.reach] for first, last in self.runs)
         return np.any([(low <= at) & (at <= high) for low, high in spans], axis=0)
 
     def poses(self, at: np.ndarray) -> np.ndarray:
-        """The poses (n, 4, 4) at the seconds `at` (n,); where the object is absent, those of its nearest run."""
+        """The poses (n, 4, 4) at the seconds `at` (n,); while the object is absent, poses of the nearest run."""
         at = np.asarray(at, dtype=np.float64)
         poses, weights = np.tile(np.eye(4), (len(at), 1, 1)), self.weights(at)
         poses[:, :3, 3] = weights @ self.object_to_world[:, :3, 3]
@@ -76,10 +75,10 @@ class Motion:
         return poses
 
     def weights(self, at: np.ndarray) -> np.ndarray:
-        """How much (n, k) each annotation has in the position at the seconds `at` (n,): position = weights @ positions.
+        """The annotations' weights (n, k) in the position at the seconds `at` (n,): position = weights @ positions.
 
-        A natural cubic spline is linear in what it goes through: whatever else is given at the annotations (a learned
-        correction) is interpolated by the same weights.
+        A natural cubic spline is linear in its control values: other values at the annotations, such as a learned
+        correction, are interpolated by the same weights.
         """
         at = np.asarray(at, dtype=np.float64)
         weights = np.zeros((len(at), len(self.times)))
@@ -88,14 +87,14 @@ class Motion:
         return weights
 
     def _chosen(self, at: np.ndarray) -> list[tuple[tuple[int, int], np.ndarray]]:
-        """For each run the positions (m,) in `at` that are nearest to it."""
+        """For each run the indices (m,) of the entries of `at` that are nearest to it."""
         ends = self.times[np.array(self.runs)]
         outside = np.maximum(ends[:, :1] - at, at - ends[:, 1:])
         nearest = outside.argmin(axis=0)
         return [(run, np.flatnonzero(nearest == i)) for i, run in enumerate(self.runs)]
 
     def _rotations(self, run: tuple[int, int], at: np.ndarray) -> np.ndarray:
-        """Rotation matrices (n, 3, 3) along a run; beyond its ends it turns on as fast as there."""
+        """Rotation matrices (n, 3, 3) along a run; beyond its ends the angular velocity is constant."""
         first, last = run
         if first == last:
             return np.tile(self.object_to_world[first, :3, :3], (len(at), 1, 1))
@@ -115,7 +114,7 @@ class Motion:
         }
 
     def _run_weights(self, run: tuple[int, int], at: np.ndarray) -> np.ndarray:
-        """The weights (n, k) of a run's k annotations in a natural cubic spline, straight on beyond its ends."""
+        """The weights (n, k) of a run's k annotations in a natural cubic spline, linear beyond its ends."""
         first, last = run
         if first == last:
             return np.ones((len(at), 1))
@@ -125,7 +124,7 @@ class Motion:
 
     @cached_property
     def _bases(self) -> dict[tuple[int, int], CubicSpline]:
-        """Per run the splines that are 1 at one annotation and 0 at the others."""
+        """Per run the cardinal splines: 1 at one annotation and 0 at the others."""
         lengths = {(first, last): last + 1 - first for first, last in self.runs if first < last}
         return {
             (first, last): CubicSpline(self.times[first : last + 1], np.eye(length), bc_type="natural")

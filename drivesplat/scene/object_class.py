@@ -1,7 +1,7 @@
-"""The classes of annotated objects, and what the measuring protocol needs to know of each.
+"""The classes of annotated objects, and their properties in the measuring protocol.
 
-A reader maps its dataset's class names to these. A dataset with one class for all vehicles maps it to VEHICLE: then no
-pixel belongs to the region `car`, which is null.
+A reader maps its dataset's class names to these. A dataset with one class for all vehicles maps it to VEHICLE; then no
+pixel belongs to the region `car`, and its metrics are null.
 """
 
 from enum import StrEnum
@@ -13,7 +13,7 @@ MOVING_HUMAN = 0.3
 
 
 class ObjectClass(StrEnum):
-    """What an object is; the values appear in scene.json and in settings."""
+    """The class of an object; the values appear in scene.json and in settings."""
 
     CAR = "car"
     TRUCK = "truck"
@@ -22,7 +22,7 @@ class ObjectClass(StrEnum):
     CONSTRUCTION_VEHICLE = "construction_vehicle"
     TRAM = "tram"
     VEHICLE = "vehicle"
-    """A vehicle of a type that the dataset does not name, or that is none of the others."""
+    """A vehicle of unknown or other type."""
     MOTORCYCLE = "motorcycle"
     BICYCLE = "bicycle"
     RIDER = "rider"
@@ -30,11 +30,11 @@ class ObjectClass(StrEnum):
     PEDESTRIAN = "pedestrian"
     ANIMAL = "animal"
     OTHER_MOVABLE = "other_movable"
-    """Cones, barriers and the like: static, as far as the protocol is concerned."""
+    """Cones, barriers and similar objects, which the protocol treats as static."""
 
     @property
     def is_vehicle(self) -> bool:
-        """Whether it belongs to the region `vehicle`: cycles with or without a rider do."""
+        """Whether it belongs to the region `vehicle`, which includes cycles with and without a rider."""
         return not self.is_human and self not in (ObjectClass.ANIMAL, ObjectClass.OTHER_MOVABLE)
 
     @property
@@ -49,7 +49,7 @@ class ObjectClass(StrEnum):
 
     @property
     def moving_speed(self) -> float | None:
-        """The horizontal speed in m/s above which it counts as moving; None where it never does."""
+        """The horizontal speed in m/s above which it counts as moving; None if it never does."""
         if self.is_vehicle:
             return MOVING_VEHICLE
         return MOVING_HUMAN if self.is_human else None

@@ -1,4 +1,4 @@
-"""A recorded drive, prepared: what every look at a trained model is held against."""
+"""A prepared drive: the recorded images, labels and splits with which renderings of a model are compared."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +15,8 @@ from drivesplat.scene.training_record import TrainingRecord, read_training_recor
 
 @dataclass(frozen=True)
 class PreparedDrive:
-    """A `scene`, the training `record` made of it, whose images are the scene's frames in their order, and the folder
-    `masks` of the stage of that name; without it the labels are those of the scene's boxes."""
+    """A `scene`, its training `record`, whose images are the scene's frames in the same order, and the folder of the
+    stage `masks`; without it the labels are computed from the scene's boxes."""
 
     scene: Scene
     record: TrainingRecord
@@ -41,11 +41,11 @@ class PreparedDrive:
         return read_labels(self.masks, frame.camera, frame.timestamp, size)
 
     def ego_mask(self, index: int) -> np.ndarray:
-        """The pixels (h, w) bool of an image in which the recording car's own body is seen."""
+        """The pixels (h, w) bool of an image that show the body of the ego vehicle."""
         return self.labels(index) == LABELS["own_car"]
 
     def split(self, index: int) -> str | None:
-        """What an image is used for: 'train', a held-out group or 'excluded'."""
+        """The split of an image: 'train', a held-out group or 'excluded'."""
         return next((name for name, images in self.record.splits.items() if index in images), None)
 
 

@@ -1,4 +1,4 @@
-"""Static and moving pixels: boxes in images, as the measuring protocol defines them.
+"""Static and moving pixels of images, from projected boxes, as the measuring protocol defines them.
 
 A label image gives each pixel one label; a region is a set of labels. Users may supply label images of their own.
 """
@@ -31,7 +31,7 @@ LABELS = {
     "moving_human": 8,
     "own_car": 9,
 }
-"""The value of a pixel in a label image. 'other' is an animal; 'own_car' the recording car's own body."""
+"""The value of a pixel in a label image. 'other' is an animal, 'own_car' the body of the ego vehicle."""
 
 REGIONS = {
     "all": tuple(name for name in LABELS if name != "own_car"),
@@ -47,7 +47,7 @@ REGIONS = {
 
 @dataclass(frozen=True)
 class Hull:
-    """A box seen in an image: `polygon` (n, 2) continuous pixels, `distance` camera to box centre in metres."""
+    """A box in an image: `polygon` (n, 2) in continuous pixels, `distance` from camera to box centre in metres."""
 
     box: Box
     polygon: np.ndarray
@@ -65,16 +65,16 @@ def region_masks(labels: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def hull_of(box: Box, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray | None:
-    """The convex hull (n, 2), continuous pixels, of a box clipped at the near plane; None where it is behind.
+    """The convex hull (n, 2), continuous pixels, of a box clipped at the near plane; None if it lies behind.
 
     `world_to_camera` (4, 4), `intrinsics` (3, 3) in the continuous convention.
     """
     in_camera = box.corners @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     edges = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
-    ahead = in_camera[:, 2] >= NEAR_PLANE
-    points = list(in_camera[ahead])
+    in_front = in_camera[:, 2] >= NEAR_PLANE
+    points = list(in_camera[in_front])
     for a, b in edges:
-        if ahead[a] != ahead[b]:
+        if in_front[a] != in_front[b]:
             fraction = (NEAR_PLANE - in_camera[a, 2]) / (in_camera[b, 2] - in_camera[a, 2])
             points.append(in_camera[a] + fraction * (in_camera[b] - in_camera[a]))
     if len(points) < 3:
@@ -84,7 +84,7 @@ def hull_of(box: Box, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np
 
 
 def hulls_in(scene: Scene, frame: Frame, size: tuple[int, int]) -> list[Hull]:
-    """The boxes of classes that can move, as seen in a frame at `size` (width, height), farthest first."""
+    """The projected boxes of dynamic classes in a frame at `size` (width, height), farthest first."""
     world_to_camera = inverse(frame.camera_to_world)
     intrinsics = continuous_intrinsics(frame, size)
     hulls = []
@@ -114,8 +114,8 @@ def fill(polygon: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def owner_image(hulls: list[Hull], size: tuple[int, int]) -> tuple[np.ndarray, list[int]]:
-    """Whose every pixel is, as a position in `hulls` (farthest first), -1 where it is nobody's: (h, w); and how many
-    pixels each hull covers, hidden ones included. Where hulls overlap the nearer box wins."""
+    """The index (h, w) into `hulls` (farthest first) of the nearest box at every pixel, -1 without one; and the number
+    of pixels that each hull covers, occluded ones included."""
     owners, covered = np.full((size[1], size[0]), -1), []
     for position, hull in enumerate(hulls):
         mask = fill(hull.polygon, size)
@@ -127,7 +127,7 @@ def owner_image(hulls: list[Hull], size: tuple[int, int]) -> tuple[np.ndarray, l
 def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     """The label (h, w) uint8 of every pixel of a frame at `size` (width, height), from the scene's boxes.
 
-    Where hulls overlap the nearer box wins, whether it is measured or left out.
+    Where hulls overlap, the nearer box wins, even if it is left out of the regions.
     """
     hulls = hulls_in(scene, frame, size)
     owners, covered = owner_image(hulls, size)
@@ -136,7 +136,7 @@ def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray
 
 
 def label_of(hull: Hull, pixels: int) -> str:
-    """The label of a hull that covers so many pixels."""
+    """The label of a hull that covers `pixels` pixels."""
     box = hull.box
     hidden = 0 < box.visibility < MIN_VISIBILITY
     if hidden or hull.distance > MAX_DISTANCE or pixels < MIN_PIXELS:

@@ -23,14 +23,14 @@ def inverse(transform: np.ndarray) -> np.ndarray:
 
 
 def apply(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """`points` (n, 3) moved by `transform` (4, 4)."""
+    """`points` (n, 3) transformed by `transform` (4, 4)."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def interpolate(start: np.ndarray, end: np.ndarray, fraction: float) -> np.ndarray:
     """The pose (4, 4) at `fraction` between two poses: linear position, slerp rotation.
 
-    Outside [0, 1] the motion continues.
+    Outside [0, 1] the motion is extrapolated.
     """
     turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
     rotation = start[:3, :3] @ Rotation.from_rotvec(fraction * turn).as_matrix()

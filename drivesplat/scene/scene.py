@@ -1,6 +1,6 @@
-"""The record that flows through the workflow: one drive, whatever dataset it came from.
+"""The record of one drive that all stages share, independent of the dataset.
 
-Frames of reference. World: metres, z up, the axes of the dataset's global frame, its origin moved to the first ego
+Frames of reference. World: metres, z up, axes of the dataset's global frame, origin at the first ego
 position (`Scene.origin`, kept in float64). Camera: OpenCV (x right, y down, z forward). Intrinsics: OpenCV (integer
 coordinates at pixel centres), in pixels of the recorded image. Object: x forward, y left, z up, at the box centre.
 Ego: x forward, y left, z up, on the ground under the rear axle. Timestamps: microseconds.
@@ -19,7 +19,7 @@ from drivesplat.scene.sensors import Camera, Lidar
 
 SCHEMA = 1
 REFINED = "scene_refined.json"
-"""What the record is called once its poses are refined."""
+"""File name of the record with refined poses."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,7 @@ class Track:
     """One annotated object over time. `category` is the dataset's own name of its class.
 
     `size` (3,) is length, width, height in metres. Per annotation: `timestamps` (n,), `sample_indices` (n,),
-    increasing; `object_to_world` (n, 4, 4); `visibility` (n,): 1 (0-40 %) to 4 (80-100 %), 0 where the dataset does not
-    say.
+    increasing; `object_to_world` (n, 4, 4); `visibility` (n,): 1 (0-40 %) to 4 (80-100 %), 0 if unknown.
     """
 
     id: str
@@ -109,21 +108,21 @@ class Scene:
         return float(np.median(np.diff(self.key_frame_timestamps)))
 
     def seconds(self, timestamp: int | np.integer) -> float:
-        """A timestamp (microseconds) as seconds since the first image, the time that models know."""
+        """A timestamp (microseconds) as seconds since the first image, the time unit of models."""
         return float(timestamp - min(frame.timestamp for frame in self.frames)) * 1e-6
 
     def track(self, track_id: str) -> Track | None:
-        """The track of that id, None where there is none."""
+        """The track with this id; None if there is none."""
         return next((track for track in self.tracks if track.id == track_id), None)
 
     def key_frames(self, camera: str) -> list[int]:
-        """Which of `frames` are key frames of `camera`."""
+        """The indices in `frames` of the key frames of `camera`."""
         return [i for i, frame in enumerate(self.frames) if frame.camera == camera and frame.is_key_frame]
 
     def middle_key_frame(self, camera: str) -> int:
-        """Which of `frames` is the key frame of `camera` in the middle of the drive.
+        """The index in `frames` of the key frame of `camera` in the middle of the drive.
 
-        Raises DatasetError where it has none, naming the cameras that do.
+        Raises DatasetError that names the cameras with key frames if this one has none.
         """
         found = self.key_frames(camera)
         if not found:
@@ -139,7 +138,7 @@ class Scene:
 
 
 def place_of(recording: Frame | Sweep) -> str:
-    """Which recording it is, for messages: its key frame, or the nearest one, and its token."""
+    """The key frame (or the nearest one) and the token of a frame or sweep, for messages."""
     where = "" if recording.is_key_frame else "between key frames, nearest "
     return f"{where}key frame {recording.sample_index}, token {recording.token}"
 
@@ -168,7 +167,7 @@ def write_scene(path: str | Path, scene: Scene) -> None:
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Reads scene.json. Raises ResultError that names the file and its rule where it is not a scene record.
+    """Reads scene.json. Raises ResultError that names the file and its rule if it is not a scene record.
 
     >>> scene = read_scene("results/0001/scene.json")
     >>> frame = scene.frames[0]

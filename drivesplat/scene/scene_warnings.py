@@ -1,5 +1,6 @@
-"""Circumstances of a drive under which figures say less than they seem to: a car that stands, darkness, a street on
-which nothing moves. What is said of them is a finding, never a gate.
+"""Warnings about drives whose metrics are easily misread: the ego vehicle stands, the images are dark, nothing moves.
+
+A warning never stops a run.
 """
 
 import numpy as np
@@ -10,61 +11,61 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import moving_tracks
 
 MIN_BASELINE = 1.0
-"""Metres. From images that lie this far apart, a point 20 m away and off by a pixel is off by a third of a metre in
-depth at nuScenes' focal length (z^2 / (f b), f = 1266 pixels); from less than that, geometry is LiDAR's alone."""
-STANDS = 0.3
-"""Metres a second up to which a car stands; poses that err by centimetres creep."""
+"""Minimum baseline for triangulation, in metres. At this baseline b and nuScenes' focal length f = 1266 pixels, an
+error of one pixel displaces a point at depth z = 20 m by a third of a metre (z^2 / (f b))."""
+MAX_STANDING_SPEED = 0.3
+"""Speed (m/s) up to which the ego vehicle counts as standing; pose errors of centimetres stay below it."""
 DARK = 0.2
-"""Mean luminance under which images are dark: nuScenes by day has 0.4, synthetic worlds by night have 0.14."""
-LOOKS = 12
-"""So many images tell how bright a drive is."""
-REDUCED = 8
-"""They are read at this fraction of their size."""
+"""Mean luminance below which images count as dark: nuScenes by day has 0.4, synthetic worlds by night 0.14."""
+SAMPLED_IMAGES = 12
+"""Number of images from which the luminance of a drive is computed."""
+REDUCTION = 8
+"""Factor by which these images are reduced on reading."""
 REC_709 = np.array([0.2126, 0.7152, 0.0722])
 """Luma weights of red, green and blue (ITU-R BT.709)."""
 
 
-def moved(scene: Scene) -> float:
-    """How far apart, in metres over the ground, the two places lie between which the car was farthest apart."""
-    places = np.unique(np.stack([frame.ego_to_world[:2, 3] for frame in scene.frames]), axis=0)
-    return float(pdist(places).max()) if len(places) > 1 else 0.0
+def max_displacement(scene: Scene) -> float:
+    """The largest horizontal distance in metres between two positions of the ego vehicle."""
+    positions = np.unique(np.stack([frame.ego_to_world[:2, 3] for frame in scene.frames]), axis=0)
+    return float(pdist(positions).max()) if len(positions) > 1 else 0.0
 
 
-def standing(scene: Scene) -> float:
-    """For how many seconds the car, from key frame to key frame of the first camera, is no faster than STANDS."""
+def standing_time(scene: Scene) -> float:
+    """The time in seconds between key frames of the first camera at a speed of at most MAX_STANDING_SPEED."""
     frames = [scene.frames[i] for i in scene.key_frames(scene.frames[0].camera)]
-    places = np.stack([frame.ego_to_world[:2, 3] for frame in frames]) if frames else np.zeros((1, 2))
+    positions = np.stack([frame.ego_to_world[:2, 3] for frame in frames]) if frames else np.zeros((1, 2))
     seconds = np.diff([frame.timestamp for frame in frames]) * 1e-6
-    return float(seconds[np.linalg.norm(np.diff(places, axis=0), axis=1) <= STANDS * seconds].sum())
+    return float(seconds[np.linalg.norm(np.diff(positions, axis=0), axis=1) <= MAX_STANDING_SPEED * seconds].sum())
 
 
-def seconds_long(scene: Scene) -> float:
-    """The time from the first image to the last."""
+def duration(scene: Scene) -> float:
+    """The time in seconds from the first image to the last."""
     times = [frame.timestamp for frame in scene.frames]
     return (max(times) - min(times)) * 1e-6
 
 
 def luminance(scene: Scene) -> float:
-    """The mean luma of LOOKS images spread over the drive, in [0, 1] of the recorded (gamma-coded) values."""
-    chosen = np.unique(np.linspace(0, len(scene.frames) - 1, LOOKS).round().astype(int))
+    """The mean luma in [0, 1] of SAMPLED_IMAGES images spread over the drive, from gamma-coded values."""
+    chosen = np.unique(np.linspace(0, len(scene.frames) - 1, SAMPLED_IMAGES).round().astype(int))
     return float(np.mean([_luma(scene.frames[i].image_path) for i in chosen]))
 
 
 def _luma(path: str) -> float:
     with Image.open(path) as image:
-        image.draft("RGB", (image.width // REDUCED, image.height // REDUCED))
+        image.draft("RGB", (image.width // REDUCTION, image.height // REDUCTION))
         return float((np.asarray(image.convert("RGB")) @ REC_709).mean() / 255.0)
 
 
 def scene_warnings(scene: Scene, brightness: float) -> list[str]:
-    """What to know before the figures of a scene are read, a sentence a circumstance; `brightness` is `luminance`."""
+    """The warnings of a scene, one sentence each; `brightness` is its `luminance`."""
     found = []
-    distance, seconds, stands = moved(scene), seconds_long(scene), standing(scene)
+    distance, seconds, stands = max_displacement(scene), duration(scene), standing_time(scene)
     if distance < MIN_BASELINE:
         found.append(
             f"the car hardly moves ({distance:.1f} m in {seconds:.1f} s): nothing can be triangulated, depth is "
-            "LiDAR's alone; held-out images show what training images show: expect a PSNR that is high and says "
-            "little, and views from beside the path that fall apart"
+            "from LiDAR alone; held-out images repeat training images, so a high PSNR says little, and views from "
+            "beside the path are expected to be poor"
         )
     elif stands >= 0.5 * seconds:
         found.append(
@@ -73,16 +74,16 @@ def scene_warnings(scene: Scene, brightness: float) -> list[str]:
         )
     if brightness < DARK:
         found.append(
-            f"the images are dark (mean luminance {brightness:.2f}): PSNR is high by night whatever is rendered; "
-            "compare it with what one colour alone reaches (flat_psnr in metrics.json)"
+            f"the images are dark (mean luminance {brightness:.2f}): PSNR is high by night for any rendering; "
+            "compare it with the PSNR of a single colour (flat_psnr in metrics.json)"
         )
     if not scene.tracks:
         found.append(
-            "nothing is annotated (the test split of nuScenes has no boxes): what moves counts as static and smears"
+            "nothing is annotated (the test split of nuScenes has no boxes): moving objects count as static and smear"
         )
     elif not any(track.object_class.is_vehicle for track in moving_tracks(scene)):
         found.append(
             "no vehicle moves: gap_db compares with parked ones (null without them), there is no vehicle to remove or "
-            "edit, and a method with actors has none but what actors.humans may add"
+            "edit, and a method with actors has none unless actors.humans adds people"
         )
     return found

@@ -9,8 +9,8 @@ import numpy as np
 @dataclass(frozen=True)
 class Camera:
     """A camera. `width`, `height` in pixels; `intrinsics` (3, 3), OpenCV (integer coordinates at pixel centres);
-    `distortion` OpenCV's coefficients, all 0 where images are rectified. `readout_s` seconds from the first line of
-    pixels to the last, read in `readout_direction`. None where the dataset does not say."""
+    `distortion`: OpenCV's coefficients, all 0 for rectified images; `readout_s`: time in seconds from the first line
+    of pixels to the last, read in `readout_direction`. None if unknown."""
 
     name: str
     width: int
@@ -23,8 +23,8 @@ class Camera:
 
 @dataclass(frozen=True)
 class Lidar:
-    """A spinning LiDAR. `beam_elevations` (b,) radians over the sensor's horizontal plane, in the order of rings;
-    `azimuth_steps` firings of a beam in one revolution. None where the dataset does not say."""
+    """A spinning LiDAR. `beam_elevations` (b,) in radians above the sensor's horizontal plane, in ring order;
+    `azimuth_steps` is the number of firings of a beam per revolution. None if unknown."""
 
     name: str
     beam_elevations: np.ndarray | None = None
@@ -35,7 +35,7 @@ class Lidar:
 class LidarReturns:
     """The n returns of a sweep. `points` (n, 3) float64, metres, in the sensor's frame at the sweep's timestamp.
 
-    None where the file does not say: `intensity` (n,) float32 in [0, 1]; `rings` (n,) int64, indices of
+    None if the file has no such column: `intensity` (n,) float32 in [0, 1]; `rings` (n,) int64, indices of
     `Lidar.beam_elevations`; `offsets_s` (n,) float64, seconds after the sweep's timestamp.
     """
 

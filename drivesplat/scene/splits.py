@@ -1,4 +1,4 @@
-"""Which images are held out: whole key-frame timestamps, and the sweeps around them."""
+"""The split of images and LiDAR sweeps: key frames are held out as a whole, and recordings near them excluded."""
 
 from typing import Literal
 
@@ -12,7 +12,7 @@ HELD_OUT_GROUPS: tuple[Group, Group] = ("interpolation", "extrapolation")
 
 
 def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[int]]:
-    """The held-out key frames of a scene with `count` of them, by group. A frame in both belongs to the block."""
+    """Held-out indices by group, of `count` key frames. A key frame in both groups belongs to the last block."""
     block = list(range(max(0, count - holdout.last_block), count))
     nth = range(holdout.offset, count, holdout.every_nth) if holdout.every_nth else range(0)
     return {"interpolation": [i for i in nth if i not in block], "extrapolation": block}
@@ -21,8 +21,8 @@ def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[
 def group_of_times(
     scene: Scene, timestamps: np.ndarray, sample_indices: np.ndarray, is_key_frame: np.ndarray, holdout: HoldoutSettings
 ) -> list[Group]:
-    """The group of each image or sweep: a key frame goes with its index; what lies between key frames is
-    'excluded' where it is nearer than half a key-frame interval to a held-out one, else 'train'.
+    """The group of each image or sweep: that of its index for a key frame; between key frames 'excluded' within half
+    a key-frame interval of a held-out one, else 'train'.
 
     `timestamps` (n,) microseconds, `sample_indices` (n,), `is_key_frame` (n,).
     """
@@ -45,7 +45,7 @@ def frame_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
 
 
 def training_images(scene: Scene, holdout: HoldoutSettings) -> np.ndarray:
-    """The numbers (n,) of the images, among `scene.frames`, that a training may see."""
+    """The indices (n,) in `scene.frames` of the training images."""
     return np.flatnonzero([group == "train" for group in frame_groups(scene, holdout)])
 
 

@@ -1,4 +1,4 @@
-"""Where an annotated object is at a time between its annotations."""
+"""The poses of annotated objects between their annotations."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import apply, interpolate, inverse
 from drivesplat.scene.scene import Scene, Track
 
-SHORT = 8
-"""At least so many characters of an id are shown to people."""
+MIN_ID_LENGTH = 8
+"""Minimum number of characters of a shortened id."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """A track at one time: `size` (3,) length, width, height in metres, `speed` horizontal in m/s."""
+    """A track at one time: `size` (3,) length, width, height in metres, horizontal `speed` in m/s."""
 
     track_id: str
     object_class: ObjectClass
@@ -31,22 +31,22 @@ class Box:
         signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         return (signs * self.size) @ self.object_to_world[:3, :3].T + self.object_to_world[:3, 3]
 
-    def holds(self, points: np.ndarray, margin: float = 0.0, floor: float = 0.0) -> np.ndarray:
-        """Which world points (n, 3) lie in the box grown by `margin` metres at its sides and roof, its floor raised by
-        `floor` metres: (n,) bool."""
+    def contains(self, points: np.ndarray, margin: float = 0.0, floor: float = 0.0) -> np.ndarray:
+        """Whether world points (n, 3) lie in the box, with its sides and roof expanded by `margin` metres and its floor
+        raised by `floor` metres: (n,) bool."""
         return in_box(points, self.object_to_world, self.size, margin, floor)
 
     @property
     def moves(self) -> bool:
-        """Whether it moves now, by the measuring protocol's threshold for its class."""
+        """Whether it moves at this time, by the measuring protocol's threshold for its class."""
         return self.object_class.moves_at(self.speed)
 
 
 def in_box(
     points: np.ndarray, object_to_world: np.ndarray, size: np.ndarray, margin: float = 0.0, floor: float = 0.0
 ) -> np.ndarray:
-    """Which world points (n, 3) lie in a box of `size` (3,) at a pose (4, 4), grown by `margin` metres at its sides and
-    roof, its floor raised by `floor` metres: (n,) bool."""
+    """Whether world points (n, 3) lie in a box of `size` (3,) at a pose (4, 4), with its sides and roof expanded by
+    `margin` metres and its floor raised by `floor` metres: (n,) bool."""
     inside = np.zeros(len(points), dtype=bool)
     reach = np.linalg.norm(size) / 2 + 2 * max(margin, -floor, 0.0)
     near = np.flatnonzero(np.linalg.norm(points - object_to_world[:3, 3], axis=1) < reach)
@@ -57,11 +57,11 @@ def in_box(
 
 
 def box_at(track: Track, timestamp: int, interval: float) -> Box | None:
-    """The box of `track` at `timestamp` (microseconds), or None where it is absent.
+    """The box of `track` at `timestamp` (microseconds), or None if it is absent.
 
-    Between consecutive key frames that both hold the track the position is linear and the rotation slerps. Up to half
-    an `interval` (microseconds, the scene's key-frame interval) beyond an end, the end segment's motion continues; a
-    single box holds still. Where the annotation has a gap, the track ends before it and begins anew after it.
+    Between consecutive annotated key frames, the position is interpolated linearly and the rotation by slerp. Up to
+    half an `interval` (microseconds, the scene's key-frame interval) beyond an end, the motion of the last segment
+    continues; a single box is static. At a gap in the annotations the track ends, and a new run begins after it.
     """
     for first, last in runs(track.sample_indices):
         times = track.timestamps[first : last + 1]
@@ -86,18 +86,18 @@ def _box(track: Track, object_to_world: np.ndarray, speed: float, visibility: in
 
 
 def boxes_of(tracks: Iterable[Track], timestamp: int, interval: float) -> list[Box]:
-    """The boxes of some tracks that are there at `timestamp`; `interval` between key frames, both in microseconds."""
+    """The boxes of `tracks` present at `timestamp`; `interval` is the key-frame interval, both in microseconds."""
     boxes = (box_at(track, timestamp, interval) for track in tracks)
     return [box for box in boxes if box is not None]
 
 
 def boxes_at(scene: Scene, timestamp: int) -> list[Box]:
-    """All boxes that are there at `timestamp` (microseconds)."""
+    """All boxes of a scene at `timestamp` (microseconds)."""
     return boxes_of(scene.tracks, timestamp, scene.key_frame_interval)
 
 
 def ever_moves(track: Track) -> bool:
-    """Whether a vehicle or person ever moves in this scene, by the same thresholds."""
+    """Whether a track moves at any annotation, by the thresholds of `Box.moves`."""
     times = track.timestamps
     for first, last in runs(track.sample_indices):
         if any(box_at(track, int(time), 0.0).moves for time in times[first:last]):
@@ -106,19 +106,19 @@ def ever_moves(track: Track) -> bool:
 
 
 def moving_tracks(scene: Scene) -> list[Track]:
-    """The tracks that ever move in a scene: they leave nothing behind that stands still."""
+    """The tracks that move at any time in a scene."""
     return [track for track in scene.tracks if ever_moves(track)]
 
 
 def runs(sample_indices: np.ndarray) -> list[tuple[int, int]]:
-    """First and last position of every run of consecutive key frames."""
+    """The first and last position of every run of consecutive key frames."""
     breaks = np.flatnonzero(np.diff(sample_indices) != 1).tolist()
     return list(zip([0, *(i + 1 for i in breaks)], [*breaks, len(sample_indices) - 1], strict=True))
 
 
-def beginnings(ids: Sequence[str]) -> dict[str, str]:
-    """For each id its beginning: SHORT characters, or as many more as tell all of them apart."""
+def short_ids(ids: Sequence[str]) -> dict[str, str]:
+    """Shortened ids by id: at least MIN_ID_LENGTH characters, and as many as make them unique."""
     longest = max(map(len, ids), default=0)
-    told_apart = (n for n in range(SHORT, longest) if len({name[:n] for name in ids}) == len(ids))
-    length = next(told_apart, longest)
+    unique = (n for n in range(MIN_ID_LENGTH, longest) if len({name[:n] for name in ids}) == len(ids))
+    length = next(unique, longest)
     return {name: name[:length] for name in ids}

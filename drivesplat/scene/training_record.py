@@ -1,4 +1,4 @@
-"""What training reads of a scene: the content of parser.pkl."""
+"""The content of parser.pkl: the scene as training reads it."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ RULE = "parser"
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """What the measuring protocol reports of the scene; fields as in `drivesplat.scene.scene.Scene`."""
+    """Properties of the scene that the measuring protocol reports; fields as in `drivesplat.scene.scene.Scene`."""
 
     name: str
     dataset: str
@@ -29,8 +29,8 @@ class SceneInfo:
 
 @dataclass(frozen=True)
 class SeedInfo:
-    """Number of seed points by source, in the order in which they are stored, the number of missing LiDAR sweeps, and
-    the name of the file of extra points (None: not given)."""
+    """The number of seed points by source, in storage order; the number of missing LiDAR sweeps; and the name of the
+    file of extra points (None: not given)."""
 
     lidar: int = 0
     triangulated: int = 0
@@ -49,7 +49,7 @@ class TrainingRecord:
     (width, height), the size at which images are trained and evaluated; `camtoworlds` is camera to world;
     `camera_indices` index `camera_names`; `timestamps` are in microseconds; `sample_indices` number the key frame that
     an image belongs to. `scene_scale` is the distance in metres of the farthest training camera from their mean, at
-    least 1. `splits` has the indices of images by group; `held_out_frames` the held-out key frames by group.
+    least 1. `splits` has the image indices by group, `held_out_frames` the held-out key frames by group.
     """
 
     Ks: Float[np.ndarray, "n 3 3"]
@@ -97,7 +97,7 @@ class TrainingRecord:
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> "TrainingRecord":
-        """The inverse of `to_plain`; further keys are ignored. Raises ValueError where `plain` is no training
+        """The inverse of `to_plain`; further keys are ignored. Raises ValueError if `plain` is not a training
         record."""
         infos = {"scene": SceneInfo, "seed": SeedInfo}
         known = {name: typed_record(kind, plain[name]) for name, kind in infos.items() if name in plain}
@@ -122,7 +122,7 @@ def write_training_record(path: str | Path, record: TrainingRecord) -> None:
 
 
 def read_training_record(path: str | Path) -> TrainingRecord:
-    """Reads parser.pkl. Raises ResultError where it is not one, or holds anything but plain data and arrays."""
+    """Reads parser.pkl. Raises ResultError if it is invalid or contains anything but plain data and arrays."""
     content = read_plain_pickle(path, RULE)
     try:
         return TrainingRecord.from_plain(content)

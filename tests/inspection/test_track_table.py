@@ -19,7 +19,7 @@ from drivesplat.inspection.track_table import (
 )
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.tracks import SHORT, beginnings
+from drivesplat.scene.tracks import MIN_ID_LENGTH, short_ids
 
 
 @pytest.fixture(scope="module")
@@ -105,14 +105,14 @@ def test_only_moving_objects_are_labelled(recording):
     ("ids", "length"),
     [
         ([], 0),
-        (["a" * 32], SHORT),
+        (["a" * 32], MIN_ID_LENGTH),
         (["12345678aa", "12345678ab"], 10),
-        (["0123456789", "9123456789"], SHORT),
+        (["0123456789", "9123456789"], MIN_ID_LENGTH),
         (["a"], 1),
     ],
 )
 def test_labels_are_short_and_unique(ids, length):
-    names = beginnings(ids)
+    names = short_ids(ids)
     assert list(names) == ids and len(set(names.values())) == len(ids)
     assert all(name == names[name] or name.startswith(names[name]) for name in ids)
     assert {len(name) for name in names.values()} <= {length}

@@ -13,7 +13,7 @@ from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
-from drivesplat.lidar.depth import taken_apart
+from drivesplat.lidar.depth import split_sweep
 from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth, write_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.occlusion import patches, unhidden
@@ -283,7 +283,7 @@ def test_returns_under_a_moving_box_are_neither_its_own_nor_still(tiny_scene):
     heights = np.array([-0.3, -0.15, 0.0, 0.05, 0.15, 0.8, 1.65, 1.75])
     under = np.stack([np.full(8, 8.5), np.full(8, 0.3), heights], axis=1)
     beside = np.array([[8.5, 1.05, 0.5], [8.5, 1.15, 0.5], [6.45, 0.0, 0.5], [6.35, 0.0, 0.5]])
-    cloud = taken_apart(tiny_scene.sweeps[0], np.concatenate([under, beside]), 0.035, [one_mover(tiny_scene)], 0.1)
+    cloud = split_sweep(tiny_scene.sweeps[0], np.concatenate([under, beside]), 0.035, [one_mover(tiny_scene)], 0.1)
     np.testing.assert_allclose(cloud.static, [*under[[0, 1, 7]], *beside[[1, 3]]])
     ((_, own),) = cloud.dynamic
     np.testing.assert_allclose(own, np.array([*under[4:7], *beside[[0, 2]]]) - [8.5, 0.0, 0.8], atol=1e-6)
@@ -365,7 +365,7 @@ def test_turned_boxes_carry_their_returns_round(tiny_scene):
     turning = dataclasses.replace(car, object_to_world=poses)
     (mover,) = dynamic_objects(dataclasses.replace(tiny_scene, tracks=(turning,)))
     nose = poses[0, :3, 3] + [1.9, 0.0, 0.0]
-    ((_, own),) = taken_apart(tiny_scene.sweeps[0], nose[None], 0.035, [mover], 0.1).dynamic
+    ((_, own),) = split_sweep(tiny_scene.sweeps[0], nose[None], 0.035, [mover], 0.1).dynamic
     np.testing.assert_allclose(own, [[1.9, 0.0, 0.0]], atol=1e-6)
     later = mover.pose(1.035)
     np.testing.assert_allclose(later[:3, :3] @ own[0] + later[:3, 3], [12.0, 2.0 + 1.9, 0.8], atol=1e-6)

@@ -11,7 +11,7 @@ from helpers.tiny_world import World, write_world
 from PIL import Image
 
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.scene_warnings import luminance, moved, scene_warnings, seconds_long, standing
+from drivesplat.scene.scene_warnings import duration, luminance, max_displacement, scene_warnings, standing_time
 
 DAY = 0.4
 
@@ -41,13 +41,13 @@ WAYS = {
 @pytest.mark.parametrize("between", [True, False])
 def test_how_far_a_car_came_and_how_long_it_stood(tiny_scene, way, metres, stands, between):
     scene = at(tiny_scene, way, between)
-    assert moved(scene) == pytest.approx(metres, abs=0.11 if metres else 1e-9)
-    assert standing(scene) == pytest.approx(stands) and seconds_long(scene) == pytest.approx(4.5)
+    assert max_displacement(scene) == pytest.approx(metres, abs=0.11 if metres else 1e-9)
+    assert standing_time(scene) == pytest.approx(stands) and duration(scene) == pytest.approx(4.5)
 
 
 def test_of_a_single_image_nothing_is_far_or_long(tiny_scene):
     scene = dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:1])
-    assert (moved(scene), standing(scene), seconds_long(scene)) == (0.0, 0.0, 0.0)
+    assert (max_displacement(scene), standing_time(scene), duration(scene)) == (0.0, 0.0, 0.0)
 
 
 def still(scene: Scene, *categories: str) -> Scene:

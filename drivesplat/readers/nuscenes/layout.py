@@ -1,4 +1,4 @@
-"""Where the files of nuScenes are."""
+"""The location of the files of nuScenes."""
 
 from pathlib import Path
 
@@ -18,14 +18,14 @@ HOW_TO_GET_MINI = (
 
 
 def how_to_get_it(version: str) -> str:
-    """What to do where a version of nuScenes is not there."""
+    """How to get a missing version of nuScenes, for messages."""
     return (HOW_TO_GET_MINI if version == "v1.0-mini" else "") + HOW_TO_GET_IT
 
 
 def find_root(dataroot: str, version: str) -> Path:
     """The folder that holds the tables' folder `version`: `dataroot` itself, its parent, or its folder of that name.
 
-    Raises DatasetError: what was looked for, where, and how to get it.
+    Raises DatasetError that says which file is missing, where, and how to get it.
     """
     given = Path(dataroot).expanduser()
     for root in (given, given.parent, given / version):
@@ -47,7 +47,7 @@ def find_root(dataroot: str, version: str) -> Path:
 
 
 def table_files(root: Path, version: str) -> list[Path]:
-    """The files that decide what `read` returns. Raises DatasetError naming the tables that are missing."""
+    """The files from which `read` reads a scene. Raises DatasetError naming the tables that are missing."""
     files = [root / version / f"{name}.json" for name in TABLES]
     absent = [file.name for file in files if not file.is_file()]
     if absent:

@@ -14,12 +14,12 @@ _CLASSES = {
     "human": ObjectClass.PEDESTRIAN,
     "animal": ObjectClass.ANIMAL,
 }
-"""By a class's name or what comes before one of its dots; ambulances and police cars are vehicles of no type named
-here, all else (cones, barriers, bicycle racks) is OTHER_MOVABLE. Boxes of cycles include riders."""
+"""Classes by name or by a prefix that ends before a dot. Ambulances and police cars are VEHICLE, names not listed
+(cones, barriers, bicycle racks) OTHER_MOVABLE. Boxes of cycles include riders."""
 
 
 def object_class(category: str) -> ObjectClass:
-    """The class of a category's name, such as vehicle.bus.rigid."""
+    """The class of a category name such as vehicle.bus.rigid."""
     while category not in _CLASSES and "." in category:
         category = category.rpartition(".")[0]
     return _CLASSES.get(category, ObjectClass.OTHER_MOVABLE)

@@ -1,7 +1,7 @@
-"""nuScenes tables into a `Scene`, through nuscenes-devkit, every value checked on the way in.
+"""Reads nuScenes tables into a `Scene` with nuscenes-devkit, and checks every value.
 
-nuScenes fires its cameras and its LiDAR at different times, so every image and sweep takes the ego pose of its own
-record, never the key frame's. The tables' quaternions are w, x, y, z; box sizes are width, length, height.
+nuScenes fires its cameras and its LiDAR at different times: every image and sweep has the ego pose of its own record,
+not that of the key frame. The tables' quaternions are w, x, y, z; box sizes are width, length, height.
 """
 
 import dataclasses
@@ -27,16 +27,16 @@ KEY_FRAME_HZ = 2.0
 LIDAR = "LIDAR_TOP"
 BEAM_ELEVATIONS = np.radians(np.linspace(-30.67, 10.67, 32))
 AZIMUTH_STEPS = 1085
-"""Of the LiDAR, a Velodyne HDL-32E at 20 Hz (its user's manual): its 32 beams, lowest first as rings count, fire every
-46.08 microseconds, so that revolutions differ by one or two firings."""
+"""Of the Velodyne HDL-32E at 20 Hz (user's manual): 32 beams in ring order, lowest first, which fire every 46.08
+microseconds. The number of firings per revolution varies by one or two."""
 
 
 def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> Scene:
-    """The scene that `source` names, its dataset's name aside; `root` holds the folder of tables, `scene_tables` those
-    rows of them that the scene needs (None: they are looked for).
+    """The scene of `source`, without the dataset's name. `root` contains the folder of tables, `scene_tables` is the
+    file of the scene's rows (None: they are extracted from the tables).
 
-    `source.sweeps` adds the images between key frames, `source.lidar_sweeps` the LiDAR sweeps there. `source.frames` =
-    (first, last + 1) keeps some key frames, which are then counted from 0, and what lies between them. Image files are
+    `source.sweeps` adds the images between key frames, `source.lidar_sweeps` the LiDAR sweeps. `source.frames` =
+    (first, last + 1) keeps these key frames, renumbered from 0, and the recordings between them. Image files are
     not opened. Raises DatasetError naming the offending token.
     """
     version, name, cameras, frames = source.version, source.scene, source.cameras, source.frames
@@ -75,7 +75,7 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
 
 
 def _camera(frame: Frame) -> Camera:
-    """The camera of a frame; nuScenes' images are rectified, and of its shutters nothing is said."""
+    """The camera of a frame; nuScenes' images are rectified, its readout times are unknown."""
     return Camera(frame.camera, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5))
 
 
@@ -90,9 +90,9 @@ def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
         tables = read_scene_tables(scene_tables)
         names = [row["name"].removeprefix("scene-") for row in tables["scene"]]
         if source.scene not in names:
-            there = ", ".join(names)
+            available = ", ".join(names)
             raise DatasetError(
-                f"scene {source.scene} is not in nuScenes {source.version} at {root}; there are: {there}"
+                f"scene {source.scene} is not in nuScenes {source.version} at {root}; there are: {available}"
             )
         try:
             (Path(folder) / source.version).mkdir()
@@ -139,7 +139,7 @@ def _key_data(tables: Any, sample: dict, channel: str) -> dict:
 
 
 def _records(tables: Any, samples: list[dict], channel: str, sweeps: bool) -> Iterator[dict]:
-    """The sample_data of a channel, key frames first to last, with those between where asked for."""
+    """The sample_data of a channel in time order: key frames, and with `sweeps` the records between them."""
     key = [_key_data(tables, sample, channel) for sample in samples]
     require_increasing([d["timestamp"] for d in key], [d["token"] for d in key], "sample_data")
     if not sweeps:

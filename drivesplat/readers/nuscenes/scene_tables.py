@@ -1,7 +1,7 @@
-"""The rows of nuScenes' tables that a scene needs, in one small file per scene.
+"""Splits nuScenes' tables into one small file of rows per scene.
 
-The tables of v1.0-trainval hold 2.5 GB of JSON for 850 scenes: read whole, they take 8 GB of memory. Here they are read
-once, row by row, and a scene's file is written only where its rows have changed. A line of it is a row, as
+The tables of v1.0-trainval are 2.5 GB of JSON for 850 scenes and take 8 GB of memory if read whole. This module reads
+them once, row by row, and rewrites a scene's file only if its rows have changed. Each line of a file is a row, such as
 {"sample": {...}}, in the order of the tables.
 """
 
@@ -21,14 +21,14 @@ from drivesplat.readers.nuscenes.layout import TABLES, table_files
 
 SCHEMA = 1
 INDEX = ".index.json"
-"""Of which tables the files beside it were made."""
+"""File that records the tables from which the files beside it were made."""
 LARGE = 200_000_000
-"""Reading tables of more bytes takes so long that it is announced."""
+"""Size of the tables in bytes above which reading them is announced."""
 _CHUNK = 2**22
 _BUFFER = 2**26
-"""Characters that are read at once, and kept before they are written."""
+"""Number of characters per read, and buffered before a write."""
 _BETWEEN_ROWS = re.compile(r"[\s,]*")
-_FOLLOWED = (
+_REFERENCES = (
     ("sample", "scene_token", "scene", {"sample": "token"}),
     (
         "sample_data", "sample_token", "sample",
@@ -40,18 +40,17 @@ _FOLLOWED = (
     ("instance", "token", "instance", {}),
     ("log", "token", "log", {}),
 )  # fmt: skip
-"""A table; the column that says to which scene a row belongs; the table whose tokens that column holds; the tables of
-which its rows refer to others, by the column with their token: those belong to the same scene."""
+"""A table; the column that determines the scene of a row; the table to whose tokens this column refers; and further
+tables that its rows reference, with the column of the token. Referenced rows belong to the same scene."""
 _SHARED = ("attribute", "category", "sensor", "visibility")
-"""Tables of a few rows, which all scenes need."""
+"""Small tables that are copied for all scenes."""
 
 
 def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) -> None:
-    """Brings the files of some scenes in `folder` up to date with the tables in `root`/`version`.
+    """Updates the files of `scenes` in `folder` from the tables in `root`/`version`.
 
-    Cheap where no table has another size or time of change than when the files were made. A scene that is not in the
-    tables gets a file that names those which are. Raises DatasetError where a table is damaged, ResultError where
-    `folder` cannot be written.
+    Returns at once if no table has changed its size or modification time. The file of a scene that is not in the tables
+    names the scenes that are. Raises DatasetError if a table is damaged, ResultError if `folder` cannot be written.
     """
     files = [(file.name, file.stat()) for file in table_files(root, version)]
     made_from = {
@@ -70,7 +69,7 @@ def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) 
 
 
 def scene_file(folder: Path, scene: str) -> Path:
-    """Where a scene's rows lie."""
+    """The path of a scene's file of rows."""
     return folder / f"{scene}.jsonl"
 
 
@@ -81,9 +80,9 @@ def _made_from(folder: Path) -> Any:
 
 
 def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) -> None:
-    """Writes the files of some scenes in `folder` where their content differs from what is there.
+    """Writes the files of `scenes` in `folder` whose content has changed.
 
-    Raises DatasetError where a table is damaged, ResultError where `folder` cannot be written.
+    Raises DatasetError if a table is damaged, ResultError if `folder` cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -93,25 +92,25 @@ def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: 
     with work as made:
         try:
             with _SceneRows(Path(made)) as found:
-                _search(root / version, scenes, found)
+                _collect(root / version, scenes, found)
         except (AttributeError, KeyError, TypeError, ValueError, OSError) as error:
             raise damaged(root, version, error) from error
         for scene in scenes:
             new, file = scene_file(Path(made), scene), scene_file(folder, scene)
             if not file.is_file() or file.read_bytes() != new.read_bytes():
-                with atomic_path(file) as aside:
-                    new.replace(aside)
+                with atomic_path(file) as temporary:
+                    new.replace(temporary)
 
 
 def damaged(root: Path, version: str, error: Exception) -> DatasetError:
-    """What to tell where tables cannot be read."""
+    """The error for tables that cannot be read."""
     return DatasetError(
         f"nuScenes {version} in {root} cannot be read ({type(error).__name__}: {error}); unpack it again"
     )
 
 
 def read_scene_tables(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """The rows of every table in a scene's file. Raises DatasetError where it is damaged."""
+    """The rows of every table in a scene's file. Raises DatasetError if it is damaged."""
     tables: dict[str, list[dict[str, Any]]] = {table: [] for table in TABLES}
     try:
         with open(path, encoding="utf-8") as file:
@@ -119,12 +118,12 @@ def read_scene_tables(path: Path) -> dict[str, list[dict[str, Any]]]:
                 ((table, row),) = json.loads(line).items()
                 tables[table].append(row)
     except (AttributeError, KeyError, OSError, ValueError) as error:
-        raise DatasetError(f"{path} is damaged ({error}); delete it and rerun: it is made again") from error
+        raise DatasetError(f"{path} is damaged ({error}); delete it and rerun to recreate it") from error
     return tables
 
 
 class _SceneRows:
-    """The files of scenes in the making: rows are gathered, and appended to their files when they are many."""
+    """Writes the rows of several scenes to their files through a buffer."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -138,7 +137,7 @@ class _SceneRows:
         self._append()
 
     def add(self, scenes: Iterable[str], table: str, row: str) -> None:
-        """Adds the text of a row of a table to some scenes."""
+        """Adds a row, as text, of a table to the given scenes."""
         for scene in scenes:
             self._lines[scene].append(f'{{"{table}": {row}}}\n')
             self._size += len(row)
@@ -157,30 +156,30 @@ class _SceneRows:
         self._size = 0
 
 
-def _search(tables: Path, scenes: Sequence[str], found: _SceneRows) -> None:
-    """Finds the rows of some scenes in a folder of tables."""
-    owners = _search_scenes(tables, scenes, found)
-    nobody: tuple[str, ...] = ()
-    for table, column, owner, references in _FOLLOWED:
+def _collect(tables: Path, scenes: Sequence[str], found: _SceneRows) -> None:
+    """Collects the rows of `scenes` in a folder of tables."""
+    owners = _collect_scenes(tables, scenes, found)
+    no_scenes: tuple[str, ...] = ()
+    for table, column, owner, references in _REFERENCES:
         owned_by, referred = owners[owner], [(owners[other], token) for other, token in references.items()]
         for text, row in rows(tables / f"{table}.json"):
-            mine = owned_by.get(row[column], nobody)
-            if mine:
-                found.add(mine, table, text)
-            for others, token in referred if mine else ():
-                known = others.setdefault(row[token], mine)
-                if known != mine:
-                    others[row[token]] = tuple(dict.fromkeys((*known, *mine)))
+            row_scenes = owned_by.get(row[column], no_scenes)
+            if row_scenes:
+                found.add(row_scenes, table, text)
+            for others, token in referred if row_scenes else ():
+                known = others.setdefault(row[token], row_scenes)
+                if known != row_scenes:
+                    others[row[token]] = tuple(dict.fromkeys((*known, *row_scenes)))
     for table in _SHARED:
         for text, _ in rows(tables / f"{table}.json"):
             found.add(scenes, table, text)
     for _, row in rows(tables / "map.json"):
         for log in row["log_tokens"]:
-            found.add(owners["log"].get(log, nobody), "map", json.dumps({**row, "log_tokens": [log]}))
+            found.add(owners["log"].get(log, no_scenes), "map", json.dumps({**row, "log_tokens": [log]}))
 
 
-def _search_scenes(tables: Path, scenes: Sequence[str], found: _SceneRows) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Finds the rows of the scenes themselves; per table, the scenes to which its tokens belong."""
+def _collect_scenes(tables: Path, scenes: Sequence[str], found: _SceneRows) -> dict[str, dict[str, tuple[str, ...]]]:
+    """Collects the rows of the table of scenes; returns per table the scenes to which each token belongs."""
     owners: dict[str, dict[str, tuple[str, ...]]] = defaultdict(dict)
     known = {row["name"]: (text, row) for text, row in rows(tables / "scene.json")}
     for scene in scenes:
@@ -196,15 +195,15 @@ def _search_scenes(tables: Path, scenes: Sequence[str], found: _SceneRows) -> di
 
 
 def rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The rows of a table, each as its text in one line and its content, without holding the table in memory.
+    """Iterates over the rows of a table, each as one line of text and as parsed content, in bounded memory.
 
-    Raises ValueError where the file is no list of JSON objects.
+    Raises ValueError if the file is not a list of JSON objects.
     """
     decoder = json.JSONDecoder()
     with open(table, encoding="utf-8") as file:
         text = file.read(_CHUNK).lstrip()
         if not text.startswith("["):
-            raise ValueError(f"{table.name} is no list of rows")
+            raise ValueError(f"{table.name} is not a list of rows")
         at = 1
         while True:
             at = _BETWEEN_ROWS.match(text, at).end()
@@ -215,7 +214,7 @@ def rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
             except json.JSONDecodeError as error:
                 more = file.read(_CHUNK)
                 if not more:
-                    raise ValueError(f"{table.name} ends within a row or is no JSON: {error.msg}") from error
+                    raise ValueError(f"{table.name} ends within a row or is not JSON: {error.msg}") from error
                 text, at = text[at:] + more, 0
                 continue
             yield text[at:end].replace("\n", ""), row

@@ -1,6 +1,6 @@
-"""nuScenes' .pcd.bin: x, y, z (metres, sensor frame), intensity (0 to 255), ring; five float32 a return.
+"""nuScenes' .pcd.bin: x, y, z (metres, sensor frame), intensity (0 to 255), ring; five float32 per return.
 
-Returns are motion-compensated: all are given at the sweep's timestamp.
+Returns are motion-compensated to the sweep's timestamp.
 """
 
 from pathlib import Path
@@ -13,14 +13,14 @@ _COLUMNS = 5
 
 
 def read_file(path: Path) -> LidarReturns:
-    """The returns in a file without a fault, those without finite coordinates left out."""
+    """The returns with finite coordinates, of a file without a fault."""
     returns = np.fromfile(path, dtype=np.float32).reshape(-1, _COLUMNS)
     returns = returns[np.isfinite(returns[:, :3]).all(axis=1)]
     return LidarReturns(returns[:, :3].astype(np.float64), returns[:, 3] / 255.0, returns[:, 4].astype(np.int64))
 
 
 def file_fault(path: Path) -> str | None:
-    """What is wrong with a file that is there, or None."""
+    """The fault of an existing file, or None."""
     size = path.stat().st_size
     if size == 0 or size % (4 * _COLUMNS):
         return f"is corrupt ({size} bytes are no whole number of returns)"

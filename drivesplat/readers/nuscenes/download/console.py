@@ -17,7 +17,7 @@ def announce(message: str) -> None:
 
 
 class ByteProgress:
-    """Counts bytes up to `total`, of which `done` were there before, and announces progress and remaining time."""
+    """Counts bytes up to `total`, starting at `done`, and announces progress and remaining time."""
 
     def __init__(self, what: str, total: int, done: int = 0):
         self._what, self._total, self._done = what, total, done

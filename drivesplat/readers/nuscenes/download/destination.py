@@ -1,6 +1,6 @@
-"""Whether nuScenes mini may be downloaded, for which dataset of the config, and whether its folder is free.
+"""The destination of the download of nuScenes mini, and the checks before it: accepted terms and an empty folder.
 
-Cheap to import: the Snakefile asks before any job runs.
+Cheap to import: the Snakefile runs the checks before any job.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ def download_job(config: Config) -> DownloadJob:
                 version=dataset.version,
                 nuscenes_mini=config.nuscenes_mini,
             )
-    raise ConfigError(f"no recorded dataset of version {VERSION} is in the config: there is nowhere to put it")
+    raise ConfigError(f"no recorded dataset of version {VERSION} is in the config to download it for")
 
 
 def require_permission(job: DownloadJob) -> None:

@@ -23,7 +23,7 @@ from drivesplat.settings.download import NuscenesMiniSettings
 
 CHUNK = 1 << 20
 PAUSE_S = 2.0
-"""Between two connections."""
+"""Pause in seconds between two connections."""
 MIN_NEW_BYTES = 1 << 20
 """A connection that brings fewer bytes counts as failed."""
 TRANSIENT = (408, 416, 429, 500, 502, 503, 504)
@@ -75,7 +75,7 @@ def _mismatch(source: NuscenesMiniSettings, path: Path) -> str | None:
 
 
 def _complete(source: NuscenesMiniSettings, part: Path) -> None:
-    """Connects until `part` has its size. Raises DatasetError after too many connections without new bytes."""
+    """Connects until `part` is complete. Raises DatasetError after too many connections without new bytes."""
     if size_of(part) > source.size_bytes:
         _discard(part)
     most, failures, reason = size_of(part), 0, ""

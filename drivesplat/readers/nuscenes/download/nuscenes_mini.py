@@ -33,7 +33,7 @@ def download(job: DownloadJob) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with locked_file(folder / "lock"):
-            if not is_present(job):  # another run may have been faster
+            if not is_present(job):  # another run may have finished first
                 _fill(job, folder)
             _clear(folder, job.nuscenes_mini.keep_archive)
     except LockHeldError:

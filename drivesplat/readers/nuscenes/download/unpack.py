@@ -15,8 +15,8 @@ from drivesplat.readers.nuscenes.download.console import ByteProgress, announce
 from drivesplat.settings.download import NuscenesMiniSettings
 
 MAX_READ = 1 << 20
-"""Maximum size of a header and of the padding: a tar file may announce names of gigabytes, which `tarfile` reads at
-once."""
+"""Maximum size of a header and of the padding: a tar file may declare names of gigabytes, which `tarfile` reads
+whole."""
 DAMAGED = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError, ValueError, OverflowError, RecursionError)
 
 
@@ -37,11 +37,11 @@ def unpack(archive: Path, folder: Path, limits: NuscenesMiniSettings, required: 
     """Unpacks a .tgz that contains the files `required` into `folder`, which must not exist.
 
     Raises BadArchiveError, before anything is written, if the archive is damaged, unsafe or over the limits;
-    DatasetError if the disk has too little room.
+    DatasetError if the disk has too little space.
     """
     if not hasattr(tarfile, "data_filter"):
         raise DatasetError("this Python cannot unpack archives safely: use 3.11.4 or newer")
-    announce("looking through the archive")
+    announce("checking the archive")
     try:
         size = _inspect(archive, limits, required)
     except DAMAGED as error:
