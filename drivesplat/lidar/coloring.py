@@ -10,8 +10,7 @@ from drivesplat.io.prefetch import prefetch
 
 @dataclass(frozen=True)
 class ColorView:
-    """An image that may colour points: `pixels` (h, w, 3) uint8, `usable` (h, w) bool, `intrinsics` (3, 3) in
-    continuous pixels, `world_to_camera` (4, 4), `timestamp` in microseconds."""
+    """An image that colours points. `pixels` (h, w, 3) uint8, `usable` (h, w) bool, continuous `intrinsics`."""
 
     pixels: np.ndarray
     intrinsics: np.ndarray

@@ -63,7 +63,7 @@ def count_passing(counts, starts, ends):
 
 @callee
 @no_type_check
-def _is_inside(counts, x, y, z):
+def _inside(counts, x, y, z):
     """Whether rays passed all six face neighbours of a voxel: one side of a surface is reached by no ray."""
     return (
         counts[x - 1, y, z] > 0
@@ -77,7 +77,7 @@ def _is_inside(counts, x, y, z):
 
 @callee
 @no_type_check
-def _is_clear(counts, x, y, z):
+def _clear(counts, x, y, z):
     """Whether a voxel and its 26 neighbours are all unoccupied."""
     for i in range(x - 1, x + 2):
         for j in range(y - 1, y + 2):
@@ -98,11 +98,7 @@ def empty_voxels(counts, min_rays):
     for x in range(1, nx - 1):
         for y in range(1, ny - 1):
             for z in range(1, nz - 1):
-                if (
-                    min_rays <= counts[x, y, z] < OCCUPIED
-                    and _is_inside(counts, x, y, z)
-                    and _is_clear(counts, x, y, z)
-                ):
+                if min_rays <= counts[x, y, z] < OCCUPIED and _inside(counts, x, y, z) and _clear(counts, x, y, z):
                     if n == len(found):
                         larger = np.empty(2 * n, np.int64)
                         larger[:n] = found

@@ -48,7 +48,7 @@ class ActorRecord:
 
 @dataclass(frozen=True)
 class ActorRecords:
-    """The content of actors.npz."""
+    """The content of actors.npz; `actors` in order of id."""
 
     actors: list[ActorRecord]
     provenance: Provenance = field(default_factory=dict)

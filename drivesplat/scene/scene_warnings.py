@@ -1,5 +1,4 @@
 """Warnings about drives whose metrics are easily misread: the ego vehicle stands, the images are dark, nothing moves.
-
 A warning never stops a run.
 """
 

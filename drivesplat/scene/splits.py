@@ -21,8 +21,8 @@ def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[
 def group_of_times(
     scene: Scene, timestamps: np.ndarray, sample_indices: np.ndarray, is_key_frame: np.ndarray, holdout: HoldoutSettings
 ) -> list[Group]:
-    """The group of each image or sweep: that of its index for a key frame; between key frames 'excluded' within half
-    a key-frame interval of a held-out one, else 'train'.
+    """The group of each image or sweep: that of its index for a key frame; between key frames, 'excluded' if nearer
+    than half a key-frame interval to a held-out one, else 'train'.
 
     `timestamps` (n,) microseconds, `sample_indices` (n,), `is_key_frame` (n,).
     """
