@@ -25,7 +25,7 @@ def checked_pose(translation: Sequence[float], rotation_wxyz: Sequence[float], r
 
 
 def checked_intrinsics(matrix: Sequence[Sequence[float]], record: str) -> np.ndarray:
-    """A pinhole K (3, 3). Raises DatasetError naming `record` where it is singular or malformed."""
+    """A pinhole K (3, 3). Raises DatasetError naming `record` if it is singular or malformed."""
     try:
         k = np.array(matrix, dtype=np.float64)
     except ValueError:
@@ -41,7 +41,7 @@ def _is_pinhole(k: np.ndarray) -> bool:
 
 
 def checked_size(width: int, height: int, record: str) -> tuple[int, int]:
-    """An image's width and height in pixels. Raises DatasetError naming `record`."""
+    """An image's width and height in pixels. Raises DatasetError naming `record` if one is not positive."""
     if not (width > 0 and height > 0):
         raise DatasetError(f"{record}: its image size is {width}x{height}")
     return int(width), int(height)

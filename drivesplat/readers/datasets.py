@@ -1,9 +1,9 @@
-"""Which modules read a dataset: those of the package `drivesplat.readers.<reader>`, by their names.
+"""The modules that read a dataset, found by name in the package `drivesplat.readers.<reader>`.
 
-`layout` knows where the files are (`find_root`, `table_files`) and is cheap to import; `reader` reads a scene (`read`);
+`layout` locates the files (`find_root`, `table_files`) and is cheap to import; `reader` reads a scene (`read`);
 `sweep_file` reads a LiDAR sweep (`drivesplat.readers.sweeps`). A dataset of large tables also has `scene_tables`, which
-splits them into a file per scene (`index_tables`, `scene_file`). The name of a reader is one of those that
-`DatasetSettings.reader` allows.
+splits them into a file per scene (`index_tables`, `scene_file`). `DatasetSettings.reader` lists the
+allowed names of readers.
 """
 
 from types import ModuleType
@@ -16,15 +16,15 @@ READER = "drivesplat.readers.*.reader"
 
 
 def layout(name: str) -> ModuleType:
-    """Where the files of a dataset of this kind are. Raises DatasetError where nothing reads it."""
+    """The module that locates a dataset's files. Raises DatasetError for an unknown reader."""
     return dataset_module(LAYOUT, name)
 
 
 def index(name: str) -> ModuleType | None:
-    """How the tables of a dataset of this kind are split into scenes; None where they are read whole."""
+    """The module that splits a dataset's tables into scenes; None if the reader has none."""
     return dataset_module(SCENE_TABLES, name) if has_module(SCENE_TABLES, name) else None
 
 
 def reader(name: str) -> ModuleType:
-    """How a dataset of this kind is read. Raises DatasetError where nothing reads it."""
+    """The module that reads a dataset's scenes. Raises DatasetError for an unknown reader."""
     return dataset_module(READER, name)

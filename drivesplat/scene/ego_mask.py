@@ -50,8 +50,8 @@ def enclosed(outlines: tuple[Outline, ...], size: tuple[int, int]) -> np.ndarray
 
 
 def read_ego_mask(path: str | Path) -> tuple[EgoMask, Provenance]:
-    """Reads own_car.json, and the provenance in it. Raises ResultError where the file is not one, naming it and the
-    rule that makes it."""
+    """Reads own_car.json; returns the masks and the provenance. Raises ResultError that names the file and its rule if
+    it is invalid."""
     content = read_json(path, RULE)
     try:
         known = {name: camera for name, camera in content["cameras"].items() if camera["source"]}

@@ -24,7 +24,7 @@ def mask_name(kind: str, camera: str, timestamp: int) -> str:
 class MasksRecord:
     """The content of masks.json: the `labels` of regions, the number of `images`, whether regions come from 'boxes' or
     'masks' and the sky from a 'heuristic' or 'masks', the mean share of sky pixels, whether any sky was found, the
-    number of semantic classes (0: none), and by camera that sees the ego vehicle where its mask comes from."""
+    number of semantic classes (0: none), and the source of the ego mask by camera that sees the ego vehicle."""
 
     labels: dict[str, int]
     images: int
@@ -38,7 +38,7 @@ class MasksRecord:
 
 
 def read_masks_record(folder: Path) -> MasksRecord:
-    """Reads masks.json. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
+    """Reads masks.json. Raises ResultError that names the file and its rule if it is invalid."""
     path = folder / "masks.json"
     content = read_json(path, RULE)
     try:

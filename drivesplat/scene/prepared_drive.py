@@ -52,7 +52,7 @@ class PreparedDrive:
 def read_prepared_drive(
     scene: str | Path, parser: str | Path, masks: str | Path
 ) -> tuple[PreparedDrive, list[Provenance]]:
-    """The recording of scene.json, parser.pkl and masks.json, and the provenances of these files."""
-    recording = PreparedDrive(read_scene(scene), read_training_record(parser), Path(masks).parent)
-    record = read_masks_record(recording.masks)
-    return recording, [recording.scene.provenance, recording.record.provenance, record.provenance]
+    """Reads scene.json, parser.pkl and masks.json; returns the drive and the provenances of these files."""
+    drive = PreparedDrive(read_scene(scene), read_training_record(parser), Path(masks).parent)
+    record = read_masks_record(drive.masks)
+    return drive, [drive.scene.provenance, drive.record.provenance, record.provenance]
