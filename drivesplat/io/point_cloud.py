@@ -1,4 +1,4 @@
-"""Coloured points as PLY files, with a JSON note in the header that says where they come from."""
+"""Coloured points as PLY files, with a JSON note on their origin in the header."""
 
 import json
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ _NOTE = "drivesplat "
 
 @dataclass(frozen=True)
 class PointCloud:
-    """`positions` (n, 3) float32 metres; `colors` (n, 3) uint8 RGB; `note`: plain data about them."""
+    """`positions` (n, 3) float32 metres; `colors` (n, 3) uint8 RGB; `note`: plain data on their origin."""
 
     positions: np.ndarray
     colors: np.ndarray
@@ -31,7 +31,7 @@ def write_ply(path: str | Path, points: PointCloud) -> None:
 
 
 def read_ply(path: str | Path, rule: str) -> PointCloud:
-    """Reads what `write_ply` wrote. Raises ResultError naming the file and the `rule` that makes it."""
+    """Reads a file of `write_ply`. Raises ResultError naming the file and its `rule` where it is missing or invalid."""
     try:
         data = PlyData.read(str(path))
         note = next(json.loads(c.removeprefix(_NOTE)) for c in data.comments if c.startswith(_NOTE))
@@ -46,7 +46,7 @@ def read_ply(path: str | Path, rule: str) -> PointCloud:
 def read_positions(path: str | Path) -> np.ndarray:
     """The vertex positions (n, 3) float64 of any PLY file.
 
-    Raises OSError, PlyParseError, KeyError or ValueError where it is none.
+    Raises OSError, PlyParseError, KeyError or ValueError where the file is not one.
     """
     return _columns(PlyData.read(str(path))["vertex"], ("x", "y", "z"), "f8")
 

@@ -1,4 +1,4 @@
-"""Prefetching: threads make a bounded number of items before they are requested, in order."""
+"""Prefetching: threads compute a bounded number of items before they are requested, in order."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -9,16 +9,16 @@ from typing import TypeVar
 A = TypeVar("A")
 B = TypeVar("B")
 THREADS = 4
-"""Default number of threads. Decoding and numpy release Python's lock most of the time."""
+"""Default number of threads. Image decoding and numpy release the GIL most of the time."""
 
 
 def prefetch(
-    made: Callable[[A], B], items: Iterable[A], threads: int = THREADS, at_most: int | None = None
+    function: Callable[[A], B], items: Iterable[A], threads: int = THREADS, at_most: int | None = None
 ) -> Iterator[B]:
-    """`made` of each item, in order, computed by `threads` threads, `at_most` (default: `threads`) before they are
-    requested.
+    """Yields `function(item)` for each item, in order. `threads` threads compute at most `at_most` (default: `threads`)
+    results before they are requested.
 
-    An exception is raised in place of its item.
+    An exception is raised in place of its result.
     """
     waiting: deque[Future[B]] = deque()
     with ThreadPoolExecutor(threads) as pool:
@@ -26,7 +26,7 @@ def prefetch(
             for item in items:
                 if len(waiting) == (at_most or threads):
                     yield waiting.popleft().result()
-                waiting.append(pool.submit(made, item))
+                waiting.append(pool.submit(function, item))
             while waiting:
                 yield waiting.popleft().result()
         finally:
@@ -35,10 +35,10 @@ def prefetch(
 
 
 def prefetch_items(items: Iterable[A], at_most: int = THREADS) -> Iterator[A]:
-    """`items`, made by one thread while earlier ones are used, at most `at_most` before they are requested.
+    """Yields `items`. One thread produces at most `at_most` of them before they are requested.
 
     An exception is raised in place of its item.
     """
     iterator, end = iter(items), object()
-    made = prefetch(lambda _: next(iterator, end), repeat(None), threads=1, at_most=at_most + 1)
-    yield from takewhile(lambda item: item is not end, made)
+    fetched = prefetch(lambda _: next(iterator, end), repeat(None), threads=1, at_most=at_most + 1)
+    yield from takewhile(lambda item: item is not end, fetched)

@@ -1,7 +1,7 @@
-"""Files that are either whole or absent: atomic writes, and readers of JSON.
+"""Atomic writes, and readers of JSON: a file is either complete or absent.
 
-Every writer writes beside its target, flushes to disk and renames. Every reader turns a truncated, foreign or unsafe
-file into a ResultError that names the file and the rule that rebuilds it.
+Every writer writes a file beside its target, flushes it to disk and renames it. Every reader raises a ResultError for a
+truncated, foreign or unsafe file, which names the file and the rule that rebuilds it.
 """
 
 import csv
@@ -21,25 +21,25 @@ from drivesplat.errors import ResultError
 ABANDONED_SECONDS = 3600.0
 
 Provenance = dict[str, Any]
-"""What a result was made of: a JSON document of settings, code and inputs (`drivesplat.provenance.record`)."""
+"""The settings, code and inputs of a result, as a JSON document (`drivesplat.provenance.record`)."""
 
 
 def unreadable(path: str | Path, rule: str, why: str, delete: str | Path | None = None) -> ResultError:
-    """The one sentence for a file that cannot be used. `delete`: the rule's declared output, where `path` is not one:
-    Snakemake rebuilds what it knows."""
+    """The error for a file that cannot be used. `delete` is the rule's declared output, where `path` is not one:
+    Snakemake rebuilds declared outputs only."""
     return ResultError(f"{path}: {why}; delete {delete or 'it'} and rerun: the rule '{rule}' rebuilds it")
 
 
 def unwritable(path: str | Path, why: OSError | str) -> ResultError:
-    """The one sentence for a file or folder that cannot be written."""
+    """The error for a file or folder that cannot be written."""
     reason = why.strerror or why if isinstance(why, OSError) else why
     return ResultError(f"{path}: cannot be written ({reason}); free space or fix its permissions")
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A path beside `path`, of the same suffix, for what another program or library writes: it becomes `path` only once
-    the context ends well and the content is on disk.
+    """A path beside `path` with the same suffix, for another program or library to write to. It is renamed to `path`
+    when the context ends without an exception and the content is on disk.
 
     Raises ResultError, naming `path`, where the disk is full or the folder cannot be written.
     """
@@ -47,7 +47,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(path)
+        _remove_abandoned(path)
         yield aside
         _fsync(aside)
         aside.replace(path)
@@ -61,7 +61,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
-    """A binary file that appears at `path` only once its content is complete and on disk.
+    """A binary file that appears at `path` only when its content is complete and on disk.
 
     Raises ResultError, naming `path`, where the disk is full or the folder cannot be written.
     """
@@ -69,8 +69,8 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
         yield file
 
 
-def _sweep(path: Path) -> None:
-    """Removes what killed writers of `path` left behind: partial files that nobody has written to for an hour."""
+def _remove_abandoned(path: Path) -> None:
+    """Removes partial files of killed writers of `path`: those that have not been modified for an hour."""
     for partial in path.parent.glob(f".{glob.escape(path.stem)}.[0-9]*.partial{glob.escape(path.suffix)}"):
         with suppress(OSError):
             if time.time() - partial.stat().st_mtime > ABANDONED_SECONDS:
@@ -86,7 +86,7 @@ def _fsync(path: Path) -> None:
 
 
 def canonical_json(value: Any) -> str:
-    """The one spelling of `value`: sorted keys, no white space, no NaN."""
+    """The canonical JSON text of `value`: sorted keys, no white space. Raises ValueError for NaN and infinity."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
@@ -106,7 +106,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Rows as a table with these columns; empty cells where a value is None."""
+    """Writes rows as a CSV table with these columns; None becomes an empty cell."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=columns)
     writer.writeheader()
@@ -116,7 +116,7 @@ def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[s
 
 
 def read_json(path: str | Path, rule: str) -> Any:
-    """The content of a JSON result. Raises ResultError naming `path` and `rule` where it is not whole."""
+    """The content of a JSON result. Raises ResultError naming `path` and `rule` where it is missing or invalid."""
     try:
         with open(path, encoding="utf-8") as file:
             return json.load(file)
@@ -125,7 +125,7 @@ def read_json(path: str | Path, rule: str) -> Any:
 
 
 def read_record(path: str | Path, rule: str, *keys: str) -> dict[str, Any]:
-    """The content of a JSON result that has at least `keys`. Raises ResultError naming `path` and `rule`."""
+    """The content of a JSON object with at least `keys`. Raises ResultError naming `path` and `rule` otherwise."""
     record = read_json(path, rule)
     absent = [key for key in keys if key not in record] if isinstance(record, dict) else list(keys)
     if absent:

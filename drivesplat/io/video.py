@@ -1,6 +1,6 @@
-"""H.264 films: written through ffmpeg, then read again by another reader before they count.
+"""H.264 films: encoded by ffmpeg, then decoded by OpenCV to verify them.
 
-ffmpeg is imageio-ffmpeg's; IMAGEIO_FFMPEG_EXE names another.
+The executable is imageio-ffmpeg's, or that in the environment variable IMAGEIO_FFMPEG_EXE.
 """
 
 import signal
@@ -22,12 +22,12 @@ from drivesplat.errors import ResultError
 from drivesplat.io.storage import atomic_path
 
 PATIENCE = 600.0
-"""Seconds that ffmpeg may take over one frame, or over the end of a film, before it counts as hung."""
+"""Timeout in seconds for ffmpeg to accept one frame, or to finish a film."""
 
 
 @dataclass(frozen=True)
 class Footage:
-    """What a film holds: its number of frames, their size in pixels, and frames per second."""
+    """Properties of a film: number of frames, their width and height in pixels, and frames per second."""
 
     frames: int
     width: int
@@ -41,20 +41,21 @@ class Footage:
 def write_video(
     path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: int, crf: int, threads: int = 0
 ) -> None:
-    """An MP4 of `frames` (h, w, 3) uint8 RGB, taken one at a time; `size` is width and height, both even. `threads`
-    encode, 0: as many as ffmpeg likes.
+    """Writes `frames` (h, w, 3) uint8 RGB, consumed one at a time, to an MP4 file. `size` is width and height, both
+    even; `threads` is the number of encoder threads, 0 for ffmpeg's default.
 
-    Raises ResultError, leaving no file, where ffmpeg is missing, fails, or wrote anything but what it was given.
+    Raises ResultError, and leaves no file, where ffmpeg is missing or fails, or the film differs from `frames` in
+    number, size or rate. Raises ValueError for a frame of another shape or type.
     """
     with atomic_path(path) as aside:
         count = _encode(path, frames, size, _command(path, aside, size, fps, crf, threads))
-        given, found = Footage(count, *size, float(fps)), read_footage(aside)
-        if found != given:
-            raise ResultError(f"{path}: ffmpeg was given {given} and wrote {found}; free disk space and rerun")
+        expected, found = Footage(count, *size, float(fps)), read_footage(aside)
+        if found != expected:
+            raise ResultError(f"{path}: ffmpeg was given {expected} and wrote {found}; free disk space and rerun")
 
 
 def read_footage(path: Path) -> Footage:
-    """What OpenCV finds in a film when it decodes every frame; all zero where it finds no film."""
+    """A film's properties according to OpenCV, which decodes every frame; all zero where the file is not a film."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         width, height = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
@@ -72,12 +73,12 @@ def _command(path: Path, aside: Path, size: tuple[int, int], fps: int, crf: int,
         executable = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         raise _not_started(path, error) from error
-    pictures = ffmpeg.input("pipe:", format="rawvideo", pix_fmt="rgb24", s=f"{size[0]}x{size[1]}", framerate=fps)
-    # unasked, ffmpeg turns RGB into YUV by BT.601's matrix, and players turn it back by BT.709's: every colour is off.
-    # Newer ones tag a film with what its frames say (setparams), older ones with what the output's options say.
+    source = ffmpeg.input("pipe:", format="rawvideo", pix_fmt="rgb24", s=f"{size[0]}x{size[1]}", framerate=fps)
+    # By default ffmpeg converts RGB to YUV by the BT.601 matrix, but players convert back by BT.709: colours shift.
+    # New versions tag a film by its frames (setparams), old ones by the output options.
     bt709 = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709"}
     converted = (
-        pictures.filter("scale", out_color_matrix="bt709", out_range="tv", flags="bicubic+accurate_rnd+full_chroma_int")
+        source.filter("scale", out_color_matrix="bt709", out_range="tv", flags="bicubic+accurate_rnd+full_chroma_int")
         .filter("format", "yuv420p")
         .filter("setparams", range="tv", **bt709)
     )
@@ -95,14 +96,14 @@ def _command(path: Path, aside: Path, size: tuple[int, int], fps: int, crf: int,
 
 
 def _encode(path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], command: list[str]) -> int:
-    """Gives ffmpeg every frame and sees it end well; returns how many. ffmpeg is gone afterwards, come what may."""
+    """Encodes all frames and returns their number. In any case the ffmpeg process has ended afterwards."""
     count = 0
-    # messages into a file: a pipe that nobody empties fills up, and ffmpeg would wait for ever
+    # messages go to a file: a pipe that nobody reads fills up and blocks ffmpeg
     with TemporaryFile() as messages, _running(path, command, messages) as process:
         for frame in frames:
             if frame.shape != (size[1], size[0], 3) or frame.dtype != np.uint8:
                 raise ValueError(f"a frame of {frame.shape} {frame.dtype} in a film of {size[0]}x{size[1]}")
-            if not _taken(process, frame):
+            if not _accepted(process, frame):
                 _wait(process, min(10.0, PATIENCE))
                 raise _failed(path, f"took no more than {count} frames", process, messages)
             count += 1
@@ -129,8 +130,8 @@ def _running(path: Path, command: list[str], messages: BinaryIO) -> Iterator[sub
             process.stdin.close()
 
 
-def _taken(process: subprocess.Popen, frame: np.ndarray) -> bool:
-    """Whether ffmpeg read the frame, rather than ending, closing its input or hanging."""
+def _accepted(process: subprocess.Popen, frame: np.ndarray) -> bool:
+    """Whether ffmpeg read the frame. It did not if it ended, closed its input or exceeded PATIENCE."""
     watchdog = Timer(PATIENCE, process.kill)
     watchdog.start()
     try:
@@ -156,14 +157,14 @@ def _not_started(path: Path, error: Exception) -> ResultError:
 
 
 def _failed(path: Path, what: str, process: subprocess.Popen, messages: BinaryIO) -> ResultError:
-    """`what` ffmpeg did, how it ended, and the last it said."""
+    """An error with `what` happened to ffmpeg, its exit status, and its last output."""
     status = process.poll()
     ending = "still running" if status is None else f"exit status {status}"
     if status is not None and status < 0:
         ending = f"ended by {signal.Signals(-status).name}"
     messages.seek(0)
-    said = [line.strip() for line in messages.read().decode(errors="replace").splitlines() if line.strip()]
-    last = "; ".join(said[-3:])[-500:] or "it said nothing"
+    lines = [line.strip() for line in messages.read().decode(errors="replace").splitlines() if line.strip()]
+    last = "; ".join(lines[-3:])[-500:] or "it said nothing"
     return ResultError(
         f"{path}: ffmpeg {what} ({ending}: {last}); free disk space and memory, or name another ffmpeg with libx264 "
         "in the environment variable IMAGEIO_FFMPEG_EXE"

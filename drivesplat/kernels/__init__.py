@@ -1,2 +1,2 @@
-"""Operations with kernels for GPUs (Triton, gsplat) and CPUs (numba): one module and function each, which picks its
-kernel by the device of its tensors. Their packages `triton` and `numba` are not imported from outside."""
+"""Operations with kernels for GPUs (Triton, gsplat) and CPUs (numba). Each has one module, whose function selects the
+kernel by the device of its tensors. Only this package imports the packages `triton` and `numba`."""

@@ -1,7 +1,7 @@
-"""Functions compiled by numba, cached on disk until any code that may be compiled into them changes.
+"""Functions compiled by numba and cached on disk. A change of any code that they may contain invalidates the cache.
 
-numba's own cache checks the time of a function's file only: it does not notice a changed constant or callee that the
-file imports.
+numba's own cache checks only the modification time of a function's file: it misses changes of imported constants and
+callees.
 """
 
 import os
@@ -23,7 +23,7 @@ MAX_UNUSED_S = 14 * 24 * 3600
 """Seconds after which unused compiled code is removed; another run may use an older version until then."""
 OPTIONS = {"nogil": True, "error_model": "numpy"}
 callee = numba.njit(**OPTIONS)
-"""Compiles a function that only kernels call; it is cached with them."""
+"""Compiles a function that only kernels call; it is cached as part of them."""
 
 
 def kernel(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Callable[..., Any]:

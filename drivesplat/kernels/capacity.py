@@ -1,7 +1,7 @@
 """Capacity of the buffers that hold tiles' lists of Gaussians.
 
-An exact capacity needs host synchronisation. Where nothing may wait for the device, as in a CUDA graph, buffers get the
-capacity that the same lists needed before, and a margin.
+An exact capacity needs host synchronisation. Where that is not allowed, as in a CUDA graph, buffers get the number of
+entries that the same lists needed before, plus a margin.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,8 +18,8 @@ MARGIN, MIN_CAPACITY = 1.5, 4096
 
 @dataclass
 class _Capacities:
-    """Of the lists made in a context: the capacities that are planned (None: exact ones), the entries that lists
-    needed, and the lists made with a planned capacity."""
+    """For the lists made in a context: their planned capacities (None: exact ones), the numbers of entries that they
+    needed, and the lists with a planned capacity."""
 
     planned: list[int] | None = None
     needed: list[int] = field(default_factory=list)
@@ -31,21 +31,21 @@ _current: ContextVar[_Capacities | None] = ContextVar("capacities", default=None
 
 @contextmanager
 def exact() -> Iterator[list[int]]:
-    """Lists made in this context have exact capacities, in the order of the yielded numbers of entries."""
+    """Lists made in this context have exact capacities. Yields their numbers of entries, in the order of creation."""
     with _entered(_Capacities()) as capacities:
         yield capacities.needed
 
 
 @contextmanager
 def planned(needed: Sequence[int]) -> Iterator[list[tuple[Int[Tensor, ""], int]]]:
-    """Lists made in this context have planned capacities, by the entries that as many lists needed before. Yields, for
-    every list, the entries that it needs, a number on the device, and its capacity."""
+    """Lists made in this context have planned capacities, computed from the entries that the same lists needed before.
+    Yields, for every list, the number of entries that it needs (on the device) and its capacity."""
     with _entered(_Capacities([MIN_CAPACITY + int(MARGIN * entries) for entries in needed])) as capacities:
         yield capacities.lists
 
 
 def capacity_for(needed: Int[Tensor, ""]) -> int:
-    """The capacity of the next list, which needs so many entries."""
+    """The capacity of the next list, which needs `needed` entries. Exact capacities synchronise with the host."""
     capacities = _current.get()
     if capacities is not None and capacities.planned is not None:
         capacity = capacities.planned[len(capacities.lists)]

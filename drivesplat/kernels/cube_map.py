@@ -1,4 +1,4 @@
-"""A cube map seen behind an image."""
+"""Compositing of an image over a cube map."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from drivesplat.kernels import triton_support
 
 
 class CubeMap(NamedTuple):
-    """`texels` (n, 3), logits of colors, and `index`, which of them every texel of a face (face, v, u) is."""
+    """`texels` (n, 3) are logits of colors; `index` (face, v, u) is the row of every face's texels in them."""
 
     texels: Float[Tensor, "n 3"]
     index: Int[Tensor, "6 r r"]

@@ -1,6 +1,6 @@
-"""Work for the GPU captured as a CUDA graph and replayed: Python launches one graph in place of hundreds of kernels.
+"""GPU work captured as a CUDA graph and replayed: Python launches one graph instead of hundreds of kernels.
 
-A graph keeps the addresses of what it reads and writes: a replay reads what is there then, and overwrites the earlier
+A graph keeps the addresses of its inputs and outputs: a replay reads their current content, and overwrites the earlier
 result. Captured work must not synchronise with the host; buffers of lists get a planned capacity
 (`drivesplat.kernels.capacity`).
 """
@@ -26,8 +26,8 @@ MemoryPool = tuple[int, int]
 
 @dataclass(frozen=True)
 class CudaGraph(Generic[T]):
-    """A captured graph. `replay` runs it and overwrites `result`, `needed`, the entries that each of its lists needed,
-    and `missing`, the most entries that any list has ever lacked; `capacities` are those of the lists."""
+    """A captured graph. `replay` runs it and overwrites `result`; `needed`, the entries that each of its lists needed;
+    and `missing`, the largest number of entries that a list has ever lacked. `capacities` are those of the lists."""
 
     replay: Callable[[], None]
     result: T
@@ -37,13 +37,13 @@ class CudaGraph(Generic[T]):
 
 
 def graphs_supported(device: torch.device) -> bool:
-    """Whether rasterization on this device can be captured: only Triton's lists do without host synchronisation."""
+    """Whether rasterization on this device can be captured: only Triton's lists need no host synchronisation."""
     return device.type == "cuda" and triton_support.compiles()
 
 
 @contextmanager
 def capture_stream(device: torch.device) -> Iterator[None]:
-    """Work for the device runs in a stream of its own; the default stream, and what autograd ran there, cannot be
+    """Runs device work of this context in a separate stream. The default stream, and autograd's work there, cannot be
     captured."""
     if device.type != "cuda":
         yield
@@ -56,7 +56,7 @@ def capture_stream(device: torch.device) -> Iterator[None]:
 
 
 def new_pool() -> MemoryPool:
-    """A memory pool for graphs. Frees torch's cached memory first, which graphs cannot use."""
+    """A memory pool for graphs. Frees torch's cached memory first, since graphs cannot use it."""
     torch.cuda.empty_cache()
     return torch.cuda.graph_pool_handle()
 
@@ -65,10 +65,10 @@ def capture(
     work: Callable[[], T], needed: Sequence[int], pool: MemoryPool, device: torch.device, what: str,
     errors: str = "global",
 ) -> CudaGraph[T] | None:  # fmt: skip
-    """Captures `work` without running it; to be called within `capture_stream`.
+    """Captures `work` without running it. Call this within `capture_stream`.
 
     `needed` are the entries that each list of Gaussians in it needed before, `errors` is torch's `capture_error_mode`.
-    Returns None, and logs a warning that names `what`, where the GPU or its driver refuses.
+    Returns None, and logs a warning that names `what`, where the capture fails.
     """
     graph, random_state = torch.cuda.CUDAGraph(), torch.cuda.get_rng_state(device)
     missing = torch.zeros((), dtype=torch.int32, device=device)
@@ -86,13 +86,13 @@ def capture(
         return CudaGraph(graph.replay, result, needed_now, [available for _, available in lists], missing)
     except Exception as error:  # of the driver, torch or Triton; the work itself is not affected
         log.warning("%s cannot be captured as a CUDA graph, which takes longer: %s", what, _first_line(error))
-    _end_broken_capture(device, pool, random_state)  # when nothing refers to the captured tensors any more
+    _end_broken_capture(device, pool, random_state)  # after the last reference to the captured tensors
     return None
 
 
 def retry_without_graphs(work: Callable[[], T], drop_graphs: Callable[[], bool]) -> T:
-    """Runs `work`; where memory runs out, calls `drop_graphs` and runs it again. Raises torch's OutOfMemoryError where
-    `drop_graphs` returns False since there were no graphs, and where memory runs out again."""
+    """Runs `work`. If GPU memory runs out, calls `drop_graphs` and runs `work` again. Raises torch's OutOfMemoryError
+    if `drop_graphs` returns False (there were no graphs), or if memory runs out again."""
     try:
         return work()
     except torch.cuda.OutOfMemoryError:

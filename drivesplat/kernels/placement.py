@@ -1,4 +1,4 @@
-"""Rigid objects' Gaussians, from their objects' frames to the world."""
+"""Transforms the Gaussians of rigid objects from object to world coordinates."""
 
 from typing import NamedTuple
 
@@ -12,8 +12,8 @@ from drivesplat.kernels.quaternions import left_factor, rotation_matrix
 
 
 class LocalGaussians(NamedTuple):
-    """n Gaussians in the frames of their objects, as they are learned: `means` (metres), `quats` of any length, log
-    `scales` and logits of `opacities`."""
+    """The parameters of n Gaussians in the frames of their objects: `means` (metres), `quats` (w, x, y, z) of any
+    length, logarithms of `scales` (metres) and logits of `opacities`."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -54,6 +54,6 @@ def place(
 
 
 def of_owners(values: Float[Tensor, "a *v"], owns: Float[Tensor, "n a"]) -> Float[Tensor, "n *v"]:
-    """Every Gaussian's value of its object. A product with the one-hot matrix is exact, and so is its gradient, which
-    for indexing would be summed row by row."""
+    """The values of every Gaussian's object. The product with the one-hot matrix is exact, and its gradient is a matrix
+    product too, while that of indexing is a sum row by row."""
     return (owns.to(values.dtype) @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])

@@ -37,7 +37,7 @@ def _products(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 4 4"
 
 @cache
 def _rotations(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 4 3 3"]:
-    """What q_i q_j has in entry k, l of the matrix of v to q v q*."""
+    """The coefficient of q_i q_j in entry k, l of the matrix of v to q v q*."""
     table = _products(dtype, torch.device("cpu"))
     conjugate = torch.diag(torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=dtype))
     # unit i times axis l gives units m; m times the conjugate of unit j gives units k

@@ -1,4 +1,4 @@
-"""The means that MCMC's regularizers keep small: of opacities and of scales."""
+"""The mean opacity and mean scale, which the MCMC strategy's regularizers penalise."""
 
 from jaxtyping import Float
 from torch import Tensor

@@ -11,7 +11,7 @@ def relocation(
     ratios: Int[Tensor, " n"],
     binoms: Float[Tensor, "n_max n_max"],
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """Opacity (in [0, 1]) and scale (metres) with which `ratios` copies in one place look like the one Gaussian before.
+    """Opacity (in [0, 1]) and scale (metres) with which `ratios` coincident copies look like the original Gaussian.
 
     `binoms[i, k]` is the binomial coefficient. The arguments are those of gsplat's `compute_relocation`, which runs on
     a GPU; elsewhere torch runs.

@@ -22,7 +22,7 @@ def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float
 
 
 def ssim_in_torch(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """The same by torch's convolutions, on any device: the reference for the compiled form."""
+    """`ssim` by torch's convolutions, on any device: the reference for the compiled version."""
     offsets = torch.arange(TAPS, device=image.device, dtype=image.dtype) - TAPS // 2
     taps = torch.softmax(-(offsets**2) / (2 * SIGMA**2), dim=0)
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)

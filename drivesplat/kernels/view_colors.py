@@ -1,4 +1,4 @@
-"""The colors that cameras see of Gaussians, from spherical harmonics."""
+"""View-dependent colors of Gaussians from spherical harmonics."""
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +17,7 @@ def view_colors(
     """Harmonics up to `degree` along the world directions from each camera to `means`, plus 0.5, at least 0. Runs
     gsplat's kernel on a GPU and numba elsewhere.
 
-    `viewmats` map world to camera (OpenCV). Gaussians with radius 0 are out of view: their colors mean nothing. Raises
+    `viewmats` map world to camera (OpenCV). Gaussians with radius 0 are out of view and have undefined colors. Raises
     ValueError for too few coefficients, and on the CPU for degrees above 3.
     """
     if not means.is_cuda:
@@ -46,8 +46,8 @@ def fused_view_colors(
     camera_to_world: Float[Tensor, "4 4"],
     degree: int,
 ) -> Float[Tensor, "n 3"] | None:
-    """The same for one camera and all Gaussians, in one pass, without joining `sh0` and `shN`; None where no kernel
-    can (Triton, degrees 0 and 1, a camera without gradient), and `view_colors` has to."""
+    """`view_colors` for one camera and all Gaussians, in one pass, without concatenating `sh0` and `shN`. Returns None
+    where the kernel does not apply; it needs Triton, degree 0 or 1 and a camera without gradient."""
     if degree > 1 or camera_to_world.requires_grad or not triton_support.usable_for(means):
         return None
     from drivesplat.kernels.triton.view_colors import ViewColors

@@ -1,8 +1,8 @@
-"""The stage `actors`: which vehicles become actors, and where their Gaussians start.
+"""The stage `actors`: which vehicles become actors, and the initial points of their Gaussians.
 
-LiDAR of the training sweeps that lies in an actor's box, gathered over the drive in the actor's own frame; random
-points in the box where that is little (Street Gaussians, Yan et al. 2024, arXiv 2401.01339). Colours are those of
-training images in whose pixels the actor is seen. Held-out images and sweeps contribute nothing.
+The points are the LiDAR returns of the training sweeps in an actor's box, accumulated over the drive in the actor's
+frame, plus random points in the box where there are few returns (Street Gaussians, Yan et al. 2024, arXiv 2401.01339).
+Colours come from training images that show the actor. Held-out images and sweeps contribute nothing.
 """
 
 import logging
@@ -27,14 +27,13 @@ from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
 log = logging.getLogger(__name__)
 
 ACTORS = "actors"
-"""The part that takes them."""
+"""The part of the model that represents actors."""
 UNSEEN = 127
-"""Grey of an actor that no pixel shows."""
+"""Grey level of an actor whose points no image shows."""
 
 
 def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MASK) -> ActorRecords:
-    """The actors of a scene, without provenance. A mover that no training image sees is left
-    out."""
+    """The actors of a scene, without provenance. Dynamic objects that no training image shows are left out."""
     sweeps = training_returns(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
@@ -44,13 +43,13 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
             seeds.append(Seed(mover, *gathered_points(scene, mover, sweeps, job.actors, random)))
     for view in actor_views(scene, job, ego_mask):
         for seed in seeds:
-            seed.look(view)
+            seed.add_view(view)
     unseen = [seed.mover.track.id for seed in seeds if not seed.seen]
     if unseen:
-        log.info("%d tracks that move are left out, no training image sees them: %s", len(unseen), ", ".join(unseen))
+        log.info("%d dynamic tracks that no training image shows are left out: %s", len(unseen), ", ".join(unseen))
     actors = [seed.record() for seed in seeds if seed.seen]
     for actor in actors:
-        log.info("%s: %d points, %d of them LiDAR's", actor.id, len(actor.points), actor.lidar_points)
+        log.info("%s: %d points, %d of them from LiDAR", actor.id, len(actor.points), actor.lidar_points)
     return ActorRecords(actors)
 
 
@@ -61,23 +60,23 @@ def gathered_points(
     settings: ActorSeedSettings,
     random: np.random.Generator,
 ) -> tuple[np.ndarray, int]:
-    """Points (n, 3) in an object's frame: LiDAR's first, then random ones in its box; and how many are LiDAR's.
+    """Points (n, 3) in an object's frame, LiDAR points before random ones in its box, and the number of LiDAR points.
 
-    `sweeps` with their returns (m, 3) in world coordinates.
+    `sweeps` come with their returns (m, 3) in world coordinates.
     """
-    gathered = (mover.own(points, scene.seconds(sweep.timestamp), settings.box_margin) for sweep, points in sweeps)
-    lidar = np.concatenate([np.empty((0, 3)), *gathered])
-    wanted = min(settings.random_points, settings.max_points) if len(lidar) < settings.min_points else 0
+    in_box = (mover.own(points, scene.seconds(sweep.timestamp), settings.box_margin) for sweep, points in sweeps)
+    lidar = np.concatenate([np.empty((0, 3)), *in_box])
+    target = min(settings.random_points, settings.max_points) if len(lidar) < settings.min_points else 0
     if len(lidar) > settings.max_points:
         lidar = lidar[np.sort(random.choice(len(lidar), settings.max_points, replace=False))]
-    filling = random.uniform(-0.5, 0.5, (max(0, wanted - len(lidar)), 3)) * mover.track.size
+    filling = random.uniform(-0.5, 0.5, (max(0, target - len(lidar)), 3)) * mover.track.size
     return np.concatenate([lidar, filling]), len(lidar)
 
 
 @dataclass(frozen=True)
 class ActorView:
-    """A training image: `pixels` (h, w, 3) uint8; `owners` (h, w), whose every pixel is, as a number of `tracks`, which
-    tells it by id, -1 where it is nobody's; `seen`, the tracks that are seen there."""
+    """A training image: `pixels` (h, w, 3) uint8 RGB; `owners` (h, w), the number of the track that each pixel shows or
+    -1; `tracks`, these numbers by track id; `seen`, the ids of the visible tracks. `seconds` is the scene's time."""
 
     frame: Frame
     seconds: float
@@ -89,28 +88,29 @@ class ActorView:
 
 
 def actor_views(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask) -> Iterator[ActorView]:
-    """The training images, one by one."""
+    """The training images, prefetched one by one."""
     frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
     return prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames)
 
 
 def actor_view(scene: Scene, frame: Frame, job: ActorSeedJob, ego_mask: EgoMask) -> ActorView:
-    """A frame, with what is seen in it: of MIN_PIXELS pixels and not hidden by nearer boxes and the own car."""
+    """A frame with its visible tracks: those that cover MIN_PIXELS pixels and are not fully hidden by nearer boxes or
+    the ego vehicle."""
     size = target_size(frame, job.images)
     hulls = hulls_in(scene, frame, size)
     owners, covered = owner_image(hulls, size)
     owners[ego_mask.pixels(frame.camera, size)] = -1
     tracks = {hull.box.track_id: number for number, hull in enumerate(hulls)}
-    shown = np.bincount(owners[owners >= 0], minlength=len(hulls))
-    seen = {track for track, number in tracks.items() if shown[number] and covered[number] >= MIN_PIXELS}
+    visible = np.bincount(owners[owners >= 0], minlength=len(hulls))
+    seen = {track for track, number in tracks.items() if visible[number] and covered[number] >= MIN_PIXELS}
     pixels, intrinsics = read_image(frame.image_path, size), continuous_intrinsics(frame, size)
     return ActorView(frame, scene.seconds(frame.timestamp), intrinsics, pixels, owners, tracks, seen)
 
 
 class Seed:
-    """An actor in the making: its points, and what the images that it has been looked at in show of them.
+    """An actor's points, and their colours from the views added so far.
 
-    A point has the colour of the image whose camera was nearest to it, of those in which its pixel is the actor's.
+    A point has the colour of its nearest camera among those whose image shows the actor at the point's pixel.
     """
 
     def __init__(self, mover: DynamicObject, points: np.ndarray, lidar: int):
@@ -120,8 +120,8 @@ class Seed:
         self._colors = np.zeros((len(points), 3), dtype=np.uint8)
         self._distances = np.full(len(points), np.inf)
 
-    def look(self, view: ActorView) -> None:
-        """Takes the colours that an image shows better than those before it."""
+    def add_view(self, view: ActorView) -> None:
+        """Updates the colours of the points that this view sees from nearer than all earlier views."""
         self.seen |= self.mover.track.id in view.seen
         number, pose = view.tracks.get(self.mover.track.id), self.mover.pose(view.seconds)
         if number is None or pose is None:
@@ -131,12 +131,12 @@ class Seed:
         camera = inverse(view.frame.camera_to_world), view.intrinsics
         index, rows, columns, _ = in_image(points, *camera, view.owners.shape)
         distances = np.linalg.norm(points[index] - view.frame.camera_to_world[:3, 3], axis=1)
-        better = (view.owners[rows, columns] == number) & (distances < self._distances[index])
-        self._distances[index[better]] = distances[better]
-        self._colors[index[better]] = view.pixels[rows[better], columns[better]]
+        nearer = (view.owners[rows, columns] == number) & (distances < self._distances[index])
+        self._distances[index[nearer]] = distances[nearer]
+        self._colors[index[nearer]] = view.pixels[rows[nearer], columns[nearer]]
 
     def record(self) -> ActorRecord:
-        """The actor. Points that no image shows have the others' mean colour."""
+        """The actor's record. Points that no image shows get the mean colour of the others, or UNSEEN."""
         track, shown = self.mover.track, np.isfinite(self._distances)
         mean = self._colors[shown].mean(axis=0).round() if shown.any() else UNSEEN
         return ActorRecord(

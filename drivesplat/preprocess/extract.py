@@ -1,4 +1,4 @@
-"""The stage `extract`: a dataset's tables into one checked `scene.json`."""
+"""The stage `extract`: converts a dataset's tables to one validated `scene.json`."""
 
 import dataclasses
 import logging
@@ -16,15 +16,15 @@ from drivesplat.settings.extract import SceneSource
 log = logging.getLogger(__name__)
 
 MAX_NAMED = 10
-"""Of images that are left out, so many are named one by one."""
+"""Maximum number of skipped images that are logged one by one."""
 
 
 def extract_scene(source: SceneSource, root: Path, scene_tables: Path | None = None) -> Scene:
-    """The scene, read and checked, its images decoded once. `root` holds the folder of tables, `scene_tables` what the
-    scene needs of them (None: it is looked for). What a reader of the figures has to know of the drive is logged as
-    warnings.
+    """Reads and checks a scene and decodes each of its images once. Logs warnings about properties of the drive that
+    affect its metrics.
 
-    Raises DatasetError naming the token and path of what is wrong.
+    `root` holds the folder of tables, `scene_tables` the scene's extract of them (None: the reader finds it). Raises
+    DatasetError naming the token and path of the fault.
     """
     scene = reader(source.reader).read(root, source, scene_tables)
     with ThreadPoolExecutor() as pool:
@@ -49,9 +49,9 @@ def extract_scene(source: SceneSource, root: Path, scene_tables: Path | None = N
 
 
 def image_fault(frame: Frame) -> str | None:
-    """What is wrong with a frame's image file, or None.
+    """The fault of a frame's image file, or None.
 
-    Decodes it, at reduced size, since a truncated JPEG opens well.
+    Decodes the image at reduced size: a truncated JPEG opens without error.
     """
     path = Path(frame.image_path)
     if not path.is_file():
@@ -68,9 +68,9 @@ def image_fault(frame: Frame) -> str | None:
 
 
 def _remedied(frame: Frame, fault: str) -> str:
-    """What to do about a frame's fault, which stops the extraction."""
-    leave_out = "" if frame.is_key_frame else "sweeps: false to do without all images between key frames, or "
+    """The error message for a fault that stops the extraction, with the remedy."""
+    no_sweeps = "" if frame.is_key_frame else "sweeps: false to do without all images between key frames, or "
     return (
         f"{place_of(frame)} ({frame.camera}): {fault}; "
-        f"restore the file, or set {leave_out}extract.on_missing: warn to go on without it"
+        f"restore the file, or set {no_sweeps}extract.on_missing: warn to go on without it"
     )

@@ -1,16 +1,16 @@
-"""Seed points for what LiDAR does not reach: along pixels that no seed point covers."""
+"""Seed points beyond the range of LiDAR, along the rays of pixels that no other seed point covers."""
 
 import numpy as np
 
 from drivesplat.lidar.coloring import ColorView, in_image
 
 COVERAGE_CELL = 8
-"""Edge in pixels of the cells that a seed point covers."""
+"""Edge length in pixels of the image cell that a seed point covers."""
 
 
 def uncovered(view: ColorView, points: np.ndarray) -> np.ndarray:
-    """The usable pixels of a view, as indices (m,) of its pixels row by row, in whose cells of COVERAGE_CELL pixels
-    none of the world points (n, 3) lies."""
+    """Flat row-major indices (m,) of a view's usable pixels in cells of COVERAGE_CELL pixels into which none of the
+    world points (n, 3) projects."""
     height, width = view.pixels.shape[:2]
     cells = np.zeros((height // COVERAGE_CELL + 1, width // COVERAGE_CELL + 1), dtype=bool)
     _, rows, columns, _ = in_image(points, view.world_to_camera, view.intrinsics, (height, width))
@@ -27,11 +27,10 @@ def far_points(
     depths: tuple[float, float],
     random: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`count` random points (at most) in the view's frustum, through pixels among the `candidates` (m,), as `uncovered`
-    gives them.
+    """At most `count` random points on the rays of pixels drawn from `candidates`, which `uncovered` returns.
 
-    Depth is log-uniform between `depths` (metres); a point that would lie under the ground plane at height `ground_z`
-    is moved up its ray onto it. Returns positions (m, 3) and the colours (m, 3) of their pixels.
+    Depth is log-uniform between `depths` (metres). A point below the ground plane at height `ground_z` is moved along
+    its ray onto the plane. Returns world positions (m, 3) and the colours (m, 3) uint8 of the pixels.
     """
     chosen = random.choice(candidates, size=min(count, len(candidates)), replace=False)
     rows, columns = np.divmod(chosen, view.pixels.shape[1])

@@ -1,17 +1,17 @@
-"""The stage `free_space`: where nothing stands, since rays went through.
+"""The stage `free_space`: the voxels that rays prove empty of static surfaces.
 
-A ray from a sensor to what it met proves the space between empty, at that moment, and so at all times of what stands
-still. Space is told in voxels. One is empty if enough rays passed it, and
+A ray from a sensor to its end point proves that the space between is empty at that time, and so never holds a static
+surface. A voxel is empty if enough rays pass through it, and
 
-- neither it nor one of the 26 around it holds the end of a ray: what is thinner than a voxel (a pole, a branch) ends
-  some rays and lets others pass;
-- rays passed the six voxels at its faces, too: a surface seen at a grazing angle lies in voxels that rays pass long
-  before they end, and the voxels behind it are passed by none.
+- neither it nor any of its 26 neighbours holds the end of a ray: objects thinner than a voxel (a pole, a branch) stop
+  some rays only;
+- rays also pass through its six face neighbours: a surface seen at a grazing angle lies in voxels that rays traverse
+  long before they end, but no ray traverses the voxels behind it.
 
-Rays are LiDAR's, and those from training images to the points that the refinement of poses has triangulated.
+The rays are those of LiDAR, and those from training images to the points that pose refinement has triangulated.
 
-A ray that ends on something that moves proves as much as any other, but its end is no occupancy: the place is empty
-again. Held-out sweeps contribute nothing.
+A ray that ends on a dynamic object proves its path empty like any other, but does not make its end occupied: the object
+moves on. Held-out sweeps contribute nothing.
 """
 
 import logging
@@ -33,13 +33,13 @@ from drivesplat.settings.free_space import FreeSpaceJob, FreeSpaceSettings
 log = logging.getLogger(__name__)
 
 MAX_VOXELS = 2**31
-"""A grid of more (a byte each while it is made) is refused."""
+"""Maximum number of voxels of a grid; building it takes one byte per voxel."""
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays from `origins` (r, 3) to what they met at `ends` (r, 3), world metres; `static` (r,) bool: whether that
-    is static."""
+    """Rays from `origins` (r, 3) to `ends` (r, 3) in world metres; `static` (r,) bool: whether a ray ends on a static
+    surface."""
 
     origins: np.ndarray
     ends: np.ndarray
@@ -47,37 +47,37 @@ class Rays:
 
     @classmethod
     def joined(cls, several: Sequence["Rays"]) -> "Rays":
-        """All of `several` as one."""
-        origins, ends = (np.concatenate([np.empty((0, 3)), *(getattr(r, of) for r in several)]) for of in _PLACES)
+        """Concatenates `several`."""
+        origins, ends = (np.concatenate([np.empty((0, 3)), *(getattr(r, name) for r in several)]) for name in _POINTS)
         return cls(origins, ends, np.concatenate([np.empty(0, dtype=bool), *(r.static for r in several)]))
 
 
-_PLACES = ("origins", "ends")
+_POINTS = ("origins", "ends")
 
 
 def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: TriangulatedPoints | None = None) -> FreeSpace:
-    """The free space of a scene, without provenance, from its LiDAR and, where they are given, triangulated points."""
+    """The free space of a scene, without provenance, from its LiDAR and, if given, its triangulated points."""
     rays = Rays.joined([lidar_rays(scene, job), *([camera_rays(scene, job, triangulated)] if triangulated else [])])
     record = proven_empty(rays, job.free_space)
-    log.info("%d rays prove %.0f cubic metres empty", len(rays.ends), len(record.keys) * record.voxel**3)
+    log.info("%d rays mark %.0f cubic metres as empty", len(rays.ends), len(record.keys) * record.voxel**3)
     return record
 
 
 def lidar_rays(scene: Scene, job: FreeSpaceJob) -> Rays:
-    """The rays of the training sweeps, each from its sweep's own sensor; the own car's returns are left out."""
-    moving, found = dynamic_objects(scene), []
+    """The rays of the training sweeps, from each sweep's sensor; returns of the ego vehicle are left out."""
+    movers, rays = dynamic_objects(scene), []
     for sweep, points in training_returns(scene, job.holdout, job.own_car_radius):
         static = np.ones(len(points), dtype=bool)
-        for mover in moving:
+        for mover in movers:
             static &= ~mover.near(points, scene.seconds(sweep.timestamp), job.box_margin)
         origins = np.broadcast_to(sweep.sensor_to_world[:3, 3], points.shape)
-        found.append(Rays(origins, points, static))
-    return Rays.joined(found)
+        rays.append(Rays(origins, points, static))
+    return Rays.joined(rays)
 
 
 def camera_rays(scene: Scene, job: FreeSpaceJob, triangulated: TriangulatedPoints) -> Rays:
     """The rays from the training images to the triangulated points that they see, if enough of them see a point. All
-    stand still: features on what moves are left out before anything is triangulated."""
+    points are static: features on dynamic objects are excluded before triangulation."""
     training = training_images(scene, job.holdout)
     counts = np.isin(triangulated.seen_by, training) & triangulated.seen_in(training)[triangulated.seen_point]
     centres = np.stack([frame.camera_to_world[:3, 3] for frame in scene.frames])
@@ -86,9 +86,9 @@ def camera_rays(scene: Scene, job: FreeSpaceJob, triangulated: TriangulatedPoint
 
 
 def proven_empty(rays: Rays, settings: FreeSpaceSettings) -> FreeSpace:
-    """What rays of any kind prove empty.
+    """The space that rays prove empty.
 
-    Raises ConfigError where the grid would be too large.
+    Raises ConfigError where the grid would have more than MAX_VOXELS.
     """
     starts, ends = proving(rays, settings)
     lower, shape = _bounds(np.concatenate([starts, ends]), settings.voxel)
@@ -107,7 +107,8 @@ def proven_empty(rays: Rays, settings: FreeSpaceSettings) -> FreeSpace:
 
 
 def proving(rays: Rays, settings: FreeSpaceSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Starts and ends (p, 3) of what rays prove: not their last metres, nor what is far from where they start."""
+    """Starts and ends (p, 3) of the segments that rays prove empty: within `settings.range` of their origins, and with
+    a margin before their ends."""
     along = rays.ends - rays.origins
     length = np.linalg.norm(along, axis=1)
     reach = np.minimum(length * (1.0 - settings.margin_share) - settings.margin, settings.range)
@@ -117,8 +118,8 @@ def proving(rays: Rays, settings: FreeSpaceSettings) -> tuple[np.ndarray, np.nda
 
 
 def _bounds(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """The lower corner (3,) in metres and the number of voxels (3,) of a grid that holds world points (n, 3), with two
-    voxels to spare: at its border nothing is told. Its voxels lie on multiples of their edge."""
+    """The lower corner (3,) in metres and the shape (3,) in voxels of a grid around world points (n, 3), with a border
+    of two voxels, where no voxel can be proven empty. The voxels are aligned to multiples of their edge."""
     if len(points) == 0:
         return np.zeros(3), np.ones(3, dtype=np.int64)
     first = np.floor(points.min(axis=0) / voxel) - 2.0

@@ -1,7 +1,7 @@
-"""The stage `lidar_depth`: how far from the camera the surfaces in every training image are, where LiDAR met them.
+"""The stage `lidar_depth`: sparse depth of every training image, from LiDAR.
 
-An image sees the returns of the training sweep nearest to it in time. What moves has gone on since: its returns go with
-its box. Held-out sweeps contribute nothing, and held-out images get nothing.
+The returns of the training sweep nearest in time are projected into an image; those of a dynamic object first move with
+its box to the image's time. Held-out sweeps contribute nothing, and held-out images get no depth.
 """
 
 import logging
@@ -20,8 +20,8 @@ log = logging.getLogger(__name__)
 
 
 def lidar_depths(scene: Scene, job: LidarDepthJob, ego_mask: EgoMask = NO_EGO_MASK) -> list[PixelDepths]:
-    """What LiDAR says of each of the scene's frames, the own car's body left out; nothing of those that no training
-    sees."""
+    """The LiDAR depths of each of the scene's frames, in their order, outside the ego vehicle's body; empty for frames
+    outside the training split."""
     clouds, images = clouds_of(scene, job, ("train",)), []
     for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
         cloud = nearest_cloud(clouds, frame.timestamp, scene.key_frame_interval) if group == "train" else None

@@ -1,9 +1,9 @@
-"""The stage `lidar_seed`: where the Gaussians start.
+"""The stage `lidar_seed`: the initial points of the static Gaussians.
 
-LiDAR of the training sweeps in world coordinates, without the own car and without what moves, thinned, coloured
-from training images; points that the refinement of poses triangulated, if two training images see them; points of a
-file, if given; then far points along pixels that none of these cover. Held-out images and sweeps contribute nothing,
-neither position (of LiDAR) nor colour, and a point that no training image sees is left out.
+The sources are static LiDAR returns of the training sweeps, without the ego vehicle and thinned; points triangulated
+by pose refinement that two training images see; points of a file, if given; and far points along pixels that none of
+these cover. Colours come from training images, and points that none of them sees are left out. Held-out images and
+sweeps contribute neither LiDAR positions nor colours.
 """
 
 import logging
@@ -37,10 +37,10 @@ log = logging.getLogger(__name__)
 def seed_points(
     scene: Scene, job: SeedJob, ego_mask: EgoMask = NO_EGO_MASK, triangulated: TriangulatedPoints | None = None
 ) -> PointCloud:
-    """The seed of a scene, to which the own car's body lends nothing; `triangulated` is the content of its
-    triangulated.npz. Its note counts points by source, missing sweeps, and names the points file.
+    """The seed points of a scene in world metres; the ego vehicle's pixels give no colour. `triangulated` is the
+    content of triangulated.npz. The note counts points by source and missing sweeps, and names the points file.
 
-    Raises DatasetError where a LiDAR file is missing (unless told to go on) or nothing is left to start from.
+    Raises DatasetError where a LiDAR file is missing and on_missing is 'stop', or where no points are left.
     """
     random = np.random.default_rng(job.random_seed)
     frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
@@ -81,10 +81,9 @@ def seed_points(
 
 
 def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, int]:
-    """Static LiDAR points (n, 3) of the training sweeps in world coordinates, their times (n,), and the sweeps missing.
-
-    Raises DatasetError where the scene has no LiDAR at all and on_missing is 'stop'.
-    """
+    """Static LiDAR points (n, 3) of the training sweeps in world coordinates, their times (n,) in microseconds, and the
+    number of missing sweeps. Raises DatasetError where the scene has no LiDAR or a sweep is missing and on_missing is
+    'stop'."""
     settings = job.lidar_seed
     if not scene.sweeps and settings.on_missing == "stop":
         raise DatasetError(
@@ -116,18 +115,18 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
 
 
 def extra_points(scene: Scene, path: str | None) -> np.ndarray:
-    """The points (n, 3) of a PLY in the dataset's global frame, in world coordinates; none without a path."""
+    """The points (n, 3) of a PLY file in the dataset's global frame, in world coordinates; empty without a path."""
     if path is None:
         return np.empty((0, 3))
     try:
         return read_positions(Path(path).expanduser()) - scene.origin
     except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise DatasetError(f"lidar_seed.points_file {path} is no readable PLY of points ({error})") from error
+        raise DatasetError(f"lidar_seed.points_file {path} is not a readable PLY file of points ({error})") from error
 
 
 def triangulated_points(scene: Scene, job: SeedJob, record: TriangulatedPoints) -> tuple[np.ndarray, np.ndarray]:
-    """The triangulated points (n, 3) that enough training images see, in world coordinates, and the times (n,) at which
-    they do, on average."""
+    """The triangulated points (n, 3) that enough training images see, in world coordinates, and the mean times (n,) of
+    those images in microseconds."""
     training = training_images(scene, job.holdout)
     times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
     chosen = record.seen_in(training)
@@ -137,12 +136,12 @@ def triangulated_points(scene: Scene, job: SeedJob, record: TriangulatedPoints) 
 def color_views(
     scene: Scene, frames: list[Frame], images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK
 ) -> Iterator[ColorView]:
-    """The frames one by one as sources of colour: at 12 Hz all of them would not fit into memory."""
+    """The frames as sources of colour, one by one: at 12 Hz all of them together exceed memory."""
     return prefetch(lambda frame: color_view(scene, frame, images, ego_mask), frames)
 
 
 def color_view(scene: Scene, frame: Frame, images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK) -> ColorView:
-    """A frame as a source of colour; pixels of moving boxes and of the own car are not usable."""
+    """A frame as a source of colour; pixels of dynamic boxes and of the ego vehicle are not usable."""
     size = target_size(frame, images)
     usable = ~ego_mask.pixels(frame.camera, size)
     for hull in hulls_in(scene, frame, size):

@@ -1,9 +1,9 @@
-"""The stage `masks`: what is static, moving or sky in every image, as PNGs that a person can look at.
+"""The stage `masks`: static, dynamic and sky regions of every image, as PNG files.
 
-- masks/masks.json: what was made, from what, and which cameras see the own car
+- masks/masks.json: the masks' sources, and the cameras that see the ego vehicle
 - masks/regions/{camera}/{timestamp}.png: labels of `drivesplat.scene.regions.LABELS`
-- masks/sky/{camera}/{timestamp}.png: 255 where the sky is
-- masks/semantic/{camera}/{timestamp}.png: the user's classes, where there are any
+- masks/sky/{camera}/{timestamp}.png: 255 in the sky
+- masks/semantic/{camera}/{timestamp}.png: the user's semantic classes, if given
 """
 
 import logging
@@ -28,16 +28,16 @@ from drivesplat.settings.masks import MaskJob
 log = logging.getLogger(__name__)
 
 MIN_SKY = 0.005
-"""Where the heuristic finds less sky than this share of all pixels, it has found none: it looks for what is bright."""
+"""Minimum share of sky over all images. Below it the heuristic, which looks for bright pixels, has found no sky."""
 NO_SKY = (
-    "scene %s: no sky was found, as by night or in a tunnel: losses about the sky are left out; "
-    "masks.sky_folder takes masks of your own"
+    "scene %s: no sky was found, as is usual at night or in a tunnel: sky losses are disabled; "
+    "set masks.sky_folder to use your own masks"
 )
 
 
 def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_EGO_MASK) -> MasksRecord:
-    """Writes the masks of every image below `folder`; returns the record of masks.json. The own car's body is a region
-    of its own, no sky, and of no class. The sky of a training image is told by sweeps that a training may see alone.
+    """Writes the masks of every image below `folder`; returns the record for masks.json. The ego vehicle's body is a
+    region of its own, neither sky nor of any class. The sky of training images depends on training sweeps only.
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
@@ -73,8 +73,8 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
 
 
 def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int:
-    """Writes the user's classes of an image, where there are any, none of them for the own car's `body` (h, w) bool;
-    returns how many there are at least."""
+    """Writes the user's semantic classes of an image, if given, unlabelled within the ego vehicle's `body` (h, w) bool.
+    Returns the highest class plus one, or 0."""
     if not job.masks.semantic_folder:
         return 0
     classes = _users_mask(job.masks.semantic_folder, frame, (body.shape[1], body.shape[0])).copy()
@@ -85,7 +85,7 @@ def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int
 
 
 def _sky(sweeps: Sequence[Sweep], frame: Frame, job: MaskJob, size: tuple[int, int], interval: float) -> np.ndarray:
-    """The sky (h, w) bool of a frame; the one of `sweeps` that is nearest, within `interval` microseconds, helps."""
+    """The sky (h, w) bool of a frame; the heuristic uses the nearest of `sweeps` within `interval` microseconds."""
     if job.masks.sky_folder:
         return _users_mask(job.masks.sky_folder, frame, size) > 127
     lidar = nearest_returns(sweeps, frame.timestamp, interval)
@@ -101,7 +101,7 @@ def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) ->
     if labels.max() > max(LABELS.values()):
         raise DatasetError(
             f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; "
-            f"they end at {max(LABELS.values())}"
+            f"the highest label is {max(LABELS.values())}"
         )
     return labels
 

@@ -1,4 +1,4 @@
-"""The stage `parser`: what a trainer needs of a scene, in one record."""
+"""The stage `parser`: all that a trainer needs from a scene, in one record."""
 
 from pathlib import Path
 from typing import get_args
@@ -15,8 +15,8 @@ from drivesplat.settings.parser import ParserJob
 
 
 def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingRecord:
-    """The training record of a scene and its seed, without provenance. Raises DatasetError where no training image is
-    left."""
+    """The training record of a scene and its seed points, without provenance. Raises DatasetError where no training
+    image is left."""
     frames = scene.frames
     sizes = [target_size(frame, job.images) for frame in frames]
     cameras = list(dict.fromkeys(frame.camera for frame in frames))

@@ -1,4 +1,4 @@
-"""Where the sky is: above the horizon, bright or blue, smooth, joined to the top edge, without LiDAR returns."""
+"""Sky detection: pixels above the horizon, bright or blue, smooth, connected to the top edge, without LiDAR returns."""
 
 import cv2
 import numpy as np
@@ -7,23 +7,23 @@ from scipy import ndimage
 from drivesplat.scene.images import pixel_rays, project
 
 MIN_ELEVATION = np.sin(np.radians(1.0))
-"""Sky lies at least a degree above the horizon."""
+"""Sine of the minimum elevation of sky, one degree above the horizon."""
 MIN_BRIGHTNESS = 0.35
-"""Sky is at least this bright, or ..."""
+"""Minimum brightness of sky with a blue tint, in [0, 1]."""
 BRIGHT = 0.7
-"""... needs no blue tint from this brightness on (overcast)."""
+"""Minimum brightness of sky without a blue tint (overcast)."""
 SMOOTH = 0.045
-"""Largest gradient (per pixel at 640 pixels' width) of sky, of brightness in [0, 1]."""
+"""Maximum brightness gradient of sky, per pixel at 640 pixels' width."""
 LIDAR_REACH = 12
-"""Pixels (at 640 pixels' width) around a LiDAR return that are not sky."""
+"""Distance from a LiDAR return within which no pixel is sky, in pixels at 640 pixels' width."""
 
 
 def sky_mask(
     pixels: np.ndarray, intrinsics: np.ndarray, camera_to_world: np.ndarray, lidar: np.ndarray | None
 ) -> np.ndarray:
-    """The sky (h, w) bool of an image (h, w, 3) uint8.
+    """The sky (h, w) bool of an image (h, w, 3) uint8 RGB.
 
-    `intrinsics` (3, 3) continuous; `lidar` (n, 3) world points of the nearest sweep, or None where there is none.
+    `intrinsics` (3, 3) in the continuous convention; `lidar` (n, 3) world points of the nearest sweep, or None.
     """
     height, width = pixels.shape[:2]
     scale = width / 640.0

@@ -24,7 +24,7 @@ def scene(tiny_scene):
     return street_scene(tiny_scene)
 
 
-def test_frames_are_counted_after_the_first_and_the_film_with_all_it_takes(scene, monkeypatch):
+def test_frame_rate_excludes_the_first_frame_and_film_time_includes_everything(scene, monkeypatch):
     """By a clock that only rendering moves: by a second a frame, 0.1 s once a tenth of them are rendered."""
     now, rendered = {"s": 0.0}, []
 

@@ -64,7 +64,7 @@ EVALS = {
 }
 
 
-def test_recipes_stand_side_by_side_with_differences_to_the_first(compared):
+def test_the_table_compares_recipes_with_the_first_one(compared):
     """Static: 24 and 25 against 25 and 27: +1 and +2, so 1.5 with a standard error of 0.5."""
     record = compared(EVALS, TWO)
     (table,) = record["tables"]
@@ -106,7 +106,7 @@ def test_the_page_says_how_it_was_measured_and_what_the_recipes_are(compared):
     assert "Shared" not in text and "failed" not in text and "depth error" not in text
 
 
-def test_depth_error_and_lpips_have_columns_where_they_were_measured(compared):
+def test_depth_error_and_lpips_have_columns_only_if_measured(compared):
     evals = json.loads(json.dumps(EVALS))
     for content, error in zip(evals["street"], (0.02, 0.04), strict=True):
         content["result"]["interpolation"] |= {"depth": {"median_relative_error": error, "pixels": 9}}
@@ -135,7 +135,7 @@ def spelled(value: Any) -> str:
 
 
 @pytest.mark.parametrize("key", OTHERWISE)
-def test_what_was_measured_otherwise_stands_in_a_table_of_its_own(compared, key):
+def test_results_measured_under_another_protocol_get_their_own_table(compared, key):
     evals = {**EVALS, "other": [evaluation(30.0, protocol=OTHERWISE[key])] * 2}
     record = compared(evals, {"plain": TWO["plain"], "other": BAD, "street": TWO["street"]})
     assert [[row["recipe"] for row in table["rows"]] for table in record["tables"]] == [["plain", "street"], ["other"]]
@@ -154,7 +154,7 @@ def test_what_was_measured_otherwise_stands_in_a_table_of_its_own(compared, key)
         ({"cameras": ["CAM_FRONT", "CAM_BACK"], "train_images": 62}, ["62", "no", "nuscenes"]),
     ],
 )
-def test_what_recipes_are_trained_on_belongs_to_their_rows(compared, change, cells):
+def test_rows_state_the_training_data_of_their_recipe(compared, change, cells):
     evals = {**EVALS, "street": [evaluation(26.0, 21.0, protocol=change)] * 2}
     record = compared(evals, TWO)
     (table,) = record["tables"]
@@ -164,7 +164,7 @@ def test_what_recipes_are_trained_on_belongs_to_their_rows(compared, change, cel
     assert ("poses: nuscenes, refined" in text) == ("poses" in change)
 
 
-def test_seconds_of_trainings_that_shared_a_card_say_so(tmp_path):
+def test_times_of_trainings_that_shared_a_gpu_are_marked(tmp_path):
     file, _ = recipe_file(tmp_path, recipes=TWO)
     results = [
         Result(recipe, seed, tmp_path, {**content, "provenance": {}}, shared=(recipe, seed) == ("street", 1))
@@ -176,7 +176,7 @@ def test_seconds_of_trainings_that_shared_a_card_say_so(tmp_path):
     assert "\n\nShared: during training another job ran on the same GPU" in text
 
 
-def test_a_recipe_that_failed_is_named_with_its_reason_and_the_others_stand(compared):
+def test_a_failed_recipe_is_listed_with_its_reason_beside_the_others(compared):
     record = compared({**EVALS, "bad": [None, None]}, {**TWO, "bad": BAD})
     assert [(item["recipe"], item["seed"]) for item in record["failed"]] == [("bad", 0), ("bad", 1)]
     between, beyond, costs = rows(markdown(record))
@@ -185,7 +185,7 @@ def test_a_recipe_that_failed_is_named_with_its_reason_and_the_others_stand(comp
     assert "- `bad`, seed 1: train: a loss | no number" in markdown(record)
 
 
-def test_a_seed_that_failed_leaves_the_recipes_other_seeds(compared):
+def test_a_failed_seed_does_not_remove_the_other_seeds_of_its_recipe(compared):
     evals = {"plain": EVALS["plain"], "street": [None, EVALS["street"][1]]}
     record = compared(evals, TWO)
     street = record["tables"][0]["rows"][1]
@@ -198,17 +198,17 @@ def test_a_seed_that_failed_leaves_the_recipes_other_seeds(compared):
     assert "failed:" not in text, "it has a row of figures"
 
 
-def test_where_the_first_recipe_failed_differences_say_what_they_are_to(compared):
+def test_if_the_first_recipe_failed_differences_name_their_reference(compared):
     record = compared({"bad": [None, None], **EVALS}, {"bad": BAD, **TWO})
     assert record["tables"][0]["reference"] == "plain" and "Difference from `plain`" in markdown(record)
 
 
-def test_where_all_failed_the_page_says_why(compared):
+def test_if_all_recipes_failed_the_page_gives_the_reasons(compared):
     text = markdown(compared({"plain": [None, None], "street": [None, None]}, TWO))
     assert "Nothing was measured." in text and text.count("a loss | no number") == 4 and "| ---" not in text
 
 
-def test_the_record_holds_every_seeds_figures_and_where_they_came_from(compared):
+def test_the_record_holds_the_figures_and_source_of_every_seed(compared):
     record = compared({**EVALS, "bad": [None, None]}, {**TWO, "bad": BAD})
     assert json.loads(json.dumps(record, allow_nan=False)) == record
     assert [(name, [run["seed"] for run in runs]) for name, runs in record["runs"].items()] == [
@@ -248,7 +248,7 @@ def called(tmp_path, monkeypatch):
     return call
 
 
-def test_the_command_hands_on_what_is_snakemakes_and_writes_page_and_record(called, tmp_path, capsys):
+def test_the_command_passes_arguments_to_snakemake_and_writes_page_and_record(called, tmp_path, capsys):
     assert called(["--", "--cores", "4", "--resources", "gpu=2"]) == (0, ["--cores", "4", "--resources", "gpu=2"])
     page = (tmp_path / "out/quality.md").read_text(encoding="utf-8")
     record = json.loads((tmp_path / "out/quality.json").read_text())
@@ -256,7 +256,7 @@ def test_the_command_hands_on_what_is_snakemakes_and_writes_page_and_record(call
 
 
 @pytest.mark.parametrize(("done", "status", "expected"), [(("plain",), 0, 1), (("plain", "street"), 7, 7)])
-def test_the_exit_status_says_whether_all_is_there(called, done, status, expected):
+def test_the_exit_status_is_zero_only_if_all_results_exist(called, done, status, expected):
     assert called(["--", "--cores", "4"], done, status)[0] == expected
 
 
@@ -265,7 +265,7 @@ def test_a_dry_run_writes_nothing(called, tmp_path):
     assert not list((tmp_path / "out").glob("quality.*"))
 
 
-def test_results_lie_by_the_files_name_unless_told_otherwise(monkeypatch, capsys):
+def test_the_output_folder_is_named_after_the_recipe_file_by_default(monkeypatch, capsys):
     places = []
     monkeypatch.setattr(
         "benchmarks.quality.__main__.measure", lambda file, out, words, workflow: places.append(out) or 0
@@ -274,7 +274,7 @@ def test_results_lie_by_the_files_name_unless_told_otherwise(monkeypatch, capsys
     assert places == [Path("results/quality/mine"), Path("there")]
 
 
-def test_it_is_called_where_snakemake_is(tmp_path):
+def test_a_folder_without_a_snakefile_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no Snakefile"):
         measure(tmp_path / "recipes.yaml", tmp_path, [], tmp_path)
 
@@ -296,7 +296,7 @@ RECIPES = {
 
 @pytest.mark.workflow
 @pytest.mark.xdist_group("quality")
-def test_recipes_run_to_a_table_that_names_what_failed_and_what_is_measured_stays(tmp_path):
+def test_recipes_run_to_a_table_with_failures_and_only_failed_ones_run_again(tmp_path):
     """One recipe's data is not there, one diverges; the third is measured, and only that which failed is run again."""
     copy = WorkflowCopy.make(tmp_path / "copy")
     (copy.folder / "recipes.yaml").write_text(yaml.safe_dump(RECIPES, sort_keys=False))

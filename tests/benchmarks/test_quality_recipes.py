@@ -33,7 +33,7 @@ def settings_of(run: SnakemakeRun, stage: str, method: str | None = None) -> dic
     return json.loads(stage_settings(run.plan.config, stage, run.scene, method))
 
 
-def test_recipes_are_methods_with_every_seed_and_the_only_ones(runs, tmp_path):
+def test_the_planned_methods_are_every_recipe_with_every_seed(runs, tmp_path):
     (run,) = runs()
     names = ["vanilla-seed0", "vanilla-seed1", "street-seed0", "street-seed1"]
     assert list(run.plan.config.all_methods) == names
@@ -42,7 +42,7 @@ def test_recipes_are_methods_with_every_seed_and_the_only_ones(runs, tmp_path):
     assert run.log("street", 1, "train") == tmp_path / "out/plain/logs/0061/street-seed1/train.log"
 
 
-def test_a_method_of_the_config_is_trained_as_it_is_there_but_for_the_seed(runs):
+def test_a_method_of_the_config_is_unchanged_except_for_its_seed(runs):
     (run,) = runs()
     config = load(DEFAULTS)
     for name in ("vanilla", "street"):
@@ -50,7 +50,7 @@ def test_a_method_of_the_config_is_trained_as_it_is_there_but_for_the_seed(runs)
         assert settings_of(run, "train", f"{name}-seed1") == expected | {"random_seed": 1}
 
 
-def test_what_is_laid_over_config_yaml_comes_to_the_config_of_the_plan(runs):
+def test_the_run_file_merged_over_config_yaml_equals_the_planned_config(runs):
     """Snakemake merges the file of a run over config.yaml, as `merged` does."""
     made = runs(recipes={"street": {"of": "street"}, "more": {"of": "street", "config": {"sweeps": True}}})
     for run in made:
@@ -58,7 +58,7 @@ def test_what_is_laid_over_config_yaml_comes_to_the_config_of_the_plan(runs):
         assert load(merged(DEFAULTS, written)) == run.plan.config
 
 
-def test_parts_and_overrides_go_over_those_of_the_method_it_is_of(runs):
+def test_parts_and_overrides_replace_those_of_the_base_method(runs):
     recipes = {
         "bare": {"of": "street", "parts": ["background"], "overrides": {"sky": "none", "train": {"depth_weight": 0.0}}},
         "own": {"parts": ["background", "actors"]},
@@ -103,7 +103,7 @@ def test_base_files_lie_under_the_recipes_in_order(runs, tmp_path):
     assert iterations == [77, 99] and settings_of(run, "train", "third-seed0")["sky"] == "mask"
 
 
-def test_what_recipes_set_holds_over_what_a_dataset_sets_for_itself(runs):
+def test_recipe_settings_take_precedence_over_dataset_settings(runs):
     """The demo trains for 1,000 iterations on 25,000 points of LiDAR, whatever stands further up in the config."""
     recipes = {"vanilla": {}, "few": {"config": {"lidar_seed": {"max_points": 200}}}}
     plain, few = runs(scene="demo", config={"train": {"iterations": 7}}, recipes=recipes)
@@ -142,7 +142,7 @@ def test_what_recipes_set_holds_over_what_a_dataset_sets_for_itself(runs):
     ],
     ids=str,
 )
-def test_what_is_wrong_is_told_in_one_line(runs, content, words):
+def test_errors_are_reported_in_one_line(runs, content, words):
     with pytest.raises(ConfigError) as failure:
         runs(content) if isinstance(content, str) else runs(**content)
     message = str(failure.value)
@@ -159,18 +159,18 @@ def test_what_is_wrong_is_told_in_one_line(runs, content, words):
     ],
     ids=str,
 )
-def test_recipes_that_train_the_same_are_refused(runs, again):
+def test_recipes_with_identical_trainings_are_refused(runs, again):
     """Vanilla has no actors; no sweeps are the default."""
     with pytest.raises(ConfigError, match="'vanilla' and 'again' train the same on scene 0061"):
         runs(recipes={"vanilla": {}, "again": again})
 
 
-def test_recipes_on_other_copies_of_a_dataset_are_not_the_same(runs):
+def test_recipes_on_different_copies_of_a_dataset_differ(runs):
     other = {"config": {"datasets": {"nuscenes": {"dataroot": "elsewhere"}}}}
     assert len(runs(recipes={"vanilla": {}, "other": other})) == 2
 
 
-def test_two_worlds_in_one_folder_are_refused(runs):
+def test_two_synthetic_worlds_in_one_folder_are_refused(runs):
     """Each run would make its own world there, and the other's results stale."""
     night = {"datasets": {"demo": {"world": {"night": True}}}}
     with pytest.raises(ConfigError, match=r"'day' and 'night' make different worlds in resources/demo"):
@@ -180,6 +180,6 @@ def test_two_worlds_in_one_folder_are_refused(runs):
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks/recipes").glob("*.yaml")), ids=lambda path: path.name)
-def test_the_recipes_that_come_along_are_valid(path, tmp_path, monkeypatch):
+def test_the_shipped_recipe_files_are_valid(path, tmp_path, monkeypatch):
     monkeypatch.chdir(REPOSITORY)
     assert plan_runs(read_recipes(path), tmp_path, REPOSITORY)

@@ -38,7 +38,7 @@ NO_CORES = "usage: snakemake [-h]\nsnakemake: error: argument --cores: expected 
         (STARTED, None),
     ],
 )
-def test_a_run_that_starts_no_job_is_named_by_its_last_message(output, reason):
+def test_the_reason_of_a_run_without_jobs_is_its_last_message(output, reason):
     """A message of a job that was started, such as that it waits for a GPU, is no refusal."""
     assert refusal(output.splitlines(keepends=True)) == reason
 
@@ -72,7 +72,7 @@ def fails(run, recipe: str, seed: int, reason: str = "out of GPU memory: lower i
     return write_failure(run.log(recipe, seed, "train"), f"{recipe}-seed{seed}/train 0061", reason, **level)
 
 
-def test_a_failed_job_is_the_reason_of_its_own_method_alone(runs):
+def test_a_failed_job_is_the_reason_for_its_own_method_only(runs):
     both, _ = runs
     fails(both, "b", 1)
     fails(both, "a", 1, level="INFO")
@@ -84,7 +84,7 @@ def test_a_failed_job_is_the_reason_of_its_own_method_alone(runs):
 
 
 @pytest.mark.parametrize("place", ["0061/extract", "demo_world/demo"])
-def test_a_failure_of_the_scene_is_the_reason_of_all_methods_that_have_none_of_their_own(runs, place):
+def test_a_scene_failure_is_the_reason_for_all_methods_without_their_own(runs, place):
     both, _ = runs
     stage = Path(place).name
     write_failure(both.logs / f"{place}.log", f"{stage} 0061", "no such table: samples")
@@ -94,7 +94,7 @@ def test_a_failure_of_the_scene_is_the_reason_of_all_methods_that_have_none_of_t
     assert found["b", 1].reason.startswith("train: ") and "no reason given" in found["c", 0].reason
 
 
-def test_a_failure_of_an_earlier_call_is_no_reason(runs):
+def test_a_failure_of_an_earlier_call_is_ignored(runs):
     path = fails(runs[0], "a", 0)
     assert ended(runs)["a", 0].reason.startswith("train: ")
     later = Outcome(1, "another run is working", path.stat().st_mtime + 1.0)
@@ -136,7 +136,7 @@ def test_figures_of_earlier_settings_or_code_do_not_count(runs):
 
 
 @pytest.mark.parametrize("content", ['{"provenance": ', "[]", '{"provenance": {}}', '{"provenance": null}'])
-def test_a_file_that_is_no_evaluation_is_named(runs, content):
+def test_an_invalid_evaluation_file_is_named(runs, content):
     path = write_evaluation(runs[0], "a", 0, evaluation(20.0))
     path.write_text(content)
     result = ended(runs)["a", 0]
@@ -168,7 +168,7 @@ def own_logging():
     root.setLevel(level)
 
 
-def test_the_log_of_a_job_says_which_card_it_had_and_when(tmp_path, monkeypatch, own_logging):
+def test_a_job_log_gives_its_gpu_and_the_time_it_held_it(tmp_path, monkeypatch, own_logging):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-8f2e")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     path = tmp_path / "train.log"
@@ -199,7 +199,7 @@ def test_the_log_of_a_job_says_which_card_it_had_and_when(tmp_path, monkeypatch,
     ],
     ids=str,
 )
-def test_trainings_that_shared_a_card_are_told_by_their_logs(runs, others, shared):
+def test_trainings_that_shared_a_gpu_are_recognised_from_their_logs(runs, others, shared):
     """One card belongs to training a from 10:00 to 10:10; a job of another run may be on it, too."""
     both, alone = runs
     write_evaluation(both, "a", 0, evaluation(20.0))
@@ -210,7 +210,7 @@ def test_trainings_that_shared_a_card_are_told_by_their_logs(runs, others, share
 
 
 @pytest.mark.parametrize(("device", "shared"), [("cpu (x86_64)", True), ("NVIDIA H200", False)])
-def test_processors_are_shared_where_no_card_is_named(runs, device, shared):
+def test_trainings_without_a_gpu_share_the_processors(runs, device, shared):
     """A GPU without a name in the log is one that a scheduler gave: which, nobody knows."""
     for recipe in ("a", "b"):
         write_evaluation(runs[0], recipe, 0, evaluation(20.0, device=device))

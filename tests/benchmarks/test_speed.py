@@ -41,7 +41,7 @@ def planned(tmp_path: Path, **content: Any) -> tuple[SpeedFile, list[Task]]:
 # --- files ---
 
 
-def test_both_recipes_are_trained_with_every_seed_and_length_and_begin_by_turns(tmp_path):
+def test_both_recipes_run_with_every_seed_and_length_in_alternating_order(tmp_path):
     _, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
     order = [(task.iterations, task.seed, task.recipe) for task in tasks]
     assert order[:4] == [(30, 4, "plain"), (30, 4, "ours"), (30, 5, "ours"), (30, 5, "plain")]
@@ -49,7 +49,7 @@ def test_both_recipes_are_trained_with_every_seed_and_length_and_begin_by_turns(
     assert len({task.folder for task in tasks}) == 8
 
 
-def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path):
+def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_path):
     """`street`: with what only that method reads."""
     file, tasks = planned(tmp_path, method="street", iterations=[77], seeds=[5])
     run, config = plan_run(file, tmp_path, REPOSITORY), load(DEFAULTS)
@@ -67,7 +67,7 @@ def test_ours_is_what_the_rule_train_would_get_but_for_length_and_seed(tmp_path)
     }  # fmt: skip
 
 
-def test_the_files_config_holds_over_what_the_dataset_sets_for_itself(tmp_path):
+def test_the_files_config_takes_precedence_over_dataset_settings(tmp_path):
     """The demo has a cap of 40,000 Gaussians and 1,000 iterations of its own."""
     _, (task, _) = planned(tmp_path, scene="demo", iterations=[9], seeds=[0], config={"train": {"cap_max": 123}})
     assert (task.train.train.cap_max, task.iterations) == (123, 9)
@@ -90,7 +90,7 @@ def test_the_files_config_holds_over_what_the_dataset_sets_for_itself(tmp_path):
     ],
     ids=str,
 )
-def test_what_is_wrong_is_told_in_one_line(tmp_path, content, words):
+def test_errors_are_reported_in_one_line(tmp_path, content, words):
     path = tmp_path / "mine.yaml"
     text = content if isinstance(content, str) else yaml.safe_dump({"scene": "0061", **content})
     path.write_text(text)
@@ -100,7 +100,7 @@ def test_what_is_wrong_is_told_in_one_line(tmp_path, content, words):
     assert "\n" not in message and all(word in message for word in words), message
 
 
-def test_what_the_command_is_told_stands_in_place_of_the_file(tmp_path, monkeypatch):
+def test_command_line_arguments_replace_the_files_values(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(command, "measure", lambda *told: seen.append(told) or 0)
     path = str(REPOSITORY / "benchmarks/speed/demo_1600.yaml")
@@ -114,7 +114,7 @@ def test_what_the_command_is_told_stands_in_place_of_the_file(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "benchmarks/speed").glob("*.yaml")), ids=lambda path: path.name)
-def test_the_files_that_come_along_are_valid(path, tmp_path):
+def test_the_shipped_files_are_valid(path, tmp_path):
     file = read_speed_file(path, {})
     assert list(tasks_of(file, plan_run(file, tmp_path, REPOSITORY), tmp_path))
 
@@ -149,7 +149,7 @@ def rows(text: str) -> list[list[list[str]]]:
     return [[[c.strip() for c in line.split("|")[1:-1]] for line in block.splitlines()] for block in blocks]
 
 
-def test_times_stand_beside_what_they_buy():
+def test_the_table_gives_times_with_the_quality_reached():
     """Loops of 60 and 50 s against 30 and 20: twice and 2.5 times as fast. Static: +2 and +3."""
     record = speed(TWO, RUNS, [])
     (table,) = record["tables"]
@@ -174,7 +174,7 @@ def test_times_stand_beside_what_they_buy():
     assert json.loads(json.dumps(record, allow_nan=False)) == record and record["runs"] == RUNS
 
 
-def test_only_seeds_that_both_recipes_were_run_with_count():
+def test_only_seeds_run_by_both_recipes_count():
     (table,) = speed(TWO, RUNS[:3], [])["tables"]
     assert table["seeds"] == [0] and table["rows"][1]["loop"]["by_seed"] == [30.0]
     assert speed(TWO, RUNS[:1], [])["tables"] == []
@@ -192,7 +192,7 @@ def test_the_page_says_how_it_was_measured():
     assert "Other programs" not in text and "Milliseconds" not in text
 
 
-def test_other_work_on_the_processors_is_told():
+def test_other_load_on_the_processors_is_reported():
     text = markdown(speed(TWO, [*RUNS[:3], ended("plain", 1, 50.0, 22.0, busy_elsewhere=4.04)], []))
     assert "up to 4.0 of the 16 processors busy" in text
     unknown = [{**run, "busy_elsewhere": None} for run in RUNS]
@@ -203,7 +203,7 @@ def shares(**of: tuple[float, float]) -> dict[str, dict[str, float]]:
     return {name: {"device_ms": device, "host_ms": host} for name, (device, host) in of.items()}
 
 
-def test_stages_stand_side_by_side_with_their_share_of_the_iteration():
+def test_the_table_compares_stages_by_their_share_of_the_iteration():
     plain = shares(data=(1.0, 1.0), render=(2.0, 2.0), other=(1.0, 1.0), iteration=(4.0, 4.0))
     ours = shares(render=(1.0, 1.0), checks=(0.5, 0.5), other=(0.5, 0.5), iteration=(2.0, 2.0))
     profiles = [{"recipe": "plain", "iterations": 300, "stages": plain}]
@@ -217,7 +217,7 @@ def test_stages_stand_side_by_side_with_their_share_of_the_iteration():
     ]  # fmt: skip
 
 
-def test_on_a_gpu_the_table_also_says_when_python_went_on():
+def test_on_a_gpu_the_table_also_gives_host_time():
     ours = shares(render=(4.0, 1.0), other=(1.0, 0.5), iteration=(5.0, 1.5))
     text = markdown(speed(TWO, RUNS, [{"recipe": "ours", "iterations": 300, "stages": ours}]))
     assert rows(text)[2][0] == ["stage", "`vanilla`", "`vanilla`, Python"]
@@ -227,14 +227,14 @@ def test_on_a_gpu_the_table_also_says_when_python_went_on():
 # --- runs ---
 
 
-def test_how_busy_processors_are_with_other_work():
+def test_the_load_of_other_processes_is_measured():
     """In 10 s two processors had 18 s of work, 6 s of it one's own; the rest is 1.2 processors' work."""
     assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 118.0, 8.0)) == pytest.approx(1.2)
     assert busy_elsewhere(CpuSample(5.0, None, 2.0), CpuSample(15.0, None, 8.0)) is None
     assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 101.0, 8.0)) == 0.0, "its own, counted twice"
 
 
-def test_ones_own_work_is_not_other_work(tmp_path, monkeypatch):
+def test_the_load_of_this_process_does_not_count_as_other_load(tmp_path, monkeypatch):
     """Work of this process shows in its own seconds; what the kernel says is read as processors' ticks."""
     before = CpuSample.now()
     sum(i * i for i in range(3_000_000))
@@ -248,13 +248,13 @@ def test_ones_own_work_is_not_other_work(tmp_path, monkeypatch):
     assert CpuSample.now().busy is None
 
 
-def test_work_in_a_process_of_its_own_returns_and_raises():
+def test_a_subprocess_passes_on_results_and_exceptions():
     assert run_in_process(divmod, 7, 2) == (3, 1)
     with pytest.raises(ConfigError, match="cannot be read"):
         run_in_process(read_speed_file, "nowhere.yaml", {})
 
 
-def test_a_training_that_is_killed_is_told_in_a_line():
+def test_a_killed_training_is_reported_in_one_line():
     with pytest.raises(TrainingError, match=r"was killed, .* lower train\.cap_max"):
         run_in_process(os._exit, 1)
 
@@ -285,7 +285,7 @@ def measured(tmp_path_factory):
 
 @pytest.mark.workflow
 @pytest.mark.xdist_group("speed")
-def test_the_command_trains_both_measures_both_and_writes_page_and_record(measured):
+def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record(measured):
     record = measured.read("results/speed/tiny/speed.json")
     (table,) = record["tables"]
     plain, ours = table["rows"]
@@ -307,7 +307,7 @@ def test_the_command_trains_both_measures_both_and_writes_page_and_record(measur
 
 @pytest.mark.workflow
 @pytest.mark.xdist_group("speed")
-def test_what_is_timed_is_what_the_rule_trains(measured, tmp_path, monkeypatch):
+def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkeypatch):
     """The same function, and with the same settings and files the same model."""
     script = (REPOSITORY / "workflow_scripts/train.py").read_text()
     assert re.search(r"^from drivesplat\.training\.run import .*\brun_training$", script, re.MULTILINE)
@@ -324,7 +324,7 @@ def test_what_is_timed_is_what_the_rule_trains(measured, tmp_path, monkeypatch):
     assert again.job == timed.job and all(torch.equal(value, again.model[name]) for name, value in timed.model.items())
 
 
-def test_where_snakemake_only_plans_or_fails_nothing_is_trained(tmp_path, monkeypatch):
+def test_nothing_is_trained_if_snakemake_fails_or_only_plans(tmp_path, monkeypatch):
     monkeypatch.chdir(REPOSITORY)
     file = SpeedFile(scene="demo", iterations=(3,), seeds=(0,))
     for arguments, status in ((["-n"], 0), (["--cores", "1"], 7)):
@@ -333,7 +333,7 @@ def test_where_snakemake_only_plans_or_fails_nothing_is_trained(tmp_path, monkey
     assert not (tmp_path / "out").exists()
 
 
-def test_seeds_are_trained_side_by_side_where_there_are_cards(tmp_path, monkeypatch):
+def test_seeds_are_trained_in_parallel_on_several_gpus(tmp_path, monkeypatch):
     file, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
     assert command.in_series(tasks, 1) == [tasks]
     assert [{task.seed for task in series} for series in command.in_series(tasks, 2)] == [{4}, {5}]
@@ -358,6 +358,6 @@ def test_seeds_are_trained_side_by_side_where_there_are_cards(tmp_path, monkeypa
         command.measure(file, tmp_path, (), REPOSITORY, cards=3)
 
 
-def test_it_is_called_where_snakemake_is(tmp_path):
+def test_a_folder_without_a_snakefile_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no Snakefile"):
         command.measure(SpeedFile(scene="demo"), tmp_path, [], tmp_path)

@@ -61,26 +61,26 @@ def images_of(record: TrainingRecord) -> ImageFiles:
 # --- the recipe ---
 
 
-def test_the_schedule_at_full_length_is_the_examples():
+def test_the_full_schedule_equals_that_of_the_example():
     schedule = Schedule.of(30_000)
     assert schedule == Schedule(30_000, sh_every=1_000, refine_start=500, refine_stop=25_000)
     assert [schedule.sh_degree(step) for step in (0, 999, 1_000, 2_999, 3_000, 29_999)] == [0, 0, 1, 2, 3, 3]
 
 
-def test_a_shorter_schedule_is_shortened_in_proportion():
+def test_a_shorter_schedule_scales_in_proportion():
     assert Schedule.of(7_000) == Schedule(7_000, sh_every=233, refine_start=116, refine_stop=5_833)
     assert Schedule.of(3).sh_degree(2) == 2
 
 
 @pytest.mark.parametrize(("iterations", "start", "stop"), [(30_000, 500, 25_000), (15_000, 250, 12_500)])
-def test_what_is_densified_how_and_when(iterations, start, stop):
+def test_densification_follows_the_example(iterations, start, stop):
     strategy = PlainRecipe(Schedule.of(iterations), cap_max=1234, seed=0).strategy()
     told = (strategy.cap_max, strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every)
     assert told == (1234, start, stop, 100)
     assert (strategy.noise_lr, strategy.min_opacity) == (5e5, 0.005)
 
 
-def test_learning_rates_are_the_examples(record):
+def test_learning_rates_equal_those_of_the_example(record):
     training = begun(record, PlainRecipe(Schedule.of(100), 100, 0))
     rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in training.optimizers.items()}
     assert rates == pytest.approx(
@@ -105,7 +105,7 @@ def test_gaussians_begin_small_and_half_opaque_at_the_seed_points(record):
     assert splats["shN"].shape == (60, 15, 3) and not splats["shN"].any()
 
 
-def test_seed_points_in_one_place_do_no_harm(record):
+def test_coincident_seed_points_give_finite_scales(record):
     splats = init_splats(np.zeros((6, 3)), record.points_rgb[:6], seed=0)
     assert torch.isfinite(splats["scales"]).all()
 
@@ -113,7 +113,7 @@ def test_seed_points_in_one_place_do_no_harm(record):
 # --- its images ---
 
 
-def test_images_come_decoded_each_once_an_epoch_in_random_order(record):
+def test_every_epoch_decodes_each_image_once_in_random_order(record):
     images = images_of(record)
     recorded = [np.asarray(Image.open(record.image_paths[i]), dtype=np.float32) for i in (0, 1, 2, 4)]
     torch.manual_seed(0)
@@ -128,7 +128,7 @@ def test_images_come_decoded_each_once_an_epoch_in_random_order(record):
     assert all(sorted(epoch) == [0, 1, 2, 3] for epoch in epochs) and len({tuple(epoch) for epoch in epochs}) > 1
 
 
-def test_processes_decode_them_as_in_the_example(record):
+def test_worker_processes_decode_the_images_as_in_the_example(record):
     loader = loader_of(images_of(record), 2, CPU)
     assert (loader.num_workers, loader.persistent_workers, loader.batch_size) == (2, True, 1)
     assert loader.multiprocessing_context.get_start_method() == "fork", "in a spawned process, too: no import of torch"
@@ -137,7 +137,7 @@ def test_processes_decode_them_as_in_the_example(record):
     assert PlainRecipe(Schedule.of(1), 1, 0).workers == 4
 
 
-def test_images_of_another_size_are_reduced_once_as_training_sees_them(record, tmp_path):
+def test_larger_images_are_resized_once_to_the_training_size(record, tmp_path):
     assert files_of_size(record, tmp_path / "reduced") == [record.image_paths[i] for i in (0, 1, 2, 4)]
     smaller = dataclasses.replace(record, image_sizes=np.tile([WIDTH // 2, HEIGHT // 2], (5, 1)))
     paths = files_of_size(smaller, tmp_path / "reduced")
@@ -152,7 +152,7 @@ def test_images_of_another_size_are_reduced_once_as_training_sees_them(record, t
 # --- its loss ---
 
 
-def test_ssim_is_that_of_windows_that_lie_in_the_image_whole():
+def test_ssim_uses_only_windows_fully_inside_the_image():
     rng = np.random.default_rng(1)
     a = rng.random((40, 50, 3))
     b = (a + rng.normal(scale=0.1, size=a.shape)).clip(0, 1)
@@ -163,7 +163,7 @@ def test_ssim_is_that_of_windows_that_lie_in_the_image_whole():
     assert float(torch_ssim(*batches)) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-6)
 
 
-def test_the_fused_ssim_is_taken_on_a_gpu_where_it_is_installed(monkeypatch):
+def test_fused_ssim_is_used_on_a_gpu_if_installed(monkeypatch):
     calls = []
     fused = SimpleNamespace(fused_ssim=lambda image, target, padding: calls.append(padding), __spec__=SimpleNamespace())
     monkeypatch.setitem(sys.modules, "fused_ssim", fused)
@@ -176,7 +176,7 @@ def test_the_fused_ssim_is_taken_on_a_gpu_where_it_is_installed(monkeypatch):
     assert chosen_ssim(torch.device("cuda")).name == "torch"
 
 
-def test_the_loss_is_that_of_the_example_mcmc(record):
+def test_the_loss_equals_that_of_the_mcmc_example(record):
     """0.8 L1 + 0.2 (1 - SSIM) + 0.01 mean opacity + 0.01 mean scale, of an image before black at degree 0."""
     training = begun(record, PlainRecipe(Schedule.of(30_000), 60, 0))
     batch = next(endless(loader_of(images_of(record), 0, CPU)))
@@ -197,7 +197,7 @@ def test_the_loss_is_that_of_the_example_mcmc(record):
 # --- its loop ---
 
 
-def test_means_learn_ever_slower_and_the_noise_goes_with_them(record, monkeypatch):
+def test_the_learning_rate_of_means_decays_and_the_noise_with_it(record, monkeypatch):
     """A hundredth at the end; the noise of a step takes the rate of the next, as the example's order has it."""
     told = []
 
@@ -215,7 +215,7 @@ def test_means_learn_ever_slower_and_the_noise_goes_with_them(record, monkeypatc
     assert training.optimizers["scales"].param_groups[0]["lr"] == 5e-3
 
 
-def test_it_learns_grows_to_its_cap_and_leaves_what_the_workflow_measures(record, tmp_path):
+def test_the_training_converges_reaches_its_cap_and_writes_a_measurable_model(record, tmp_path):
     splats = init_splats(record.points, record.points_rgb, seed=0)
     schedule = Schedule(220, sh_every=1, refine_start=0, refine_stop=220)
     before = as_model({name: value.detach().clone() for name, value in splats.items()}, record)

@@ -46,7 +46,7 @@ def training(config: Config, method: str) -> dict[str, Any]:
 # --- which methods there are ---
 
 
-def test_the_whole_and_every_variant_are_methods_with_every_seed():
+def test_the_full_method_and_every_variant_become_methods_with_every_seed():
     config = load({})
     assert list(config.ablated) == names() and len(config.ablated) == 27
     assert list(config.all_methods) == ["vanilla", "street", *names()]
@@ -67,7 +67,7 @@ LACKING = {
 
 @pytest.mark.parametrize("without", VARIANTS)
 @pytest.mark.parametrize("seed", [0, 2])
-def test_a_variant_is_trained_as_the_method_is_but_for_the_one_thing(without, seed):
+def test_a_variant_differs_from_the_method_in_one_setting_only(without, seed):
     """Every default variant changes something: one that did not would be compared with itself."""
     config = load({})
     street, variant = training(config, "street"), training(config, f"street-without-{without}-seed{seed}")
@@ -77,12 +77,12 @@ def test_a_variant_is_trained_as_the_method_is_but_for_the_one_thing(without, se
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_whole_is_the_method_itself_with_each_seed(seed):
+def test_the_full_method_is_unchanged_except_for_its_seed(seed):
     config = load({})
     assert training(config, f"street-seed{seed}") == training(config, "street") | {"random_seed": seed}
 
 
-def test_a_variants_overrides_are_laid_over_the_methods_own():
+def test_overrides_of_a_variant_are_merged_over_those_of_the_method():
     """Key by key; the method's own others stay, and the ablation's seeds come over a seed of the method's own."""
     mine = {
         "parts": ["background", "actors"],
@@ -101,13 +101,13 @@ def test_a_variants_overrides_are_laid_over_the_methods_own():
     assert config.methods["mine"].overrides == mine["overrides"], "the method itself stays as it is"
 
 
-def test_a_variant_goes_over_what_a_dataset_sets_for_itself():
+def test_a_variant_takes_precedence_over_dataset_settings():
     values = {"datasets": {"nuscenes": {"overrides": {"train": {"entropy_weight": 0.7, "iterations": 5}}}}}
     told = training(load(values), "street-without-entropy-seed1")
     assert (told["train.entropy_weight"], told["train.iterations"]) == (0.0, 5)
 
 
-def test_users_leave_variants_out_and_add_their_own():
+def test_users_can_drop_variants_and_add_their_own():
     mine = {"ablation": {"without": {"sky": None, "ssim": {"overrides": {"train": {"ssim_weight": 0.0}}}}}}
     defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
     config = load(merged(defaults, mine))
@@ -117,14 +117,14 @@ def test_users_leave_variants_out_and_add_their_own():
     assert training(config, "street-without-ssim-seed0")["train.ssim_weight"] == 0.0
 
 
-def test_a_methods_own_random_seed_is_that_of_its_training_alone():
+def test_the_random_seed_of_a_method_affects_its_training_only():
     config = load({"methods": {"vanilla": {}, "again": {"overrides": {"random_seed": 5}}}})
     assert (training(config, "again")["random_seed"], training(config, "vanilla")["random_seed"]) == (5, 0)
     assert for_scene(config, "0061").random_seed == 0
     assert stage_settings(config, "evaluate", "0061", "again") == stage_settings(config, "evaluate", "0061", "vanilla")
 
 
-def test_only_what_has_actors_takes_actors_and_only_what_is_held_to_depth_takes_depth():
+def test_only_methods_with_actors_read_actors_and_only_methods_with_depth_loss_read_depth():
     taken = {name: training_inputs(load({}), "0061", name) for name in names(seeds=[1])}
     for name, inputs in taken.items():
         expected = {"actors": "without-actors" not in name, "lidar_depth": "without-depth" not in name}
@@ -144,7 +144,7 @@ def refusal(values: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize("name", ["street-seed1", "street-without-sky_loss-seed2"])
-def test_a_method_called_like_a_variant_is_refused(name):
+def test_a_method_with_the_name_of_a_variant_is_refused(name):
     message = refusal({"methods": {"street": {}, name: {}}})
     assert name in message and "ablation" in message and "rename" in message
     assert name in load({"methods": {"vanilla": {}, name: {}}}).methods, "no such ablation, no such variant"
@@ -170,7 +170,7 @@ def test_a_method_called_like_a_variant_is_refused(name):
     ],
     ids=str,
 )
-def test_what_is_wrong_in_the_section_is_told_in_one_line(section, words):
+def test_errors_in_the_section_are_reported_in_one_line(section, words):
     message = refusal({"ablation": section})
     assert all(word in message for word in words), message
 
@@ -180,7 +180,7 @@ def plan(**values: Any) -> Plan:
 
 
 @pytest.mark.parametrize("target", ["results/a1/ablation.csv", "results/a1/ablation.json"])
-def test_a_config_without_the_method_is_valid_until_its_ablation_is_asked_for(target):
+def test_a_config_without_the_method_is_valid_until_its_ablation_is_requested(target):
     made = plan(methods={"vanilla": {}, "mine": {}})
     assert made.config.ablated == {} and list(made.config.all_methods) == ["vanilla", "mine"]
     made.refuse_unknown(["all", "results/a1/metrics.json", "results/a1/mine/eval.json"])
@@ -199,7 +199,7 @@ def told_to_drop(made: Plan, target: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("target", ["results/a1/ablation.csv", "results/a1/ablation.json"])
-def test_variants_that_take_nothing_out_are_refused_with_what_drops_them(target):
+def test_variants_without_effect_are_refused_with_the_setting_that_drops_them(target):
     """Vanilla has no actors, and is held neither to LiDAR's depth nor to masks of the sky: there is its sky alone."""
     of_vanilla = {"ablation": {"of": "vanilla"}}
     idle = [name for name in VARIANTS if name != "sky"]
@@ -211,12 +211,12 @@ def test_variants_that_take_nothing_out_are_refused_with_what_drops_them(target)
     assert list(made.config.ablated) == names(of="vanilla", without=["sky"])
 
 
-def test_variants_that_take_nothing_out_hinder_nothing_but_the_ablation():
+def test_variants_without_effect_block_the_ablation_only():
     files = ("metrics.json", "street/eval.json", "vanilla-without-sky-seed0/eval.json")
     plan(ablation={"of": "vanilla"}).refuse_unknown(["all", *(f"results/a1/{file}" for file in files)])
 
 
-def test_what_a_variant_takes_out_is_judged_by_what_holds_on_the_scene():
+def test_the_effect_of_a_variant_depends_on_the_settings_of_the_scene():
     """Where the drive's settings have no loss of entropy the method is without it anyway."""
     free = {"scenes": ["a1"], "overrides": {"train": {"entropy_weight": 0.0}}}
     made = Plan({"datasets": {"a": free, "b": {"scenes": ["b1"]}}}, str(REPOSITORY))
@@ -234,7 +234,7 @@ def test_what_a_variant_takes_out_is_judged_by_what_holds_on_the_scene():
         ((2,), (), "it-seed2"),
     ],
 )
-def test_names_of_methods_are_spelled_as_a_shell_expands_them(seeds, without, expected):
+def test_method_names_are_written_as_shell_braces(seeds, without, expected):
     job = AblationJob(of="it", seeds=seeds, without=without)
     assert job.name_pattern == expected
     command = ["bash", "-c", f"echo {expected.replace(', ', ' ')}"]
@@ -242,7 +242,7 @@ def test_names_of_methods_are_spelled_as_a_shell_expands_them(seeds, without, ex
     assert sorted(expanded) == sorted(job.method(name, seed) for name in (None, *without) for seed in seeds)
 
 
-def test_a_variant_that_there_is_none_of_is_refused_with_those_there_are():
+def test_an_unknown_variant_is_refused_with_a_list_of_known_ones():
     made = plan(ablation={"seeds": [3, 5]})
     made.refuse_unknown(["results/a1/street-without-sky-seed3/eval.json", "results/a1/street-seed5/original.mp4"])
     for unknown in ("street-without-sky-seed0", "street-without-skies-seed3", "street-without-sky"):
@@ -253,7 +253,7 @@ def test_a_variant_that_there_is_none_of_is_refused_with_those_there_are():
         assert "street-seed{3,5}" in message and "street-without-{actors,track_correction," in message
 
 
-def test_variants_can_be_filmed_and_edited_as_far_as_they_have_actors():
+def test_variants_can_be_filmed_and_those_with_actors_edited():
     made = plan()
     made.refuse_unknown(["results/a1/street-without-sky-seed0/parts.mp4"])
     with pytest.raises(ConfigError, match=r"street-without-actors-seed0.*those do: street$"):
@@ -263,7 +263,7 @@ def test_variants_can_be_filmed_and_edited_as_far_as_they_have_actors():
 # --- what everything else is told ---
 
 
-def test_nothing_else_knows_of_the_ablation():
+def test_other_stages_do_not_depend_on_the_ablation():
     """Settings of all stages, films, edits and what a report expects are the same without any."""
     edits = {"demo": str(REPOSITORY / "presets/edits/demo.yaml")}
     datasets = {"a": {"scenes": ["a1", "demo"], "edits": edits}}
@@ -315,7 +315,7 @@ def evals(whole=WHOLE, sky=SKY, depth=DEPTH, job=JOB) -> dict[str, dict[str, Any
     return {f"{stem}-seed{seed}": found[i] for stem, found in stems.items() for i, seed in enumerate(job.seeds)}
 
 
-def test_a_row_holds_means_spreads_and_differences_paired_by_seed():
+def test_a_row_has_means_standard_deviations_and_differences_paired_by_seed():
     """Static: 24, 25, 26 with the sky and 23 thrice without: -1, -2, -3; mean -2, its standard error 1 / sqrt(3)."""
     record = ablation(evals(), JOB)
     assert (record["scene"], record["of"], record["seeds"], record["protocol"]) == (
@@ -350,7 +350,7 @@ def still() -> dict[str, Any]:
     return ablation(evals(runs, runs, runs), JOB)
 
 
-def test_where_nothing_moves_its_figures_are_null(still, tmp_path):
+def test_moving_figures_are_null_on_a_static_scene(still, tmp_path):
     for row in still["rows"]:
         for group in ("interpolation", "extrapolation"):
             assert row[group]["moving_vehicle"] is row[group]["gap_db"] is None
@@ -363,7 +363,7 @@ def test_where_nothing_moves_its_figures_are_null(still, tmp_path):
 
 
 @pytest.mark.parametrize("key", ["protocol", "scene", "dataset"])
-def test_what_was_measured_otherwise_is_not_compared(key):
+def test_results_of_different_protocols_are_not_compared(key):
     other = {**SKY[1], key: {**PROTOCOL, "width": 320} if key == "protocol" else "other"}
     with pytest.raises(ResultError) as failure:
         ablation(evals(sky=[SKY[0], other, SKY[2]]), JOB)
@@ -420,7 +420,7 @@ def test_the_markdown_is_a_table_ready_for_the_documentation():
     assert "beyond" not in text.lower(), "a group that was not measured has no table"
 
 
-def test_both_groups_have_a_table_where_both_were_measured(still):
+def test_each_measured_group_has_a_table(still):
     text = markdown(still)
     between, beyond = tables(text)
     assert text.index("Between training frames") < text.index("Beyond the last training frame")
@@ -452,7 +452,7 @@ def planned_files(copy: WorkflowCopy, target: str, rule: str) -> dict[str, list[
 
 @pytest.mark.workflow
 @pytest.mark.xdist_group("ablation")
-def test_asking_for_it_plans_exactly_the_trainings_of_all_variants_with_all_seeds(copy):
+def test_the_target_plans_one_training_per_variant_and_seed(copy):
     copy.write_config(yaml.safe_dump({key: value for key, value in copy.config.items() if key != "ablation"}))
     try:
         trainings = planned_files(copy, "results/0001/ablation.csv", "train")
@@ -475,7 +475,7 @@ def test_asking_for_it_plans_exactly_the_trainings_of_all_variants_with_all_seed
 
 @pytest.mark.workflow
 @pytest.mark.xdist_group("ablation")
-def test_it_runs_to_a_table_and_fails_in_one_line_where_protocols_differ(copy):
+def test_the_ablation_runs_to_a_table_and_fails_in_one_line_if_protocols_differ(copy):
     done = copy.run("results/0001/ablation.csv")
     assert done.returncode == 0, done.stdout
     methods = names(seeds=[2], without=["sky"], of="vanilla")

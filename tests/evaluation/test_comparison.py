@@ -14,7 +14,7 @@ from drivesplat.evaluation.comparison import (
 )
 
 
-def test_differences_are_of_trainings_with_one_seed():
+def test_differences_are_paired_by_seed():
     """What all trainings of a seed have in common cancels: the spread of the figures is not that of the difference."""
     assert paired_difference([10.0, 20.0, 30.0], [11.0, 21.0, 31.0]) == {
         "mean": -1.0, "standard_error": 0.0, "by_seed": [-1.0] * 3
@@ -28,7 +28,7 @@ def test_a_single_seed_has_no_standard_error():
     assert summarize([1.0]) == {"mean": 1.0, "min": 1.0, "max": 1.0, "by_seed": [1.0]}
 
 
-def test_null_figures_count_in_no_mean_and_no_difference():
+def test_null_figures_are_left_out_of_means_and_differences():
     assert summarize([None, None]) is None and paired_difference([None, 1.0], [1.0, None]) is None
     assert summarize([0.0, 2.0])["mean"] == 1.0, "0 is not null"
     assert paired_difference([1.0, 4.0], [1.0, 2.0])["mean"] == 1.0
@@ -42,7 +42,7 @@ def group(static: float | None, gap: float | None = None) -> dict:
     return {"static": None if static is None else {"psnr": static}, "moving_vehicle": None, "gap_db": gap}
 
 
-def test_a_run_that_is_missing_counts_in_no_figure_and_no_difference():
+def test_a_missing_run_is_left_out_of_figures_and_differences():
     """The second seed has no result, the third no static pixels beyond the last training frame."""
     runs = [
         {"interpolation": group(20.0), "extrapolation": group(10.0)},
@@ -61,19 +61,19 @@ def test_a_run_that_is_missing_counts_in_no_figure_and_no_difference():
     assert compare_runs(runs, None, PSNRS)["interpolation"]["difference"] == dict.fromkeys(PSNRS)
 
 
-def test_keys_lead_into_records_as_far_as_these_go():
+def test_a_path_beyond_a_record_gives_null():
     runs = [{"a": {"b": 0.0}}, {"a": None}, {}, None, {"a": {}}]
     assert values_at(runs, "a", "b") == [0.0, None, None, None, None]
     assert values_at([{"gaussians": 5}, None], "gaussians") == [5, None]
 
 
-def test_a_group_is_measured_where_any_row_has_a_figure_of_it():
+def test_a_group_counts_as_measured_if_any_row_has_a_figure():
     runs = [{"interpolation": group(None), "extrapolation": group(psnr)} for psnr in (None, 0)]
     rows = [compare_runs([run], None, PSNRS) for run in runs]
     assert measured_groups(rows, PSNRS) == ["extrapolation"] and measured_groups(rows[:1], PSNRS) == []
 
 
-def test_figures_are_spelled_with_spread_and_error():
+def test_figures_are_formatted_with_standard_deviation_and_error():
     found = {"mean": 25.04, "min": 24.0, "max": 26.26}
     assert format_spread(found) == "25.0 (24.0 to 26.3)" and format_spread(found, digits=2) == "25.04 (24.00 to 26.26)"
     assert format_difference({"mean": 0.5, "standard_error": 0.123}) == "+0.50 ± 0.12"

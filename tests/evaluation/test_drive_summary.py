@@ -27,7 +27,7 @@ def record_of(recording: PreparedDrive) -> dict:
     return summarize_drive(recording, "CAM_FRONT", measured_images(recording.record, "CAM_FRONT"))
 
 
-def test_held_out_images_are_as_far_from_training_images_as_the_car_came_between(tiny_scene):
+def test_from_training_m_is_the_distance_driven_since_the_nearest_training_image(tiny_scene):
     """At 4 m/s, images every quarter of a second: those a quarter before 2, 6 and 8 are trained on, since cameras fire
     35 ms early, those a quarter after are not; 9 comes a second and a quarter after the last."""
     record = record_of(recording_of(tiny_scene))
@@ -50,7 +50,7 @@ def test_images_of_other_cameras_do_not_count_as_near(tiny_scene):
     assert record_of(only_held_out)["interpolation"]["from_training_m"] is None
 
 
-def test_brightness_is_that_of_the_held_out_images_and_flat_psnr_that_of_their_static_pixels(tiny_scene):
+def test_brightness_covers_held_out_images_and_flat_psnr_their_static_pixels(tiny_scene):
     recording = recording_of(tiny_scene)
     measured = measured_images(recording.record, "CAM_FRONT")
     record = record_of(recording)
@@ -66,7 +66,7 @@ def test_brightness_is_that_of_the_held_out_images_and_flat_psnr_that_of_their_s
         assert record[group]["flat_psnr"] == pytest.approx(-10 * np.log10(flat))
 
 
-def test_a_group_without_images_and_images_of_one_colour_are_none(tiny_scene, tmp_path):
+def test_an_empty_group_and_images_of_one_colour_give_none(tiny_scene, tmp_path):
     Image.new("RGB", (96, 54), (0, 0, 0)).save(tmp_path / "black.png")
     frames = (dataclasses.replace(frame, image_path=str(tmp_path / "black.png")) for frame in tiny_scene.frames)
     black = dataclasses.replace(tiny_scene, frames=tuple(frames))

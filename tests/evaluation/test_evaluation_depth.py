@@ -55,7 +55,7 @@ def test_the_figure_is_the_median_over_all_pixels_of_the_group():
 @pytest.mark.parametrize(
     ("count", "summary"), [(None, {}), (0, {"depth": None}), (MIN_REGION_PIXELS - 1, {"depth": None})]
 )
-def test_too_few_pixels_are_no_figure_and_no_sweep_is_no_entry(count, summary):
+def test_too_few_pixels_give_null_and_no_sweep_gives_no_entry(count, summary):
     errors = DepthErrors()
     if count is not None:
         columns = np.arange(count)
@@ -67,7 +67,7 @@ def held_out_recording(root: Path) -> PreparedDrive:
     return recording_of(scene_at(root), **HELD_OUT)
 
 
-def test_images_are_held_to_the_sweep_of_their_own_key_frame(tiny_root):
+def test_images_are_compared_with_the_sweep_of_their_own_key_frame(tiny_root):
     """To what a training would be held to, if nothing were held out. Only key frames that are held out are measured."""
     recording = held_out_recording(tiny_root)
     everything = lidar_depths(recording.scene, job(NOTHING_HELD_OUT))
@@ -81,7 +81,7 @@ def test_images_are_held_to_the_sweep_of_their_own_key_frame(tiny_root):
             np.testing.assert_array_equal(values, vars(everything[index])[key])
 
 
-def test_images_without_a_sweep_of_their_own_are_held_to_none(tiny_root, tmp_path):
+def test_images_without_their_own_sweep_are_not_compared(tiny_root, tmp_path):
     """Not to that of another key frame, held out or not, half a second away."""
     root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
     (root / "samples/LIDAR_TOP/0001__0008.pcd.bin").unlink()
@@ -89,7 +89,7 @@ def test_images_without_a_sweep_of_their_own_are_held_to_none(tiny_root, tmp_pat
     assert [index // 2 for index in sorted(depths)] == [2, 6, 9]
 
 
-def test_groups_have_the_figure_beside_their_regions(tiny_root):
+def test_groups_include_the_depth_error(tiny_root):
     """Of a disc 5 metres before the first held-out image, known to be 4 metres away, and one of which nothing is."""
     recording = held_out_recording(tiny_root)
     index = 4
@@ -103,7 +103,7 @@ def test_groups_have_the_figure_beside_their_regions(tiny_root):
     assert "depth" not in groups["extrapolation"]
 
 
-def test_depth_is_rendered_beside_the_same_image():
+def test_rendering_depth_does_not_change_the_image():
     model = SplatModel([round_gaussians([[6.0, 0.0, 0.0]], 0.5, 0.9)], None).requires_grad_(False)
     view = looking_at([6.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     image, depth = rendered_with_depth(model, view)

@@ -8,6 +8,6 @@ from drivesplat.evaluation import comparison, metrics
 
 
 @pytest.mark.parametrize("module", [comparison, metrics], ids=lambda module: module.__name__)
-def test_worked_examples_give_what_they_show(module):
+def test_worked_examples_are_correct(module):
     result = doctest.testmod(module)
     assert result.attempted and not result.failed

@@ -55,7 +55,7 @@ def images(seed: int, height: int = 70, width: int = 90) -> tuple[np.ndarray, np
     return np.clip(truth + 0.2 * rng.normal(size=truth.shape), 0, 1), truth
 
 
-def test_identical_images_have_no_distance(distance):
+def test_identical_images_have_distance_zero(distance):
     _, truth = images(0)
     found = distance(truth, truth)
     assert found.shape == (70, 90)
@@ -63,13 +63,13 @@ def test_identical_images_have_no_distance(distance):
 
 
 @pytest.mark.parametrize(("height", "width"), [(70, 90), (65, 64)])
-def test_unlike_images_have_a_distance_at_every_pixel(distance, height, width):
+def test_different_images_have_a_positive_distance_at_every_pixel(distance, height, width):
     found = distance(*images(1, height, width))
     assert found.shape == (height, width)
     assert (found > 0).all() and np.isfinite(found).all()
 
 
-def test_the_map_is_that_of_lpips_with_these_weights(distance, alexnet):
+def test_the_map_equals_that_of_the_lpips_package(distance, alexnet):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reference = lpips.LPIPS(net="alex", spatial=True, pnet_rand=True, verbose=False)
@@ -85,7 +85,7 @@ def test_the_map_is_that_of_lpips_with_these_weights(distance, alexnet):
     np.testing.assert_allclose(distance(image, truth), expected[0, 0], rtol=1e-5, atol=1e-6)
 
 
-def test_the_random_start_of_the_network_leaves_no_trace(distance, backbone):
+def test_lpips_does_not_depend_on_the_random_initialisation(distance, backbone):
     image, truth = images(3)
     np.testing.assert_array_equal(lpips_map(backbone, CPU)(image, truth), distance(image, truth))
 
@@ -125,7 +125,7 @@ def broken_backbone(kind: str, path: Path, alexnet: dict[str, torch.Tensor]) -> 
     "kind",
     ["missing", "empty", "a web page", "truncated", "another network", "other shapes", "a list", "malicious"],
 )
-def test_what_is_no_alexnet_is_a_reason_in_one_line_and_nothing_of_it_runs(kind, tmp_path, alexnet):
+def test_an_invalid_backbone_gives_a_reason_in_one_line_and_is_not_executed(kind, tmp_path, alexnet):
     path = tmp_path / "alexnet.pth"
     broken_backbone(kind, path, alexnet)
     reason, made = load_lpips({"file": str(path), "sha256": "", "unavailable": None}, CPU)
@@ -134,12 +134,12 @@ def test_what_is_no_alexnet_is_a_reason_in_one_line_and_nothing_of_it_runs(kind,
     assert not (tmp_path / "executed").exists()
 
 
-def test_a_wrong_backbone_is_an_error_that_names_the_rule_to_run(tmp_path):
+def test_an_invalid_backbone_raises_an_error_with_the_rule_to_run(tmp_path):
     with pytest.raises(ResultError, match=r"alexnet\.pth.*lpips_backbone"):
         lpips_map(tmp_path / "alexnet.pth", CPU)
 
 
-def test_a_good_backbone_is_a_map_and_no_reason(backbone):
+def test_a_valid_backbone_gives_a_map_and_no_reason(backbone):
     reason, made = load_lpips({"file": str(backbone), "sha256": "", "unavailable": None}, CPU)
     assert reason is None
     assert made(*images(4)).shape == (70, 90)
@@ -152,7 +152,7 @@ def test_a_good_backbone_is_a_map_and_no_reason(backbone):
         pytest.param({"file": "x", "sha256": None, "unavailable": "no network"}, "no network", id="not fetched"),
     ],
 )
-def test_without_a_backbone_there_is_the_reason_alone(record, reason):
+def test_without_a_backbone_only_the_reason_is_returned(record, reason):
     assert load_lpips(record, CPU) == (reason, None)
 
 
@@ -244,7 +244,7 @@ def settings_of(url: str, sha256: str = DIGEST, timeout_s: float = 5.0) -> Lpips
 
 @pytest.mark.parametrize("digits", [8, 12, 64])
 @pytest.mark.parametrize("length", [None, -1])
-def test_a_good_file_is_fetched_and_kept(tmp_path, digits, length):
+def test_a_valid_file_is_fetched_and_kept(tmp_path, digits, length):
     path = tmp_path / "lpips" / "alexnet.pth"
     with served(sends(CONTENT, length)) as url:
         record = provide_backbone(settings_of(url, DIGEST[:digits]), path)
@@ -274,7 +274,7 @@ def refused(record: dict, path: Path) -> str:
         pytest.param(resets_halfway, "", id="connection reset"),
     ],
 )
-def test_a_bad_answer_is_a_reason_and_nothing_is_kept(tmp_path, answer, why):
+def test_an_invalid_response_gives_a_reason_and_leaves_no_file(tmp_path, answer, why):
     path = tmp_path / "alexnet.pth"
     with served(answer) as url:
         record = provide_backbone(settings_of(url), path)
@@ -283,7 +283,7 @@ def test_a_bad_answer_is_a_reason_and_nothing_is_kept(tmp_path, answer, why):
 
 
 @pytest.mark.parametrize("answer", [says_nothing, stops_halfway])
-def test_a_silent_server_is_not_waited_for(tmp_path, answer):
+def test_a_silent_server_times_out(tmp_path, answer):
     path = tmp_path / "alexnet.pth"
     began = time.monotonic()
     with served(answer) as url:
@@ -292,25 +292,25 @@ def test_a_silent_server_is_not_waited_for(tmp_path, answer):
     assert "timed out" in refused(record, path)
 
 
-def test_no_server_is_a_reason(tmp_path):
+def test_an_unreachable_server_gives_a_reason(tmp_path):
     path = tmp_path / "alexnet.pth"
     assert "refused" in refused(provide_backbone(settings_of(closed_port()), path), path)
 
 
 @pytest.mark.parametrize("url", ["nowhere", "http://", "http://127.0.0.1:none/x", "file:///nowhere/alexnet.pth"])
-def test_an_address_that_is_none_is_a_reason(tmp_path, url):
+def test_an_invalid_address_gives_a_reason(tmp_path, url):
     path = tmp_path / "alexnet.pth"
     assert refused(provide_backbone(settings_of(url), path), path)
 
 
-def test_a_file_that_a_user_put_there_is_used_without_the_network(tmp_path):
+def test_an_existing_file_is_used_without_network_access(tmp_path):
     path = tmp_path / "alexnet.pth"
     path.write_bytes(CONTENT)
     record = provide_backbone(settings_of(closed_port(), DIGEST[:8]), path)
     assert record == {"file": str(path), "sha256": DIGEST, "unavailable": None}
 
 
-def test_a_wrong_file_that_a_user_put_there_is_named_and_left_alone(tmp_path):
+def test_an_invalid_existing_file_is_named_and_kept(tmp_path):
     path = tmp_path / "alexnet.pth"
     path.write_bytes(b"something else")
     record = provide_backbone(settings_of(closed_port()), path)
@@ -319,7 +319,7 @@ def test_a_wrong_file_that_a_user_put_there_is_named_and_left_alone(tmp_path):
     assert path.read_bytes() == b"something else"
 
 
-def test_a_file_can_be_put_there_after_a_failed_fetch(tmp_path):
+def test_a_file_can_be_added_by_hand_after_a_failed_fetch(tmp_path):
     path = tmp_path / "alexnet.pth"
     assert provide_backbone(settings_of(closed_port()), path)["unavailable"]
     path.write_bytes(CONTENT)

@@ -46,11 +46,11 @@ def test_psnr_of_a_squared_error(error, expected):
     assert psnr(error) == pytest.approx(expected, abs=1e-4)
 
 
-def test_psnr_of_no_error_is_none():
+def test_psnr_of_zero_error_is_none():
     assert psnr(0.0) is None
 
 
-def test_a_constant_offset_has_the_closed_forms_psnr():
+def test_the_psnr_of_a_constant_offset_equals_the_closed_form():
     truth = np.full((HEIGHT, WIDTH, 3), 0.4)
     result = measured((truth + 0.1, truth, labels_of()))
     assert result["all"]["psnr"] == pytest.approx(20.0)
@@ -58,7 +58,7 @@ def test_a_constant_offset_has_the_closed_forms_psnr():
     assert result["all"]["pixels"] == HEIGHT * WIDTH
 
 
-def test_psnr_is_skimages():
+def test_psnr_equals_that_of_skimage():
     image, truth = pair(0)
     expected = peak_signal_noise_ratio(truth, image, data_range=1.0)
     assert measured((image, truth, labels_of()))["all"]["psnr"] == pytest.approx(expected)
@@ -89,14 +89,14 @@ def test_colours_are_not_quantised():
 
 
 @pytest.mark.parametrize(("pixels", "kept"), [(0, False), (999, False), (1000, True)])
-def test_a_region_of_under_a_thousand_pixels_is_null(pixels, kept):
+def test_a_region_of_fewer_than_1000_pixels_is_null(pixels, kept):
     record = measured((*pair(2), labels_of(moving_car=pixels)))["moving_vehicle"]
     assert (record is not None) is kept
     if kept:
         assert record["pixels"] == pixels
 
 
-def test_the_thousand_pixels_are_counted_over_all_frames():
+def test_the_minimum_of_1000_pixels_applies_to_all_frames_together():
     frames = [(*pair(seed), labels_of(moving_human=400)) for seed in range(3)]
     assert measured(*frames[:2])["moving_human"] is None
     assert measured(*frames)["moving_human"]["pixels"] == 1200
@@ -117,7 +117,7 @@ def test_pooling_weighs_pixels_not_frames():
     assert record["psnr"] == pytest.approx(-10 * math.log10((1500 * 0.01 + 300 * 0.04) / 1800))
 
 
-def test_a_frame_with_under_a_hundred_pixels_of_a_region_is_not_in_its_frame_mean():
+def test_a_frame_with_fewer_than_100_pixels_of_a_region_is_left_out_of_its_frame_mean():
     truth = np.full((HEIGHT, WIDTH, 3), 0.3)
     frames = [
         (truth + 0.1, truth, labels_of(moving_car=1200)),
@@ -134,7 +134,7 @@ def fake_lpips(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.abs(image - truth).max(axis=2) + 0.25 * truth[..., 0]
 
 
-def test_every_region_pools_what_a_concatenation_of_its_pixels_gives():
+def test_pooled_figures_equal_those_of_the_concatenated_pixels():
     rng = np.random.default_rng(3)
     frames = [(*pair(seed), rng.integers(0, len(LABELS), (HEIGHT, WIDTH)).astype(np.uint8)) for seed in range(4)]
     result = measured(*frames, lpips_map=fake_lpips)
@@ -159,7 +159,7 @@ def test_every_region_pools_what_a_concatenation_of_its_pixels_gives():
         assert result[region]["pixels"] == len(perceptual)
 
 
-def test_regions_are_the_protocols():
+def test_regions_follow_the_protocol():
     expected = {"all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human", "gap_db"}
     assert measured((*pair(4), labels_of())).keys() == expected
 
@@ -185,7 +185,7 @@ def test_a_pixel_counts_in_the_regions_of_its_label(label, regions):
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.3])
-def test_the_ssim_map_is_skimages_full_map(noise):
+def test_the_ssim_map_equals_that_of_skimage(noise):
     image, truth = pair(6, noise)
     _, expected = structural_similarity(
         image, truth, data_range=1.0, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
@@ -198,7 +198,7 @@ def test_without_a_map_lpips_is_null():
     assert measured((*pair(7), labels_of()))["all"]["lpips"] is None
 
 
-def test_the_images_of_a_caller_are_left_as_they_were():
+def test_the_input_images_are_not_modified():
     image, truth = pair(8)
     image = image * 2.0 - 0.5
     before = image.copy(), truth.copy()
@@ -207,7 +207,7 @@ def test_the_images_of_a_caller_are_left_as_they_were():
     np.testing.assert_array_equal(truth, before[1])
 
 
-def test_no_frame_at_all_is_null_everywhere():
+def test_without_frames_all_figures_are_null():
     assert set(measured().values()) == {None}
 
 
@@ -226,7 +226,7 @@ def test_no_figure_is_nan_or_infinite(frames):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_rendering_that_is_no_number_never_passes_for_a_good_one(bad):
+def test_a_rendering_with_nan_or_infinity_never_scores_well(bad):
     """It is refused, or costs what the worst colour would cost; it is neither identical nor NaN."""
     image, truth = pair(10)
     image[3, 4, 1] = bad
@@ -258,7 +258,7 @@ def test_gap_is_static_minus_moving(static, moving, vehicle, expected):
     assert gap_db({"static": static, "moving_vehicle": moving, "vehicle": vehicle}) == expected
 
 
-def test_the_summarys_gap_is_that_of_its_regions():
+def test_the_gap_of_the_summary_equals_that_of_its_regions():
     truth = np.full((HEIGHT, WIDTH, 3), 0.3)
     image = truth + 0.01
     image.reshape(-1, 3)[:1000] = 0.4

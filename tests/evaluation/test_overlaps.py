@@ -50,12 +50,12 @@ def test_the_front_camera_shares_both_edges_and_not_its_middle(front, key_frame)
     assert not middle.any() and seen[size[1] // 2, 2] and seen[size[1] // 2, -3] and 0.1 < seen.mean() < 0.5
 
 
-def test_a_camera_that_looks_the_other_way_shares_nothing(tmp_path):
+def test_cameras_in_opposite_directions_do_not_overlap(tmp_path):
     recording = recording_of(rig_drive(tmp_path, ("CAM_FRONT", "CAM_BACK"), 2), every_nth=0, offset=0, last_block=0)
     assert not any(seen_by_others(recording.record, index).any() for index in range(4))
 
 
-def test_static_pixels_fall_into_two_parts(front):
+def test_static_pixels_are_split_by_overlap(front):
     index = image_of(front, "CAM_FRONT", 2)
     static = np.random.default_rng(1).random(front.labels(index).shape) < 0.5
     parts = overlap_masks(front.record, index, static)

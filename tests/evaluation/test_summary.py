@@ -37,17 +37,17 @@ def test_each_group_is_a_sentence_with_its_gap():
     assert "results/demo/metrics.json" in figures and figures.endswith(" results/demo")
 
 
-def test_a_group_that_is_off_is_not_spoken_of():
+def test_a_disabled_group_is_not_mentioned():
     lines = sentences({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}, "m.json")
     assert not any("beyond" in line for line in lines)
 
 
-def test_a_scene_where_nothing_moves_has_no_gap():
+def test_a_static_scene_has_no_gap():
     lines = sentences({"methods": {"vanilla": method(interpolation=group(27.1, None))}}, "m.json")
     assert lines[0].endswith("static 27.1 dB, no moving vehicle to compare with")
 
 
-def test_what_was_measured_against_truth_is_told():
+def test_figures_against_ground_truth_are_reported():
     lateral = {"2.0": {"all": {"psnr": 21.5}, "static": {"psnr": 22.7}}}
     before = {"box": {"psnr": 14.3}, "outside": {"psnr": 25.9}}
     removal = {"box": {"psnr": 17.0}, "outside": {"psnr": 26.2}, "not_removed": before}
@@ -58,7 +58,7 @@ def test_what_was_measured_against_truth_is_told():
     assert expected in lines
 
 
-def test_what_there_is_to_look_at_is_named_last_by_method(tmp_path):
+def test_existing_films_and_images_are_listed_last_by_method(tmp_path):
     """Of the files that are there; of a method that has none nothing is said."""
     made = {"vanilla": ("viewer.html", "original.mp4", "train.json", "removal.png"), "plain": ("ghost_panel.png",)}
     for name, files in {**made, "bare": ("train.json",)}.items():
@@ -76,14 +76,14 @@ def test_what_there_is_to_look_at_is_named_last_by_method(tmp_path):
     assert sum("To look at" in line for line in lines) == 2
 
 
-def test_truth_over_too_few_pixels_is_not_spoken_of():
+def test_ground_truth_figures_over_too_few_pixels_are_not_mentioned():
     removal = {"box": None, "outside": {"psnr": 20.0}, "not_removed": {"box": None, "outside": {"psnr": 20.0}}}
     metrics = {"methods": {"vanilla": {**method(), "lateral": {"2.0": {"static": None}}, "removal": removal}}}
     lines = sentences(metrics, "m.json")
     assert not any("truth" in line or "removed" in line for line in lines)
 
 
-def test_the_command_line_prints_it_and_names_a_missing_file(tmp_path):
+def test_the_command_prints_the_summary_and_names_a_missing_file(tmp_path):
     file = tmp_path / "metrics.json"
     command = [sys.executable, "-m", "drivesplat.evaluation.summary", str(file)]
     absent = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)

@@ -161,7 +161,7 @@ def ego_to_global(tables, sample_data: str) -> np.ndarray:
     return matrix
 
 
-def test_the_model_is_looked_at_from_two_metres_to_the_own_cars_left(known, demo_tables):
+def test_the_lateral_view_is_two_metres_to_the_left_of_the_ego_vehicle(known, demo_tables):
     model = Watched()
     lateral_metrics(model, known, "CAM_FRONT", None, CPU)
     assert len(model.views) == 6
@@ -190,7 +190,7 @@ def nudged(known: DriveTruth, seed: int) -> DriveTruth:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_where_recorded_poses_are_off_the_view_is_two_metres_to_the_left_of_the_recorded_one(known, demo_tables, seed):
+def test_with_pose_errors_the_lateral_view_is_relative_to_the_recorded_pose(known, demo_tables, seed):
     """To the left as the camera is mounted: it moves along the own car's y axis, and does not turn."""
     model, off = Watched(), nudged(known, seed)
     lateral_metrics(model, off, "CAM_FRONT", None, CPU)
@@ -205,7 +205,7 @@ def test_where_recorded_poses_are_off_the_view_is_two_metres_to_the_left_of_the_
         assert np.abs(view.camera_to_world.numpy() - true_pose).max() > 0.05, "the true view is elsewhere"
 
 
-def test_where_recorded_poses_are_off_what_moves_is_left_out_where_it_is_seen_from_there(known):
+def test_with_pose_errors_dynamic_boxes_are_masked_in_the_rendered_view(known):
     """Static pixels are those outside the boxes in the view that is rendered."""
     model, off = Watched(), nudged(known, 0)
     result = lateral_metrics(model, off, "CAM_FRONT", None, CPU)["2.0"]["static"]
@@ -236,7 +236,7 @@ def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known):
     assert result["box"]["pixels"] + result["outside"]["pixels"] == 6 * 160 * (90 - OWN_CAR_ROWS)
 
 
-def test_the_own_cars_pixels_are_neither_of_the_removals_box_nor_outside_of_it(known, tmp_path):
+def test_pixels_of_the_ego_vehicle_are_neither_inside_nor_outside_the_removed_box(known, tmp_path):
     """The own car's body hides all below the middle of the leading car's box in the first key frame."""
     frame = front_frames(known)[0][0]
     rows = np.flatnonzero(rays_meet(leading_box(known, frame), frame.camera_to_world, frame).any(axis=1))
@@ -283,7 +283,7 @@ def unremoved(model: SplatModel, known: DriveTruth) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("knows", [False, True])
-def test_removing_a_car_that_lies_in_its_box_leaves_what_would_be_there_without_it(known, knows):
+def test_removing_a_car_equals_a_model_without_it(known, knows):
     """By box or by its own Gaussians: the figures are those of a model that never had the car, and better."""
     model = flat_model(parts=[Riding(known, knows)])
     removed = removal_metrics(model, known, "CAM_FRONT", MARGIN, None, CPU)
@@ -295,7 +295,7 @@ def test_removing_a_car_that_lies_in_its_box_leaves_what_would_be_there_without_
 
 
 @pytest.mark.parametrize("knows", [False, True])
-def test_what_the_removal_is_to_beat_are_the_same_pixels_of_the_model_as_it_is(known, knows):
+def test_the_removal_baseline_uses_the_same_pixels_of_the_unedited_model(known, knows):
     model = flat_model(parts=[Riding(known, knows)])
     removed = removal_metrics(model, known, "CAM_FRONT", MARGIN, None, CPU)
     before, by_hand = removed["not_removed"], unremoved(model, known)
@@ -307,12 +307,12 @@ def test_what_the_removal_is_to_beat_are_the_same_pixels_of_the_model_as_it_is(k
     assert before["box"]["psnr"] < removed["box"]["psnr"] - 3.0
 
 
-def test_where_nothing_is_removed_there_is_nothing_to_beat(known):
+def test_without_a_removal_there_is_no_baseline(known):
     result = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
     assert result.pop("not_removed") == result
 
 
-def test_what_lies_beside_the_box_is_not_removed_but_by_its_own_part(known):
+def test_gaussians_outside_the_box_are_removed_only_by_their_part(known):
     """The same Gaussians three metres to the car's left."""
     by_box, by_actor = (
         removal_metrics(flat_model(parts=[Riding(known, knows, beside=3.0)]), known, "CAM_FRONT", MARGIN, None, CPU)
@@ -323,7 +323,7 @@ def test_what_lies_beside_the_box_is_not_removed_but_by_its_own_part(known):
     assert by_box["outside"]["psnr"] != pytest.approx(never["outside"]["psnr"], abs=0.05)
 
 
-def test_the_margin_decides_on_gaussians_near_the_box(known):
+def test_gaussians_near_the_box_are_removed_within_the_margin(known):
     """Gaussians 0.3 m over the roof go with a margin of 0.5 m alone."""
     frame = front_frames(known)[0][0]
     box = leading_box(known, frame)
@@ -335,7 +335,7 @@ def test_the_margin_decides_on_gaussians_near_the_box(known):
 
 
 @pytest.mark.parametrize("camera", ["CAM_BACK", "CAM_LEFT"])
-def test_of_another_camera_there_is_no_truth(known, camera):
+def test_other_cameras_have_no_ground_truth(known, camera):
     assert lateral_metrics(flat_model(), known, camera, None, CPU) is None
     assert removal_metrics(flat_model(), known, camera, MARGIN, None, CPU) is None
 
@@ -355,19 +355,19 @@ def job_of(camera: str, synthetic: bool = True) -> EvaluateJob:
     ("has_truth", "camera", "keys"),
     [(True, "CAM_FRONT", {"lateral", "removal"}), (True, "CAM_BACK", set()), (False, "CAM_FRONT", set())],
 )
-def test_figures_against_truth_exist_only_where_truth_does(known, has_truth, camera, keys):
+def test_ground_truth_figures_require_ground_truth(known, has_truth, camera, keys):
     found = truth_metrics(flat_model(), inputs_of(known, known.path if has_truth else None), job_of(camera), None, CPU)
     assert found.keys() == keys
     json.dumps(found, allow_nan=False)
 
 
-def test_a_recorded_drives_evaluation_is_held_to_no_truth(known):
+def test_a_recorded_drive_is_not_compared_with_ground_truth(known):
     """Its job says nothing of a removal; a truth.json that lies beside its tables is none of it."""
     job = job_of("CAM_FRONT", synthetic=False)
     assert truth_metrics(flat_model(), inputs_of(known, known.path), job, None, CPU) == {}
 
 
-def test_frames_that_have_truth_are_those_of_its_camera_by_their_numbers(known):
+def test_frames_with_ground_truth_are_those_of_its_camera(known):
     numbers = [index for index, _ in known.frames("CAM_FRONT")]
     frames = known.recording.scene.frames
     assert numbers == [index for index, frame in enumerate(frames) if frame.camera == "CAM_FRONT"] and len(numbers) == 6
@@ -381,7 +381,7 @@ def changed(known: DriveTruth, leading: str | None = None, **changes: Any) -> Dr
     return dataclasses.replace(known, truth=dataclasses.replace(known.truth, frames=frames, leading=leading))
 
 
-def test_a_street_where_no_car_leads_has_a_lateral_view_and_no_removal(known):
+def test_a_street_without_a_leading_car_has_a_lateral_view_and_no_removal(known):
     alone = changed(known, without_leading=None)
     assert removal_metrics(flat_model(), alone, "CAM_FRONT", MARGIN, None, CPU) is None
     assert lateral_metrics(flat_model(), alone, "CAM_FRONT", None, CPU)["2.0"]["all"]["pixels"] == 6 * 90 * 160
@@ -431,7 +431,7 @@ def damaged(content: dict[str, Any], how: str) -> str:
         "with a foreign field", "without frames", "with frames by name", "with a short frame",
     ],
 )  # fmt: skip
-def test_a_truth_that_is_none_is_refused_naming_file_and_rule(known, tmp_path, how):
+def test_an_invalid_truth_file_is_refused_naming_file_and_rule(known, tmp_path, how):
     path = tmp_path / "truth.json"
     path.write_text(damaged(good(known), how))
     with pytest.raises(ResultError) as refusal:
@@ -439,7 +439,7 @@ def test_a_truth_that_is_none_is_refused_naming_file_and_rule(known, tmp_path, h
     assert str(path) in str(refusal.value) and "demo_world" in str(refusal.value)
 
 
-def test_a_truth_whose_poses_are_none_is_refused_naming_file_and_rule(known, tmp_path):
+def test_invalid_poses_in_a_truth_file_are_refused_naming_file_and_rule(known, tmp_path):
     content = good(known)
     content["frames"][0]["lateral_camera_to_global"] = [[1.0, 0.0]]
     path = tmp_path / "truth.json"
@@ -448,7 +448,7 @@ def test_a_truth_whose_poses_are_none_is_refused_naming_file_and_rule(known, tmp
         read_truth(path)
 
 
-def test_a_binary_file_is_no_truth(tmp_path):
+def test_a_binary_truth_file_is_refused(tmp_path):
     path = tmp_path / "truth.json"
     path.write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
     with pytest.raises(ResultError, match="demo_world"):
@@ -460,7 +460,7 @@ def test_a_missing_truth_is_refused_naming_file_and_rule(tmp_path):
         read_truth(tmp_path / "nowhere" / "truth.json")
 
 
-def test_what_truth_json_says_is_what_is_read(known):
+def test_truth_json_is_read_completely(known):
     content, truth = good(known), read_truth(known.path)
     assert content.pop("schema") == 1
     frames = content.pop("frames")
@@ -469,20 +469,20 @@ def test_what_truth_json_says_is_what_is_read(known):
     assert isinstance(truth, Truth) and list(truth.by_image()) == [frame["sample_data"] for frame in frames]
 
 
-def test_a_true_image_that_is_missing_is_named_with_its_rule(known):
+def test_a_missing_ground_truth_image_is_named_with_its_rule(known):
     assert truth_image(known.path, known.truth.frames[0].lateral).is_file()
     with pytest.raises(ResultError, match=r"lateral/9999\.png.*demo_world"):
         lateral_metrics(flat_model(), changed(known, lateral="lateral/9999.png"), "CAM_FRONT", None, CPU)
 
 
-def test_a_true_image_that_is_truncated_is_named(known, tmp_path):
+def test_a_truncated_ground_truth_image_is_named(known, tmp_path):
     (tmp_path / "half.png").write_bytes((known.path.parent / known.truth.frames[0].lateral).read_bytes()[:400])
     moved = dataclasses.replace(changed(known, lateral="half.png"), path=tmp_path / "truth.json")
     with pytest.raises((ResultError, DatasetError), match=r"half\.png"):
         lateral_metrics(flat_model(), moved, "CAM_FRONT", None, CPU)
 
 
-def test_figures_are_the_same_to_the_last_bit_by_however_many_threads_frames_are_measured(known):
+def test_figures_are_bit_identical_for_any_number_of_threads(known):
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 3):

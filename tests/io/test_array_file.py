@@ -35,7 +35,7 @@ def same(a: Any, b: Any) -> bool:
     return type(a) is type(b) and a == b
 
 
-def test_content_returns_as_it_was_written(tmp_path):
+def test_content_survives_a_round_trip(tmp_path):
     write_arrays(tmp_path / "a.npz", CONTENT)
     again = read_arrays(tmp_path / "a.npz", "actors")
     assert same(again, CONTENT)
@@ -55,7 +55,7 @@ def test_equal_content_makes_equal_files(tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-def test_tensors_return_as_tensors(tmp_path):
+def test_tensors_are_read_as_tensors(tmp_path):
     content = {
         "means": torch.randn(4, 3, requires_grad=True),
         "step": torch.tensor(5.0),
@@ -70,13 +70,13 @@ def test_tensors_return_as_tensors(tmp_path):
     "value",
     [np.array([None]), np.array(["text"]), np.array([1j]), np.zeros(2, "f4,f4"), np.float64(1), {1, 2}, b"x", 1j],
 )
-def test_anything_but_numbers_and_plain_data_is_refused_when_written(tmp_path, value):
+def test_writing_anything_but_numbers_and_plain_data_is_refused(tmp_path, value):
     with pytest.raises(TypeError, match="not plain data"):
         write_arrays(tmp_path / "a.npz", {"value": [value]})
     assert not list(tmp_path.iterdir())
 
 
-def test_each_of_a_hundred_flipped_bits_changes_nothing_or_is_refused(tmp_path):
+def test_a_flipped_bit_is_refused_or_without_effect(tmp_path):
     """Headers of archive members have bytes without meaning, such as the time of writing."""
     path, chance = tmp_path / "a.npz", random.Random(0)
     write_arrays(path, {**CONTENT, "many": np.random.default_rng(0).normal(size=500)})
@@ -165,7 +165,7 @@ def test_a_forged_archive_is_refused(tmp_path, members):
         read_arrays(tmp_path / "a.npz", "actors")
 
 
-def test_a_compressed_archive_is_refused_unread(tmp_path):
+def test_a_compressed_archive_is_refused_without_decompression(tmp_path):
     """A few bytes could stand for many gigabytes."""
     archive(tmp_path / "a.npz", zipfile.ZIP_DEFLATED, content=REFERS, a=npy(np.zeros(100_000)))
     with pytest.raises(ResultError, match=r"larger than the file|is compressed"):

@@ -50,7 +50,7 @@ def assert_same(a, b) -> None:
         {"a": {"b": [(1,), (2, 3), (4, 5, 6), (7, 8, 9, 10), ()]}, "long": [2**70, -(2**70)], "float": 0.1},
     ],
 )
-def test_a_plain_pickle_returns_as_it_was_written(tmp_path, value):
+def test_a_plain_pickle_survives_a_round_trip(tmp_path, value):
     write_plain_pickle(tmp_path / "value.pkl", value)
     assert_same(read_plain_pickle(tmp_path / "value.pkl", rule="parser"), value)
 
@@ -102,7 +102,7 @@ Pair = collections.namedtuple("Pair", "a b")
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_is_no_plain_data_is_refused_when_it_is_written(tmp_path, value):
+def test_writing_anything_but_plain_data_is_refused(tmp_path, value):
     """Whatever the reader refuses the writer must refuse: a result that is written can be read again."""
     with pytest.raises(TypeError):
         write_plain_pickle(tmp_path / "value.pkl", {"value": value})
@@ -135,7 +135,7 @@ class Evaluates:
 
 @pytest.mark.parametrize("attack", [RunsACommand, Opens, Evaluates])
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_a_pickle_that_would_run_something_is_refused_and_runs_nothing(tmp_path, attack, protocol):
+def test_a_pickle_with_code_is_refused_and_not_executed(tmp_path, attack, protocol):
     marker = tmp_path / "executed"
     content = pickle.dumps({"Ks": np.eye(3), "attack": attack(marker)}, protocol=protocol)
     pickle.loads(pickle.dumps(attack(marker)))
@@ -147,7 +147,7 @@ def test_a_pickle_that_would_run_something_is_refused_and_runs_nothing(tmp_path,
     assert not marker.exists()
 
 
-def test_an_attack_hidden_inside_an_array_of_objects_is_refused_and_runs_nothing(tmp_path):
+def test_code_inside_an_object_array_is_refused_and_not_executed(tmp_path):
     marker = tmp_path / "executed"
     array = np.empty(1, dtype=object)
     array[0] = RunsACommand(marker)
@@ -158,7 +158,7 @@ def test_an_attack_hidden_inside_an_array_of_objects_is_refused_and_runs_nothing
 
 
 @pytest.mark.parametrize("value", [np.array([None, 1]), collections.OrderedDict(a=1), Pair(1, 2), {1, 2}, 1j])
-def test_a_pickle_of_anything_but_plain_data_is_refused_when_it_is_read(tmp_path, value):
+def test_reading_anything_but_plain_data_is_refused(tmp_path, value):
     (tmp_path / "parser.pkl").write_bytes(pickle.dumps({"value": value}))
     with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
         read_plain_pickle(tmp_path / "parser.pkl", rule="parser")
@@ -305,13 +305,13 @@ def read_apart(files: dict[str, bytes], folder: Path) -> dict[str, str]:
     return dict(line.split(" ", 1) for line in done.stdout.splitlines())
 
 
-def test_a_forged_pickle_crashes_nothing_and_is_refused(tmp_path):
+def test_a_forged_pickle_is_refused_without_a_crash(tmp_path):
     names = {f"{i:03}": name for i, name in enumerate(ATTACKS)}
     found = read_apart({number: ATTACKS[name] for number, name in names.items()}, tmp_path)
     assert {names[number]: outcome for number, outcome in found.items()} == dict.fromkeys(ATTACKS, "refused True")
 
 
-def test_a_hundred_spoilt_pickles_are_refused_or_plain_and_crash_nothing(tmp_path):
+def test_100_mutated_pickles_are_plain_or_refused_without_a_crash(tmp_path):
     """What is read can be written: it is plain."""
     record = {
         "Ks": np.eye(3), "names": ["a.jpg", "b.jpg"], "times": np.array([1, 2]), "seen": np.array([True]), "none": None,
@@ -323,7 +323,7 @@ def test_a_hundred_spoilt_pickles_are_refused_or_plain_and_crash_nothing(tmp_pat
     assert sum(outcome == "refused True" for outcome in found.values()) > 50
 
 
-def test_data_may_be_as_deep_as_said(tmp_path):
+def test_data_may_be_nested_to_the_documented_depth(tmp_path):
     value: list = []
     for _ in range(MAX_DEPTH):
         value = [value]
@@ -343,7 +343,7 @@ def test_arrays_of_numpy_1_and_2_are_read(tmp_path, core):
 
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
-def test_arrays_of_every_protocol_can_be_written_to(tmp_path, protocol):
+def test_arrays_of_every_protocol_are_writable(tmp_path, protocol):
     (tmp_path / "value.pkl").write_bytes(pickle.dumps([np.arange(3), np.zeros((0, 3))], protocol=protocol))
     first, empty = read_plain_pickle(tmp_path / "value.pkl", "parser")
     first += 1

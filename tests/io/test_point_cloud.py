@@ -16,7 +16,7 @@ def some_points(count: int = 5) -> PointCloud:
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 1000])
-def test_points_colors_and_note_return_as_they_were_written(tmp_path, count):
+def test_points_colors_and_note_survive_a_round_trip(tmp_path, count):
     points = some_points(count)
     write_ply(tmp_path / "seed.ply", points)
     again = read_ply(tmp_path / "seed.ply", rule="lidar_seed")
@@ -27,7 +27,7 @@ def test_points_colors_and_note_return_as_they_were_written(tmp_path, count):
     assert again.note == points.note
 
 
-def test_other_programs_find_the_usual_names_of_properties(tmp_path):
+def test_properties_have_the_usual_names(tmp_path):
     points = some_points()
     write_ply(tmp_path / "seed.ply", points)
     vertices = PlyData.read(str(tmp_path / "seed.ply"))["vertex"]
@@ -75,7 +75,7 @@ def foreign_cloud(path) -> np.ndarray:
     return positions
 
 
-def test_a_cloud_of_another_program_is_no_seed_but_its_positions_can_be_read(tmp_path):
+def test_a_foreign_point_cloud_is_not_a_seed_but_its_positions_can_be_read(tmp_path):
     positions = foreign_cloud(tmp_path / "foreign.ply")
     with pytest.raises(ResultError, match=r"foreign\.ply.*'lidar_seed'"):
         read_ply(tmp_path / "foreign.ply", rule="lidar_seed")

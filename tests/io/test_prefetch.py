@@ -8,7 +8,7 @@ import pytest
 from drivesplat.io.prefetch import prefetch, prefetch_items
 
 
-def test_results_come_in_order_however_long_each_takes():
+def test_results_are_in_order_whatever_their_durations():
     def slow_at_first(item: int) -> int:
         time.sleep(0.02 if item == 0 else 0.0)
         return 10 * item
@@ -17,7 +17,7 @@ def test_results_come_in_order_however_long_each_takes():
     assert list(prefetch(slow_at_first, [])) == []
 
 
-def test_no_more_than_asked_for_are_made_before_they_are_taken():
+def test_at_most_the_given_number_of_results_is_computed_before_use():
     made = []
     results = prefetch(lambda item: made.append(item) or item, range(100), threads=3)
     for taken in range(1, 6):
@@ -28,19 +28,19 @@ def test_no_more_than_asked_for_are_made_before_they_are_taken():
     assert len(made) < 10
 
 
-def test_several_are_made_at_once():
+def test_results_are_computed_in_parallel():
     meeting = threading.Barrier(3, timeout=5.0)
     assert list(prefetch(lambda item: meeting.wait() >= 0, range(3), threads=3)) == [True] * 3
 
 
-def test_what_one_raises_is_raised_in_its_place():
+def test_an_exception_is_raised_in_place_of_its_result():
     results = prefetch(lambda item: 1 // (item - 2), range(5), threads=2)
     assert [next(results), next(results)] == [-1, -1]
     with pytest.raises(ZeroDivisionError):
         next(results)
 
 
-def test_items_in_advance_are_made_by_one_thread_while_others_are_used():
+def test_items_are_prefetched_by_one_thread_while_earlier_ones_are_used():
     made, meeting = [], threading.Barrier(2, timeout=5.0)
 
     def items():
@@ -58,7 +58,7 @@ def test_items_in_advance_are_made_by_one_thread_while_others_are_used():
     assert list(prefetch_items([])) == []
 
 
-def test_no_more_than_asked_for_are_in_advance():
+def test_at_most_the_given_number_of_items_is_prefetched():
     made = []
     given = prefetch_items((made.append(item) or item for item in range(100)), at_most=3)
     for taken in range(1, 6):
@@ -69,7 +69,7 @@ def test_no_more_than_asked_for_are_in_advance():
     assert len(made) < 10
 
 
-def test_what_making_an_item_raises_is_raised_in_its_place():
+def test_an_exception_is_raised_in_place_of_its_item():
     given = prefetch_items((1 // (item - 2) for item in range(5)), at_most=4)
     assert [next(given), next(given)] == [-1, -1]
     with pytest.raises(ZeroDivisionError):

@@ -37,13 +37,13 @@ def raiser(number: int):
     return raises
 
 
-def test_a_written_file_holds_what_was_written_and_nothing_lies_beside_it(tmp_path):
+def test_a_written_file_is_complete_and_leaves_no_partial_file(tmp_path):
     write(tmp_path / "new folder" / "result.bin", b"content")
     assert (tmp_path / "new folder" / "result.bin").read_bytes() == b"content"
     assert files_below(tmp_path) == {"new folder/result.bin"}
 
 
-def test_nothing_stands_at_the_target_while_it_is_being_written(tmp_path):
+def test_the_target_does_not_exist_while_it_is_being_written(tmp_path):
     target = tmp_path / "result.bin"
     with atomic_write(target) as file:
         file.write(b"half")
@@ -52,7 +52,7 @@ def test_nothing_stands_at_the_target_while_it_is_being_written(tmp_path):
     assert target.read_bytes() == b"half"
 
 
-def test_whoever_reads_the_old_file_while_a_new_one_comes_reads_the_old_one_whole(tmp_path):
+def test_a_reader_of_the_old_file_is_not_affected_by_its_replacement(tmp_path):
     write(tmp_path / "result.bin", b"old")
     with open(tmp_path / "result.bin", "rb") as reader:
         write(tmp_path / "result.bin", b"new")
@@ -76,7 +76,7 @@ def test_a_crash_while_writing_a_new_file_leaves_none(tmp_path):
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_partial_files_that_killed_writers_left_go_after_an_hour(tmp_path, whole):
+def test_partial_files_of_killed_writers_are_removed_after_an_hour(tmp_path, whole):
     """Those of the same target alone; whether the new file becomes whole or not."""
     left = {
         ".result.4711.partial.bin": ABANDONED_SECONDS + 60,
@@ -99,7 +99,7 @@ def test_partial_files_that_killed_writers_left_go_after_an_hour(tmp_path, whole
     assert files_below(tmp_path) == left.keys() - gone | ({"result.bin"} if whole else set())
 
 
-def test_names_are_no_patterns_when_partial_files_are_swept(tmp_path):
+def test_special_characters_in_names_are_not_glob_patterns(tmp_path):
     other = tmp_path / ".a.4711.partial.bin"
     other.write_bytes(b"half")
     os.utime(other, (0, 0))
@@ -107,7 +107,7 @@ def test_names_are_no_patterns_when_partial_files_are_swept(tmp_path):
     assert files_below(tmp_path) == {".a.4711.partial.bin", "[ab].bin"}
 
 
-def test_a_full_disk_is_told_with_the_name_of_the_file_and_keeps_the_old_one(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_with_the_file_name_and_keeps_the_old_file(tmp_path, monkeypatch):
     write(tmp_path / "result.bin", b"old")
     monkeypatch.setattr(os, "fsync", raiser(errno.ENOSPC))
     with pytest.raises(ResultError) as failure:
@@ -118,7 +118,7 @@ def test_a_full_disk_is_told_with_the_name_of_the_file_and_keeps_the_old_one(tmp
     assert files_below(tmp_path) == {"result.bin"}
 
 
-def test_a_read_only_file_system_is_told_with_the_name_of_the_file(tmp_path, monkeypatch):
+def test_a_read_only_file_system_is_reported_with_the_file_name(tmp_path, monkeypatch):
     """There every change fails, that of a file which is not there included."""
     opened = builtins.open
 
@@ -134,7 +134,7 @@ def test_a_read_only_file_system_is_told_with_the_name_of_the_file(tmp_path, mon
     assert os.strerror(errno.EROFS) in str(failure.value)
 
 
-def test_a_file_where_the_folder_should_be_is_told_with_the_name_of_the_file(tmp_path):
+def test_a_file_in_place_of_a_folder_is_reported_with_its_name(tmp_path):
     (tmp_path / "results").write_text("a file, no folder")
     with pytest.raises(ResultError, match=r"results/0061/scene\.json"):
         write(tmp_path / "results" / "0061" / "scene.json", b"{}")
@@ -156,7 +156,7 @@ def test_canonical_json_depends_on_every_value():
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_no_json_holds_a_number_that_is_not_finite(tmp_path, value):
+def test_json_with_numbers_that_are_not_finite_is_refused(tmp_path, value):
     with pytest.raises(ValueError):
         canonical_json({"psnr": value})
     with pytest.raises(ValueError):
@@ -171,7 +171,7 @@ def test_digests_are_sha256(tmp_path):
     assert sha256_file(tmp_path / "abc") == known
 
 
-def test_json_returns_as_it_was_written_to_the_last_bit(tmp_path):
+def test_json_survives_a_round_trip_bit_for_bit(tmp_path):
     value = {"numbers": [0.1, 1 / 3, 1e-300, 2**53 + 1], "text": "Zürich", "none": None, "nested": {"a": [True]}}
     write_json(tmp_path / "value.json", value)
     assert read_json(tmp_path / "value.json", rule="extract") == value

@@ -100,7 +100,7 @@ def returns_of(world: World, thing: Thing, key_frames, margin=0.1, radius=2.5) -
 
 
 @pytest.mark.parametrize("radius", [2.5, 6.3])
-def test_the_returns_of_training_sweeps_in_its_box_lie_in_its_own_frame_and_no_others_do(tiny_scene, radius):
+def test_points_are_exactly_the_training_returns_in_the_box_in_its_frame(tiny_scene, radius):
     """The whole rule at once: own car, road and held-out sweeps are out. The car ahead is 5.6 m from the LiDAR, so that
     a radius of 6.3 m cuts it."""
     actor = the_actor(tiny_scene, job(radius=radius))
@@ -112,7 +112,7 @@ def test_the_returns_of_training_sweeps_in_its_box_lie_in_its_own_frame_and_no_o
 
 
 @pytest.mark.parametrize(("thing", "seen", "hidden"), [(CAR, (0, -1), (0, 1)), (ONCOMING, (1, 1), (1, -1))])
-def test_gathered_points_lie_on_the_faces_that_the_lidar_sees(tmp_path, thing, seen, hidden):
+def test_points_lie_on_the_faces_visible_to_the_lidar(tmp_path, thing, seen, hidden):
     """However far it has moved between. A car ahead shows its rear and not its front (x), one that comes by on the left
     its left and not its right (y)."""
     actor = the_actor(drive(tmp_path, thing), job(NOTHING_HELD_OUT))
@@ -127,20 +127,20 @@ def test_gathered_points_lie_on_the_faces_that_the_lidar_sees(tmp_path, thing, s
 
 
 @pytest.mark.parametrize("margin", [0.0, 1.0])
-def test_a_margin_grows_the_box_at_its_sides_and_leaves_the_road_out(tiny_scene, margin):
+def test_the_margin_enlarges_the_box_sideways_and_excludes_the_road(tiny_scene, margin):
     actor = the_actor(tiny_scene, job(box_margin=margin))
     np.testing.assert_allclose(actor.points, returns_of(World(), CAR, TRAINING, margin=margin), atol=1e-4)
     assert actor.points[:, 2].min() > FLOOR - 0.8
 
 
-def test_sweeps_that_are_missing_or_corrupt_give_nothing(root):
+def test_missing_or_corrupt_sweeps_are_skipped(root):
     scene = scene_at(root)
     (root / "samples/LIDAR_TOP/0001__0001.pcd.bin").unlink()
     (root / "samples/LIDAR_TOP/0001__0003.pcd.bin").write_bytes(b"no sweep")
     np.testing.assert_allclose(the_actor(scene, job()).points, returns_of(World(), CAR, (0, 4, 5, 7)), atol=1e-4)
 
 
-def test_few_lidar_points_are_filled_up_with_random_ones_in_the_box(tiny_scene):
+def test_few_lidar_points_are_complemented_by_random_points_in_the_box(tiny_scene):
     lidar = the_actor(tiny_scene, job()).points
     actor = the_actor(tiny_scene, job(min_points=len(lidar) + 1, random_points=4000))
     assert (actor.lidar_points, len(actor.points)) == (len(lidar), 4000)
@@ -153,18 +153,18 @@ def test_few_lidar_points_are_filled_up_with_random_ones_in_the_box(tiny_scene):
 
 
 @pytest.mark.parametrize(("less", "count"), [(0, None), (1, 4000)])
-def test_enough_lidar_points_are_left_alone(tiny_scene, less, count):
+def test_enough_lidar_points_get_no_random_ones(tiny_scene, less, count):
     lidar = len(returns_of(World(), CAR, TRAINING))
     actor = the_actor(tiny_scene, job(min_points=lidar + less, random_points=4000))
     assert len(actor.points) == (count or lidar)
 
 
-def test_random_points_stay_under_the_most_there_may_be(tiny_scene):
+def test_random_points_respect_the_maximum(tiny_scene):
     actor = the_actor(tiny_scene, job(min_points=10**6, random_points=4000, max_points=1000))
     assert len(actor.points) == 1000 and 0 < actor.lidar_points < 1000
 
 
-def test_too_many_points_are_thinned_at_random(tiny_scene):
+def test_too_many_points_are_subsampled_at_random(tiny_scene):
     whole = returns_of(World(), CAR, TRAINING).round(3)
     actor = the_actor(tiny_scene, job(max_points=100))
     assert actor.lidar_points == len(actor.points) == 100
@@ -173,7 +173,7 @@ def test_too_many_points_are_thinned_at_random(tiny_scene):
     assert len(set(numbers)) == 100 and max(numbers) > len(whole) / 2 > 100
 
 
-def test_without_any_lidar_an_actor_starts_at_random(root):
+def test_an_actor_without_lidar_points_has_random_ones(root):
     shutil.rmtree(root / "samples" / "LIDAR_TOP")
     actor = the_actor(scene_at(root), job(min_points=1, random_points=300))
     assert (actor.lidar_points, len(actor.points)) == (0, 300)
@@ -204,17 +204,18 @@ HELD_OUT_AND_TRAINING = dataclasses.replace(HELD_OUT_ALONE, seen=range(7, 10))
     ],
     ids=["ahead", "parked", "behind", "far", "hiding", "not hidden", "hidden", "held out", "partly held out", "none"],
 )
-def test_an_actor_is_a_vehicle_that_moves_and_that_a_training_image_sees(tmp_path, caplog, things, expected):
+def test_actors_are_dynamic_vehicles_that_a_training_image_sees(tmp_path, caplog, things, expected):
     scene = drive(tmp_path, *(things or [World().things[3]]), width=192, height=108)
     caplog.set_level("INFO")
     record = actors_record(scene, job())
     assert len(record.actors) == expected
     moving = [track.id for track in scene.tracks if track.category.startswith("vehicle.") and things != [PARKED]]
     left_out = set(moving) - {actor.id for actor in record.actors}
-    assert all(any(track in line for line in caplog.messages if "no training image sees" in line) for track in left_out)
+    skipped = [line for line in caplog.messages if "no training image shows" in line]
+    assert all(any(track in line for line in skipped) for track in left_out)
 
 
-def test_what_fills_too_few_pixels_at_one_size_is_seen_at_another(tmp_path):
+def test_visibility_depends_on_the_image_size(tmp_path):
     scene = drive(tmp_path, FAR, width=384, height=216)
     assert len(actors_of(scene, job())) == 1
     assert len(actors_of(scene, job(width=96))) == 0
@@ -271,7 +272,7 @@ NEARING = dataclasses.replace(CAR, velocity=(3.0, 0.0))
 
 
 @pytest.mark.parametrize("thing", [CAR, NEARING], ids=["away", "near"])
-def test_a_point_has_the_colour_of_the_nearest_training_image_in_which_its_pixel_is_the_actors(tmp_path, thing):
+def test_a_point_has_the_colour_of_its_nearest_training_camera_that_sees_the_actor_there(tmp_path, thing):
     """Every image has a grey of its own."""
     world, scene = World(things=[thing]), drive(tmp_path, thing)
     painted(scene, lambda frame: (2 * scene.frames.index(frame) + 10,) * 3)
@@ -289,7 +290,7 @@ def test_a_point_has_the_colour_of_the_nearest_training_image_in_which_its_pixel
     np.testing.assert_array_equal(actor.points_rgb[~shown], round(expected[shown].mean()))
 
 
-def test_colours_are_those_of_the_cars_surface(tmp_path):
+def test_colours_match_the_surface_of_the_car(tmp_path):
     """Up to JPEG, pixel size and the stripes' edges: the drive's geometry says what colour each point has."""
     actor = the_actor(drive(tmp_path, *World().things, width=384, height=216), job())
     stripes = 0.75 + 0.25 * np.sign(np.sin(5.0 * actor.points.sum(axis=1)))
@@ -300,7 +301,7 @@ def test_colours_are_those_of_the_cars_surface(tmp_path):
 SPEEDING = Speeding("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0), gain=(1.0, 0.0))
 
 
-def test_what_stands_nearer_lends_no_colour(tmp_path):
+def test_occluders_do_not_colour_an_actor(tmp_path):
     """A walker hides the same part of the car in every image. Images are red where the walker's box is seen, else blue:
     what lies behind the walker has the others' colour."""
     walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (5.5, 0.3, 0.95), (4.2, 0.0))
@@ -318,7 +319,7 @@ LEFT_HALF = ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.0, 1.0))
 WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 
 
-def test_the_own_cars_body_lends_no_colour_and_hides(tmp_path):
+def test_the_ego_vehicle_does_not_colour_actors_and_hides_them(tmp_path):
     scene = drive(tmp_path, CAR)
     painted(scene, lambda frame: np.where(np.arange(96)[:, None] <= 48, (255, 0, 0), (0, 0, 255)))
     colors = the_actor(scene, job(), EgoMask({"CAM_FRONT": (LEFT_HALF,)})).points_rgb
@@ -327,7 +328,7 @@ def test_the_own_cars_body_lends_no_colour_and_hides(tmp_path):
     assert actors_of(scene, job(), EgoMask({"CAM_FRONT": (WHOLE,)})) == []
 
 
-def test_an_actor_that_is_seen_but_shows_no_point_is_grey(tmp_path):
+def test_a_visible_actor_without_visible_points_is_grey(tmp_path):
     """Its only points lie left of what the own car's body leaves of it."""
     scene = drive(tmp_path, dataclasses.replace(CAR, position=(8.5, 0.0, 0.8)))
     outline = ((0.0, 0.0), (0.52, 0.0), (0.52, 1.0), (0.0, 1.0))
@@ -380,14 +381,14 @@ def test_training_images_and_sweeps_do_contribute(root, what):
     assert vars(before)[key].tobytes() != vars(after)[key].tobytes()
 
 
-def test_equal_random_seeds_give_equal_actors_and_others_do_not(tiny_scene):
+def test_the_random_seed_determines_the_actors(tiny_scene):
     settings = {"min_points": 10**6, "random_points": 1000}
     first, again, other = (actors_record(tiny_scene, job(random_seed=seed, **settings)) for seed in (0, 0, 1))
     assert_same(first, again)
     assert first.actors[0].points.tobytes() != other.actors[0].points.tobytes()
 
 
-def test_actors_come_by_id_each_with_random_points_of_its_own_whatever_else_becomes_one(tmp_path):
+def test_actors_are_sorted_by_id_and_their_random_points_are_independent(tmp_path):
     twins = [dataclasses.replace(CAR, position=(9.0, y, 0.8)) for y in (-2.0, 2.0)]
     walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (8.0, 0.0, 0.95), (4.2, 0.0))
     scene = drive(tmp_path, *twins, walker)
@@ -425,7 +426,7 @@ def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
     np.testing.assert_array_equal(motion.present(at), expected.present(at))
 
 
-def test_the_record_is_plain_and_reads_as_it_was_written(tiny_scene, tmp_path):
+def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, tmp_path):
     record = dataclasses.replace(actors_record(tiny_scene, job()), provenance={"stages": {}})
     write_actors(tmp_path / "actors.npz", record)
     read = read_actors(tmp_path / "actors.npz")
@@ -439,7 +440,7 @@ def test_the_record_is_plain_and_reads_as_it_was_written(tiny_scene, tmp_path):
     }  # fmt: skip
 
 
-def test_a_drive_in_which_nothing_moves_has_no_actors_and_a_record_of_them(tmp_path):
+def test_a_static_drive_has_an_empty_record_of_actors(tmp_path):
     write_actors(tmp_path / "actors.npz", actors_record(drive(tmp_path, PARKED), job()))
     assert read_actors(tmp_path / "actors.npz").actors == []
 
@@ -450,7 +451,7 @@ def test_a_drive_in_which_nothing_moves_has_no_actors_and_a_record_of_them(tmp_p
      *({"actors": actors, "provenance": {}} for actors in (None, ["x"], [{"id": "x"}]))],
     ids=str,
 )  # fmt: skip
-def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
+def test_an_invalid_record_is_named_with_its_rule(tmp_path, content):
     path = tmp_path / "actors.npz"
     if content is not None:
         path.write_bytes(content if isinstance(content, bytes) else b"")
@@ -484,7 +485,7 @@ def test_20_actors_in_40_images_are_gathered_and_coloured_within_10_seconds(tiny
     assert len(found) >= 5 and all(len(actor.points) == 20_000 for actor in found)
 
 
-def test_of_the_real_scene_the_vehicles_that_move_in_sight_become_actors(real_scene_root):
+def test_visible_dynamic_vehicles_of_the_real_scene_become_actors(real_scene_root):
     source = SceneSource(
         dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
         sweeps=False, on_missing="stop",
@@ -496,7 +497,7 @@ def test_of_the_real_scene_the_vehicles_that_move_in_sight_become_actors(real_sc
         assert len(np.unique(actor.points_rgb, axis=0)) > 50
 
 
-def test_the_names_of_classes_in_settings_are_those_of_objects():
+def test_class_names_in_settings_equal_those_of_objects():
     assert get_args(ObjectClassName) == tuple(known.value for known in ObjectClass)
 
 
@@ -515,13 +516,13 @@ def test_by_default_vehicles_are_actors_and_nothing_else_is(known):
          {"motorcycle": "background", "bicycle": "background", "rider": "background"}),
     ],
 )  # fmt: skip
-def test_settings_choose_the_part_of_a_class_and_leave_all_others(settings, changed):
+def test_a_setting_changes_the_part_of_its_class_only(settings, changed):
     chosen, default = ActorSeedSettings.model_validate(settings), ActorSeedSettings()
     assert {known.value: chosen.part_of(known) for known in ObjectClass} == {
         known.value: changed.get(known.value, default.part_of(known)) for known in ObjectClass
     }
 
 
-def test_a_class_that_there_is_none_of_is_refused():
+def test_an_unknown_class_is_refused():
     with pytest.raises(ValidationError, match="lorry"):
         ActorSeedSettings.model_validate({"classes": {"lorry": "actors"}})

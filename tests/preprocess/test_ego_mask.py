@@ -11,8 +11,15 @@ from PIL import Image
 
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import write_json
-from drivesplat.preprocess import ego_mask as own_car_search
-from drivesplat.preprocess.ego_mask import ComparedImages, ego_mask_record, ends, found_in, known, outlines_of
+from drivesplat.preprocess import ego_mask as search_module
+from drivesplat.preprocess.ego_mask import (
+    ComparedImages,
+    camera_outlines,
+    ego_mask_record,
+    find_outlines,
+    outlines_of,
+    stands_out,
+)
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.ego_mask import EgoMask, enclosed, read_ego_mask
 from drivesplat.scene.scene import Scene
@@ -57,13 +64,13 @@ def painted(scene: Scene, folder: Path, paint: Callable[[np.ndarray, int], np.nd
 
 def body_in(scene: Scene, camera: str = "CAM_BACK", search: EgoMaskSearch = LOOKING) -> np.ndarray:
     """The pixels (h, w) bool that are taken for the own car's body."""
-    outlines, _, why = known(scene, camera, EgoMaskJob(polygons={}, search=search))
+    outlines, _, why = camera_outlines(scene, camera, EgoMaskJob(polygons={}, search=search))
     assert (why is None) == bool(outlines)
     return enclosed(outlines, SIZE)
 
 
 def why_not(scene: Scene, camera: str = "CAM_BACK") -> str:
-    outlines, source, why = known(scene, camera, JOB)
+    outlines, source, why = camera_outlines(scene, camera, JOB)
     assert (outlines, source) == ((), None)
     return why
 
@@ -78,14 +85,14 @@ def assert_is_the_body(found: np.ndarray) -> None:
 # ---- what is found
 
 
-def test_the_body_is_found_where_it_is_and_nowhere_else(seen):
+def test_the_detected_body_matches_the_true_one(seen):
     assert_is_the_body(body_in(seen))
     for camera in CAMERAS[1:]:
         assert not true_body(camera).any() and not body_in(seen, camera).any()
 
 
-def test_a_car_that_no_camera_sees_is_not_found(unseen):
-    assert [known(unseen, camera, JOB)[:2] for camera in CAMERAS] == [((), None)] * 3
+def test_no_body_is_found_if_no_camera_sees_it(unseen):
+    assert [camera_outlines(unseen, camera, JOB)[:2] for camera in CAMERAS] == [((), None)] * 3
 
 
 def test_a_body_under_changing_light_is_found(seen, tmp_path):
@@ -120,7 +127,7 @@ def test_held_out_images_and_sweeps_contribute_nothing(seen, tmp_path):
 # ---- what is refused
 
 
-def test_a_car_that_stands_is_refused(tmp_path):
+def test_a_stationary_car_is_refused(tmp_path):
     assert why_not(rig_drive(tmp_path, ["CAM_BACK"], own_car=True, ego="stands")).startswith("the car hardly moves")
 
 
@@ -129,7 +136,7 @@ def test_few_images_are_refused(seen):
     assert "9 images" in why_not(few)
 
 
-def test_a_car_that_waits_is_judged_by_the_images_of_its_way(seen):
+def test_images_at_a_standstill_are_left_out(seen):
     """Thirty more images at a standstill, of a camera that sees all the world unmoved."""
     waited = [frame for frame in seen.frames if frame.camera == "CAM_BACK" and frame.sample_index == 5]
     more = [dataclasses.replace(waited[0], timestamp=waited[0].timestamp + i) for i in range(1, 31)]
@@ -138,14 +145,14 @@ def test_a_car_that_waits_is_judged_by_the_images_of_its_way(seen):
     np.testing.assert_array_equal(body_in(scene), body_in(seen))
 
 
-def test_without_lidar_nothing_tells_an_even_road_from_a_body(seen):
-    assert why_not(dataclasses.replace(seen, sweeps=())).startswith("LiDAR tells of 0 images")
+def test_without_lidar_no_body_is_found(seen):
+    assert why_not(dataclasses.replace(seen, sweeps=())).startswith("0 images have LiDAR")
 
 
-def test_an_even_road_that_lidar_meets_is_no_body(unseen, tmp_path):
+def test_an_even_road_with_lidar_returns_is_not_a_body(unseen, tmp_path):
     """The road near the camera becomes one grey, up to a line that stays where it is."""
     even = painted(unseen, tmp_path, lambda pixels, _: np.where(np.arange(90)[:, None, None] > 75, 90.0, pixels))
-    assert why_not(even) == "LiDAR meets something all along the edge of the images"
+    assert why_not(even) == "LiDAR has returns all along the edge of the images"
 
 
 def without_returns_below(scene: Scene, folder: Path) -> Scene:
@@ -160,7 +167,7 @@ def without_returns_below(scene: Scene, folder: Path) -> Scene:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_what_is_black_or_blown_out_is_no_body(unseen, tmp_path, level):
+def test_black_and_overexposed_areas_are_not_a_body(unseen, tmp_path, level):
     """The same in a grey that can be seen to stay is taken for one."""
     missed = without_returns_below(unseen, tmp_path)
     for grey in (level, 120):
@@ -170,12 +177,12 @@ def test_what_is_black_or_blown_out_is_no_body(unseen, tmp_path, level):
         assert body_in(scene).any() == (grey == 120)
 
 
-def test_by_night_nothing_is_told(seen, tmp_path):
+def test_dark_images_are_refused(seen, tmp_path):
     dark = painted(seen, tmp_path, lambda pixels, _: 0.05 * pixels)
-    assert "too little to tell" in why_not(dark)
+    assert "too little to detect" in why_not(dark)
 
 
-def test_what_reaches_above_the_horizon_is_cut_there(unseen, tmp_path):
+def test_a_body_is_cut_at_the_horizon(unseen, tmp_path):
     """A pane of dirt over the right edge of the image, sky included, where LiDAR meets nothing."""
     missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
     dirty = painted(missed, tmp_path, lambda p, _: np.where(np.arange(160)[None, :, None] > 150, 120.0, p))
@@ -189,31 +196,31 @@ def _empty(sweep, folder: Path):
     return dataclasses.replace(sweep, path=str(path))
 
 
-def test_most_of_an_image_is_no_body(unseen, tmp_path):
+def test_a_constant_area_that_is_too_large_is_not_a_body(unseen, tmp_path):
     missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
     even = painted(missed, tmp_path, lambda p, _: np.where(np.arange(90)[:, None, None] > 60, 120.0, p))
     assert "more than a body fills" in why_not(even)
 
 
-def test_what_varies_ever_more_has_no_end(unseen):
+def test_a_gradual_increase_of_variation_is_not_a_border(unseen):
     """A body ends at once; a road grows more varied with distance."""
     drive = ComparedImages.of(unseen, "CAM_BACK", LOOKING)
     rows = np.arange(90.0)[:, None].repeat(160, axis=1)
     lower = rows >= 70
-    assert ends(lower, np.where(lower, 4.0, 20.0), drive)
-    assert not ends(lower, 4.0 + 0.5 * (89.0 - rows), drive)
+    assert stands_out(lower, np.where(lower, 4.0, 20.0), drive)
+    assert not stands_out(lower, 4.0 + 0.5 * (89.0 - rows), drive)
 
 
 # ---- what is told
 
 
-def test_the_users_outline_wins_and_other_cameras_are_looked_at(seen):
+def test_an_outline_of_the_user_replaces_the_search_in_its_camera_only(seen):
     outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0))
     job = EgoMaskJob(polygons={"CAM_BACK": outline}, search=LOOKING.model_copy(update={"cameras": ("CAM_FRONT",)}))
     cameras = ego_mask_record(seen, job)["cameras"]
     assert (cameras["CAM_BACK"]["source"], cameras["CAM_BACK"]["outlines"]) == ("polygons", (outline,))
     assert cameras["CAM_BACK"]["share"] == pytest.approx(0.05, abs=0.002) and cameras["CAM_BACK"]["why_null"] is None
-    assert cameras["CAM_FRONT"]["why_null"] and "not looked for" in cameras["CAM_BACK_RIGHT"]["why_null"]
+    assert cameras["CAM_FRONT"]["why_null"] and "not searched" in cameras["CAM_BACK_RIGHT"]["why_null"]
 
 
 @pytest.mark.parametrize(
@@ -225,7 +232,7 @@ def test_the_users_outline_wins_and_other_cameras_are_looked_at(seen):
         ("auto_measured", ["CAM_BACK"], ("CAM_FRONT", "CAM_BACK_RIGHT")),
     ],
 )
-def test_a_setting_says_where_it_is_looked_for(kind, outlined, searched):
+def test_a_setting_chooses_the_cameras_to_search(kind, outlined, searched):
     """CAM_FRONT is measured; of CAM_BACK an outline is given."""
     masks = {"own_car": kind, "own_car_polygons": {"CAM_BACK": [[0, 1], [1, 1], [0.5, 0.9]]}}
     values = {"cameras": ["CAM_FRONT", "CAM_BACK", "CAM_BACK_RIGHT"], "masks": masks}
@@ -234,14 +241,14 @@ def test_a_setting_says_where_it_is_looked_for(kind, outlined, searched):
     assert (job.search.cameras if job.search else None) == searched
 
 
-def test_the_camera_that_is_measured_is_spared_by_default():
+def test_the_evaluated_camera_is_not_searched_by_default():
     """So that figures hang on no guess; where it is the only one, on no setting of the search either."""
     default = load({})
     assert default.masks.own_car == "auto"
     assert stage_settings(default, "own_car", "0061") == '{"polygons":{},"search":null}'
 
 
-def test_a_record_returns_as_it_was_written(seen, tmp_path):
+def test_a_record_survives_a_round_trip(seen, tmp_path):
     record = ego_mask_record(seen, JOB)
     write_json(tmp_path / "own_car.json", {**record, "provenance": {"stages": {}}})
     ego_mask, provenance = read_ego_mask(tmp_path / "own_car.json")
@@ -261,7 +268,7 @@ def test_a_foreign_record_is_named_with_its_rule(tmp_path, content):
 
 
 @pytest.mark.parametrize("size", [(160, 90), (400, 225), (1600, 900)])
-def test_outlines_enclose_what_they_were_drawn_around_at_any_size(size):
+def test_outlines_enclose_their_mask_at_any_size(size):
     y, x = np.mgrid[:90, :160]
     mask = (y > 70 + 0.002 * (x - 80) ** 2) | ((x < 20) & (y > 40))
     drawn = EgoMask({"A": outlines_of(mask)}).pixels("A", size)
@@ -271,20 +278,20 @@ def test_outlines_enclose_what_they_were_drawn_around_at_any_size(size):
     assert drawn[-1, expected[-1]].mean() > 0.97 and drawn[expected[:, 0], 0].mean() > 0.97, "up to the image's edge"
 
 
-def test_of_two_bodies_each_has_its_outline():
+def test_each_of_two_bodies_has_its_outline():
     mask = np.zeros((90, 160), dtype=bool)
     mask[80:, :30] = mask[80:, 130:] = True
     assert len(outlines_of(mask)) == 2
 
 
-def test_the_front_camera_of_a_real_drive_sees_no_body(real_scene_root, monkeypatch):
+def test_no_body_is_found_in_the_front_camera_of_a_real_drive(real_scene_root, monkeypatch):
     """Even if LiDAR had met nothing in any image: its road varies far too much to be taken for a body."""
     source = SceneSource(
         dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
         sweeps=False, on_missing="stop",
     )  # fmt: skip
     drive = ComparedImages.of(extract_scene(source, real_scene_root), "CAM_FRONT", LOOKING)
-    assert found_in(drive)[1].startswith("LiDAR tells of ")
+    assert "images have LiDAR" in find_outlines(drive)[1]
     nothing = np.zeros((drive.size[1], drive.size[0]), dtype=bool)
-    monkeypatch.setattr(own_car_search, "lidar_images", lambda drive: [nothing] * len(drive.compared))
-    assert len(drive.compared) > 30 and found_in(drive) == ((), "nothing stays as it is that could be the own car")
+    monkeypatch.setattr(search_module, "lidar_images", lambda drive: [nothing] * len(drive.compared))
+    assert len(drive.compared) > 30 and find_outlines(drive) == ((), "no constant region can be the ego vehicle")

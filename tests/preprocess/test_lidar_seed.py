@@ -77,7 +77,7 @@ def rows(points: np.ndarray) -> set[tuple]:
     return {tuple(row) for row in np.round(points, 3)}
 
 
-def test_static_returns_of_training_sweeps_stay_and_no_others(tiny_scene):
+def test_lidar_points_are_exactly_the_static_returns_of_training_sweeps(tiny_scene):
     """The whole rule at once, computed from the drive's geometry: own car, moving boxes and held-out sweeps are out."""
     points, times, missing = lidar_points(tiny_scene, job(voxel_size=0.0))
     assert missing == 0
@@ -97,18 +97,18 @@ def test_static_returns_of_training_sweeps_stay_and_no_others(tiny_scene):
         assert rows(found) == rows(everything[kept])
 
 
-def test_a_larger_margin_takes_more_around_moving_objects(tiny_scene):
+def test_a_larger_margin_removes_more_points_around_dynamic_objects(tiny_scene):
     none, wide = (lidar_points(tiny_scene, job(voxel_size=0.0, box_margin=margin))[0] for margin in (0.0, 2.0))
     assert rows(wide) < rows(none)
 
 
-def test_returns_of_the_own_car_are_those_near_the_sensor_horizontally():
+def test_returns_of_the_ego_vehicle_are_those_horizontally_near_the_sensor():
     points = np.array([[0.5, 0.3, -0.4], [2.6, 0.0, 0.0], [1.8, 1.8, 5.0], [1.7, 1.7, 0.0], [0.0, 0.0, 9.0]])
     np.testing.assert_array_equal(without_ego_vehicle(points, 2.5), points[[1, 2]])
     np.testing.assert_array_equal(without_ego_vehicle(points[:2], 0.0), points[:2])
 
 
-def test_own_car_returns_are_there_unless_they_are_taken_out(tiny_scene):
+def test_returns_of_the_ego_vehicle_exist_unless_removed(tiny_scene):
     settings = {"voxel_size": 0.0, "box_margin": 0.0}
     with_car, _, _ = lidar_points(tiny_scene, job(own_car_radius=0.0, **settings))
     without, _, _ = lidar_points(tiny_scene, job(own_car_radius=2.5, **settings))
@@ -123,7 +123,7 @@ def turned_box(angle: float) -> Box:
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.2, 1.0])
-def test_points_outside_a_turned_box_are_told_by_its_own_axes(margin):
+def test_a_rotated_box_is_tested_along_its_own_axes(margin):
     box = turned_box(0.7)
     offsets = np.random.default_rng(0).uniform(-5.0, 5.0, (2000, 3))
     points = offsets + box.object_to_world[:3, 3]
@@ -135,7 +135,7 @@ def test_points_outside_a_turned_box_are_told_by_its_own_axes(margin):
     assert outside_boxes(points, [], margin).all()
 
 
-def test_a_track_that_moves_later_leaves_no_points_while_it_stands(tiny_scene):
+def test_a_dynamic_track_leaves_no_points_even_while_it_stands_still(tiny_scene):
     (truck,) = [track for track in tiny_scene.tracks if track.category == "vehicle.truck"]
     poses = truck.object_to_world.copy()
     poses[6:, 0, 3] += 3.0 * np.arange(1, 5)
@@ -159,12 +159,12 @@ def test_thinning_keeps_the_first_point_of_every_occupied_voxel(voxel):
     assert thin(points, voxel).tolist() == sorted(first.values())
 
 
-def test_thinning_by_0_keeps_all_and_takes_no_points_at_all():
+def test_thinning_accepts_voxel_size_0_and_empty_input():
     assert thin(np.zeros((3, 3)), 0.0).tolist() == [0, 1, 2]
     assert len(thin(np.empty((0, 3)), 0.1)) == len(thin(np.empty((0, 3)), 0.0)) == 0
 
 
-def test_thinning_holds_over_the_range_of_a_long_drive():
+def test_thinning_works_over_the_extent_of_a_long_drive():
     points = np.array([[-2000.0, -2000.0, -50.0], [-2000.0, -2000.0, -49.95], [2000.0, 2000.0, 50.0]])
     assert thin(points, 0.1).tolist() in ([0, 1, 2], [0, 2])
     assert thin(points[[0, 0, 2, 2]], 0.01).tolist() == [0, 2]
@@ -199,7 +199,7 @@ def test_a_point_takes_the_colour_of_the_view_nearest_in_time(moment, color, fli
     assert tuple(colors[0]) == color and seen[0] == 2
 
 
-def test_a_view_in_which_the_point_is_hidden_does_not_colour_it():
+def test_a_hidden_point_takes_no_colour_from_that_view():
     """Seen from the left the occluder stands before the point; from the right it stands beside it."""
     left, right = view(RED, 0), view(BLUE, 100, at=(4.0, 0.0, 0.0))
     points = np.array([[0.0, 0.0, 10.0], [0.0, 0.0, 5.0]])
@@ -214,7 +214,7 @@ def test_without_the_occluder_the_nearer_view_colours_it():
     assert tuple(colors[0]) == RED and seen[0] == 2
 
 
-def test_points_of_one_surface_do_not_hide_each_other():
+def test_points_of_one_surface_do_not_occlude_each_other():
     """A wall that recedes at 45 degrees, and ground near the camera: neighbours in a cell differ a little in depth."""
     along, across = (grid.ravel() for grid in np.meshgrid(np.linspace(-4.0, 4.0, 200), np.linspace(-1.0, 1.0, 20)))
     wall = np.stack([along, across, 20.0 + along], axis=1)
@@ -240,7 +240,7 @@ def test_a_point_takes_the_pixel_it_lies_in():
     np.testing.assert_array_equal(colors, source.pixels[rows_, columns])
 
 
-def test_pixels_that_are_not_usable_colour_nothing():
+def test_unusable_pixels_give_no_colour():
     unusable = view(RED, 0)
     unusable.usable[:, :41] = False
     points = np.array([[0.0, 0.0, 10.0], [2.0, 0.0, 10.0]])
@@ -248,7 +248,7 @@ def test_pixels_that_are_not_usable_colour_nothing():
     assert [tuple(c) for c in colors] == [BLUE, RED] and seen.tolist() == [1, 2]
 
 
-def test_no_points_and_no_views_are_no_error():
+def test_empty_points_and_views_are_accepted():
     colors, seen = color_by_visibility(np.empty((0, 3)), np.empty(0), [view(RED, 0)])
     assert colors.shape == (0, 3) and seen.shape == (0,)
     assert color_by_visibility(np.ones((2, 3)), np.zeros(2), [])[1].tolist() == [0, 0]
@@ -286,7 +286,7 @@ def some_far_points(count: int, covered: np.ndarray, seed: int = 0) -> tuple[np.
     return far_points(far_view(), GROUND, candidates, count, (3.0, 300.0), np.random.default_rng(seed))
 
 
-def test_far_points_lie_along_distinct_pixels_between_the_depths_and_have_their_colours():
+def test_far_points_have_distinct_pixels_with_their_colours_and_depths_in_range():
     positions, colors = some_far_points(500, np.empty((0, 3)))
     pixels, depth = project(positions, far_view().world_to_camera, K)
     assert positions.shape == (500, 3)
@@ -307,14 +307,14 @@ def test_far_points_are_log_uniform_in_depth_above_the_horizon():
     np.testing.assert_allclose(quartiles, expected, atol=0.2)
 
 
-def test_far_points_never_lie_under_the_ground():
+def test_far_points_are_never_below_the_ground():
     positions, _ = some_far_points(2640, np.empty((0, 3)))
     assert len(positions) == 60 * 44
     assert positions[:, 2].min() > GROUND - 1e-6
     assert (np.abs(positions[:, 2] - GROUND) < 1e-6).any(), "some rays must meet the ground for this to mean anything"
 
 
-def test_far_points_leave_out_the_cells_that_are_covered():
+def test_far_points_skip_covered_cells():
     """SparseGrid are 8 x 8 pixels. Covered: the first, one in the middle, and the cut ones at the right and lower
     edges."""
     cells = [(0, 0), (3, 2), (7, 5)]
@@ -330,7 +330,7 @@ def test_far_points_leave_out_the_cells_that_are_covered():
     assert len(positions) == 60 * 44 - 64 - 64 - 4 * 4
 
 
-def test_no_free_pixel_gives_no_far_points():
+def test_without_free_pixels_there_are_no_far_points():
     everywhere = far_view()
     unusable = dataclasses.replace(everywhere, usable=np.zeros_like(everywhere.usable))
     candidates = uncovered(unusable, np.empty((0, 3)))
@@ -388,7 +388,7 @@ def test_every_seed_point_is_seen_by_a_training_image(tiny_scene):
     assert seen.all()
 
 
-def test_colours_of_the_seed_are_those_of_the_surfaces(tiny_scene):
+def test_seed_colours_match_the_surfaces(tiny_scene):
     """Static LiDAR points take the colour that the drive's geometry gives them, up to JPEG and pixel size."""
     seed = seed_points(tiny_scene, job(far_points=0))
     assert len(seed.positions) == seed.note["lidar"] > 200
@@ -402,7 +402,7 @@ def test_colours_of_the_seed_are_those_of_the_surfaces(tiny_scene):
 
 
 @pytest.mark.parametrize("limit", [100, 250])
-def test_points_are_thinned_to_the_limit_at_random(tiny_scene, limit):
+def test_points_are_subsampled_to_the_limit_at_random(tiny_scene, limit):
     whole = seed_points(tiny_scene, job(far_points=0))
     thinned = seed_points(tiny_scene, job(far_points=0, max_points=limit))
     assert len(whole.positions) > 250
@@ -410,7 +410,7 @@ def test_points_are_thinned_to_the_limit_at_random(tiny_scene, limit):
     assert rows(thinned.positions) < rows(whole.positions)
 
 
-def test_the_seed_is_lidar_then_far_points_as_its_note_says(tiny_scene):
+def test_the_seed_has_lidar_points_before_far_points_and_its_note_counts_them(tiny_scene):
     seed = seed_points(tiny_scene, job())
     lidar, far = seed.note["lidar"], seed.note["far"]
     assert lidar > 0 and far == 200 and len(seed.positions) == lidar + far
@@ -420,11 +420,11 @@ def test_the_seed_is_lidar_then_far_points_as_its_note_says(tiny_scene):
     assert seed.positions[lidar:, 2].min() > -1e-3, "the tiny drive's ground is at z = 0"
 
 
-def test_no_far_points_where_none_are_wanted(tiny_scene):
+def test_far_points_can_be_disabled(tiny_scene):
     assert seed_points(tiny_scene, job(far_points=0)).note["far"] == 0
 
 
-def test_equal_seeds_of_randomness_give_equal_seeds_and_others_do_not(tiny_scene):
+def test_the_random_seed_determines_the_seed_points(tiny_scene):
     assert_same_seed(seed_points(tiny_scene, job()), seed_points(tiny_scene, job()))
     other = seed_points(tiny_scene, job(random_seed=1))
     assert not np.array_equal(other.positions, seed_points(tiny_scene, job()).positions)
@@ -435,7 +435,7 @@ def write_cloud(path: Path, positions: np.ndarray) -> None:
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
 
 
-def test_points_of_a_file_are_moved_from_the_global_frame_and_coloured(tiny_scene, tmp_path):
+def test_points_of_a_file_are_transformed_from_the_global_frame_and_coloured(tiny_scene, tmp_path):
     """Points on the truck's side, and one that no image sees."""
     (truck,) = [thing for thing in World().things if thing.category == "vehicle.truck"]
     side = np.array(truck.position) + [[dx, truck.size[1] / 2, dz] for dx in (-1.0, 0.0, 1.0) for dz in (-0.5, 0.5)]
@@ -459,7 +459,7 @@ def test_an_unreadable_points_file_is_named_with_its_setting(tiny_scene, tmp_pat
         seed_points(tiny_scene, job(points_file=str(path)))
 
 
-def test_a_scene_without_lidar_stops_unless_told_to_go_on(tiny_scene):
+def test_a_scene_without_lidar_is_refused_unless_on_missing_is_warn(tiny_scene):
     scene = dataclasses.replace(tiny_scene, sweeps=())
     with pytest.raises(DatasetError, match=r"0001.*lidar_seed\.on_missing: warn"):
         seed_points(scene, job())
@@ -467,19 +467,19 @@ def test_a_scene_without_lidar_stops_unless_told_to_go_on(tiny_scene):
     assert (seed.note["lidar"], seed.note["far"]) == (0, 200)
 
 
-def test_a_hold_out_that_takes_all_key_frames_is_named(tiny_scene):
+def test_a_hold_out_of_all_key_frames_is_refused(tiny_scene):
     everything = job().model_copy(update={"holdout": HoldoutSettings(last_block=10)})
     with pytest.raises(DatasetError, match=r"0001.*none of its 10 key frames.*holdout\.last_block"):
         seed_points(tiny_scene, everything)
 
 
-def test_nothing_to_start_from_is_an_error_that_says_so(tiny_scene):
+def test_a_scene_without_seed_points_is_refused(tiny_scene):
     scene = dataclasses.replace(tiny_scene, sweeps=())
     with pytest.raises(DatasetError, match=r"0001.*no seed points.*far_points"):
         seed_points(scene, job(on_missing="warn", far_points=0))
 
 
-def test_sweeps_that_are_all_missing_leave_far_points_and_their_count(root):
+def test_with_all_sweeps_missing_far_points_remain_and_the_note_counts_the_sweeps(root):
     scene = scene_at(root)
     shutil.rmtree(root / "samples" / "LIDAR_TOP")
     seed = seed_points(scene, job(on_missing="warn"))
@@ -506,7 +506,7 @@ def test_1_4_million_points_are_thinned_and_coloured_over_30_views_within_half_a
     assert len(kept) > 1_000_000 and seen.any()
 
 
-def test_the_real_scene_is_seeded_from_the_one_sweep_there_is_and_from_points_of_a_file(real_scene_root):
+def test_the_real_scene_is_seeded_from_its_only_sweep_and_a_file(real_scene_root):
     source = SceneSource(
         dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
         sweeps=False, on_missing="stop",
@@ -521,7 +521,7 @@ def test_the_real_scene_is_seeded_from_the_one_sweep_there_is_and_from_points_of
     assert seed.note["lidar"] > 1_000
 
 
-def test_the_own_cars_body_lends_no_colour(root):
+def test_the_ego_vehicle_gives_no_colour(root):
     """The left half of every image is the own car's body, and red: no seed point is, near or far, nor lies there."""
     scene = scene_at(root)
     for frame in scene.frames:

@@ -56,7 +56,7 @@ def true_sky(frame: Frame, size: tuple[int, int]) -> np.ndarray:
     return ~np.isfinite(distance).reshape(size[1], size[0])
 
 
-def test_every_image_gets_its_labels_and_its_sky(tiny_scene, made):
+def test_every_image_has_labels_and_a_sky_mask(tiny_scene, made):
     folder, record = made
     expected = {f"{kind}/CAM_FRONT/{f.timestamp}.png" for kind in ("regions", "sky") for f in tiny_scene.frames}
     assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == expected
@@ -64,7 +64,7 @@ def test_every_image_gets_its_labels_and_its_sky(tiny_scene, made):
     assert record.labels == LABELS
 
 
-def test_labels_return_as_they_were_made(tiny_scene, made):
+def test_labels_survive_a_round_trip(tiny_scene, made):
     for frame in tiny_scene.frames[::5]:
         labels = read_labels(made[0], "CAM_FRONT", frame.timestamp, SIZE)
         np.testing.assert_array_equal(labels, label_image(tiny_scene, frame, SIZE))
@@ -90,12 +90,12 @@ def test_the_sky_of_the_tiny_drive_is_found(tiny_scene, made, index):
     assert iou(found, true) > 0.8
 
 
-def test_the_record_says_how_much_of_the_images_is_sky(tiny_scene, made):
+def test_the_record_has_the_share_of_sky(tiny_scene, made):
     true = np.mean([true_sky(frame, SIZE).mean() for frame in tiny_scene.frames])
     assert made[1].sky_share == pytest.approx(true, abs=0.1)
 
 
-def test_no_sky_lies_where_lidar_returns(tiny_scene, made):
+def test_pixels_with_lidar_returns_are_not_sky(tiny_scene, made):
     for frame in tiny_scene.frames[::2]:
         sweep = min(tiny_scene.sweeps, key=lambda s: abs(s.timestamp - frame.timestamp))
         at, depth = project(apply(sweep.sensor_to_world, read_returns(sweep).points), inverse(frame.camera_to_world), K)
@@ -109,7 +109,7 @@ K = np.array([[0.62 * 96, 0.0, 48.0], [0.0, 0.62 * 96, 27.0], [0.0, 0.0, 1.0]])
 """The tiny drive's camera, continuous convention."""
 
 
-def test_a_return_in_what_looks_like_sky_takes_its_surroundings_from_the_sky(tiny_scene):
+def test_the_surroundings_of_a_return_are_not_sky(tiny_scene):
     frame = tiny_scene.frames[0]
     pixels = np.full((54, 96, 3), (150, 190, 240), dtype=np.uint8)
     at = frame.camera_to_world @ [0.0, -8.0, 30.0, 1.0]
@@ -147,7 +147,7 @@ def test_a_clear_sky_reaches_into_the_corners_of_the_image(tiny_scene, width):
     assert sky_mask(pixels, k, tiny_scene.frames[0].camera_to_world, None)[: height // 3].all()
 
 
-def test_a_bright_patch_that_does_not_reach_the_top_is_no_sky(tiny_scene):
+def test_a_bright_patch_not_connected_to_the_top_is_not_sky(tiny_scene):
     pixels = np.full((54, 96, 3), (90, 80, 70), dtype=np.uint8)
     pixels[8:18, 30:60] = (150, 190, 240)
     assert not sky_mask(pixels, K, tiny_scene.frames[0].camera_to_world, None).any()
@@ -159,7 +159,7 @@ def test_masks_are_made_without_lidar(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut"])
-def test_masks_are_made_though_a_lidar_file_is_bad(tiny_root, tmp_path, damage):
+def test_masks_do_not_require_readable_lidar(tiny_root, tmp_path, damage):
     """`lidar_seed.on_missing` decides whether a run may go on without it; masks are only the better for LiDAR."""
     root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
     scene = extracted(root)
@@ -168,7 +168,7 @@ def test_masks_are_made_though_a_lidar_file_is_bad(tiny_root, tmp_path, damage):
     assert make_masks(scene, job(), tmp_path / "masks").images == len(scene.frames)
 
 
-def test_the_sky_of_a_training_image_is_told_by_no_held_out_sweep(tiny_scene, tmp_path):
+def test_the_sky_of_training_images_is_independent_of_held_out_sweeps(tiny_scene, tmp_path):
     """There is one sweep, that of key frame 2, with a return in the middle of every image's sky. It is 465 ms from the
     image of key frame 3, and 285 from the one before its own."""
     frames = [tiny_scene.frames[i] for i in (3, 4, 6)]
@@ -209,7 +209,7 @@ def two_images(tiny_scene) -> Scene:
     return dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:2])
 
 
-def test_the_users_own_masks_are_used(two_images, tmp_path):
+def test_masks_of_the_user_are_used(two_images, tmp_path):
     labels = np.random.default_rng(0).integers(0, 10, (54, 96)).astype(np.uint8)
     sky = np.where(labels > 4, 255, 0).astype(np.uint8)
     settings = job(
@@ -231,7 +231,7 @@ def test_the_users_own_masks_are_used(two_images, tmp_path):
     [(1.0, None, True), (0.2, None, False), (1.0, 0, True)],
     ids=["day", "night", "the user's, without sky"],
 )
-def test_where_no_sky_is_found_none_is_known_unless_the_user_says_so(two_images, tmp_path, caplog, light, sky, known):
+def test_sky_is_unknown_if_none_is_found_unless_the_user_gives_masks(two_images, tmp_path, caplog, light, sky, known):
     dimmed = []
     for frame in two_images.frames:
         path = tmp_path / "images" / Path(frame.image_path).name
@@ -245,7 +245,7 @@ def test_where_no_sky_is_found_none_is_known_unless_the_user_says_so(two_images,
     assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
 
 
-def test_the_users_masks_at_another_size_are_brought_to_that_of_the_images(two_images, tmp_path):
+def test_masks_of_the_user_are_resized_to_the_images(two_images, tmp_path):
     labels = np.random.default_rng(0).integers(0, 10, (54, 96)).astype(np.uint8)
     large = np.kron(labels, np.ones((3, 3), dtype=np.uint8))
     settings = job(regions_folder=str(users_masks(two_images, tmp_path / "mine", large)))
@@ -256,7 +256,7 @@ def test_the_users_masks_at_another_size_are_brought_to_that_of_the_images(two_i
 
 @pytest.mark.parametrize("kind", ["regions_folder", "sky_folder"])
 @pytest.mark.parametrize("damage", ["missing", "corrupt"])
-def test_a_users_mask_that_is_bad_is_named(two_images, tmp_path, kind, damage):
+def test_an_invalid_mask_of_the_user_is_named(two_images, tmp_path, kind, damage):
     folder = users_masks(two_images, tmp_path / "mine", np.zeros((54, 96), dtype=np.uint8))
     path = folder / "CAM_FRONT" / f"{Path(two_images.frames[1].image_path).stem}.png"
     path.unlink() if damage == "missing" else path.write_bytes(b"no image")
@@ -266,7 +266,7 @@ def test_a_users_mask_that_is_bad_is_named(two_images, tmp_path, kind, damage):
 
 
 @pytest.mark.parametrize("label", [10, 255])
-def test_a_label_that_there_is_none_is_refused_naming_setting_and_file(two_images, tmp_path, label):
+def test_an_unknown_label_is_refused_naming_setting_and_file(two_images, tmp_path, label):
     labels = np.zeros((54, 96), dtype=np.uint8)
     labels[3, 4] = label
     folder = users_masks(two_images, tmp_path / "mine", labels)
@@ -277,7 +277,7 @@ def test_a_label_that_there_is_none_is_refused_naming_setting_and_file(two_image
         assert part in str(failure.value)
 
 
-def test_the_own_cars_outline_is_left_out_of_every_region(two_images, tmp_path):
+def test_the_outline_of_the_ego_vehicle_is_excluded_from_every_region(two_images, tmp_path):
     """The lower right quarter of the image, in fractions of its width and height; one pixel of rounding."""
     outline = ((0.5, 0.5), (1.0, 0.5), (1.0, 1.0), (0.5, 1.0))
     ego_mask = EgoMask({"CAM_FRONT": (outline,), "CAM_BACK": (WHOLE,)}, {"CAM_FRONT": "polygons", "CAM_BACK": "images"})
@@ -294,7 +294,7 @@ def test_the_own_cars_outline_is_left_out_of_every_region(two_images, tmp_path):
         np.testing.assert_array_equal(labels[outside], label_image(two_images, frame, SIZE)[outside])
 
 
-def test_the_own_cars_outline_is_left_out_of_the_users_masks_too(two_images, tmp_path):
+def test_the_outline_of_the_ego_vehicle_is_excluded_from_masks_of_the_user(two_images, tmp_path):
     folder = users_masks(two_images, tmp_path / "mine", np.full((54, 96), LABELS["moving_car"], dtype=np.uint8))
     outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0))
     make_masks(two_images, job(regions_folder=str(folder)), tmp_path / "masks", seen_in_front(outline))
@@ -303,7 +303,7 @@ def test_the_own_cars_outline_is_left_out_of_the_users_masks_too(two_images, tmp
     assert (labels[50:] == LABELS["own_car"]).all() and (labels[:47] == LABELS["moving_car"]).all()
 
 
-def test_the_own_car_is_no_sky_and_of_no_class(two_images, tmp_path):
+def test_the_ego_vehicle_is_neither_sky_nor_of_any_class(two_images, tmp_path):
     """The user's masks say that all is sky, and of class 3."""
     full = users_masks(two_images, tmp_path / "full", np.full((54, 96), 255, dtype=np.uint8))
     classes = users_masks(two_images, tmp_path / "classes", np.full((54, 96), 3, dtype=np.uint8))
@@ -317,13 +317,13 @@ def test_the_own_car_is_no_sky_and_of_no_class(two_images, tmp_path):
     assert (found[:27] == 3).all() and (found[27:] == UNLABELLED).all()
 
 
-def test_a_drive_that_shows_no_own_car_says_so(made):
+def test_the_record_states_that_no_camera_sees_the_ego_vehicle(made):
     assert made[1].own_car == {}
 
 
 @pytest.mark.parametrize("kind", ["sky", "regions"])
 @pytest.mark.parametrize("damage", ["missing", "cut", "foreign"])
-def test_a_mask_that_is_bad_is_named_with_the_rule_that_makes_it(two_images, tmp_path, kind, damage):
+def test_an_invalid_mask_is_named_with_its_rule(two_images, tmp_path, kind, damage):
     make_masks(two_images, job(), tmp_path)
     timestamp = two_images.frames[1].timestamp
     path = tmp_path / mask_name(kind, "CAM_FRONT", timestamp)
@@ -338,7 +338,7 @@ def test_a_mask_that_is_bad_is_named_with_the_rule_that_makes_it(two_images, tmp
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"images": 3}', '{"regions"'])
-def test_a_record_of_masks_that_is_bad_is_named_with_its_rule(tmp_path, content):
+def test_an_invalid_record_of_masks_is_named_with_its_rule(tmp_path, content):
     if content is not None:
         (tmp_path / "masks.json").write_text(content)
     with pytest.raises(ResultError, match=r"masks\.json.*'masks'"):
@@ -350,7 +350,7 @@ def test_a_record_of_masks_is_read(made, tmp_path):
     assert read_masks_record(tmp_path) == made[1]
 
 
-def test_an_image_that_is_gone_is_named(tiny_root, tmp_path):
+def test_a_missing_image_is_named(tiny_root, tmp_path):
     root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
     scene = extracted(root)
     assert read_image(scene.frames[1].image_path).shape == (54, 96, 3)

@@ -84,7 +84,7 @@ def test_splits_are_disjoint_and_cover_every_image(tiny_scene, seed):
 
 
 @pytest.mark.parametrize(("width", "size"), [(None, (96, 54)), (48, (48, 27)), (64, (64, 36)), (192, (192, 108))])
-def test_intrinsics_are_those_of_the_size_that_is_trained_at(tiny_scene, seed, width, size):
+def test_intrinsics_refer_to_the_training_size(tiny_scene, seed, width, size):
     """Continuous convention: the image's centre is at half its width and height, whatever the size."""
     record = training_record(tiny_scene, seed, job(width))
     np.testing.assert_array_equal(record.image_sizes, [size] * 19)
@@ -93,7 +93,7 @@ def test_intrinsics_are_those_of_the_size_that_is_trained_at(tiny_scene, seed, w
     np.testing.assert_allclose(record.Ks, [expected] * 19)
 
 
-def test_the_scale_is_the_farthest_training_camera_from_their_mean(tiny_scene, seed):
+def test_the_scene_scale_is_the_distance_of_the_farthest_training_camera_from_their_mean(tiny_scene, seed):
     """The tiny drive's camera moves along x at a steady speed; a scene is at least a metre large."""
     record = training_record(tiny_scene, seed, job())
     train = record.camtoworlds[record.splits["train"], 0, 3]
@@ -102,7 +102,7 @@ def test_the_scale_is_the_farthest_training_camera_from_their_mean(tiny_scene, s
     assert training_record(dataclasses.replace(tiny_scene, frames=tuple(still)), seed, job()).scene_scale == 1.0
 
 
-def test_held_out_cameras_do_not_widen_the_scale(tiny_scene, seed):
+def test_held_out_cameras_do_not_affect_the_scene_scale(tiny_scene, seed):
     whole = training_record(tiny_scene, seed, job()).scene_scale
     frames = list(tiny_scene.frames)
     far = frames[-1].camera_to_world.copy()
@@ -111,7 +111,7 @@ def test_held_out_cameras_do_not_widen_the_scale(tiny_scene, seed):
     assert training_record(dataclasses.replace(tiny_scene, frames=tuple(frames)), seed, job()).scene_scale == whole
 
 
-def test_what_the_protocol_says_of_scene_and_seed_is_carried_along(tiny_scene, seed):
+def test_the_record_describes_scene_and_seed(tiny_scene, seed):
     scene = dataclasses.replace(tiny_scene, missing_images=2, key_frame_range=[0, 10], poses="refined")
     record = training_record(scene, seed, job())
     assert dataclasses.asdict(record.scene) == {
@@ -127,14 +127,14 @@ def test_what_the_protocol_says_of_scene_and_seed_is_carried_along(tiny_scene, s
     "holdout",
     [HoldoutSettings(every_nth=1, offset=0), HoldoutSettings(last_block=10), HoldoutSettings(last_block=99)],
 )
-def test_a_scene_without_training_images_is_refused_with_the_settings_that_hold_them_out(tiny_scene, seed, holdout):
+def test_a_scene_without_training_images_is_refused_with_the_hold_out_settings(tiny_scene, seed, holdout):
     key_frames = tuple(frame for frame in tiny_scene.frames if frame.is_key_frame)
     scene = dataclasses.replace(tiny_scene, frames=key_frames)
     with pytest.raises(DatasetError, match=r"0001.*holdout\.every_nth.*holdout\.last_block"):
         training_record(scene, seed, job(holdout=holdout))
 
 
-def test_the_record_is_plain_data_that_returns_from_its_file(tiny_scene, seed, tmp_path):
+def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, seed, tmp_path):
     record = dataclasses.replace(training_record(tiny_scene, seed, job()), provenance={"made": "here"})
     write_training_record(tmp_path / "parser.pkl", record)
     again = read_training_record(tmp_path / "parser.pkl")
@@ -144,7 +144,7 @@ def test_the_record_is_plain_data_that_returns_from_its_file(tiny_scene, seed, t
 
 
 @pytest.mark.parametrize("content", [{}, {"Ks": np.eye(3)}, [1], None])
-def test_a_pickle_that_is_no_parser_record_is_refused_naming_file_and_rule(tmp_path, content):
+def test_an_invalid_parser_record_is_refused_naming_file_and_rule(tmp_path, content):
     write_plain_pickle(tmp_path / "parser.pkl", content)
     with pytest.raises(ResultError, match=r"parser\.pkl.*'parser'"):
         read_training_record(tmp_path / "parser.pkl")
@@ -165,7 +165,7 @@ def test_a_pickle_that_is_no_parser_record_is_refused_naming_file_and_rule(tmp_p
         ({"scene": {"name": "0001"}}, "it lacks dataset, version, poses"),
     ],
 )
-def test_a_record_whose_fields_do_not_fit_is_refused_with_the_reason(tiny_scene, seed, tmp_path, changes, reason):
+def test_a_record_with_inconsistent_fields_is_refused_with_the_reason(tiny_scene, seed, tmp_path, changes, reason):
     write_plain_pickle(tmp_path / "parser.pkl", training_record(tiny_scene, seed, job()).to_plain() | changes)
     with pytest.raises(ResultError, match=rf"parser\.pkl: not a training record.*{reason}.*'parser'"):
         read_training_record(tmp_path / "parser.pkl")

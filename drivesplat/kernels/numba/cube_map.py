@@ -1,4 +1,4 @@
-"""Where directions meet a cube."""
+"""Intersections of directions with a cube."""
 
 from typing import no_type_check
 

@@ -11,7 +11,7 @@ from drivesplat.kernels.numba.projection import arrays
 from drivesplat.kernels.numba.threads import parallel_for
 
 STEEPNESS, MIDPOINT = 100.0, 0.005
-"""Of the logistic function by which the noise decreases with opacity, as in gsplat."""
+"""Parameters of the logistic function by which the noise decreases with opacity, as in gsplat."""
 CHUNK = 4096
 """Gaussians per chunk."""
 

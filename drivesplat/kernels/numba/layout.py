@@ -4,9 +4,9 @@ TILE_WIDTH = 16
 TILE_HEIGHT = 16
 """Size of a tile in pixels."""
 MIN_ALPHA = 1.0 / 255.0
-"""Contributions below are not drawn."""
+"""Minimum alpha: smaller contributions are not drawn."""
 SLACK = 0.02
-"""Pixels by which ellipses are enlarged, more than float32 rounding can move them."""
+"""Margin of ellipses in pixels, larger than any float32 rounding error."""
 MEAN_X, MEAN_Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, REACH, RADIUS_X, RADIUS_Y = range(9)
 """Columns of `Splats.shapes`. A Gaussian is drawn where its exponent's quadratic form is at most REACH."""
 MOMENTS = 6

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 BLOCK = 256
 """Pixels per program."""
 MIN_TRANSMITTANCE = tl.constexpr(1e-3)
-"""Texels get no gradient from pixels with less: every opaque surface lets a trace of the background through."""
+"""Minimum transmittance for gradients of texels: every opaque surface lets a trace of the background through."""
 RUN = tl.constexpr(4)
 """Neighbouring pixels that mostly see the same texels."""
 

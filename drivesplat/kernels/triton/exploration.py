@@ -11,7 +11,7 @@ from drivesplat.kernels.triton.rows import store_three, three, unit
 
 STEEPNESS = tl.constexpr(100.0)
 MIDPOINT = tl.constexpr(0.005)
-"""Of the logistic function by which the noise decreases with opacity, as in gsplat."""
+"""Parameters of the logistic function by which the noise decreases with opacity, as in gsplat."""
 BLOCK = 256
 """Gaussians per program."""
 SEEDS = 2**31

@@ -19,7 +19,7 @@ BLOCK = 128
 TILE = tl.constexpr(16)
 """Edge of a tile in pixels."""
 MIN_ALPHA = tl.constexpr(1.0 / 255.0)
-"""Contributions below are not rasterized, as in 3D Gaussian Splatting."""
+"""Minimum alpha: smaller contributions are not rasterized, as in 3D Gaussian Splatting."""
 SLACK = tl.constexpr(0.01)
 """Pixels by which ellipses are enlarged against rounding."""
 
