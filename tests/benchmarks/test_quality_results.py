@@ -210,8 +210,8 @@ def test_trainings_that_shared_a_gpu_are_recognised_from_their_logs(runs, others
 
 
 @pytest.mark.parametrize(("device", "shared"), [("cpu (x86_64)", True), ("NVIDIA H200", False)])
-def test_trainings_without_a_gpu_share_the_processors(runs, device, shared):
-    """A GPU without a name in the log is one that a scheduler gave: which, nobody knows."""
+def test_without_a_gpu_name_only_cpu_trainings_count_as_shared(runs, device, shared):
+    """A GPU without a name in the log was assigned by a scheduler and is unknown."""
     for recipe in ("a", "b"):
         write_evaluation(runs[0], recipe, 0, evaluation(20.0, device=device))
         write_log(runs[0], recipe, 0, "10:00:00", "10:10:00", None)
