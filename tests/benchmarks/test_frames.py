@@ -1,4 +1,4 @@
-"""How many frames a second there are, and how long a film takes: what the benchmark counts."""
+"""Frames per second and film duration: what the benchmark measures."""
 
 import json
 import time
@@ -25,7 +25,7 @@ def scene(tiny_scene):
 
 
 def test_frame_rate_excludes_the_first_frame_and_film_time_includes_everything(scene, monkeypatch):
-    """By a clock that only rendering moves: by a second a frame, 0.1 s once a tenth of them are rendered."""
+    """The test clock advances only by rendering: 1 s per frame, and 0.1 s per frame after the first tenth."""
     now, rendered = {"s": 0.0}, []
 
     def rendering(model, shot, device):

@@ -1,4 +1,4 @@
-"""The table of recipes: what stands side by side, what it must be read with, and the command from end to end."""
+"""The table of recipes: its content, its notes, and the command end to end."""
 
 import json
 import os
@@ -27,7 +27,7 @@ BAD = {"overrides": {"sky": "none"}}
 
 @pytest.fixture
 def compared(tmp_path):
-    """Makes a record of recipes whose eval.json files hold what is given by name and seed; the rest has failed."""
+    """Makes a record of recipes from eval.json contents by name and seed; all others have failed."""
 
     def compare(evals: dict[str, list[dict[str, Any] | None]], recipes: dict[str, Any]) -> dict[str, Any]:
         file, runs = recipe_file(tmp_path, recipes=recipes)
@@ -65,7 +65,7 @@ EVALS = {
 
 
 def test_the_table_compares_recipes_with_the_first_one(compared):
-    """Static: 24 and 25 against 25 and 27: +1 and +2, so 1.5 with a standard error of 0.5."""
+    """Static PSNR 24 and 25 against 25 and 27: differences +1 and +2, mean 1.5, standard error 0.5."""
     record = compared(EVALS, TWO)
     (table,) = record["tables"]
     plain, street = table["rows"]
@@ -130,7 +130,7 @@ OTHERWISE = {
 
 
 def spelled(value: Any) -> str:
-    """A value as YAML spells it in a line."""
+    """A value as one line of YAML."""
     return yaml.safe_dump(value, default_flow_style=True, sort_keys=False).split("\n")[0]
 
 
@@ -227,8 +227,8 @@ def test_the_record_holds_the_figures_and_source_of_every_seed(compared):
 
 @pytest.fixture
 def called(tmp_path, monkeypatch):
-    """Calls the command with these words for Snakemake, whose run leaves the results of these recipes; returns the exit
-    status, and what Snakemake was told."""
+    """Calls the command with `words`; a fake Snakemake writes the results of the recipes in `done`. Returns the exit
+    status and Snakemake's arguments."""
 
     def call(words: list[str], done: tuple[str, ...] = ("plain", "street"), status: int = 0) -> tuple[int, list[str]]:
         recipe_file(tmp_path, recipes=TWO)
@@ -297,7 +297,7 @@ RECIPES = {
 @pytest.mark.workflow
 @pytest.mark.xdist_group("quality")
 def test_recipes_run_to_a_table_with_failures_and_only_failed_ones_run_again(tmp_path):
-    """One recipe's data is not there, one diverges; the third is measured, and only that which failed is run again."""
+    """One recipe has no data, one diverges, the third is measured. A second call runs only the failed ones."""
     copy = WorkflowCopy.make(tmp_path / "copy")
     (copy.folder / "recipes.yaml").write_text(yaml.safe_dump(RECIPES, sort_keys=False))
     done = command(copy)

@@ -1,4 +1,4 @@
-"""Recipe files: refusals in one line, which recipes share a run, and the settings of each."""
+"""Recipe files: one-line errors, recipes that share a run, and the settings of each."""
 
 import json
 from typing import Any
@@ -51,7 +51,7 @@ def test_a_method_of_the_config_is_unchanged_except_for_its_seed(runs):
 
 
 def test_the_run_file_merged_over_config_yaml_equals_the_planned_config(runs):
-    """Snakemake merges the file of a run over config.yaml, as `merged` does."""
+    """Snakemake merges the run's file over config.yaml; `merged` does the same."""
     made = runs(recipes={"street": {"of": "street"}, "more": {"of": "street", "config": {"sweeps": True}}})
     for run in made:
         written = yaml.safe_load(yaml.safe_dump(run.overlay))
@@ -104,7 +104,7 @@ def test_base_files_lie_under_the_recipes_in_order(runs, tmp_path):
 
 
 def test_recipe_settings_take_precedence_over_dataset_settings(runs):
-    """The demo trains for 1,000 iterations on 25,000 points of LiDAR, whatever stands further up in the config."""
+    """The demo dataset sets 1,000 iterations and 25,000 LiDAR points, which override the general settings."""
     recipes = {"vanilla": {}, "few": {"config": {"lidar_seed": {"max_points": 200}}}}
     plain, few = runs(scene="demo", config={"train": {"iterations": 7}}, recipes=recipes)
     assert settings_of(plain, "train", "vanilla-seed0")["train"]["iterations"] == 7
@@ -171,7 +171,7 @@ def test_recipes_on_different_copies_of_a_dataset_differ(runs):
 
 
 def test_two_synthetic_worlds_in_one_folder_are_refused(runs):
-    """Each run would make its own world there, and the other's results stale."""
+    """Each run would overwrite the other's world and make its results stale."""
     night = {"datasets": {"demo": {"world": {"night": True}}}}
     with pytest.raises(ConfigError, match=r"'day' and 'night' make different worlds in resources/demo"):
         runs(scene="demo", recipes={"day": {}, "night": {"config": night}})

@@ -39,7 +39,7 @@ NO_CORES = "usage: snakemake [-h]\nsnakemake: error: argument --cores: expected 
     ],
 )
 def test_the_reason_of_a_run_without_jobs_is_its_last_message(output, reason):
-    """A message of a job that was started, such as that it waits for a GPU, is no refusal."""
+    """A message of a started job, such as waiting for a GPU, is not an error."""
     assert refusal(output.splitlines(keepends=True)) == reason
 
 
@@ -116,7 +116,7 @@ def test_every_recipe_and_seed_has_its_own_figures_or_a_reason(runs):
 
 
 def test_figures_of_earlier_settings_or_code_do_not_count(runs):
-    """A failed training leaves the eval.json of the one before it in place."""
+    """A failed training leaves the eval.json of the previous training in place."""
     both, _ = runs
     for recipe, seed, change in (("a", 0, None), ("a", 1, "settings"), ("b", 0, "code"), ("b", 1, "settings")):
         path = write_evaluation(both, recipe, seed, evaluation(20.0))
@@ -144,7 +144,7 @@ def test_an_invalid_evaluation_file_is_named(runs, content):
 
 
 def write_log(run, recipe: str, seed: int, began: str, finished: str, card: str | None, stage: str = "train") -> Path:
-    """What a job logs that had its card from `began` on; for a card it has waited since nine."""
+    """Writes the log of a job that held its GPU from `began` on, after waiting for it since nine o'clock."""
     path = run.log(recipe, seed, stage)
     path.parent.mkdir(parents=True, exist_ok=True)
     took = f"2026-11-21 {began},000 INFO drivesplat.workflow.gpus: runs on the GPU 0 ({card})\n" if card else ""
@@ -159,7 +159,7 @@ def write_log(run, recipe: str, seed: int, began: str, finished: str, card: str 
 
 @pytest.fixture
 def own_logging():
-    """A root logger without handlers, which a script configures for its process, and afterwards the one there was."""
+    """Removes the root logger's handlers, so that a script can configure them, and restores them afterwards."""
     root = logging.getLogger()
     handlers, level, root.handlers[:] = root.handlers[:], root.level, []
     yield
@@ -200,7 +200,7 @@ def test_a_job_log_gives_its_gpu_and_the_time_it_held_it(tmp_path, monkeypatch, 
     ids=str,
 )
 def test_trainings_that_shared_a_gpu_are_recognised_from_their_logs(runs, others, shared):
-    """One card belongs to training a from 10:00 to 10:10; a job of another run may be on it, too."""
+    """Training a holds one GPU from 10:00 to 10:10; a job of another run may use it as well."""
     both, alone = runs
     write_evaluation(both, "a", 0, evaluation(20.0))
     write_log(both, "a", 0, "10:00:00", "10:10:00", "GPU-1")

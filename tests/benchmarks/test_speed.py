@@ -1,4 +1,4 @@
-"""Timed trainings: what is trained for a file, the tables, and the command from end to end."""
+"""Timed trainings: the planned trainings, the tables, and the command end to end."""
 
 import json
 import os
@@ -50,7 +50,7 @@ def test_both_recipes_run_with_every_seed_and_length_in_alternating_order(tmp_pa
 
 
 def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_path):
-    """`street`: with what only that method reads."""
+    """Uses `street`, with the inputs that only this method reads."""
     file, tasks = planned(tmp_path, method="street", iterations=[77], seeds=[5])
     run, config = plan_run(file, tmp_path, REPOSITORY), load(DEFAULTS)
     expected = json.loads(stage_settings(config, "train", "0061", "street"))
@@ -68,7 +68,7 @@ def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_pa
 
 
 def test_the_files_config_takes_precedence_over_dataset_settings(tmp_path):
-    """The demo has a cap of 40,000 Gaussians and 1,000 iterations of its own."""
+    """The demo dataset sets a cap of 40,000 Gaussians and 1,000 iterations."""
     _, (task, _) = planned(tmp_path, scene="demo", iterations=[9], seeds=[0], config={"train": {"cap_max": 123}})
     assert (task.train.train.cap_max, task.iterations) == (123, 9)
 
@@ -127,7 +127,7 @@ PROTOCOL = {
 
 
 def ended(recipe: str, seed: int, loop: float, static: float, **more: Any) -> dict[str, Any]:
-    """A run with such figures between training frames, and static ones 5 dB lower beyond them."""
+    """A run with these interpolation figures; its static extrapolation PSNR is 5 dB lower."""
     between = {"static": {"psnr": static}, "all": {"psnr": static - 1.0, "ssim": 0.5}, "moving_vehicle": None}
     result = {"interpolation": between, "extrapolation": {"static": {"psnr": static - 5.0}, "all": None}}
     costs = {"gaussians": 1000 + seed, "peak_gpu_memory_gb": 2.5, "loop": loop, "whole": 2.0 * loop}
@@ -150,7 +150,7 @@ def rows(text: str) -> list[list[list[str]]]:
 
 
 def test_the_table_gives_times_with_the_quality_reached():
-    """Loops of 60 and 50 s against 30 and 20: twice and 2.5 times as fast. Static: +2 and +3."""
+    """Loops of 60 and 50 s against 30 and 20 s: 2 and 2.5 times as fast. Static PSNR: +2 and +3."""
     record = speed(TWO, RUNS, [])
     (table,) = record["tables"]
     assert (table["iterations"], table["seeds"]) == (300, [0, 1]), "no table of what has not been run"
@@ -228,14 +228,14 @@ def test_on_a_gpu_the_table_also_gives_host_time():
 
 
 def test_the_load_of_other_processes_is_measured():
-    """In 10 s two processors had 18 s of work, 6 s of it one's own; the rest is 1.2 processors' work."""
+    """In 10 s two processors worked 18 s, 6 s of these for this process: the rest is the load of 1.2 processors."""
     assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 118.0, 8.0)) == pytest.approx(1.2)
     assert busy_elsewhere(CpuSample(5.0, None, 2.0), CpuSample(15.0, None, 8.0)) is None
     assert busy_elsewhere(CpuSample(5.0, 100.0, 2.0), CpuSample(15.0, 101.0, 8.0)) == 0.0, "its own, counted twice"
 
 
 def test_the_load_of_this_process_does_not_count_as_other_load(tmp_path, monkeypatch):
-    """Work of this process shows in its own seconds; what the kernel says is read as processors' ticks."""
+    """This process's work counts as `own`; the kernel's statistics are converted from ticks."""
     before = CpuSample.now()
     sum(i * i for i in range(3_000_000))
     assert CpuSample.now().own - before.own > 0.05
@@ -272,7 +272,7 @@ TINY = {
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A tiny drive, timed: the folder of the workflow, and what was printed."""
+    """A timed tiny drive: the workflow's folder and the printed text."""
     copy = WorkflowCopy.make(tmp_path_factory.mktemp("speed") / "copy")
     (copy.folder / "tiny.yaml").write_text(yaml.safe_dump(TINY))
     with pytest.MonkeyPatch.context() as patch:
@@ -308,7 +308,7 @@ def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record
 @pytest.mark.workflow
 @pytest.mark.xdist_group("speed")
 def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkeypatch):
-    """The same function, and with the same settings and files the same model."""
+    """Both call the same function, and equal settings and files give the same model."""
     script = (REPOSITORY / "workflow_scripts/train.py").read_text()
     assert re.search(r"^from drivesplat\.training\.run import .*\brun_training$", script, re.MULTILINE)
     assert runs.run_training is run_training and runs.read_inputs is read_inputs

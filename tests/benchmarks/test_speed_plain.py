@@ -1,4 +1,4 @@
-"""The plain recipe: it is what gsplat's example trainer does in its configuration `mcmc`."""
+"""The plain recipe follows gsplat's example trainer in its configuration `mcmc`."""
 
 import dataclasses
 import math
@@ -177,7 +177,7 @@ def test_fused_ssim_is_used_on_a_gpu_if_installed(monkeypatch):
 
 
 def test_the_loss_equals_that_of_the_mcmc_example(record):
-    """0.8 L1 + 0.2 (1 - SSIM) + 0.01 mean opacity + 0.01 mean scale, of an image before black at degree 0."""
+    """0.8 L1 + 0.2 (1 - SSIM) + 0.01 mean opacity + 0.01 mean scale, for a black background and degree 0."""
     training = begun(record, PlainRecipe(Schedule.of(30_000), 60, 0))
     batch = next(endless(loader_of(images_of(record), 0, CPU)))
     terms, _ = training.fit_one(iter([batch]))
@@ -198,7 +198,7 @@ def test_the_loss_equals_that_of_the_mcmc_example(record):
 
 
 def test_the_learning_rate_of_means_decays_and_the_noise_with_it(record, monkeypatch):
-    """A hundredth at the end; the noise of a step takes the rate of the next, as the example's order has it."""
+    """The final rate is 1% of the initial one. A step's noise uses the next step's rate, as in the example."""
     told = []
 
     def noted(self, params, optimizers, state, step, info, lr):
@@ -241,7 +241,7 @@ def test_on_a_gpu_it_trains_with_gsplats_own_rasterizer(record, tmp_path):
 
 
 def off(model, record: TrainingRecord) -> float:
-    """How far a model's picture of the first image is off it, on average."""
+    """Mean absolute error of a model's rendering of the first image."""
     from drivesplat.model.view import View
 
     pose, intrinsics = (torch.from_numpy(getattr(record, key)[0]).float() for key in ("camtoworlds", "Ks"))

@@ -1,4 +1,4 @@
-"""The ablation of a method: which trainings it takes, and what it says of them."""
+"""The ablation of a method: its trainings and its tables."""
 
 import csv
 import json
@@ -28,7 +28,7 @@ NOTHING = {"ablation": {"of": "nobody"}}
 
 
 def names(seeds=(0, 1, 2), without=VARIANTS, of="street") -> list[str]:
-    """What the methods of an ablation are to be called."""
+    """The expected names of an ablation's methods."""
     return [f"{stem}-seed{seed}" for stem in (of, *(f"{of}-without-{name}" for name in without)) for seed in seeds]
 
 
@@ -39,7 +39,7 @@ def flat(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def training(config: Config, method: str) -> dict[str, Any]:
-    """What the training of a method is told, by the paths of its settings."""
+    """The training settings of a method, by key path."""
     return flat(json.loads(stage_settings(config, "train", "0061", method)))
 
 
@@ -68,7 +68,7 @@ LACKING = {
 @pytest.mark.parametrize("without", VARIANTS)
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_variant_differs_from_the_method_in_one_setting_only(without, seed):
-    """Every default variant changes something: one that did not would be compared with itself."""
+    """Every default variant changes a setting; otherwise the method would be compared with itself."""
     config = load({})
     street, variant = training(config, "street"), training(config, f"street-without-{without}-seed{seed}")
     changed = {key: value for key, value in variant.items() if street[key] != value}
@@ -83,7 +83,7 @@ def test_the_full_method_is_unchanged_except_for_its_seed(seed):
 
 
 def test_overrides_of_a_variant_are_merged_over_those_of_the_method():
-    """Key by key; the method's own others stay, and the ablation's seeds come over a seed of the method's own."""
+    """Overrides are merged key by key, and the ablation's seeds replace the method's own seed."""
     mine = {
         "parts": ["background", "actors"],
         "overrides": {"train": {"iterations": 7, "mcmc": {"noise_lr": 3.0}, "depth_weight": 0.5}, "random_seed": 9},
@@ -190,7 +190,7 @@ def test_a_config_without_the_method_is_valid_until_its_ablation_is_requested(ta
 
 
 def told_to_drop(made: Plan, target: str) -> dict[str, Any]:
-    """What a refusal of an ablation says to add to the config."""
+    """The setting that the error message of an ablation suggests."""
     with pytest.raises(ConfigError) as failure:
         made.refuse_unknown([target])
     message, advice = str(failure.value).split("drop them with ")
@@ -200,7 +200,7 @@ def told_to_drop(made: Plan, target: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("target", ["results/a1/ablation.csv", "results/a1/ablation.json"])
 def test_variants_without_effect_are_refused_with_the_setting_that_drops_them(target):
-    """Vanilla has no actors, and is held neither to LiDAR's depth nor to masks of the sky: there is its sky alone."""
+    """Vanilla has no actors, no LiDAR depth loss and no sky mask loss: only its sky can be removed."""
     of_vanilla = {"ablation": {"of": "vanilla"}}
     idle = [name for name in VARIANTS if name != "sky"]
     assert told_to_drop(plan(**of_vanilla), target) == {"ablation": {"without": dict.fromkeys(idle)}}
@@ -217,7 +217,7 @@ def test_variants_without_effect_block_the_ablation_only():
 
 
 def test_the_effect_of_a_variant_depends_on_the_settings_of_the_scene():
-    """Where the drive's settings have no loss of entropy the method is without it anyway."""
+    """If the drive's settings have no entropy loss, the variant without it equals the method."""
     free = {"scenes": ["a1"], "overrides": {"train": {"entropy_weight": 0.0}}}
     made = Plan({"datasets": {"a": free, "b": {"scenes": ["b1"]}}}, str(REPOSITORY))
     made.refuse_unknown(["results/b1/ablation.csv"])
@@ -264,7 +264,7 @@ def test_variants_can_be_filmed_and_those_with_actors_edited():
 
 
 def test_other_stages_do_not_depend_on_the_ablation():
-    """Settings of all stages, films, edits and what a report expects are the same without any."""
+    """Stage settings, films, edits and the report's inputs are the same without an ablation."""
     edits = {"demo": str(REPOSITORY / "presets/edits/demo.yaml")}
     datasets = {"a": {"scenes": ["a1", "demo"], "edits": edits}}
     with_it, without = (Plan({"datasets": datasets, **more}, str(REPOSITORY)) for more in ({}, NOTHING))
@@ -286,7 +286,7 @@ PROTOCOL = {"width": 640, "holdout": {"every_nth": 8, "offset": 4, "last_block":
 
 
 def measured(static: float | None, moving: float | None, beyond: tuple = (None, None), **more: Any) -> dict[str, Any]:
-    """An eval.json with such PSNRs between training frames, and `beyond` them."""
+    """An eval.json with these PSNRs for interpolation, and `beyond` for extrapolation."""
 
     def group(static: float | None, moving: float | None) -> dict[str, Any]:
         gap = None if static is None or moving is None else static - moving
@@ -316,7 +316,7 @@ def evals(whole=WHOLE, sky=SKY, depth=DEPTH, job=JOB) -> dict[str, dict[str, Any
 
 
 def test_a_row_has_means_standard_deviations_and_differences_paired_by_seed():
-    """Static: 24, 25, 26 with the sky and 23 thrice without: -1, -2, -3; mean -2, its standard error 1 / sqrt(3)."""
+    """Static PSNR 24, 25, 26 with the sky and 23 without: differences -1, -2, -3, mean -2, error 1 / sqrt(3)."""
     record = ablation(evals(), JOB)
     assert (record["scene"], record["of"], record["seeds"], record["protocol"]) == (
         "0061",
@@ -345,7 +345,7 @@ def test_a_row_has_means_standard_deviations_and_differences_paired_by_seed():
 
 @pytest.fixture
 def still() -> dict[str, Any]:
-    """The ablation on a scene where nothing moves, measured in both groups."""
+    """The ablation of a static scene, measured in both groups."""
     runs = [measured(24.0 + i, None, beyond=(18.0 - i, None)) for i in range(3)]
     return ablation(evals(runs, runs, runs), JOB)
 
@@ -433,7 +433,7 @@ def test_each_measured_group_has_a_table(still):
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory) -> WorkflowCopy:
-    """The workflow with a small ablation: of vanilla, without its sky, with one seed."""
+    """The workflow with a small ablation: vanilla without its sky, one seed."""
     without = dict.fromkeys(VARIANTS) | {"sky": {"overrides": {"sky": "none"}}}
     section = {"of": "vanilla", "seeds": [2], "without": without}
     train = {**TINY_TRAINING, "iterations": 20}
@@ -441,7 +441,7 @@ def copy(tmp_path_factory) -> WorkflowCopy:
 
 
 def planned_files(copy: WorkflowCopy, target: str, rule: str) -> dict[str, list[str]]:
-    """The inputs of every job of `rule` that a dry run plans, by the wildcard `method`."""
+    """The inputs of every planned job of `rule` in a dry run, by the wildcard `method`."""
     done = copy.run(target, flags=("-n",))
     assert done.returncode == 0, done.stdout
     jobs = re.findall(rf"^(?:local)?rule {rule}:\n((?:    .*\n)+)", done.stdout, re.M)

@@ -1,4 +1,4 @@
-"""Figures over several random seeds: means that leave out what is null, differences paired by seed, their spelling."""
+"""Figures over several random seeds: means without nulls, differences paired by seed, and their format."""
 
 from drivesplat.evaluation.comparison import (
     PSNRS,
@@ -15,7 +15,7 @@ from drivesplat.evaluation.comparison import (
 
 
 def test_differences_are_paired_by_seed():
-    """What all trainings of a seed have in common cancels: the spread of the figures is not that of the difference."""
+    """Effects common to all trainings of a seed cancel: differences vary less than the figures."""
     assert paired_difference([10.0, 20.0, 30.0], [11.0, 21.0, 31.0]) == {
         "mean": -1.0, "standard_error": 0.0, "by_seed": [-1.0] * 3
     }  # fmt: skip
@@ -43,7 +43,7 @@ def group(static: float | None, gap: float | None = None) -> dict:
 
 
 def test_a_missing_run_is_left_out_of_figures_and_differences():
-    """The second seed has no result, the third no static pixels beyond the last training frame."""
+    """The second seed has no result, the third no static pixels in extrapolation."""
     runs = [
         {"interpolation": group(20.0), "extrapolation": group(10.0)},
         None,

@@ -1,4 +1,4 @@
-"""What stands beside the figures of a drive: how near held-out images are to training images, and how bright."""
+"""The summary of a drive: distances from held-out to training images, and brightness."""
 
 import dataclasses
 
@@ -28,8 +28,8 @@ def record_of(recording: PreparedDrive) -> dict:
 
 
 def test_from_training_m_is_the_distance_driven_since_the_nearest_training_image(tiny_scene):
-    """At 4 m/s, images every quarter of a second: those a quarter before 2, 6 and 8 are trained on, since cameras fire
-    35 ms early, those a quarter after are not; 9 comes a second and a quarter after the last."""
+    """At 4 m/s with an image every 0.25 s: those 0.25 s before key frames 2, 6 and 8 are trained on, since cameras
+    fire 35 ms early, but not those 0.25 s after. Key frame 9 follows the last training image by 0.75 s."""
     record = record_of(recording_of(tiny_scene))
     assert record["interpolation"]["from_training_m"] == pytest.approx(1.0)
     assert record["extrapolation"]["from_training_m"] == pytest.approx((1.0 + 3.0) / 2)

@@ -1,4 +1,4 @@
-"""How far off rendered depth is: the figure, and which LiDAR it is held to."""
+"""The error of rendered depth, and the LiDAR sweep that it is compared with."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def known(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray) -> PixelDept
 
 
 def test_the_figure_is_the_median_over_all_pixels_of_the_group():
-    """Not the mean, and not the mean of the images' medians: a third of the pixels belongs to the first image."""
+    """It is neither the mean nor the mean of the images' medians: the first image has a third of the pixels."""
     random, errors = np.random.default_rng(0), DepthErrors()
     expected = []
     for count, spread in ((500, 0.3), (1000, 0.05)):
@@ -68,7 +68,7 @@ def held_out_recording(root: Path) -> PreparedDrive:
 
 
 def test_images_are_compared_with_the_sweep_of_their_own_key_frame(tiny_root):
-    """To what a training would be held to, if nothing were held out. Only key frames that are held out are measured."""
+    """The depths are those of a training without hold-out. Only held-out key frames are measured."""
     recording = held_out_recording(tiny_root)
     everything = lidar_depths(recording.scene, job(NOTHING_HELD_OUT))
     groups = frame_groups(recording.scene, HoldoutSettings(**HELD_OUT))
@@ -82,7 +82,7 @@ def test_images_are_compared_with_the_sweep_of_their_own_key_frame(tiny_root):
 
 
 def test_images_without_their_own_sweep_are_not_compared(tiny_root, tmp_path):
-    """Not to that of another key frame, held out or not, half a second away."""
+    """The sweeps of other key frames, 0.5 s away, are not used."""
     root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
     (root / "samples/LIDAR_TOP/0001__0008.pcd.bin").unlink()
     depths = held_out_depths(held_out_recording(root), "CAM_FRONT", job())
@@ -90,7 +90,7 @@ def test_images_without_their_own_sweep_are_not_compared(tiny_root, tmp_path):
 
 
 def test_groups_include_the_depth_error(tiny_root):
-    """Of a disc 5 metres before the first held-out image, known to be 4 metres away, and one of which nothing is."""
+    """The first held-out image shows a disc at 5 m whose LiDAR depth is 4 m; the second has no LiDAR depth."""
     recording = held_out_recording(tiny_root)
     index = 4
     pose = recording.scene.frames[index].camera_to_world

@@ -1,4 +1,4 @@
-"""LPIPS from a backbone file, and the fetching of that file, which never stops a run."""
+"""LPIPS from a backbone file, and the download of that file, whose failure never stops a run."""
 
 import hashlib
 import socket
@@ -29,7 +29,7 @@ DIGEST = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.fixture(scope="module")
 def alexnet() -> dict[str, torch.Tensor]:
-    """Random weights under torchvision's names; the large classifier is stood in for by a small one."""
+    """Random weights under torchvision's names, with a small classifier in place of the large one."""
     torch.manual_seed(0)
     with torch.device("meta"):
         shapes = torchvision.models.alexnet(weights=None).state_dict()
@@ -91,7 +91,7 @@ def test_lpips_does_not_depend_on_the_random_initialisation(distance, backbone):
 
 
 class Malicious:
-    """A pickle of it makes a file when it is loaded."""
+    """Its pickle creates a file when it is loaded."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -161,7 +161,7 @@ Answer = Callable[[BaseHTTPRequestHandler], None]
 
 @contextmanager
 def served(answer: Answer) -> Iterator[str]:
-    """The address of a local server that answers every GET so."""
+    """The address of a local server that answers every GET with the given function."""
     ended = threading.Event()
 
     class Handler(BaseHTTPRequestHandler):
@@ -186,7 +186,7 @@ def served(answer: Answer) -> Iterator[str]:
 
 
 def sends(body: bytes, length: int | None = None) -> Answer:
-    """An answer that announces `length` bytes (default: as many as there are; -1: no announcement)."""
+    """A response whose Content-Length is `length` (default: the actual one; -1: no such header)."""
 
     def answer(handler: BaseHTTPRequestHandler) -> None:
         handler.send_response(200)
@@ -254,7 +254,7 @@ def test_a_valid_file_is_fetched_and_kept(tmp_path, digits, length):
 
 
 def refused(record: dict, path: Path) -> str:
-    """The reason of a record whose file was not kept, after checks that hold for all of them."""
+    """The reason in the record of a rejected file, after checks common to all cases."""
     assert record["sha256"] is None
     assert not path.exists() and not any(path.parent.glob("*")), "nothing is kept, not even a part"
     reason = record["unavailable"]

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and the gap, as the measuring protocol defines them."""
+"""PSNR, SSIM and the gap, as the evaluation protocol defines them."""
 
 import json
 import math
@@ -24,7 +24,7 @@ def pair(seed: int, noise: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
 
 
 def labels_of(**pixels: int) -> np.ndarray:
-    """A label image with so many pixels of each label, the rest static."""
+    """A label image with the given number of pixels of each label, the rest static."""
     flat = np.full(HEIGHT * WIDTH, LABELS["static"], dtype=np.uint8)
     start = 0
     for name, count in pixels.items():
@@ -130,7 +130,7 @@ def test_a_frame_with_fewer_than_100_pixels_of_a_region_is_left_out_of_its_frame
 
 
 def fake_lpips(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """A stand-in with the interface of the map: any function of the two images, by pixel."""
+    """A replacement for the LPIPS map: an arbitrary function of two images, per pixel."""
     return np.abs(image - truth).max(axis=2) + 0.25 * truth[..., 0]
 
 
@@ -227,7 +227,7 @@ def test_no_figure_is_nan_or_infinite(frames):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_rendering_with_nan_or_infinity_never_scores_well(bad):
-    """It is refused, or costs what the worst colour would cost; it is neither identical nor NaN."""
+    """It is refused or scores like the worst colour; it is neither identical nor NaN."""
     image, truth = pair(10)
     image[3, 4, 1] = bad
     try:

@@ -1,4 +1,4 @@
-"""Where other cameras of the rig see the same: which pixels that are, and what is measured there."""
+"""Overlaps between cameras of the rig: their pixels, and the figures over these."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def image_of(recording: PreparedDrive, camera: str, key_frame: int) -> int:
 
 @pytest.mark.parametrize("key_frame", [0, 2])
 def test_the_front_camera_shares_both_edges_and_not_its_middle(front, key_frame):
-    """Each pixel as another way round tells it: the far end of its ray, projected into every other camera."""
+    """Computed independently: the far end of each pixel's ray is projected into the other cameras."""
     index = image_of(front, "CAM_FRONT", key_frame)
     frame, size = front.frame(index), front.size(index)
     seen = seen_by_others(front.record, index)
@@ -64,7 +64,7 @@ def test_static_pixels_are_split_by_overlap(front):
 
 
 def test_both_parts_are_measured_where_there_are_several_cameras(front, tiny_scene):
-    """Of one colour against the recorded images: their PSNR follows from the pixels. With one camera there are none."""
+    """The PSNR of a constant colour follows from the recorded pixels. A single camera has no overlap."""
     model = SplatModel([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2)).requires_grad_(False)
     groups = evaluate_groups(model, front, "CAM_FRONT", None, torch.device("cpu"))
     index = image_of(front, "CAM_FRONT", 2)

@@ -1,4 +1,4 @@
-"""What a metrics.json says, in sentences."""
+"""The summary of a metrics.json in sentences."""
 
 import json
 import subprocess
@@ -59,7 +59,7 @@ def test_figures_against_ground_truth_are_reported():
 
 
 def test_existing_films_and_images_are_listed_last_by_method(tmp_path):
-    """Of the files that are there; of a method that has none nothing is said."""
+    """Only existing files are listed; methods without files are not mentioned."""
     made = {"vanilla": ("viewer.html", "original.mp4", "train.json", "removal.png"), "plain": ("ghost_panel.png",)}
     for name, files in {**made, "bare": ("train.json",)}.items():
         (tmp_path / name).mkdir()

@@ -1,4 +1,4 @@
-"""Renderings against a synthetic world's truth: models so simple that their figures follow from the PNGs by hand."""
+"""Renderings against synthetic ground truth: the figures of simple models can be computed from the PNGs."""
 
 import dataclasses
 import json
@@ -46,7 +46,7 @@ LIDAR = LidarDepthJob(
     box_margin=0.2,
 )  # fmt: skip
 OWN_CAR_ROWS = 12
-"""So many of the lowest rows of the masks are the own car's."""
+"""Number of rows at the lower edge of the masks that show the ego vehicle."""
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_a_constant_colours_lateral_psnr_follows_from_the_pngs(known):
 
 
 def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known):
-    """Outside every box of what can move, seen from the lateral camera, not from the recorded one."""
+    """They are outside all boxes of movable objects, as seen by the lateral camera and not the recorded one."""
     images, static, recorded = [], [], []
     for frame, truth in front_frames(known):
         boxes = [box for box in boxes_at(known.recording.scene, frame.timestamp) if box.object_class.is_dynamic]
@@ -142,7 +142,7 @@ def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known):
 
 
 class Watched(SplatModel):
-    """A flat model that keeps the views it is asked for."""
+    """A flat model that records the requested views."""
 
     def __init__(self):
         super().__init__([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2))
@@ -179,7 +179,7 @@ def test_the_lateral_view_is_two_metres_to_the_left_of_the_ego_vehicle(known, de
 
 
 def nudged(known: DriveTruth, seed: int) -> DriveTruth:
-    """The same truth with recorded poses that are off by decimetres and degrees, each otherwise."""
+    """The same truth, with a different error of decimetres and degrees in each recorded pose."""
     random = np.random.default_rng(seed)
     frames = []
     for frame in known.recording.scene.frames:
@@ -191,7 +191,7 @@ def nudged(known: DriveTruth, seed: int) -> DriveTruth:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_with_pose_errors_the_lateral_view_is_relative_to_the_recorded_pose(known, demo_tables, seed):
-    """To the left as the camera is mounted: it moves along the own car's y axis, and does not turn."""
+    """The camera moves along the ego vehicle's y axis and does not rotate."""
     model, off = Watched(), nudged(known, seed)
     lateral_metrics(model, off, "CAM_FRONT", None, CPU)
     assert len(model.views) == 6
@@ -206,7 +206,7 @@ def test_with_pose_errors_the_lateral_view_is_relative_to_the_recorded_pose(know
 
 
 def test_with_pose_errors_dynamic_boxes_are_masked_in_the_rendered_view(known):
-    """Static pixels are those outside the boxes in the view that is rendered."""
+    """Static pixels are those outside the boxes in the rendered view."""
     model, off = Watched(), nudged(known, 0)
     result = lateral_metrics(model, off, "CAM_FRONT", None, CPU)["2.0"]["static"]
     count = 0
@@ -218,7 +218,7 @@ def test_with_pose_errors_dynamic_boxes_are_masked_in_the_rendered_view(known):
 
 
 def hulls(known: DriveTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Per key frame: the street without the leading car, the pixels of its box, and the others; own car aside."""
+    """Per key frame: the street without the leading car, and the pixels inside and outside its box (no ego vehicle)."""
     free = np.arange(90)[:, None] < 90 - OWN_CAR_ROWS
     for frame, truth in front_frames(known):
         inside = rays_meet(leading_box(known, frame), frame.camera_to_world, frame)
@@ -237,7 +237,7 @@ def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known):
 
 
 def test_pixels_of_the_ego_vehicle_are_neither_inside_nor_outside_the_removed_box(known, tmp_path):
-    """The own car's body hides all below the middle of the leading car's box in the first key frame."""
+    """The ego vehicle hides everything below the middle of the leading car's box in the first key frame."""
     frame = front_frames(known)[0][0]
     rows = np.flatnonzero(rays_meet(leading_box(known, frame), frame.camera_to_world, frame).any(axis=1))
     free = np.arange(90)[:, None] < int(rows.mean())
@@ -254,7 +254,7 @@ def test_pixels_of_the_ego_vehicle_are_neither_inside_nor_outside_the_removed_bo
 
 
 class Riding(Own):
-    """Gaussians in a grid that fills the leading car's box and rides with it; its own where `knows` says so."""
+    """A grid of Gaussians that fills the leading car's box and moves with it, as the car's own part if `knows`."""
 
     def __init__(self, known: DriveTruth, knows: bool, beside: float = 0.0):
         axes = [np.linspace(-0.5, 0.5, n) * share for n, share in ((5, 0.95), (4, 0.95), (4, 0.95))]
@@ -284,7 +284,7 @@ def unremoved(model: SplatModel, known: DriveTruth) -> dict[str, Any]:
 
 @pytest.mark.parametrize("knows", [False, True])
 def test_removing_a_car_equals_a_model_without_it(known, knows):
-    """By box or by its own Gaussians: the figures are those of a model that never had the car, and better."""
+    """The figures equal those of a model without the car, and improve, for removal by box and by part."""
     model = flat_model(parts=[Riding(known, knows)])
     removed = removal_metrics(model, known, "CAM_FRONT", MARGIN, None, CPU)
     never = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
@@ -324,7 +324,7 @@ def test_gaussians_outside_the_box_are_removed_only_by_their_part(known):
 
 
 def test_gaussians_near_the_box_are_removed_within_the_margin(known):
-    """Gaussians 0.3 m over the roof go with a margin of 0.5 m alone."""
+    """Gaussians 0.3 m above the roof are removed only with a margin of 0.5 m."""
     frame = front_frames(known)[0][0]
     box = leading_box(known, frame)
     over = box.object_to_world @ np.array([0.0, 0.0, box.size[2] / 2 + 0.3, 1.0])
@@ -362,7 +362,7 @@ def test_ground_truth_figures_require_ground_truth(known, has_truth, camera, key
 
 
 def test_a_recorded_drive_is_not_compared_with_ground_truth(known):
-    """Its job says nothing of a removal; a truth.json that lies beside its tables is none of it."""
+    """Its job has no removal, and a truth.json beside its tables is ignored."""
     job = job_of("CAM_FRONT", synthetic=False)
     assert truth_metrics(flat_model(), inputs_of(known, known.path), job, None, CPU) == {}
 
@@ -388,7 +388,7 @@ def test_a_street_without_a_leading_car_has_a_lateral_view_and_no_removal(known)
 
 
 def test_frames_without_the_leading_car_are_not_measured(known):
-    """Its track ends with key frame 1, and reaches half an interval further."""
+    """Its track ends half an interval after key frame 1."""
     tracks = []
     for track in known.recording.scene.tracks:
         cut = track.id == known.truth.leading

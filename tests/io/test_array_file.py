@@ -1,4 +1,4 @@
-"""Files of arrays: what is written is read, and nothing else is."""
+"""Files of arrays: round trips, and refusal of all other content."""
 
 import io
 import json
@@ -24,7 +24,7 @@ CONTENT = {
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether both are the same, arrays to the bit and in their memory's order."""
+    """Whether both are equal; arrays bit for bit and with the same memory order."""
     if isinstance(a, np.ndarray):
         order = a.flags.c_contiguous == b.flags.c_contiguous
         return (a.dtype, a.shape, a.tobytes(), order) == (b.dtype, b.shape, b.tobytes(), True)
@@ -77,7 +77,7 @@ def test_writing_anything_but_numbers_and_plain_data_is_refused(tmp_path, value)
 
 
 def test_a_flipped_bit_is_refused_or_without_effect(tmp_path):
-    """Headers of archive members have bytes without meaning, such as the time of writing."""
+    """Archive headers contain bytes without effect, such as the modification time."""
     path, chance = tmp_path / "a.npz", random.Random(0)
     write_arrays(path, {**CONTENT, "many": np.random.default_rng(0).normal(size=500)})
     whole, expected, refused = path.read_bytes(), read_arrays(path, "actors"), 0
@@ -125,7 +125,7 @@ def archive(path: Path, compression: int = zipfile.ZIP_STORED, **members: bytes)
 
 
 def npy(array: np.ndarray, **header: Any) -> bytes:
-    """An array as numpy stores it; `header` replaces what it says of itself."""
+    """An array in numpy's format; `header` replaces its header."""
     file = io.BytesIO()
     told = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape, **header}
     np.lib.format.write_array_header_1_0(file, told)
@@ -166,7 +166,7 @@ def test_a_forged_archive_is_refused(tmp_path, members):
 
 
 def test_a_compressed_archive_is_refused_without_decompression(tmp_path):
-    """A few bytes could stand for many gigabytes."""
+    """A few compressed bytes could expand to gigabytes."""
     archive(tmp_path / "a.npz", zipfile.ZIP_DEFLATED, content=REFERS, a=npy(np.zeros(100_000)))
     with pytest.raises(ResultError, match=r"larger than the file|is compressed"):
         read_arrays(tmp_path / "a.npz", "actors")

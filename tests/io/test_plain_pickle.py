@@ -103,7 +103,7 @@ Pair = collections.namedtuple("Pair", "a b")
     ids=lambda value: type(value).__name__,
 )
 def test_writing_anything_but_plain_data_is_refused(tmp_path, value):
-    """Whatever the reader refuses the writer must refuse: a result that is written can be read again."""
+    """The writer refuses whatever the reader refuses, so that every written result can be read."""
     with pytest.raises(TypeError):
         write_plain_pickle(tmp_path / "value.pkl", {"value": value})
     assert not list(tmp_path.iterdir())
@@ -292,7 +292,7 @@ for path in sorted(Path(sys.argv[1]).iterdir()):
 
 
 def read_apart(files: dict[str, bytes], folder: Path) -> dict[str, str]:
-    """How a process of its own, of at most 2 GB and half a minute, reads each of some files."""
+    """Reads files in a subprocess limited to 2 GB and 30 s, and returns the outcome for each."""
     (folder / "forged").mkdir()
     for name, content in files.items():
         (folder / "forged" / name).write_bytes(content)
@@ -312,7 +312,7 @@ def test_a_forged_pickle_is_refused_without_a_crash(tmp_path):
 
 
 def test_100_mutated_pickles_are_plain_or_refused_without_a_crash(tmp_path):
-    """What is read can be written: it is plain."""
+    """Content that can be read can also be written, so it is plain data."""
     record = {
         "Ks": np.eye(3), "names": ["a.jpg", "b.jpg"], "times": np.array([1, 2]), "seen": np.array([True]), "none": None,
         "camera": np.array(["FRONT", "é"]), "splits": {"train": np.arange(3)}, "scale": 1.5, "pair": (1, b"x", -7),
@@ -335,7 +335,7 @@ def test_data_may_be_nested_to_the_documented_depth(tmp_path):
 
 @pytest.mark.parametrize("core", [b"numpy.core", b"numpy._core"])
 def test_arrays_of_numpy_1_and_2_are_read(tmp_path, core):
-    """Both name the package of their arrays differently; protocol 3 names it in text."""
+    """The two versions name the package of arrays differently; protocol 3 stores the name as text."""
     content = pickle.dumps({"a": np.arange(6.0).reshape(2, 3)}, protocol=3)
     (tmp_path / "value.pkl").write_bytes(content.replace(b"numpy._core", b"numpy.core").replace(b"numpy.core", core))
     again = read_plain_pickle(tmp_path / "value.pkl", "parser")

@@ -1,4 +1,4 @@
-"""Seeds as PLY files: they return as written, other programs can read them, and a bad one is named with its rule."""
+"""Seed points as PLY files: round trips, readable by other programs, and errors that name file and rule."""
 
 import numpy as np
 import pytest

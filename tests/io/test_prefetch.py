@@ -1,4 +1,4 @@
-"""Work done ahead."""
+"""Prefetching of results and items."""
 
 import threading
 import time

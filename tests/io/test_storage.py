@@ -1,4 +1,4 @@
-"""Files are whole or absent, hold plain data only, and a bad one is named together with the rule that rebuilds it."""
+"""Files are complete or absent and hold plain data only; errors name the file and the rule that rebuilds it."""
 
 import builtins
 import errno
@@ -77,7 +77,7 @@ def test_a_crash_while_writing_a_new_file_leaves_none(tmp_path):
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_partial_files_of_killed_writers_are_removed_after_an_hour(tmp_path, whole):
-    """Those of the same target alone; whether the new file becomes whole or not."""
+    """Only those of the same target, whether the new write succeeds or not."""
     left = {
         ".result.4711.partial.bin": ABANDONED_SECONDS + 60,
         ".result.8.partial.bin": 10 * ABANDONED_SECONDS,
@@ -119,7 +119,7 @@ def test_a_full_disk_is_reported_with_the_file_name_and_keeps_the_old_file(tmp_p
 
 
 def test_a_read_only_file_system_is_reported_with_the_file_name(tmp_path, monkeypatch):
-    """There every change fails, that of a file which is not there included."""
+    """Every change fails there, including removal of a file that does not exist."""
     opened = builtins.open
 
     def open_read_only(file, mode="r", *args, **kwargs):

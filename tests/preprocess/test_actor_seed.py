@@ -1,4 +1,4 @@
-"""What becomes an actor and where its Gaussians start: LiDAR in its own frame, coloured by training images alone."""
+"""Selection of actors and their initial points: LiDAR in the actor's frame, coloured by training images only."""
 
 import dataclasses
 import pickle
@@ -37,13 +37,13 @@ from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, Obje
 from drivesplat.settings.extract import SceneSource
 
 CAR = World().things[0]
-"""It drives ahead of the own car: 4 x 2 x 1.6 m, its rear 4.8 m from the camera at first."""
+"""A car ahead of the ego vehicle: 4 x 2 x 1.6 m, its rear initially 4.8 m from the camera."""
 ONCOMING = Thing("vehicle.car", (4.4, 1.8, 1.5), (32.0, 3.5, 0.75), (-3.0, 0.0), heading=np.pi, color=(90, 200, 90))
 FLOOR = 0.1
 
 
 def job(holdout=HELD_OUT, width=None, random_seed=0, radius=2.5, **settings) -> ActorSeedJob:
-    """Without random points, unless told otherwise."""
+    """Settings without random points by default."""
     return ActorSeedJob.model_validate(
         {
             "actors": {"min_points": 0, **settings},
@@ -65,7 +65,7 @@ def the_actor(scene: Scene, settings: ActorSeedJob, ego_mask: EgoMask = NO_EGO_M
 
 
 def assert_same(a: ActorRecords, b: ActorRecords) -> None:
-    """Bit by bit, their motions too."""
+    """Compares records bit for bit, including motions."""
     assert a.provenance == b.provenance
     for one, other in zip(a.actors, b.actors, strict=True):
         for (name, value), (other_name, other_value) in zip(fields_of(one), fields_of(other), strict=True):
@@ -101,8 +101,8 @@ def returns_of(world: World, thing: Thing, key_frames, margin=0.1, radius=2.5) -
 
 @pytest.mark.parametrize("radius", [2.5, 6.3])
 def test_points_are_exactly_the_training_returns_in_the_box_in_its_frame(tiny_scene, radius):
-    """The whole rule at once: own car, road and held-out sweeps are out. The car ahead is 5.6 m from the LiDAR, so that
-    a radius of 6.3 m cuts it."""
+    """Ego vehicle, road and held-out sweeps are all left out. The car ahead is 5.6 m from the LiDAR, so a radius of
+    6.3 m cuts it."""
     actor = the_actor(tiny_scene, job(radius=radius))
     expected = returns_of(World(), CAR, TRAINING, radius=radius)
     assert 30 < len(expected) < len(returns_of(World(), CAR, range(10), radius=radius))
@@ -113,8 +113,8 @@ def test_points_are_exactly_the_training_returns_in_the_box_in_its_frame(tiny_sc
 
 @pytest.mark.parametrize(("thing", "seen", "hidden"), [(CAR, (0, -1), (0, 1)), (ONCOMING, (1, 1), (1, -1))])
 def test_points_lie_on_the_faces_visible_to_the_lidar(tmp_path, thing, seen, hidden):
-    """However far it has moved between. A car ahead shows its rear and not its front (x), one that comes by on the left
-    its left and not its right (y)."""
+    """This holds however far it moved between sweeps. A car ahead shows its rear and not its front (x), an oncoming car
+    on the left its left side and not its right (y)."""
     actor = the_actor(drive(tmp_path, thing), job(NOTHING_HELD_OUT))
     half = np.array(thing.size) / 2
     points = actor.points.astype(float)
@@ -245,7 +245,7 @@ def test_settings_say_whether_cycles_and_people_become_actors(tmp_path, settings
 
 
 def painted(scene: Scene, color_of) -> None:
-    """Paints every image of a scene over: `color_of` gives an image (h, w, 3) for a frame. PNG within: lossless."""
+    """Replaces every image of a scene by `color_of(frame)` (h, w, 3), stored losslessly as PNG."""
     for frame in scene.frames:
         image = np.broadcast_to(np.asarray(color_of(frame), dtype=np.uint8), (frame.height, frame.width, 3))
         Image.fromarray(np.ascontiguousarray(image)).save(frame.image_path, format="PNG")
@@ -268,7 +268,7 @@ def inside(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 NEARING = dataclasses.replace(CAR, velocity=(3.0, 0.0))
-"""The own car gains a metre a second on it."""
+"""The ego vehicle approaches it at 1 m/s."""
 
 
 @pytest.mark.parametrize("thing", [CAR, NEARING], ids=["away", "near"])
@@ -291,7 +291,7 @@ def test_a_point_has_the_colour_of_its_nearest_training_camera_that_sees_the_act
 
 
 def test_colours_match_the_surface_of_the_car(tmp_path):
-    """Up to JPEG, pixel size and the stripes' edges: the drive's geometry says what colour each point has."""
+    """The drive's geometry gives the expected colours, up to JPEG, pixel size and the stripes' edges."""
     actor = the_actor(drive(tmp_path, *World().things, width=384, height=216), job())
     stripes = 0.75 + 0.25 * np.sign(np.sin(5.0 * actor.points.sum(axis=1)))
     off = np.abs(actor.points_rgb - np.array(CAR.color) * stripes[:, None]).max(axis=1)
@@ -302,8 +302,8 @@ SPEEDING = Speeding("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), (2.0, 0.0)
 
 
 def test_occluders_do_not_colour_an_actor(tmp_path):
-    """A walker hides the same part of the car in every image. Images are red where the walker's box is seen, else blue:
-    what lies behind the walker has the others' colour."""
+    """A walker hides the same part of the car in every image. Images are red in the walker's box and blue elsewhere;
+    points behind the walker get the mean colour of the others."""
     walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (5.5, 0.3, 0.95), (4.2, 0.0))
     scene, world = drive(tmp_path, walker, CAR), World(things=[walker, CAR])
     masks = {frame.token: shows(world, frame, walker) for frame in scene.frames}
@@ -329,7 +329,7 @@ def test_the_ego_vehicle_does_not_colour_actors_and_hides_them(tmp_path):
 
 
 def test_a_visible_actor_without_visible_points_is_grey(tmp_path):
-    """Its only points lie left of what the own car's body leaves of it."""
+    """All of its points are hidden by the ego vehicle's body, but part of it is visible."""
     scene = drive(tmp_path, dataclasses.replace(CAR, position=(8.5, 0.0, 0.8)))
     outline = ((0.0, 0.0), (0.52, 0.0), (0.52, 1.0), (0.0, 1.0))
     left = [

@@ -1,4 +1,4 @@
-"""Where the recording car's own body is seen: as the user says, or as images show it that stay alike on the way."""
+"""Detection of the ego vehicle's body: from the user's outlines, or from pixels that stay constant along the drive."""
 
 import dataclasses
 from collections.abc import Callable
@@ -39,18 +39,18 @@ JOB = EgoMaskJob(polygons={}, search=LOOKING)
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory) -> Scene:
-    """A drive of 14 key frames, 50 m, in which CAM_BACK sees the own car's rear."""
+    """A drive of 14 key frames and 50 m, in which CAM_BACK sees the ego vehicle's rear."""
     return rig_drive(tmp_path_factory.mktemp("seen"), CAMERAS, own_car=True)
 
 
 @pytest.fixture(scope="module")
 def unseen(tmp_path_factory) -> Scene:
-    """The same drive by a car that no camera sees."""
+    """The same drive, in which no camera sees the ego vehicle."""
     return rig_drive(tmp_path_factory.mktemp("unseen"), CAMERAS)
 
 
 def painted(scene: Scene, folder: Path, paint: Callable[[np.ndarray, int], np.ndarray]) -> Scene:
-    """A scene whose images of CAM_BACK have gone through `paint`, told which of them each is."""
+    """A scene whose images of CAM_BACK are changed by `paint(pixels, number)`."""
     frames, number = [], 0
     for frame in scene.frames:
         if frame.camera == "CAM_BACK":
@@ -63,7 +63,7 @@ def painted(scene: Scene, folder: Path, paint: Callable[[np.ndarray, int], np.nd
 
 
 def body_in(scene: Scene, camera: str = "CAM_BACK", search: EgoMaskSearch = LOOKING) -> np.ndarray:
-    """The pixels (h, w) bool that are taken for the own car's body."""
+    """The pixels (h, w) bool that are detected as the ego vehicle's body."""
     outlines, _, why = camera_outlines(scene, camera, EgoMaskJob(polygons={}, search=search))
     assert (why is None) == bool(outlines)
     return enclosed(outlines, SIZE)
@@ -96,15 +96,15 @@ def test_no_body_is_found_if_no_camera_sees_it(unseen):
 
 
 def test_a_body_under_changing_light_is_found(seen, tmp_path):
-    """The light on the body, and on nothing else, goes up and down by a quarter."""
+    """The brightness of the body alone varies by a quarter."""
     body, light = true_body("CAM_BACK")[..., None], np.random.default_rng(0).uniform(0.75, 1.25, KEY_FRAMES)
     lit = painted(seen, tmp_path, lambda pixels, number: np.where(body, 0.8 * light[number] * pixels, pixels))
     assert_is_the_body(body_in(lit))
 
 
 def test_held_out_images_and_sweeps_contribute_nothing(seen, tmp_path):
-    """What is held out becomes noise, and garbage on the body: not a pixel changes. Two training sweeps are missing, so
-    that held-out ones are the nearest to their images, by when the car has driven on for 4 m."""
+    """Held-out images become noise and held-out sweeps get returns on the body: no pixel changes. Two training sweeps
+    are missing, so that held-out ones, 4 m away, are the nearest to their images."""
     search = LOOKING.model_copy(update={"holdout": HoldoutSettings(every_nth=6, offset=3, last_block=0)})
     groups = frame_groups(seen, search.holdout)
     held_out = {f.sample_index for f, group in zip(seen.frames, groups, strict=True) if group != "train"}
@@ -137,7 +137,7 @@ def test_few_images_are_refused(seen):
 
 
 def test_images_at_a_standstill_are_left_out(seen):
-    """Thirty more images at a standstill, of a camera that sees all the world unmoved."""
+    """Thirty more images taken at a standstill, in which every pixel is constant."""
     waited = [frame for frame in seen.frames if frame.camera == "CAM_BACK" and frame.sample_index == 5]
     more = [dataclasses.replace(waited[0], timestamp=waited[0].timestamp + i) for i in range(1, 31)]
     scene = dataclasses.replace(seen, frames=(*seen.frames, *more))
@@ -156,7 +156,7 @@ def test_an_even_road_with_lidar_returns_is_not_a_body(unseen, tmp_path):
 
 
 def without_returns_below(scene: Scene, folder: Path) -> Scene:
-    """A scene whose LiDAR misses the road near the car, as it does a wet one."""
+    """A scene without LiDAR returns from the road near the car, as when it is wet."""
     sweeps = []
     for number, sweep in enumerate(scene.sweeps):
         returns = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, 5)
@@ -168,7 +168,7 @@ def without_returns_below(scene: Scene, folder: Path) -> Scene:
 
 @pytest.mark.parametrize("level", [0, 255])
 def test_black_and_overexposed_areas_are_not_a_body(unseen, tmp_path, level):
-    """The same in a grey that can be seen to stay is taken for one."""
+    """The same area in a medium grey is detected as a body."""
     missed = without_returns_below(unseen, tmp_path)
     for grey in (level, 120):
         (folder := tmp_path / str(grey)).mkdir()
@@ -183,7 +183,7 @@ def test_dark_images_are_refused(seen, tmp_path):
 
 
 def test_a_body_is_cut_at_the_horizon(unseen, tmp_path):
-    """A pane of dirt over the right edge of the image, sky included, where LiDAR meets nothing."""
+    """Dirt covers the right edge of the image up to the sky, without LiDAR returns."""
     missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
     dirty = painted(missed, tmp_path, lambda p, _: np.where(np.arange(160)[None, :, None] > 150, 120.0, p))
     found = body_in(dirty)
@@ -203,7 +203,7 @@ def test_a_constant_area_that_is_too_large_is_not_a_body(unseen, tmp_path):
 
 
 def test_a_gradual_increase_of_variation_is_not_a_border(unseen):
-    """A body ends at once; a road grows more varied with distance."""
+    """Variation jumps at a body's border, but increases gradually along a road."""
     drive = ComparedImages.of(unseen, "CAM_BACK", LOOKING)
     rows = np.arange(90.0)[:, None].repeat(160, axis=1)
     lower = rows >= 70
@@ -233,7 +233,7 @@ def test_an_outline_of_the_user_replaces_the_search_in_its_camera_only(seen):
     ],
 )
 def test_a_setting_chooses_the_cameras_to_search(kind, outlined, searched):
-    """CAM_FRONT is measured; of CAM_BACK an outline is given."""
+    """CAM_FRONT is evaluated; CAM_BACK has a given outline."""
     masks = {"own_car": kind, "own_car_polygons": {"CAM_BACK": [[0, 1], [1, 1], [0.5, 0.9]]}}
     values = {"cameras": ["CAM_FRONT", "CAM_BACK", "CAM_BACK_RIGHT"], "masks": masks}
     job = EgoMaskJob.model_validate_json(stage_settings(load(values), "own_car", "0061"))
@@ -242,7 +242,7 @@ def test_a_setting_chooses_the_cameras_to_search(kind, outlined, searched):
 
 
 def test_the_evaluated_camera_is_not_searched_by_default():
-    """So that figures hang on no guess; where it is the only one, on no setting of the search either."""
+    """Figures then do not depend on the search, nor on its settings if there is no other camera."""
     default = load({})
     assert default.masks.own_car == "auto"
     assert stage_settings(default, "own_car", "0061") == '{"polygons":{},"search":null}'
@@ -285,7 +285,7 @@ def test_each_of_two_bodies_has_its_outline():
 
 
 def test_no_body_is_found_in_the_front_camera_of_a_real_drive(real_scene_root, monkeypatch):
-    """Even if LiDAR had met nothing in any image: its road varies far too much to be taken for a body."""
+    """This holds even without any LiDAR returns: the road varies too much to be detected as a body."""
     source = SceneSource(
         dataset="nuscenes", reader="nuscenes", version="v1.0-mini", scene="0061", frames=None, cameras=("CAM_FRONT",),
         sweeps=False, on_missing="stop",

@@ -1,4 +1,4 @@
-"""Where the Gaussians start: static LiDAR points and far points, coloured by training images alone."""
+"""Seed points: static LiDAR points and far points, coloured by training images only."""
 
 import dataclasses
 import shutil
@@ -63,7 +63,7 @@ def scene_at(root: Path) -> Scene:
 
 
 def returns_at(seconds: float) -> np.ndarray:
-    """All LiDAR returns (n, 3) of the tiny drive at a time, in its world, those of the own car included."""
+    """All LiDAR returns (n, 3) of the tiny drive at a time, in world coordinates, including the ego vehicle's."""
     return cast_lidar(World(), seconds)[:, :3].astype(float) + World().ego_at(seconds) + LIDAR_AT
 
 
@@ -78,7 +78,7 @@ def rows(points: np.ndarray) -> set[tuple]:
 
 
 def test_lidar_points_are_exactly_the_static_returns_of_training_sweeps(tiny_scene):
-    """The whole rule at once, computed from the drive's geometry: own car, moving boxes and held-out sweeps are out."""
+    """Ego vehicle, dynamic boxes and held-out sweeps are left out, by the drive's geometry."""
     points, times, missing = lidar_points(tiny_scene, job(voxel_size=0.0))
     assert missing == 0
     for index in range(10):
@@ -315,8 +315,8 @@ def test_far_points_are_never_below_the_ground():
 
 
 def test_far_points_skip_covered_cells():
-    """SparseGrid are 8 x 8 pixels. Covered: the first, one in the middle, and the cut ones at the right and lower
-    edges."""
+    """Cells are 8 x 8 pixels. The first, one in the middle, and the partial ones at the right and lower edges are
+    covered."""
     cells = [(0, 0), (3, 2), (7, 5)]
     rays = np.array([[(8 * x + 1.2 - 40.0) / 50.0, (8 * y + 1.7 - 30.0) / 50.0, 1.0] for x, y in cells])
     in_camera = 12.0 * rays
@@ -389,7 +389,7 @@ def test_every_seed_point_is_seen_by_a_training_image(tiny_scene):
 
 
 def test_seed_colours_match_the_surfaces(tiny_scene):
-    """Static LiDAR points take the colour that the drive's geometry gives them, up to JPEG and pixel size."""
+    """Static LiDAR points have the colours of the drive's geometry, up to JPEG and pixel size."""
     seed = seed_points(tiny_scene, job(far_points=0))
     assert len(seed.positions) == seed.note["lidar"] > 200
     rays = seed.positions.astype(float) - CAMERA_AT
@@ -522,7 +522,7 @@ def test_the_real_scene_is_seeded_from_its_only_sweep_and_a_file(real_scene_root
 
 
 def test_the_ego_vehicle_gives_no_colour(root):
-    """The left half of every image is the own car's body, and red: no seed point is, near or far, nor lies there."""
+    """The ego vehicle fills the left half of every image in red: no seed point is red or lies there."""
     scene = scene_at(root)
     for frame in scene.frames:
         pixels = np.full((54, 96, 3), (0, 0, 255), dtype=np.uint8)

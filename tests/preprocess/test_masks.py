@@ -31,7 +31,7 @@ WHOLE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 
 
 def seen_in_front(outline: tuple) -> EgoMask:
-    """The own car within an outline of CAM_FRONT's images."""
+    """The ego vehicle within an outline in CAM_FRONT's images."""
     return EgoMask({"CAM_FRONT": (outline,)}, {"CAM_FRONT": "polygons"})
 
 
@@ -160,7 +160,7 @@ def test_masks_are_made_without_lidar(tiny_scene, tmp_path):
 
 @pytest.mark.parametrize("damage", ["missing", "cut"])
 def test_masks_do_not_require_readable_lidar(tiny_root, tmp_path, damage):
-    """`lidar_seed.on_missing` decides whether a run may go on without it; masks are only the better for LiDAR."""
+    """`lidar_seed.on_missing` decides whether a run continues without LiDAR; masks only use it where available."""
     root = Path(shutil.copytree(tiny_root, tmp_path / "nuscenes"))
     scene = extracted(root)
     path = Path(scene.sweeps[0].path)
