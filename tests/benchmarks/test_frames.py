@@ -24,7 +24,7 @@ def scene(tiny_scene):
     return street_scene(tiny_scene)
 
 
-def test_frame_rate_excludes_the_first_frame_and_film_time_includes_everything(scene, monkeypatch):
+def test_frame_rate_excludes_the_first_frames_and_film_time_includes_everything(scene, monkeypatch):
     """The test clock advances only by rendering: 1 s per frame, and 0.1 s per frame after the first tenth."""
     now, rendered = {"s": 0.0}, []
 
