@@ -1,4 +1,4 @@
-"""The space that rays prove empty: exact traversal, what protects surfaces and thin things, and the record."""
+"""Free space: exact voxel traversal, the protection of surfaces and thin objects, and the record."""
 
 import dataclasses
 import pickle
@@ -25,7 +25,7 @@ from drivesplat.training.sparse_grid import SparseGrid
 
 SENSOR = np.array([0.0, 0.0, 1.8])
 GOING = Thing("vehicle.car", (4.0, 2.0, 1.6), (9.0, 0.0, 0.8), (6.0, 0.0))
-"""It drives ahead, and ever farther."""
+"""A leading car whose distance grows."""
 
 
 def by(x: float, y: float, z: float) -> np.ndarray:
@@ -47,13 +47,13 @@ def rays_to(ends: np.ndarray, origin: np.ndarray = SENSOR, still: bool = True) -
 
 
 def empty_at(record: FreeSpace, points: Any) -> np.ndarray:
-    """Which world points (n, 3) the record says lie in empty voxels, by its documented meaning."""
+    """Whether world points (n, 3) lie in empty voxels of the record, by its documented key formula."""
     cells = np.floor((np.asarray(points, dtype=float) - record.lower) / record.voxel).astype(int)
-    told = set(record.keys.tolist())
+    empty = set(record.keys.tolist())
     _, ny, nz = record.shape
     inside = ((cells >= 0) & (cells < record.shape)).all(axis=1)
     return np.array(
-        [bool(ok) and int((i * ny + j) * nz + k) in told for ok, (i, j, k) in zip(inside, cells, strict=True)]
+        [bool(ok) and int((i * ny + j) * nz + k) in empty for ok, (i, j, k) in zip(inside, cells, strict=True)]
     )
 
 
@@ -61,7 +61,7 @@ def empty_at(record: FreeSpace, points: Any) -> np.ndarray:
 
 
 def crossed(start: np.ndarray, end: np.ndarray, size: int) -> np.ndarray:
-    """The voxels (size, size, size) bool in which a segment has a length: by the slabs of every voxel."""
+    """The voxels (size, size, size) bool that a segment crosses with positive length, by the slab method per voxel."""
     low = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (low - start) / (end - start), (low + 1 - start) / (end - start)
@@ -73,7 +73,7 @@ def crossed(start: np.ndarray, end: np.ndarray, size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_ray_counts_in_the_voxels_that_it_passes_and_in_no_others(seed):
+def test_a_ray_is_counted_in_exactly_the_voxels_that_it_passes(seed):
     random, size = np.random.default_rng(seed), 9
     starts, ends = random.uniform(0, size, (40, 3)), random.uniform(0, size, (40, 3))
     ends[:6, random.integers(0, 3)] = starts[:6, 0]
@@ -86,8 +86,8 @@ def test_a_ray_counts_in_the_voxels_that_it_passes_and_in_no_others(seed):
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_long_rays_end_in_the_voxel_of_their_end(sign):
-    """Through 900 voxels, whose borders they meet at fractions that no float holds."""
+def test_a_long_ray_ends_in_the_voxel_of_its_end_point(sign):
+    """Rays cross 900 voxels at fractions that floats represent inexactly."""
     random = np.random.default_rng(5)
     middle = np.array([450.0, 4.0, 4.0])
     half = np.column_stack([np.full(50, 449.9), random.uniform(-3.9, 3.9, (50, 2))]) * sign
@@ -96,7 +96,7 @@ def test_long_rays_end_in_the_voxel_of_their_end(sign):
     assert counts[0].sum() == counts[-1].sum() == 50 and (counts.sum(axis=(1, 2)) >= 50).all()
 
 
-def test_counts_stop_below_what_means_occupied():
+def test_counts_saturate_below_the_value_for_occupied():
     counts = np.zeros((2, 1, 1), np.uint8)
     count_passing(counts, np.full((400, 3), 0.5), np.tile([1.5, 0.5, 0.5], (400, 1)))
     assert counts.ravel().tolist() == [OCCUPIED - 1] * 2
@@ -115,7 +115,7 @@ def test_counts_stop_below_what_means_occupied():
         (0.2, {}, None),
     ],
 )
-def test_a_ray_proves_nothing_of_its_end_nor_of_what_is_far(length, changes, reach):
+def test_a_ray_proves_nothing_near_its_end_and_beyond_the_range(length, changes, reach):
     direction = np.array([0.6, 0.0, 0.8])
     starts, ends = proving(rays_to((SENSOR + length * direction)[None]), settings(**changes))
     if reach is None:
@@ -130,14 +130,14 @@ def wall(distance: float = 10.0, half: float = 1.5, step: float = 0.05, height: 
     return np.stack([np.full(y.size, distance), y.ravel(), z.ravel()], axis=1)
 
 
-def test_what_lies_before_a_wall_is_empty_and_the_wall_and_what_is_behind_are_not():
+def test_space_before_a_wall_is_empty_the_wall_and_space_behind_it_are_not():
     record = proven_empty(rays_to(wall()), settings())
     x = np.arange(8.0, 13.0, 0.05)
     empty = empty_at(record, np.column_stack([x, np.zeros(len(x)), np.full(len(x), 1.8)]))
     assert empty[x < 9.0].all() and not empty[x > 9.7].any()
 
 
-def test_an_end_that_moves_is_no_occupancy_and_what_is_behind_it_then_is_not_proven():
+def test_a_dynamic_end_point_does_not_occupy_its_voxel_and_proves_nothing_behind_it():
     place = [[9.9, 0.0, 1.8], [13.0, 0.0, 1.8]]
     gone = rays_to(wall(20.0, half=3.0))
     for still, expected in ((True, [False, True]), (False, [True, True])):
@@ -147,16 +147,16 @@ def test_an_end_that_moves_is_no_occupancy_and_what_is_behind_it_then_is_not_pro
     assert empty_at(alone, place).tolist() == [False, False]
 
 
-def test_enough_rays_must_have_passed():
-    """Twenty rays a voxel at ten metres, and half as many again at eight."""
+def test_a_voxel_is_empty_only_after_enough_rays_have_passed():
+    """Twenty rays per voxel at ten metres, thirty at eight."""
     rays = rays_to(wall(10.0, step=0.3 / np.sqrt(20.0)))
     place = [[9.0, 0.0, 1.8]]
     assert [empty_at(proven_empty(rays, settings(min_rays=n)), place)[0] for n in (1, 15, 60)] == [True, True, False]
 
 
 def swept(pole: float | None, lost: float = 0.0) -> Rays:
-    """Four sensors in a row look past, or at, a pole (its radius in metres) at x = 10, y = 0, at a wall behind. Of the
-    returns from the pole a fraction is `lost`."""
+    """Rays of four sensors side by side to a wall behind a pole of radius `pole` (metres, None: no pole) at x = 10, y =
+    0. A fraction `lost` of the returns from the pole is missing."""
     found, random = [], np.random.default_rng(0)
     for aside in (-3.0, -1.0, 1.0, 3.0):
         origin, ends = SENSOR + by(0.0, aside, 0.0), wall(16.0, half=4.0, step=0.1)
@@ -174,7 +174,7 @@ def swept(pole: float | None, lost: float = 0.0) -> Rays:
 
 @pytest.mark.parametrize(("radius", "lost"), [(0.03, 0.0), (0.06, 0.0), (0.15, 0.0), (0.03, 0.9), (0.06, 0.95)])
 def test_a_thin_pole_in_voxels_that_most_rays_pass_is_not_empty(radius, lost):
-    """Nor is the space around it; also where it is so dark that few of its voxels have a return of their own."""
+    """Neither is the space around it, even if the pole is so dark that few of its voxels contain a return."""
     heights = np.arange(0.8, 2.8, 0.02)
     pole = np.column_stack([np.full(len(heights), 10.0), np.zeros(len(heights)), heights])
     rays = swept(radius, lost)
@@ -190,8 +190,8 @@ def test_a_thin_pole_in_voxels_that_most_rays_pass_is_not_empty(radius, lost):
 
 
 def test_a_road_between_rings_is_not_empty_though_rays_pass_its_voxels():
-    """Beams a degree and a third apart meet the road 5 to 20 metres ahead in rings up to 5 metres apart; they graze the
-    voxels of the road on the last metres before."""
+    """Beams 1.33 degrees apart hit the road 5 to 20 metres ahead in rings up to 5 metres apart, and pass through voxels
+    of the road on the last metres before each ring."""
     azimuth, elevation = np.meshgrid(np.radians(np.arange(-20, 20, 0.33)), np.radians(np.arange(-20.0, -4.0, 1.33)))
     distance = 1.8 / np.tan(-elevation.ravel())
     ends = np.column_stack([distance * np.cos(azimuth.ravel()), distance * np.sin(azimuth.ravel()), 0.0 * distance])
@@ -210,8 +210,8 @@ def test_a_road_between_rings_is_not_empty_though_rays_pass_its_voxels():
     assert empty_at(record, above[x < 8.0]).all()
 
 
-def test_rays_of_any_kind_are_arrays():
-    """Points that cameras saw prove as much as LiDAR's do."""
+def test_joined_rays_prove_the_same_as_one_set_of_rays():
+    """Rays to triangulated points count like LiDAR rays."""
     points = wall()
     ends = np.concatenate([points, points + by(0.0, 0.0, 0.025)])
     several = Rays.joined([rays_to(points), rays_to(points + by(0.0, 0.0, 0.025))])
@@ -223,18 +223,18 @@ def test_no_rays_prove_nothing():
     assert len(proven_empty(Rays.joined([]), settings()).keys) == 0
 
 
-def test_a_grid_too_large_is_refused_with_what_to_do():
+def test_a_grid_that_is_too_large_is_refused_with_the_setting_to_change():
     far = rays_to(np.array([[3e4, 0.0, 0.0], [0.0, 3e4, 0.0], [0.0, 0.0, 3e4]]))
     corners = Rays.joined([far, rays_to(far.ends + 5.0, origin=np.array([3e4, 3e4, 3e4]))])
     with pytest.raises(ConfigError, match=r"free_space\.voxel"):
         proven_empty(corners, settings())
 
 
-# ---- of a drive
+# ---- drives
 
 
 def surfaces(scene: Scene, world: World) -> np.ndarray:
-    """World points (n, 3) of what stands still in the images of a drive past `world`, and nearer than 40 metres."""
+    """World points (n, 3) of surfaces nearer than 40 metres in the images of a drive through the static `world`."""
     found = []
     for frame in scene.frames[::3]:
         depth = true_depths(world, frame)[..., 0]
@@ -245,7 +245,7 @@ def surfaces(scene: Scene, world: World) -> np.ndarray:
     return np.concatenate(found)
 
 
-def test_of_a_drive_the_air_is_empty_and_no_surface_is(tiny_scene):
+def test_in_a_drive_air_is_empty_and_surfaces_are_not(tiny_scene):
     record = free_space_record(tiny_scene, job(NOTHING_HELD_OUT))
     still = World(things=[thing for thing in World().things if thing.velocity == (0.0, 0.0)])
     points = surfaces(tiny_scene, still)
@@ -255,15 +255,15 @@ def test_of_a_drive_the_air_is_empty_and_no_surface_is(tiny_scene):
     assert empty_at(record, path + by(0.0, 1.5, 0.0)).mean() > 0.9
 
 
-def test_where_something_drove_away_is_empty(tmp_path):
-    """The middle of a car as it stood at first; the sensor sees the place empty two seconds later."""
+def test_space_that_a_vehicle_has_left_is_empty(tmp_path):
+    """The centre of a car's first position, which the sensor sees empty two seconds later."""
     scene = drive(tmp_path, GOING)
     assert empty_at(free_space_record(scene, job(NOTHING_HELD_OUT)), [[8.0, 0.0, 1.2], [7.4, 0.3, 1.0]]).all()
     nobody = dataclasses.replace(scene, tracks=())
     assert not empty_at(free_space_record(nobody, job(NOTHING_HELD_OUT)), [[7.1, 0.0, 1.2]]).any()
 
 
-def test_rays_start_at_their_own_sweeps_sensor_and_leave_the_own_car_out(tiny_scene):
+def test_rays_start_at_the_sensor_of_their_sweep_and_exclude_the_ego_vehicle(tiny_scene):
     rays = lidar_rays(tiny_scene, job())
     starts = {tuple(sweep.sensor_to_world[:3, 3]) for sweep in tiny_scene.sweeps}
     assert len(starts) == 10 and len({tuple(origin) for origin in rays.origins}) == 6
@@ -273,12 +273,12 @@ def test_rays_start_at_their_own_sweeps_sensor_and_leave_the_own_car_out(tiny_sc
 
 
 def triangulated(scene: Scene, point: np.ndarray, *seen_by: int) -> TriangulatedPoints:
-    """A point (3,) that the images of these numbers see."""
+    """A point (3,) seen by the images `seen_by`."""
     return TriangulatedPoints(point[None], np.array(seen_by), np.zeros(len(seen_by), dtype=np.int64))
 
 
-def test_training_images_prove_what_lies_before_triangulated_points_empty(tiny_scene):
-    """Of a scene without LiDAR: the point is seen by two training images, or by one and one that is held out."""
+def test_training_images_prove_space_before_triangulated_points_empty(tiny_scene):
+    """In a scene without LiDAR, for a point seen by two training images, or by a training image and a held-out one."""
     blind = dataclasses.replace(tiny_scene, sweeps=())
     groups = frame_groups(blind, job().holdout)
     seeing, held_out = (
@@ -316,7 +316,7 @@ def test_held_out_sweeps_prove_nothing(tiny_root, tmp_path):
 # ---- the record
 
 
-def test_the_record_reads_as_it_was_written(tiny_scene, tmp_path):
+def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
     record = dataclasses.replace(free_space_record(tiny_scene, job()), provenance={"stages": {}})
     write_free_space(tmp_path / "free_space.npz", record)
     again = read_free_space(tmp_path / "free_space.npz")
@@ -337,7 +337,7 @@ GRID = {"lower": np.zeros(3), "voxel": 0.3, "shape": np.array([9, 9, 9]), "keys"
                                        {"lower": np.zeros(2)}))],
     ids=str,
 )  # fmt: skip
-def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
+def test_an_invalid_file_is_refused_with_its_name_and_rule(tmp_path, content):
     path = tmp_path / "free_space.npz"
     if content is not None:
         path.write_bytes(content if isinstance(content, bytes) else b"")
@@ -349,11 +349,11 @@ def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
     assert read_free_space(path).voxel == 0.3
 
 
-# ---- looking it up
+# ---- lookup
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
-def test_points_are_found_in_the_cells_they_lie_in(dimensions):
+def test_points_are_found_in_the_cells_that_contain_them(dimensions):
     random = np.random.default_rng(dimensions)
     shape, lower, edge = np.array([7, 4, 5][:dimensions]), np.array([-20.0, 30.0, 1.5][:dimensions]), 0.4
     keys = np.sort(random.choice(shape.prod(), shape.prod() // 3, replace=False))
@@ -367,7 +367,7 @@ def test_points_are_found_in_the_cells_they_lie_in(dimensions):
     np.testing.assert_array_equal(keys[place.numpy()[found.numpy()]], expected[found.numpy()])
 
 
-def test_no_cells_and_what_is_no_place_are_found_nowhere():
+def test_an_empty_grid_and_points_that_are_not_finite_have_no_cell():
     points = torch.tensor([[0.1, 0.1], [float("nan"), 0.1], [float("inf"), 0.1]])
     none = SparseGrid.from_numpy(np.zeros(2), 1.0, np.array([1, 1]), np.empty(0, dtype=np.int64))
     one = SparseGrid.from_numpy(np.zeros(2), 1.0, np.array([1, 1]), np.zeros(1, dtype=np.int64))

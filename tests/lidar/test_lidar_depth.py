@@ -1,4 +1,4 @@
-"""The depth that LiDAR gives training images: against the depth that rays cast at each image's own moment find."""
+"""LiDAR depths of training images, compared with ray-cast depths at each image's own time."""
 
 import dataclasses
 import pickle
@@ -29,10 +29,10 @@ from drivesplat.settings.lidar_depth import LidarDepthJob, LidarDepthSettings
 
 CAR, TRUCK = World().things[:2]
 AHEAD = Thing("vehicle.truck", (4.0, 2.0, 2.6), (8.5, 0.0, 1.3), (4.2, 0.0))
-"""Its rear is 4.8 m before the camera at first. So tall that LiDAR does not see its roof, as the camera does not."""
+"""A leading truck with its rear initially 4.8 m from the camera, too tall for LiDAR and camera to see its roof."""
 SPEEDING = Speeding("vehicle.truck", (4.0, 2.0, 2.6), (9.0, 0.5, 1.3), (1.0, 0.0), gain=(3.0, 0.0))
 CROSSING = Thing("vehicle.truck", (4.0, 2.0, 2.6), (24.0, -9.0, 1.3), (0.0, 4.0), heading=np.pi / 2)
-"""It crosses the road before the own car, from the right to the left."""
+"""It crosses the road in front of the ego vehicle from right to left."""
 
 
 TINY_SPACING = (1.5, 1.65)
@@ -68,20 +68,20 @@ def lost(root: Path, *key_frames: int) -> Scene:
 
 
 def of(image: PixelDepths, values: np.ndarray) -> np.ndarray:
-    """The values (m, ...) that an array (h, w, ...) has at an image's pixels."""
+    """The values (m, ...) of an array (h, w, ...) at an image's pixels."""
     return values[image.rows, image.columns]
 
 
 def fits(world: World, frame, image: PixelDepths, within: float = 0.02) -> np.ndarray:
-    """Which depths (m,) are those of a surface that their pixel shows somewhere at the image's own moment."""
+    """Whether each depth (m,) lies within the range of depths that its pixel shows at the image's own time."""
     truth = of(image, true_depths(world, frame, subpixels=7))
     return (image.depth > truth.min(axis=1) - within) & (image.depth < truth.max(axis=1) + within)
 
 
 @pytest.mark.parametrize("things", [World().things, [CROSSING], [SPEEDING]], ids=["street", "crossing", "speeding"])
-def test_depths_are_those_of_what_is_seen_at_the_images_own_moment(tmp_path, things):
-    """Images are taken up to a quarter of a second after the sweep: what moves has gone on by a metre. LiDAR and camera
-    stand apart: some returns lie behind what LiDAR looks past."""
+def test_depths_match_the_surfaces_visible_at_the_images_own_time(tmp_path, things):
+    """Images are taken up to a quarter of a second after the sweep, in which objects move by a metre. LiDAR and camera
+    have different positions, so some returns are occluded in the image."""
     world, scene = World(things=things), drive(tmp_path, *things)
     images = lidar_depths(scene, job(NOTHING_HELD_OUT))
     fitting = [fits(world, frame, image) for frame, image in zip(scene.frames, images, strict=True)]
@@ -90,10 +90,10 @@ def test_depths_are_those_of_what_is_seen_at_the_images_own_moment(tmp_path, thi
 
 
 @pytest.mark.parametrize("mover", [CROSSING, SPEEDING], ids=["crossing", "speeding"])
-def test_what_moves_is_where_it_is_in_the_image(tmp_path, mover):
-    """In its pixels every depth is its own, within a centimetre, but for a return from the road before it; also where
-    it gains speed: straight lines between annotations would be off by 9 cm. The first and last second are left out: a
-    spline that starts straight does not know the acceleration there."""
+def test_depths_of_a_moving_object_match_its_position_in_the_image(tmp_path, mover):
+    """Depths at its pixels are correct to a centimetre, except for returns from the road, also while it accelerates:
+    linear interpolation between annotations would err by 9 cm. The first and last second are left out, since a natural
+    spline has no acceleration at its ends."""
     world, scene = World(things=[mover]), drive(tmp_path, mover)
     images = lidar_depths(scene, job(NOTHING_HELD_OUT))
     fitting = [
@@ -103,18 +103,18 @@ def test_what_moves_is_where_it_is_in_the_image(tmp_path, mover):
     assert min(map(len, fitting)) > 30 and np.concatenate(fitting).mean() > 0.99
 
 
-def test_the_rear_of_what_drives_ahead_is_as_far_away_as_its_speed_says(tmp_path):
-    """4.8 m at first, and 0.2 m/s farther; from sweeps that saw it up to 0.9 m further back."""
+def test_the_depth_of_a_leading_vehicles_rear_follows_its_speed(tmp_path):
+    """4.8 m at first, growing by 0.2 m/s, from sweeps in which it was up to 0.9 m further back on the road."""
     world, scene = World(things=[AHEAD]), drive(tmp_path, AHEAD)
     for frame, image in zip(scene.frames, lidar_depths(scene, job(NOTHING_HELD_OUT)), strict=True):
         own = of(image, shows(world, frame, AHEAD))
         assert own.sum() > 80
         off = image.depth[own] - (4.8 + 0.2 * seconds_of(frame.timestamp))
-        assert (np.abs(off) < 1e-3).mean() > 0.95, "but for the road before it"
+        assert (np.abs(off) < 1e-3).mean() > 0.95, "except for the road before it"
 
 
-def test_a_return_is_in_the_pixel_and_at_the_depth_that_geometry_says(tiny_scene):
-    """Of what stands still, 35 ms before the sweep."""
+def test_a_return_projects_to_the_pixel_and_depth_computed_by_geometry(tiny_scene):
+    """A static object, 35 ms before the sweep."""
     image = lidar_depths(tiny_scene, job())[0]
     points = cast_lidar(World(), 0.0)[:, :3].astype(float) + LIDAR_AT
     away = points - World().ego_at(-0.035) - CAMERA_AT
@@ -124,16 +124,16 @@ def test_a_return_is_in_the_pixel_and_at_the_depth_that_geometry_says(tiny_scene
     found = np.stack([image.rows, image.columns, image.depth], axis=1)[on_truck]
     assert len(found) > 20
     off = np.abs(found[:, None] - known).max(axis=2).min(axis=1)
-    assert (off < 1e-3).mean() > 0.9, "but for those on the edge of two pixels"
+    assert (off < 1e-3).mean() > 0.9, "except for those on the edge of two pixels"
 
 
 HEDGE = Thing("movable_object.barrier", (0.5, 8.0, 1.6), (6.0, 0.0, 0.8))
 HOUSE = Thing("static_object.bicycle_rack", (2.0, 30.0, 4.0), (25.0, 0.0, 2.0))
-"""LiDAR, 30 cm above the camera, looks over the hedge at windows of the house that the camera does not see."""
+"""LiDAR, 30 cm above the camera, sees a part of the house over the hedge that is hidden from the camera."""
 
 
-def test_what_lidar_sees_over_a_hedge_is_not_what_the_image_shows(tmp_path):
-    """Rays are ten and more pixels apart: between two returns from the hedge there is room for one from the house."""
+def test_returns_over_a_hedge_are_occluded_in_the_image(tmp_path):
+    """Rays are at least ten pixels apart: a return from the house may project between two returns from the hedge."""
     size = {"key_frames": 2, "sweeps_between": 0, "width": 480, "height": 270}
     world, scene = World(things=[HEDGE, HOUSE], **size), drive(tmp_path, HEDGE, HOUSE, **size)
     truth, wrong = true_depths(world, scene.frames[0])[..., 0], {}
@@ -150,22 +150,23 @@ def test_what_lidar_sees_over_a_hedge_is_not_what_the_image_shows(tmp_path):
     [(50, 60, 12.0, False), (45, 60, 12.0, False), (44, 60, 12.0, True), (50, 53, 12.0, False), (50, 52, 12.0, True),
      (50, 60, 10.9, True), (50, 60, 9.0, True), (0, 0, 12.0, True)],
 )  # fmt: skip
-def test_a_return_hides_what_lies_clearly_behind_it_in_its_window(row, column, depth, seen):
-    """One at 10 metres, 15 pixels wide and 11 high about (50, 60); clearly: by a twentieth and half a metre."""
+def test_a_return_occludes_farther_returns_in_its_window(row, column, depth, seen):
+    """The window of a return at 10 metres is 15 pixels wide and 11 high around (50, 60); farther: by 5 % and half a
+    metre."""
     rows, columns, depths = np.array([50, row]), np.array([60, column]), np.array([10.0, depth])
     halves = np.array([[7.2, 4.8], [0.0, 0.0]])
     assert unhidden(rows, columns, depths, halves, (100, 100))[1] == seen
 
 
-def test_windows_grow_with_nearness():
-    """Ten metres from LiDAR rays of a degree are 17 cm apart: at nine metres before a camera of 900 pixels' focal
-    length 17 pixels, at 4.5 metres 35."""
+def test_windows_grow_as_depth_decreases():
+    """Rays one degree apart are 17 cm apart at a range of ten metres. With a focal length of 900 pixels, these are 17
+    pixels at a depth of 9 metres and 35 at 4.5."""
     intrinsics = np.array([[900.0, 0.0, 400.0], [0.0, 1800.0, 300.0], [0.0, 0.0, 1.0]])
     found = patches(np.array([10.0, 10.0, 5.0]), np.array([9.0, 4.5, 4.5]), intrinsics, (1.0, 0.5))
     np.testing.assert_allclose(found, np.array([[17.45, 17.45], [34.9, 34.9], [17.45, 17.45]]) / 2, rtol=1e-3)
 
 
-def test_each_pixel_has_one_depth_and_each_frame_its_place(tiny_scene):
+def test_each_pixel_has_one_depth_and_images_follow_the_order_of_frames(tiny_scene):
     images = lidar_depths(tiny_scene, job())
     groups = frame_groups(tiny_scene, job().holdout)
     assert len(images) == len(tiny_scene.frames)
@@ -178,8 +179,8 @@ def test_each_pixel_has_one_depth_and_each_frame_its_place(tiny_scene):
         assert ((image.rows >= 0) & (image.rows < 54) & (image.columns >= 0) & (image.columns < 96)).all()
 
 
-def test_of_two_returns_in_a_pixel_the_nearer_counts(tmp_path):
-    """A tenth as wide, a pixel has the least depth of the finer pixels in it, or less."""
+def test_the_nearest_of_several_returns_in_a_pixel_is_kept(tmp_path):
+    """At a tenth of the width, a pixel has at most the smallest depth of the finer pixels in it."""
     scene = drive(tmp_path, TRUCK)
     fine, coarse = (lidar_depths(scene, job(width=width))[0] for width in (480, 48))
     least: dict[tuple, float] = {}
@@ -191,7 +192,7 @@ def test_of_two_returns_in_a_pixel_the_nearer_counts(tmp_path):
 
 
 @pytest.mark.parametrize("width", [48, 192])
-def test_pixels_are_those_of_the_size_at_which_images_are_trained(tiny_scene, width):
+def test_pixels_refer_to_the_training_size(tiny_scene, width):
     world = World(width=width, height=width * 54 // 96)
     (image, *_) = lidar_depths(tiny_scene, job(width=width))
     assert image.columns.max() > 0.9 * width and image.columns.max() < width
@@ -199,8 +200,8 @@ def test_pixels_are_those_of_the_size_at_which_images_are_trained(tiny_scene, wi
 
 
 def test_an_image_gets_the_training_sweep_nearest_in_time_within_a_key_frames_interval(root):
-    """Sweeps 2, 6, 8 and 9 are held out; then 0, 1 and 3 are lost as well. An image at a key frame is taken 35 ms
-    before its sweep, and so 465 ms after the one before; the next sweep but one is more than half a second away."""
+    """Sweeps 2, 6, 8 and 9 are held out; then 0, 1 and 3 are deleted as well. An image at a key frame is taken 35 ms
+    before its sweep and 465 ms after the previous one; the sweep after the next is more than half a second away."""
     scene = scene_at(root)
     whole = lidar_depths(scene, job())
     images = lidar_depths(lost(root, 0, 1, 3), job())
@@ -232,9 +233,9 @@ def test_held_out_sweeps_and_images_contribute_nothing(root):
     assert pickle.dumps(lidar_depths(scene_at(root), job())) != pickle.dumps(before), "training sweeps do contribute"
 
 
-def test_what_is_absent_in_the_image_takes_its_returns_along(root):
-    """The car is annotated up to key frame 3 and so there until 1.75 s; the image at 1.965 s sees the sweep of 1.5 s,
-    since that of its own key frame is lost. Nobody knows where the car is by then."""
+def test_returns_of_an_object_absent_at_the_images_time_are_left_out(root):
+    """The car is annotated up to key frame 3 and present until 1.75 s. The image at 1.965 s uses the sweep of 1.5 s,
+    since that of its own key frame is deleted; the car's pose is unknown by then."""
     scene = lost(root, 4)
     ending = [
         dataclasses.replace(
@@ -252,7 +253,7 @@ def test_what_is_absent_in_the_image_takes_its_returns_along(root):
         assert (on_car.sum() > 10) == carried
 
 
-def test_returns_of_the_own_car_are_left_out(tiny_scene):
+def test_returns_of_the_ego_vehicle_are_left_out(tiny_scene):
     """The LiDAR is 0.8 m behind the camera and 0.3 m above it."""
     image = lidar_depths(tiny_scene, job(radius=8.0))[0]
     places = np.stack([image.columns, image.rows, np.ones(len(image.rows))], axis=1)
@@ -263,7 +264,7 @@ def test_returns_of_the_own_car_are_left_out(tiny_scene):
     assert lidar_depths(tiny_scene, job())[0].depth.min() < 6.0
 
 
-def test_pixels_of_the_own_cars_body_have_no_depth(tiny_scene):
+def test_pixels_of_the_ego_vehicles_body_have_no_depth(tiny_scene):
     outline = ((0.0, 0.5), (0.5, 0.5), (0.5, 1.0), (0.0, 1.0))
     whole, cut = (lidar_depths(tiny_scene, job(), EgoMask(seen))[0] for seen in ({}, {"CAM_FRONT": (outline,)}))
     body = [(image.rows >= 27) & (image.columns <= 48) for image in (whole, cut)]
@@ -272,28 +273,28 @@ def test_pixels_of_the_own_cars_body_have_no_depth(tiny_scene):
         np.testing.assert_array_equal(value[~body[0]], vars(cut)[key])
 
 
-def one_mover(tiny_scene: Scene) -> DynamicObject:
+def moving_car(tiny_scene: Scene) -> DynamicObject:
     (mover,) = [mover for mover in dynamic_objects(tiny_scene) if mover.track.category == "vehicle.car"]
     return mover
 
 
-def test_returns_under_a_moving_box_are_neither_its_own_nor_still(tiny_scene):
+def test_returns_under_a_moving_box_are_neither_dynamic_nor_static(tiny_scene):
     """The car's centre is at x = 8.5 m when its first key frame is taken, 35 ms after the first image; its box is 4 m
     long, 2 m wide, 1.6 m high, and stands on the road."""
     heights = np.array([-0.3, -0.15, 0.0, 0.05, 0.15, 0.8, 1.65, 1.75])
     under = np.stack([np.full(8, 8.5), np.full(8, 0.3), heights], axis=1)
     beside = np.array([[8.5, 1.05, 0.5], [8.5, 1.15, 0.5], [6.45, 0.0, 0.5], [6.35, 0.0, 0.5]])
-    cloud = split_sweep(tiny_scene.sweeps[0], np.concatenate([under, beside]), 0.035, [one_mover(tiny_scene)], 0.1)
+    cloud = split_sweep(tiny_scene.sweeps[0], np.concatenate([under, beside]), 0.035, [moving_car(tiny_scene)], 0.1)
     np.testing.assert_allclose(cloud.static, [*under[[0, 1, 7]], *beside[[1, 3]]])
     ((_, own),) = cloud.dynamic
     np.testing.assert_allclose(own, np.array([*under[4:7], *beside[[0, 2]]]) - [8.5, 0.0, 0.8], atol=1e-6)
 
 
-def test_people_are_carried_along_and_what_never_moves_is_still(tiny_scene):
+def test_moving_people_are_dynamic_and_parked_vehicles_are_static(tiny_scene):
     assert {mover.track.category for mover in dynamic_objects(tiny_scene)} == {"vehicle.car", "human.pedestrian.adult"}
 
 
-def test_a_drive_without_lidar_has_no_depths_and_a_record_of_them(root, tmp_path):
+def test_a_drive_without_lidar_has_a_record_without_depths(root, tmp_path):
     shutil.rmtree(root / "samples" / "LIDAR_TOP")
     scene = scene_at(root)
     write_lidar_depth(tmp_path / "lidar_depth.npz", LidarDepthRecord(lidar_depths(scene, job())))
@@ -301,7 +302,7 @@ def test_a_drive_without_lidar_has_no_depths_and_a_record_of_them(root, tmp_path
     assert len(images) == len(scene.frames) and not any(len(image.depth) for image in images)
 
 
-def test_the_record_reads_as_it_was_written(tiny_scene, tmp_path):
+def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
     record = LidarDepthRecord(lidar_depths(tiny_scene, job()), {"stages": {}})
     write_lidar_depth(tmp_path / "lidar_depth.npz", record)
     assert pickle.dumps(read_lidar_depth(tmp_path / "lidar_depth.npz")) == pickle.dumps(record)
@@ -314,7 +315,7 @@ def test_the_record_reads_as_it_was_written(tiny_scene, tmp_path):
      *({"images": images, "provenance": {}} for images in (None, ["x"], [{"rows": 1}]))],
     ids=str,
 )  # fmt: skip
-def test_a_file_that_is_no_record_is_named_with_its_rule(tmp_path, content):
+def test_an_invalid_file_is_refused_with_its_name_and_rule(tmp_path, content):
     path = tmp_path / "lidar_depth.npz"
     if content is not None:
         path.write_bytes(content if isinstance(content, bytes) else b"")
@@ -332,9 +333,9 @@ def demo_scene(root: Path) -> Scene:
     return extract_scene(source, root)
 
 
-def test_on_the_demo_world_depths_agree_with_its_truth(demo_root):
-    """Bodies that are no boxes, noise of 2 cm, LiDAR on the roof: nineteen in twenty are right within 5 % and 0.3 m,
-    and of what moves nearly all."""
+def test_depths_of_the_demo_world_agree_with_its_ground_truth(demo_root):
+    """With meshes instead of boxes, 2 cm of noise and LiDAR on the roof, 95 % of all depths are correct to 5 % and 0.3
+    m, and nearly all of moving objects."""
     scene = demo_scene(demo_root)
     truth = read_truth(demo_root / "truth/truth.json")
     moving = {mover.track.id for mover in dynamic_objects(scene)}
@@ -356,9 +357,9 @@ def test_on_the_demo_world_depths_agree_with_its_truth(demo_root):
     assert of_movers.sum() > 100 and right[of_movers].mean() > 0.98
 
 
-def test_turned_boxes_carry_their_returns_round(tiny_scene):
-    """A car that turns by 90 degrees a second about itself: a return at its nose goes a quarter round in a second."""
-    car = one_mover(tiny_scene).track
+def test_returns_rotate_with_their_box(tiny_scene):
+    """A car turns in place by 90 degrees per second: a return at its front rotates by a quarter turn in a second."""
+    car = moving_car(tiny_scene).track
     angles = np.pi / 4 * np.arange(10)
     turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
     poses = np.stack([rigid(turn, np.array([12.0, 1.0 * i, 0.8])) for i, turn in enumerate(turns)])

@@ -1,5 +1,5 @@
-"""What lies between key frames, images at 12 Hz and LiDAR at 10 Hz: what of it is read, what a training may see, and
-that nothing near a held-out key frame reaches anything a training starts from."""
+"""Recordings between key frames (images at 12 Hz, LiDAR at 10 Hz): which are read, which a training may see, and that
+none near a held-out key frame reaches an input of the training."""
 
 import dataclasses
 import json
@@ -63,7 +63,7 @@ def table(root: Path, name: str) -> list[dict]:
 @pytest.mark.parametrize("frames", [None, (2, 6)])
 @pytest.mark.parametrize("sweeps", [False, True])
 @pytest.mark.parametrize("lidar_sweeps", [False, True])
-def test_images_and_lidar_between_key_frames_are_read_where_asked_for(rich_root, frames, sweeps, lidar_sweeps):
+def test_images_and_lidar_between_key_frames_are_read_on_request(rich_root, frames, sweeps, lidar_sweeps):
     scene = scene_at(rich_root, sweeps, lidar_sweeps=lidar_sweeps, frames=frames)
     first, last = frames or (0, 8)
     intervals = last - first - 1
@@ -91,7 +91,7 @@ HOLDOUTS = {
 
 @pytest.fixture(params=HOLDOUTS.values(), ids=HOLDOUTS.keys())
 def case(request, root) -> tuple[Path, dict, tuple[int, int] | None, set[str]]:
-    """A drive, a hold-out, a range, and the files that then are held out or near what is, told by the tables alone."""
+    """A drive, a hold-out, a range, and the held-out and excluded files, determined from the tables alone."""
     holdout, frames, key_frames = request.param
     samples = sorted(table(root, "sample"), key=lambda sample: sample["timestamp"])
     near = set()
@@ -112,13 +112,13 @@ def spoil(path: str, random: np.random.Generator) -> None:
 
 
 def job(stage: str, kind: type[S], holdout: dict) -> S:
-    """The settings that a stage gets of the config, with nothing of what LiDAR gives thinned away."""
+    """The settings of a stage in the config, without thinning of LiDAR points."""
     whole = {"lidar_seed": {"far_points": 200, "voxel_size": 0.0}, "actors": {"min_points": 0}}
     return settings_of(load({"datasets": {"nuscenes": {"scenes": ["0001"]}}, "holdout": holdout, **whole}), stage, kind)
 
 
 def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
-    """All that a training of the scene starts from, each as bytes."""
+    """All inputs of a training of the scene, each as bytes."""
     groups = frame_groups(scene, HoldoutSettings(**holdout))
     training = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
     seed = seed_points(scene, job("lidar_seed", SeedJob, holdout))
@@ -148,8 +148,8 @@ def test_nothing_near_a_held_out_key_frame_reaches_a_training(case, tmp_path):
 
 
 @pytest.mark.parametrize("case", [HOLDOUTS[name] for name in (BOTH_KINDS, IN_A_RANGE)], indirect=True)
-def test_what_lies_just_beyond_does(case, tmp_path):
-    """The recordings next to those that are held out or near: each kind reaches what it should."""
+def test_recordings_just_beyond_the_excluded_ones_reach_a_training(case, tmp_path):
+    """Each kind of recording next to the held-out and excluded ones reaches the expected inputs."""
     root, holdout, frames, near = case
     scene = scene_at(root, frames=frames, **EVERYTHING)
     before = made(scene, holdout, tmp_path / "before")
@@ -167,8 +167,8 @@ def test_what_lies_just_beyond_does(case, tmp_path):
         before = after
 
 
-def test_key_frames_that_come_unevenly_exclude_by_time(rich_root):
-    """nuScenes' key frames are 400 to 600 ms apart; half the median interval counts, on every side."""
+def test_unevenly_spaced_key_frames_exclude_by_time(rich_root):
+    """nuScenes' key frames are 400 to 600 ms apart; half the median interval applies on both sides."""
     scene = scene_at(rich_root, **EVERYTHING)
     offsets = np.array([0, 30_000, -50_000, 0, 50_000, -40_000, 20_000, 0])
     uneven = dataclasses.replace(scene, key_frame_timestamps=scene.key_frame_timestamps + offsets)
@@ -210,7 +210,7 @@ def test_the_seed_has_the_static_returns_of_all_training_sweeps(rich_root):
 
 
 def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
-    """Five times as many moments as key frames alone give, each in the car's own frame where it then is."""
+    """Five times as many sweeps as key frames, each in the car's own frame at its time."""
     settings = ActorSeedJob(
         actors={"min_points": 0, "box_margin": 0.0}, holdout=HELD_OUT, images={}, own_car_radius=2.5,
         random_seed=0,
@@ -226,8 +226,8 @@ def test_an_actor_gathers_the_returns_of_all_training_sweeps(rich_root):
     assert len(many) > 3 * len(few) > 0
 
 
-def test_an_image_sees_the_training_sweep_of_its_moment(rich_root):
-    """Of the sweeps alone that is nearest in time, what moves is carried on by at most half a sweep's time."""
+def test_an_image_uses_the_training_sweep_nearest_in_time(rich_root):
+    """Only the nearest sweep in time is used, so dynamic returns move by at most half a sweep interval."""
     scene = scene_at(rich_root, **EVERYTHING)
     settings = LidarDepthJob(holdout=HELD_OUT, images={}, own_car_radius=2.5, box_margin=0.1, ray_spacing=(1.5, 1.65))
     whole = lidar_depths(scene, settings)
@@ -245,14 +245,14 @@ def test_an_image_sees_the_training_sweep_of_its_moment(rich_root):
 
 
 def delete(root: Path, channel: str, count: int) -> list[Path]:
-    """Deletes the first so many recordings of a channel between key frames."""
+    """Deletes the first `count` recordings of a channel between key frames."""
     paths = sorted((root / "sweeps" / channel).iterdir())[:count]
     for path in paths:
         path.unlink()
     return paths
 
 
-def test_a_missing_image_between_key_frames_stops_and_says_how_to_do_without(root):
+def test_a_missing_image_between_key_frames_stops_and_names_the_setting_to_skip_it(root):
     (path,) = delete(root, "CAM_FRONT", 1)
     with pytest.raises(DatasetError) as failure:
         scene_at(root)
@@ -262,8 +262,8 @@ def test_a_missing_image_between_key_frames_stops_and_says_how_to_do_without(roo
 
 
 @pytest.mark.parametrize("count", [3, 35])
-def test_missing_images_between_key_frames_are_left_out_and_counted_where_told_to_go_on(root, count, caplog):
-    """Who has no sweeps/ at all reads ten names, not a thousand."""
+def test_missing_images_between_key_frames_are_skipped_and_counted_with_on_missing_warn(root, count, caplog):
+    """At most ten names are listed, even if the whole folder sweeps/ is missing."""
     paths = delete(root, "CAM_FRONT", count)
     with caplog.at_level(logging.WARNING, logger="drivesplat.preprocess.extract"):
         scene = scene_at(root, on_missing="warn")
@@ -273,7 +273,7 @@ def test_missing_images_between_key_frames_are_left_out_and_counted_where_told_t
     assert count == 3 or f"{count - 10} more of {IMAGES} images" in messages[-1]
 
 
-def test_a_missing_lidar_sweep_between_key_frames_stops_and_says_how_to_do_without(root):
+def test_a_missing_lidar_sweep_between_key_frames_stops_and_names_the_setting_to_skip_it(root):
     (path,) = delete(root, "LIDAR_TOP", 1)
     settings = SeedJob(lidar_seed={"far_points": 0}, holdout=HELD_OUT, images={}, random_seed=0)
     with pytest.raises(DatasetError) as failure:

@@ -1,4 +1,4 @@
-"""nuScenes mini from a local server into a dataroot: whole, gone on with, checked, and left alone where it is there."""
+"""Download of nuScenes mini from a local server: complete, resumed, verified, and skipped if the dataset exists."""
 
 import logging
 import multiprocessing
@@ -47,7 +47,7 @@ def site(archive):
 
 @pytest.fixture
 def plain():
-    """A site whose file is no archive, where nothing looks into it."""
+    """A site whose file is not an archive, for tests that do not unpack it."""
     with served(Site(CONTENT)) as made:
         yield made
 
@@ -70,7 +70,7 @@ def refused(what: str, *words: str, call) -> str:
     return message
 
 
-def test_a_good_archive_becomes_the_dataset_and_nothing_else_is_left(site, world, tmp_path):
+def test_a_valid_archive_becomes_the_dataset_and_leaves_no_other_files(site, world, tmp_path):
     root = tmp_path / "data/nuscenes/v1.0-mini"
     download(site.job(root))
     assert files(root) == files(world)
@@ -89,7 +89,7 @@ def test_an_empty_folder_and_a_link_to_one_are_filled(site, world, tmp_path):
     assert (tmp_path / "mini").is_symlink() and files(tmp_path / "large disk/mini") == files(world)
 
 
-def test_what_is_there_already_is_left_alone_and_nothing_is_fetched(site, tmp_path, capsys):
+def test_an_existing_dataset_is_left_unchanged_and_nothing_is_fetched(site, tmp_path, capsys):
     download(site.job(tmp_path / "mini"))
     (tmp_path / "mini/mine.txt").write_text("mine")
     site.asked.clear()
@@ -98,7 +98,7 @@ def test_what_is_there_already_is_left_alone_and_nothing_is_fetched(site, tmp_pa
     assert site.asked == [] and (tmp_path / "mini/mine.txt").read_text() == "mine"
 
 
-def test_where_another_run_was_faster_nothing_is_fetched(site, tmp_path, monkeypatch):
+def test_nothing_is_fetched_if_another_run_finished_first(site, tmp_path, monkeypatch):
     looks = [False, True]
     monkeypatch.setattr(nuscenes_mini, "is_present", lambda _: looks.pop(0))
     download(site.job(tmp_path / "mini"))
@@ -106,7 +106,7 @@ def test_where_another_run_was_faster_nothing_is_fetched(site, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("part_only", [False, True])
-def test_other_data_are_not_touched(site, world, tmp_path, part_only):
+def test_other_data_in_the_folder_are_left_unchanged(site, world, tmp_path, part_only):
     root = tmp_path / "mini"
     if part_only:
         shutil.copytree(world, root)
@@ -119,17 +119,17 @@ def test_other_data_are_not_touched(site, world, tmp_path, part_only):
     assert files(root) == before and site.asked == []
 
 
-def test_terms_that_are_not_accepted_fetch_nothing(site, tmp_path):
+def test_nothing_is_fetched_without_accepted_terms(site, tmp_path):
     job = site.job(tmp_path / "mini").model_copy(update={"accept_nuscenes_terms": False})
     refused("accept_nuscenes_terms: true", "https://www.nuscenes.org/terms-of-use", call=lambda: download(job))
     assert site.asked == [] and list(tmp_path.iterdir()) == []
 
 
-def test_terms_accepted_as_snakemake_does_not_read_it_are_a_line_that_says_how_to():
+def test_an_acceptance_of_the_wrong_type_is_refused_with_the_correct_spelling():
     refused("accept_nuscenes_terms", "write True", call=lambda: load({"accept_nuscenes_terms": "true"}))
 
 
-def test_an_archive_that_is_kept_needs_no_network_the_next_time(site, world, tmp_path):
+def test_a_kept_archive_is_unpacked_without_network(site, world, tmp_path):
     job = site.job(tmp_path / "mini", keep_archive=True)
     download(job)
     assert [path.name for path in work_folder(job).iterdir()] == ["v1.0-mini.tgz"]
@@ -139,7 +139,7 @@ def test_an_archive_that_is_kept_needs_no_network_the_next_time(site, world, tmp
     assert site.asked == [] and files(tmp_path / "mini") == files(world)
 
 
-def test_a_connection_that_breaks_off_is_gone_on_with(plain, tmp_path):
+def test_a_broken_connection_is_resumed(plain, tmp_path):
     plain.cut_after = [300_000, 200_000]
     fetch(plain.settings(attempts=1), tmp_path / "file")
     assert plain.ranges_asked == [None, "bytes=300000-", "bytes=500000-"]
@@ -148,7 +148,7 @@ def test_a_connection_that_breaks_off_is_gone_on_with(plain, tmp_path):
 
 
 def broken_off(site: Site, path: Path, at: int = 400_000) -> None:
-    """A call that ends with so many bytes."""
+    """A call that is interrupted after `at` bytes."""
     site.cut_after = [at, 0]
     message = refused("kept: run again", f"{at:,} of", call=lambda: fetch(site.settings(attempts=1), path))
     assert site.address in message
@@ -156,7 +156,7 @@ def broken_off(site: Site, path: Path, at: int = 400_000) -> None:
     site.asked.clear()
 
 
-def test_the_next_call_goes_on_where_the_last_one_broke_off(plain, tmp_path):
+def test_the_next_call_resumes_an_interrupted_download(plain, tmp_path):
     broken_off(plain, tmp_path / "file")
     fetch(plain.settings(), tmp_path / "file")
     assert plain.ranges_asked == ["bytes=400000-"]
@@ -164,14 +164,14 @@ def test_the_next_call_goes_on_where_the_last_one_broke_off(plain, tmp_path):
 
 
 @pytest.mark.parametrize("tag", [None, 'W/"first"'])
-def test_a_file_that_nothing_tells_from_a_later_one_is_fetched_anew(plain, tmp_path, tag):
+def test_a_file_without_a_validator_is_fetched_anew(plain, tmp_path, tag):
     plain.tag, plain.cut_after = tag, [400_000]
     fetch(plain.settings(), tmp_path / "file")
     assert plain.ranges_asked == [None, None] and (tmp_path / "file").read_bytes() == CONTENT
 
 
 @pytest.mark.parametrize("kind", ["no ranges", "another tag", "another address"])
-def test_where_it_cannot_go_on_it_starts_over(plain, tmp_path, kind):
+def test_a_download_that_cannot_be_resumed_restarts(plain, tmp_path, kind):
     broken_off(plain, tmp_path / "file")
     settings = plain.settings()
     match kind:
@@ -187,7 +187,7 @@ def test_where_it_cannot_go_on_it_starts_over(plain, tmp_path, kind):
     assert ("Range" in plain.asked[0]) == (kind in ("no ranges", "another tag"))
 
 
-def test_a_date_marks_a_file_where_there_is_no_tag(plain, tmp_path):
+def test_last_modified_is_the_validator_without_an_etag(plain, tmp_path):
     plain.tag, plain.date = None, "Wed, 21 Oct 2015 07:28:00 GMT"
     broken_off(plain, tmp_path / "file")
     fetch(plain.settings(), tmp_path / "file")
@@ -195,7 +195,7 @@ def test_a_date_marks_a_file_where_there_is_no_tag(plain, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["another part", "part of another file", "no such part"])
-def test_bytes_that_nobody_asked_for_are_not_glued_on(plain, tmp_path, kind):
+def test_bytes_outside_the_requested_range_are_not_appended(plain, tmp_path, kind):
     broken_off(plain, tmp_path / "file")
     plain.wrong_range, plain.range_error = kind == "another part", kind == "no such part"
     if kind == "part of another file":
@@ -204,19 +204,19 @@ def test_bytes_that_nobody_asked_for_are_not_glued_on(plain, tmp_path, kind):
     assert plain.ranges_asked == ["bytes=400000-", None] and (tmp_path / "file").read_bytes() == plain.content
 
 
-def test_a_file_that_came_whole_but_was_not_checked_yet_is_not_fetched_again(plain, tmp_path):
+def test_a_complete_file_that_is_not_yet_verified_is_not_fetched_again(plain, tmp_path):
     fetching.part_of(tmp_path / "file").write_bytes(CONTENT)
     fetch(plain.settings(), tmp_path / "file")
     assert plain.asked == [] and (tmp_path / "file").read_bytes() == CONTENT
 
 
-def test_a_part_that_is_too_long_starts_over(plain, tmp_path):
+def test_a_part_that_is_too_long_restarts_the_download(plain, tmp_path):
     fetching.part_of(tmp_path / "file").write_bytes(CONTENT + b"more")
     fetch(plain.settings(), tmp_path / "file")
     assert plain.ranges_asked == [None] and (tmp_path / "file").read_bytes() == CONTENT
 
 
-def test_a_checksum_of_null_is_a_warning_and_the_size_counts(site, tmp_path, caplog):
+def test_a_checksum_of_null_warns_and_checks_the_size_only(site, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         download(site.job(tmp_path / "mini", sha256=None))
     assert "only the size of" in caplog.text and is_present(site.job(tmp_path / "mini"))
@@ -240,7 +240,7 @@ def kill(process: multiprocessing.Process) -> None:
     process.join()
 
 
-def test_a_run_killed_while_fetching_is_gone_on_with(site, world, tmp_path):
+def test_a_run_killed_while_fetching_is_resumed(site, world, tmp_path):
     job, part = site.job(tmp_path / "mini"), tmp_path / "mini.download/v1.0-mini.tgz.part"
     site.silent_after = len(site.content) // 2
     process = in_a_process(download, job)
@@ -251,14 +251,14 @@ def test_a_run_killed_while_fetching_is_gone_on_with(site, world, tmp_path):
     assert site.ranges_asked == [None, f"bytes={len(site.content) // 2}-"] and files(tmp_path / "mini") == files(world)
 
 
-def test_a_file_that_has_moved_is_gone_on_with_where_it_is(plain, tmp_path):
+def test_a_redirected_download_is_resumed(plain, tmp_path):
     plain.cut_after = [400_000]
     moved = plain.settings(url=plain.address.replace("v1.0-mini.tgz", "moved"))
     fetch(moved, tmp_path / "file")
     assert plain.ranges_asked == [None, "bytes=400000-"] and (tmp_path / "file").read_bytes() == CONTENT
 
 
-def test_a_proxy_in_the_environment_is_taken(plain, tmp_path, monkeypatch):
+def test_a_proxy_in_the_environment_is_used(plain, tmp_path, monkeypatch):
     for name in ("no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(urllib.request, "_opener", None)  # it remembers the proxies of its first use
@@ -286,7 +286,7 @@ def test_a_run_killed_while_unpacking_unpacks_again_without_fetching(site, world
     assert site.asked == [] and files(tmp_path / "mini") == files(world)
 
 
-def test_progress_is_told_now_and_then(monkeypatch, capsys):
+def test_progress_is_announced_at_intervals(monkeypatch, capsys):
     monkeypatch.setattr(console, "INTERVAL_S", 0.0)
     ByteProgress("download", 4_000_000_000, 1_000_000_000).add(1_000_000_000)
     assert "download: 50 % of 4.00 GB, " in capsys.readouterr().err
@@ -295,7 +295,7 @@ def test_progress_is_told_now_and_then(monkeypatch, capsys):
     assert told.line(100.0) == "download: 50 % of 4.00 GB, 10.0 MB/s, 3 min left"
 
 
-def test_the_first_recorded_dataset_of_the_mini_split_is_filled():
+def test_the_first_recorded_dataset_of_the_mini_split_is_the_destination():
     datasets = {
         "made": {"dataroot": "a", "scenes": ["made"], "world": {}},
         "full": {"dataroot": "b", "version": "v1.0-trainval", "scenes": ["0001"]},
@@ -307,7 +307,7 @@ def test_the_first_recorded_dataset_of_the_mini_split_is_filled():
         download_job(load({"datasets": datasets}))
 
 
-def test_asking_for_the_data_is_not_refused_for_want_of_them_and_a_scene_names_the_way_to_them(tmp_path):
+def test_the_download_needs_no_dataset_and_a_missing_scene_names_the_download(tmp_path):
     plan = Plan({"datasets": {"nuscenes": {"dataroot": str(tmp_path / "nowhere")}}}, str(REPOSITORY))
     plan.refuse_absent_data(["download_nuscenes_mini"])
     for targets in (["results/0103/metrics.json"], ["download_nuscenes_mini", "metrics"], []):

@@ -1,4 +1,4 @@
-"""nuScenes tables into a Scene: poses and boxes against the tiny drive's geometry, and every fault named."""
+"""Reading nuScenes tables: poses and boxes compared with the tiny drive's geometry, and the message of every fault."""
 
 import json
 import logging
@@ -56,7 +56,7 @@ def pose_of(translation, rotation) -> np.ndarray:
     return pose
 
 
-def test_key_frames_images_stand_where_the_tiny_drives_camera_was(tiny_root):
+def test_key_frame_images_have_the_camera_poses_of_the_tiny_drive(tiny_root):
     scene = extract_scene(source(), tiny_root)
     assert [frame.sample_index for frame in scene.frames] == list(range(10))
     for i, frame in enumerate(scene.frames):
@@ -70,7 +70,7 @@ def test_key_frames_images_stand_where_the_tiny_drives_camera_was(tiny_root):
         assert Path(frame.image_path).is_file()
 
 
-def test_lidar_sweeps_stand_where_the_tiny_drives_lidar_was(tiny_root):
+def test_lidar_sweeps_have_the_lidar_poses_of_the_tiny_drive(tiny_root):
     scene = extract_scene(source(), tiny_root)
     assert [sweep.timestamp for sweep in scene.sweeps] == [START_US + i * KEY_FRAME_US for i in range(10)]
     for sweep in scene.sweeps:
@@ -79,7 +79,7 @@ def test_lidar_sweeps_stand_where_the_tiny_drives_lidar_was(tiny_root):
         assert sweep.is_key_frame and Path(sweep.path).is_file()
 
 
-def test_names_and_times_of_the_scene_are_those_of_the_tables(tiny_root):
+def test_names_and_times_of_the_scene_match_the_tables(tiny_root):
     scene = extract_scene(source(), tiny_root)
     assert (scene.name, scene.dataset, scene.version, scene.poses) == ("0001", "tiny", "v1.0-mini", "nuscenes")
     assert (scene.description, scene.key_frame_range, scene.missing_images) == ("tiny", None, 0)
@@ -94,7 +94,7 @@ def test_the_origin_is_the_first_ego_position(root):
     np.testing.assert_array_equal(extract_scene(source(), root).origin, [1.5, -2.5, 3.5])
 
 
-def test_every_image_and_sweep_takes_its_own_ego_pose_and_calibration(root):
+def test_every_image_and_sweep_uses_its_own_ego_pose_and_calibration(root):
     random = np.random.default_rng(3)
     expected = {}
 
@@ -135,7 +135,7 @@ def test_sweeps_adds_the_images_between_key_frames_with_their_own_poses(tiny_roo
         assert ("sweeps" in frame.image_path) == (not frame.is_key_frame)
 
 
-def test_an_image_between_key_frames_counts_to_the_nearest_key_frame(tmp_path):
+def test_an_image_between_key_frames_is_assigned_to_the_nearest_key_frame(tmp_path):
     scene = extract_scene(source(sweeps=True), write_world(tmp_path, World(key_frames=3, sweeps_between=5)))
     for frame in scene.frames:
         nearest = round((frame.timestamp - START_US) / KEY_FRAME_US)
@@ -162,25 +162,25 @@ def test_a_frame_range_beyond_the_scene_is_refused(tiny_root, frames):
         extract_scene(source(frames=frames), tiny_root)
 
 
-def test_an_unknown_scene_is_refused_with_those_there_are(tmp_path):
+def test_an_unknown_scene_is_refused_with_the_available_scenes(tmp_path):
     root = write_world(tmp_path, World(scenes=("0001", "0007"), key_frames=2))
     with pytest.raises(DatasetError, match=r"0061.*0001, 0007"):
         extract_scene(source(scene="0061"), root)
     assert extract_scene(source(scene="0007"), root).frames[0].token.startswith("0007")
 
 
-def test_a_camera_that_is_not_there_is_refused_with_the_sensors_there_are(tiny_root):
+def test_an_unknown_camera_is_refused_with_the_available_sensors(tiny_root):
     with pytest.raises(DatasetError, match=r"CAM_BACK.*CAM_FRONT"):
         extract_scene(source(cameras=("CAM_FRONT", "CAM_BACK")), tiny_root)
 
 
-def test_boxes_are_length_width_height_though_the_tables_say_width_length_height(tiny_root):
+def test_box_sizes_are_converted_from_width_length_height_to_length_width_height(tiny_root):
     scene = extract_scene(source(), tiny_root)
     sizes = {track.category: track.size.tolist() for track in scene.tracks}
     assert sizes == {thing.category: list(thing.size) for thing in World().things}
 
 
-def test_tracks_are_the_things_of_the_tiny_drive(tiny_root):
+def test_tracks_match_the_objects_of_the_tiny_drive(tiny_root):
     scene = extract_scene(source(), tiny_root)
     things = {thing.category: thing for thing in World().things}
     assert len(scene.tracks) == len(things)
@@ -220,17 +220,17 @@ def test_a_track_with_one_box_is_kept(root):
 
 
 @pytest.mark.parametrize("token", ["1", "2", "3", "4"])
-def test_visibility_is_the_tables_level(root, token):
+def test_visibility_is_the_level_in_the_tables(root, token):
     edit(root, "sample_annotation", lambda boxes: [{**box, "visibility_token": token} for box in boxes])
     assert {int(v) for track in extract_scene(source(), root).tracks for v in track.visibility} == {int(token)}
 
 
-def test_visibility_that_the_tables_do_not_say_is_0(root):
+def test_a_missing_visibility_is_0(root):
     edit(root, "sample_annotation", lambda boxes: [{**box, "visibility_token": ""} for box in boxes])
     assert {int(v) for track in extract_scene(source(), root).tracks for v in track.visibility} == {0}
 
 
-def test_the_dataroot_may_be_the_root_its_table_folder_or_the_folder_around_it(root):
+def test_the_dataroot_may_be_the_root_its_table_folder_or_its_parent(root):
     assert find_root(str(root), "v1.0-mini") == root
     assert find_root(str(root / "v1.0-mini"), "v1.0-mini") == root
     around = root.parent / "around"
@@ -253,27 +253,27 @@ def refused(dataroot: Path, version: str = "v1.0-mini") -> str:
     return message
 
 
-def test_a_missing_dataroot_is_told_with_where_and_how_to_get_it(tmp_path):
+def test_a_missing_dataroot_is_refused_with_its_path_and_how_to_get_it(tmp_path):
     assert "nuscenes.org" in refused(tmp_path / "absent")
 
 
-def test_an_empty_dataroot_is_told_with_where_and_how_to_get_it(tmp_path):
+def test_an_empty_dataroot_is_refused_with_its_path_and_how_to_get_it(tmp_path):
     assert "nuscenes.org" in refused(tmp_path)
 
 
-def test_another_version_is_told_with_the_one_that_is_there(tiny_root):
+def test_a_missing_version_is_refused_with_the_available_one(tiny_root):
     message = refused(tiny_root, "v1.0-trainval")
     assert "v1.0-mini" in message and "version" in message
 
 
-def test_the_parent_of_a_folder_of_another_name_is_not_taken(root):
+def test_the_parent_of_a_folder_of_another_name_is_not_used(root):
     """`dataroot` with a typo must not silently find the dataset beside it."""
     (root / "maps-of-mine").mkdir()
     refused(root / "maps-of-mine")
 
 
 @pytest.mark.parametrize("table", ["ego_pose", "sample_annotation"])
-def test_an_incomplete_dataset_is_told_with_the_tables_that_are_missing(root, table):
+def test_an_incomplete_dataset_is_refused_with_the_missing_tables(root, table):
     (root / "v1.0-mini" / f"{table}.json").unlink()
     with pytest.raises(DatasetError, match=rf"{table}\.json.*nuscenes\.org"):
         table_files(root, "v1.0-mini")
@@ -285,7 +285,7 @@ def test_the_table_files_are_all_tables_of_the_version(root):
 
 
 @pytest.mark.parametrize("content", ["", "[{", "nothing"])
-def test_a_damaged_table_is_told_without_a_traceback(root, content):
+def test_a_damaged_table_is_refused_without_a_traceback(root, content):
     (root / "v1.0-mini" / "sample_data.json").write_text(content)
     with pytest.raises(DatasetError, match=str(root)):
         extract_scene(source(), root)
@@ -330,7 +330,7 @@ def test_a_bad_image_stops_the_extraction_naming_key_frame_token_and_path(root, 
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_bad_image_is_left_out_and_counted_where_told_to_go_on(root, fault, caplog):
+def test_a_bad_image_is_skipped_and_counted_with_on_missing_warn(root, fault, caplog):
     fault(image_of(root, 3))
     fault(image_of(root, 5))
     with caplog.at_level(logging.WARNING):
@@ -341,7 +341,7 @@ def test_a_bad_image_is_left_out_and_counted_where_told_to_go_on(root, fault, ca
     assert str(image_of(root, 3)) in caplog.text and "0001 CAM_FRONT 10" in caplog.text
 
 
-def test_no_image_left_is_an_error_even_where_told_to_go_on(root):
+def test_a_drive_without_a_readable_image_is_an_error_even_with_on_missing_warn(root):
     shutil.rmtree(root / "samples" / "CAM_FRONT")
     with pytest.raises(DatasetError, match=r"0001.*10 images"):
         extract_scene(source(on_missing="warn"), root)
@@ -377,7 +377,7 @@ def test_a_bad_lidar_file_stops_the_seeding_naming_key_frame_token_and_path(root
 
 
 @pytest.mark.parametrize("fault", [remove, empty, cut_off])
-def test_a_bad_lidar_file_is_counted_where_told_to_go_on(root, fault, caplog):
+def test_a_bad_lidar_file_is_counted_with_on_missing_warn(root, fault, caplog):
     for index in (0, 3):
         fault(sweep_of(root, index))
     scene = extract_scene(source(), root)
@@ -410,13 +410,13 @@ def refusal(root: Path, **changes) -> str:
     ],
     ids=str,
 )
-def test_a_pose_that_is_not_finite_or_no_rotation_is_refused_naming_it(root, sensor, change):
+def test_a_pose_that_is_not_finite_or_not_a_rotation_is_refused_naming_it(root, sensor, change):
     edit(root, "ego_pose", lambda poses: record(poses, f"0001 {sensor} 2").update(change))
     assert f"ego_pose 0001 {sensor} 2" in refusal(root, sweeps=True)
 
 
-def test_a_quaternion_of_nearly_unit_length_is_taken(root):
-    """The tables round: lengths are off by up to 1e-4 or so."""
+def test_a_quaternion_of_nearly_unit_length_is_accepted(root):
+    """The tables are rounded: lengths deviate by up to about 1e-4."""
     edit(root, "ego_pose", lambda poses: [{**pose, "rotation": [1.0002, 0.0, 0.0, 0.0]} for pose in poses])
     scene = extract_scene(source(), root)
     np.testing.assert_allclose(scene.frames[0].ego_to_world[:3, :3], np.eye(3), atol=1e-9)
@@ -507,7 +507,7 @@ def test_a_chain_of_images_that_ends_early_is_refused_naming_its_end(root):
         ("sample", "0001 sample 4", "next"),
     ],
 )
-def test_a_token_that_leads_nowhere_is_refused_naming_it(root, table, token, key):
+def test_a_token_without_a_row_is_refused_naming_it(root, table, token, key):
     edit(root, table, lambda records: record(records, token).update({key: "nowhere"}))
     assert "nowhere" in refusal(root, sweeps=True)
 
@@ -525,8 +525,8 @@ def test_the_real_scene_has_its_frames_tracks_and_sweeps(real_scene):
     assert sum(Path(sweep.path).is_file() for sweep in real_scene.sweeps) == 1
 
 
-def test_the_real_scenes_images_have_poses_of_their_own(real_scene, real_scene_root):
-    """Against the tables themselves: camera pose = ego pose of the image's own record x calibration."""
+def test_the_real_scenes_images_have_their_own_poses(real_scene, real_scene_root):
+    """Compared with the tables: camera pose = ego pose of the image's own record x calibration."""
     read = {
         table: {r["token"]: r for r in json.loads((real_scene_root / "v1.0-mini" / f"{table}.json").read_text())}
         for table in ("sample_data", "ego_pose", "calibrated_sensor")
@@ -554,7 +554,7 @@ def camera_pose(tables: dict, frame: Frame) -> np.ndarray:
     return pose_of(ego["translation"], ego["rotation"]) @ pose_of(sensor["translation"], sensor["rotation"])
 
 
-def test_the_sensors_of_the_tiny_drive_are_told(tiny_root):
+def test_the_scene_describes_the_sensors_of_the_tiny_drive(tiny_root):
     scene = extract_scene(source(), tiny_root)
     (camera,), (lidar,) = scene.cameras, scene.lidars
     assert (camera.name, camera.width, camera.height) == ("CAM_FRONT", 96, 54)

@@ -1,4 +1,4 @@
-"""What a scene needs of nuScenes' tables: all of it, nothing of other scenes, found in bounded memory."""
+"""The rows of a scene from nuScenes' tables: complete, without rows of other scenes, in bounded memory."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def edit(root: Path, table: str, token: str, **changes) -> None:
 
 
 def expected_tokens(root: Path, scene: str) -> dict[str, set[str]]:
-    """The tokens of a scene's rows, by nuscenes-devkit's own links."""
+    """The tokens of a scene's rows, by the links of nuscenes-devkit."""
     tables = NuScenes(VERSION, str(root), verbose=False)
     row = next(row for row in tables.scene if row["name"] == f"scene-{scene}")
     samples, data = set(), set()
@@ -61,7 +61,7 @@ def expected_tokens(root: Path, scene: str) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("buffer", [1, 500, 2**26])
-def test_a_scene_gets_its_own_rows_and_no_others(root, tmp_path, buffer, monkeypatch):
+def test_a_scenes_file_has_exactly_the_rows_of_the_scene(root, tmp_path, buffer, monkeypatch):
     monkeypatch.setattr(scene_tables, "_BUFFER", buffer)
     index_tables(root, VERSION, SCENES, tmp_path / "rows")
     for scene in SCENES:
@@ -70,7 +70,7 @@ def test_a_scene_gets_its_own_rows_and_no_others(root, tmp_path, buffer, monkeyp
         assert all(len({row["token"] for row in of}) == len(of) for of in found.values())
 
 
-def test_rows_are_as_in_the_tables_and_in_their_order(root, tmp_path):
+def test_rows_keep_the_content_and_order_of_the_tables(root, tmp_path):
     index_tables(root, VERSION, ["0002"], tmp_path)
     for table, found in read_scene_tables(scene_file(tmp_path, "0002")).items():
         whole = json.loads((root / VERSION / f"{table}.json").read_text())
@@ -78,7 +78,7 @@ def test_rows_are_as_in_the_tables_and_in_their_order(root, tmp_path):
         assert table == "map" or found == [row for row in whole if row["token"] in tokens]
 
 
-def test_a_scene_read_from_its_rows_is_the_one_read_from_the_tables(root, tmp_path):
+def test_a_scene_read_from_its_rows_equals_the_one_read_from_the_tables(root, tmp_path):
     index_tables(root, VERSION, SCENES, tmp_path)
     for name in SCENES:
         source = SceneSource(
@@ -92,7 +92,7 @@ def times_of_change(folder: Path) -> dict[str, int]:
     return {scene: scene_file(folder, scene).stat().st_ino for scene in SCENES}
 
 
-def test_touched_and_newly_spelled_tables_rewrite_no_scene(root, tmp_path):
+def test_touched_and_reformatted_tables_rewrite_no_scene(root, tmp_path):
     index_tables(root, VERSION, SCENES, tmp_path)
     before = times_of_change(tmp_path)
     for table in (root / VERSION).iterdir():
@@ -110,7 +110,7 @@ def test_touched_and_newly_spelled_tables_rewrite_no_scene(root, tmp_path):
         ("sample", "0002 sample 3", {"timestamp": 7}),
     ],
 )
-def test_a_changed_row_rewrites_its_own_scene_alone(root, tmp_path, table, token, changes):
+def test_a_changed_row_rewrites_its_own_scene_only(root, tmp_path, table, token, changes):
     index_tables(root, VERSION, SCENES, tmp_path)
     before = times_of_change(tmp_path)
     edit(root, table, token, **changes)
@@ -121,14 +121,14 @@ def test_a_changed_row_rewrites_its_own_scene_alone(root, tmp_path, table, token
     assert {key: changed[key] for key in changes} == changes
 
 
-def test_tables_that_have_not_changed_are_not_read_again(root, tmp_path, monkeypatch):
+def test_unchanged_tables_are_not_read_again(root, tmp_path, monkeypatch):
     index_tables(root, VERSION, SCENES, tmp_path)
     monkeypatch.setattr(scene_tables, "rows", lambda table: pytest.fail(f"{table} is read"))
     index_tables(root, VERSION, SCENES, tmp_path)
 
 
 @pytest.mark.parametrize("lost", ["0003.jsonl", scene_tables.INDEX])
-def test_a_lost_file_is_made_again(root, tmp_path, lost):
+def test_a_deleted_file_is_recreated(root, tmp_path, lost):
     index_tables(root, VERSION, SCENES, tmp_path)
     content = scene_file(tmp_path, "0003").read_bytes()
     (tmp_path / lost).unlink()
@@ -164,7 +164,7 @@ ROWS = [{"token": "ä}]", "text": 'a "quoted"  ], [ text', "nested": [[1.5, -2],
 @pytest.mark.parametrize("chunk", [7, 64, 2**22])
 @pytest.mark.parametrize("indent", [None, 0, 4])
 @pytest.mark.parametrize("content", [ROWS, [], ROWS * 3])
-def test_rows_are_those_that_json_reads_whatever_is_read_at_once(tmp_path, monkeypatch, chunk, indent, content):
+def test_rows_equal_those_of_json_for_any_chunk_size(tmp_path, monkeypatch, chunk, indent, content):
     monkeypatch.setattr(scene_tables, "_CHUNK", chunk)
     (tmp_path / "table.json").write_text(" \n" + json.dumps(content, indent=indent, ensure_ascii=False) + "\n")
     found = list(rows(tmp_path / "table.json"))
@@ -172,7 +172,7 @@ def test_rows_are_those_that_json_reads_whatever_is_read_at_once(tmp_path, monke
     assert [json.loads(text) for text, _ in found] == content and not any("\n" in text for text, _ in found)
 
 
-def test_a_large_table_is_read_in_little_memory(tmp_path, monkeypatch):
+def test_a_large_table_is_read_in_bounded_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(scene_tables, "_CHUNK", 2**14)
     row = {"token": "0" * 32, "translation": [1.0, 2.0, 3.0]}
     (tmp_path / "table.json").write_text(json.dumps([row] * 30_000))

@@ -1,4 +1,4 @@
-"""Images and their pixel conventions, against hand-computed pixels."""
+"""Images and their pixel conventions, compared with pixels computed by hand."""
 
 import io
 
@@ -14,7 +14,7 @@ from drivesplat.settings.images import ImageSettings
 
 
 def frame(width: int = 1600, height: int = 900, cx: float = 799.5, cy: float = 449.5) -> Frame:
-    """A camera whose integer coordinates are pixel centres, as OpenCV and nuScenes have it."""
+    """A camera whose integer coordinates are pixel centres, as in OpenCV and nuScenes."""
     k = np.array([[1000.0, 0.0, cx], [0.0, 1100.0, cy], [0.0, 0.0, 1.0]])
     return Frame("CAM_FRONT", 0, "", width, height, k, np.eye(4), np.eye(4), True, 0, "")
 
@@ -30,7 +30,7 @@ def frame(width: int = 1600, height: int = 900, cx: float = 799.5, cy: float = 4
         ((10_000, 10), 16, (16, 1)),
     ],
 )
-def test_images_keep_their_aspect(recorded, width, size):
+def test_images_keep_their_aspect_ratio(recorded, width, size):
     assert target_size(frame(*recorded), ImageSettings(width=width)) == size
 
 
@@ -39,7 +39,7 @@ def test_at_recorded_size_the_centre_of_the_first_pixel_is_at_half_a_pixel():
     np.testing.assert_allclose(k, [[1000.0, 0.0, 10.5], [0.0, 1100.0, 20.5], [0.0, 0.0, 1.0]])
 
 
-def test_halving_maps_the_corner_between_four_pixels_to_the_centre_of_the_one_they_become():
+def test_halving_maps_the_corner_between_four_pixels_to_the_centre_of_their_merged_pixel():
     """Pixels (6, 4), (7, 4), (6, 5), (7, 5) become (3, 2): their common corner (7, 5) becomes its centre (3.5, 2.5)."""
     corner = np.array([6.5, 4.5])  # OpenCV's coordinates of that corner: half way between the pixels' centres
     source = frame(16, 10, cx=3.0, cy=7.0)
@@ -48,13 +48,13 @@ def test_halving_maps_the_corner_between_four_pixels_to_the_centre_of_the_one_th
     np.testing.assert_allclose([x, y], [3.5, 2.5], atol=1e-12)
 
 
-def test_sizes_of_another_aspect_scale_each_axis_by_itself():
+def test_another_aspect_ratio_scales_each_axis_separately():
     k = continuous_intrinsics(frame(1600, 900), (100, 56))
     np.testing.assert_allclose(k[0], [1000.0 / 16, 0.0, 800.0 / 16])
     np.testing.assert_allclose(k[1], [0.0, 1100.0 * 56 / 900, 450.0 * 56 / 900])
 
 
-def test_the_recorded_intrinsics_are_left_alone():
+def test_the_recorded_intrinsics_are_not_modified():
     source = frame()
     before = source.intrinsics.copy()
     continuous_intrinsics(source, (800, 450))
@@ -68,7 +68,7 @@ def test_resizing_to_a_half_averages_blocks_of_four(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "image.png", (10, 6)), blocks, atol=0.51)
 
 
-def test_an_image_at_its_own_size_is_returned_as_it_is(tmp_path):
+def test_an_image_at_its_own_size_is_returned_unchanged(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
     Image.fromarray(pixels).save(tmp_path / "image.png")
     np.testing.assert_array_equal(read_image(tmp_path / "image.png"), pixels)

@@ -1,4 +1,4 @@
-"""The smooth way of an object through its annotations: exact at them, smooth between, steady beyond, absent in gaps."""
+"""The smooth motion of an object: exact at its annotations, smooth between them, uniform beyond, absent in gaps."""
 
 import dataclasses
 
@@ -63,7 +63,7 @@ def test_between_three_annotations_it_is_the_natural_cubic_spline():
 
 
 @pytest.mark.parametrize("end", ["first", "last"])
-def test_beyond_its_ends_it_goes_straight_on_and_turns_on_as_at_the_end(end):
+def test_beyond_its_ends_velocity_and_turn_rate_are_constant(end):
     motion = winding()
     time, side = (TIMES[0], 1.0) if end == "first" else (TIMES[-1], -1.0)
     (place, speed, _), (rate, _) = local_polynomials(motion, time, side)
@@ -103,7 +103,7 @@ def test_positions_are_weighted_means_of_the_annotated_ones():
 
 
 def with_a_gap() -> Motion:
-    """Annotated at 0, 0.5, 1.0 and again at 2.5, 3.0 seconds, where it stands elsewhere."""
+    """Annotated at 0, 0.5, 1.0 and again at 2.5, 3.0 seconds, at another position."""
     places = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [20.0, 5.0, 0.0], [20.0, 6.0, 0.0]]
     return motion_through([0.0, 0.5, 1.0, 2.5, 3.0], places, [0.0, 0.0, 0.0, 1.5, 1.5], runs=((0, 2), (3, 4)))
 
@@ -117,7 +117,7 @@ def test_it_is_absent_in_a_gap_and_beyond_its_reach(time, present):
     assert with_a_gap().present(np.array([time])).tolist() == [present]
 
 
-def test_each_run_moves_by_its_own_annotations_alone():
+def test_each_run_depends_on_its_own_annotations_only():
     motion, at = with_a_gap(), np.array([1.2, 2.3])
     np.testing.assert_allclose(motion.poses(at)[0], rigid(np.eye(3), np.array([2.4, 0.0, 0.0])), atol=1e-9)
     np.testing.assert_allclose(motion.poses(at)[1], rigid(about_z(1.5), np.array([20.0, 4.6, 0.0])), atol=1e-9)
@@ -130,7 +130,7 @@ def test_it_spans_all_its_runs():
     assert with_a_gap().span == (-0.25, 3.25)
 
 
-def test_a_single_annotation_holds_still_for_its_reach():
+def test_a_single_annotation_is_static_within_its_reach():
     motion = motion_through([2.0], [[1.0, 2.0, 3.0]], 0.7)
     at = np.array([1.74, 1.75, 2.0, 2.25, 2.26])
     assert motion.present(at).tolist() == [False, True, True, True, False]
@@ -148,7 +148,7 @@ def annotated(scene: Scene, key_frames: list[int], poses: list[np.ndarray]) -> T
     )  # fmt: skip
 
 
-def test_of_a_track_times_count_from_the_first_image_and_it_reaches_as_boxes_do(tiny_scene):
+def test_a_tracks_times_start_at_the_first_image_and_its_reach_is_that_of_boxes(tiny_scene):
     """The camera fires 35 ms before the LiDAR, at whose times boxes are annotated, every half second."""
     track = annotated(tiny_scene, [1, 2, 5], [np.eye(4)] * 3)
     motion = Motion.of_track(tiny_scene, track)
@@ -157,8 +157,8 @@ def test_of_a_track_times_count_from_the_first_image_and_it_reaches_as_boxes_do(
     assert motion.object_to_world is track.object_to_world
 
 
-def test_of_a_car_that_goes_straight_it_says_what_the_measuring_protocol_says(tiny_scene):
-    """Where it is, and whether it is there at all, for two runs with a gap between."""
+def test_the_motion_of_a_straight_path_agrees_with_the_measuring_protocol(tiny_scene):
+    """Its pose and presence, for two runs with a gap between."""
     key_frames = [0, 1, 2, 3, 6, 7, 8]
     poses = [rigid(about_z(0.3 + 0.2 * i), np.array([4.0 * i, -1.5 * i, 0.1 * i])) for i in key_frames]
     track = annotated(tiny_scene, key_frames, poses)
@@ -173,9 +173,9 @@ def test_of_a_car_that_goes_straight_it_says_what_the_measuring_protocol_says(ti
             np.testing.assert_allclose(motion.poses(at)[0], box.object_to_world, atol=1e-6)
 
 
-def test_on_a_bend_it_is_near_the_boxes_and_nearer_to_the_truth(tiny_scene):
-    """A straight line between key frames leaves an arc by up to (speed x interval)² / 8 radius. The spline may
-    leave the line by little more than that; the arc it may leave by half of it near the ends and hardly within."""
+def test_on_a_curve_the_motion_is_closer_to_the_truth_than_boxes_are(tiny_scene):
+    """A straight line between key frames deviates from an arc by up to (speed x interval)² / 8 radius. The spline may
+    deviate from the line by little more than that, and from the arc by half of it near the ends and less within."""
     radius, rate = 12.0, 0.6
     sagitta = (radius * rate * 0.5) ** 2 / (8 * radius)
 

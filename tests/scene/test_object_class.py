@@ -1,4 +1,4 @@
-"""What the measuring protocol needs to know of a class of objects."""
+"""The properties of object classes in the measuring protocol."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def test_every_class_of_nuscenes_has_an_object_class(category, expected):
 
 
 @pytest.mark.parametrize("category", NUSCENES)
-def test_vehicles_humans_and_dynamic_objects_are_told_by_the_first_word_of_their_nuscenes_class(category):
+def test_vehicles_humans_and_dynamic_objects_agree_with_the_prefix_of_their_nuscenes_class(category):
     kind, known = category.split(".")[0], object_class(category)
     assert known.is_vehicle == (kind == "vehicle")
     assert known.is_human == (kind == "human")
@@ -38,7 +38,7 @@ def test_vehicles_humans_and_dynamic_objects_are_told_by_the_first_word_of_their
 
 
 @pytest.mark.parametrize("known", ObjectClass)
-def test_vehicles_move_above_1_metre_a_second_pedestrians_above_0_3_and_nothing_else_does(known):
+def test_vehicles_move_above_1_metre_per_second_pedestrians_above_0_3_others_never(known):
     humans, never = {"pedestrian"}, {"animal", "other_movable"}
     threshold = 0.3 if known.value in humans else 1.0
     assert known.moving_speed == (None if known.value in never else threshold)
@@ -46,7 +46,7 @@ def test_vehicles_move_above_1_metre_a_second_pedestrians_above_0_3_and_nothing_
     assert known.moves_at(threshold + 0.01) == (known.value not in never)
 
 
-def test_where_a_dataset_does_not_tell_cars_from_other_vehicles_no_pixel_is_a_cars(tiny_scene):
+def test_without_a_class_for_cars_no_pixel_belongs_to_a_car(tiny_scene):
     tracks = (
         dataclasses.replace(track, object_class=ObjectClass.VEHICLE) if track.object_class.is_vehicle else track
         for track in tiny_scene.tracks

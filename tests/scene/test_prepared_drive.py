@@ -1,4 +1,4 @@
-"""A recorded drive as the stages behind training see it: images, labels and splits by one number."""
+"""The prepared drive of the stages after training: images, labels and splits by image index."""
 
 import dataclasses
 import json
@@ -24,7 +24,7 @@ GREY = (0.45, 0.5, 0.4)
 
 @pytest.fixture(scope="module")
 def labels() -> np.ndarray:
-    """Label images at half the recorded width: a moving car over static pixels over the own car's body."""
+    """Label images at half the recorded width: a moving car above static pixels above the body of the ego vehicle."""
     labels = np.full((27, 48), LABELS["static"], dtype=np.uint8)
     labels[:, 30:44], labels[20:] = LABELS["moving_car"], LABELS["own_car"]
     return labels
@@ -39,7 +39,7 @@ def masks(labels, tiny_scene, tmp_path_factory):
 
 
 @pytest.mark.parametrize("width", [None, 48])
-def test_an_image_is_the_recorded_one_at_the_size_of_training(tiny_scene, width):
+def test_an_image_is_the_recorded_one_at_training_size(tiny_scene, width):
     recording = recording_of(tiny_scene, width=width)
     with Image.open(tiny_scene.frames[3].image_path) as recorded:
         whole = np.asarray(recorded.convert("RGB")) / 255.0
@@ -52,7 +52,7 @@ def test_an_image_is_the_recorded_one_at_the_size_of_training(tiny_scene, width)
         assert image.shape == blocks.shape and np.abs(image - blocks).mean() < 0.01
 
 
-def test_labels_are_those_of_the_masks_where_there_are_some_and_else_of_the_boxes(tiny_scene, masks, labels):
+def test_labels_come_from_the_masks_or_without_masks_from_the_boxes(tiny_scene, masks, labels):
     given, bare = recording_of(tiny_scene, masks, 48), recording_of(tiny_scene, width=48)
     np.testing.assert_array_equal(given.labels(4), labels)
     np.testing.assert_array_equal(given.ego_mask(4), labels == LABELS["own_car"])
@@ -60,30 +60,30 @@ def test_labels_are_those_of_the_masks_where_there_are_some_and_else_of_the_boxe
     assert not bare.ego_mask(4).any()
 
 
-def test_every_image_has_the_split_it_was_given(tiny_scene):
-    """Key frames are the even images; those between fall to no group next to one that is held out."""
+def test_every_image_has_its_split(tiny_scene):
+    """Key frames are the even images; images between them are excluded next to a held-out one."""
     recording = recording_of(tiny_scene, every_nth=4, offset=2, last_block=2)
     splits = [recording.split(index) for index in range(len(tiny_scene.frames))]
     assert splits[::2] == [*["train", "train", "interpolation", "train"] * 2, *["extrapolation"] * 2]
     assert set(splits[1::2]) <= {"train", "excluded"}
 
 
-def test_a_recording_is_read_with_the_provenance_of_its_three_files(tiny_scene, masks, labels, tmp_path):
+def test_a_prepared_drive_is_read_with_the_provenance_of_its_three_files(tiny_scene, masks, labels, tmp_path):
     record = dataclasses.replace(recording_of(tiny_scene, width=48).record, provenance={"made": "parser"})
     write_scene(tmp_path / "scene.json", dataclasses.replace(tiny_scene, provenance={"made": "scene"}))
     write_training_record(tmp_path / "parser.pkl", record)
     paths = (tmp_path / "scene.json", tmp_path / "parser.pkl", masks / "masks.json")
-    recording, provenances = read_prepared_drive(*paths)
+    drive, provenances = read_prepared_drive(*paths)
     assert provenances == [{"made": "scene"}, {"made": "parser"}, {"made": "masks"}]
-    assert recording.frame(2).token == tiny_scene.frames[2].token and recording.size(2) == (48, 27)
-    np.testing.assert_array_equal(recording.labels(2), labels)
+    assert drive.frame(2).token == tiny_scene.frames[2].token and drive.size(2) == (48, 27)
+    np.testing.assert_array_equal(drive.labels(2), labels)
     (tmp_path / "masks.json").write_text("[]")
     with pytest.raises(ResultError, match=r"masks\.json.*masks"):
         read_prepared_drive(*paths[:2], tmp_path / "masks.json")
 
 
 def test_held_out_groups_are_measured_over_the_regions_of_the_labels(tiny_scene, masks, labels):
-    """A constant colour against the recorded images: its PSNR follows from their pixels."""
+    """The PSNR of a constant colour follows from the pixels of the recorded images."""
     recording = recording_of(tiny_scene, masks, 48, every_nth=4, offset=2, last_block=2)
     model = SplatModel([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2)).requires_grad_(False)
     groups = evaluate_groups(model, recording, "CAM_FRONT", None, torch.device("cpu"))

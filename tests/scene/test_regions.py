@@ -1,4 +1,4 @@
-"""Boxes in images: polygons, hulls and labels against geometry computed another way."""
+"""Boxes in images: polygons, hulls and labels compared with independently computed geometry."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ K = np.array([[200.0, 0.0, 160.0], [0.0, 210.0, 90.0], [0.0, 0.0, 1.0]])
 """A camera of 320 x 180 pixels, continuous convention."""
 
 
-def crossings_are_odd(polygon: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def inside_by_crossing_number(polygon: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Point in polygon by the crossing number (Shimrat 1962), pixel by pixel."""
     inside = np.zeros((size[1], size[0]), dtype=bool)
     x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
@@ -33,11 +33,11 @@ def crossings_are_odd(polygon: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize(("middle", "spread"), [((24, 16), 10), ((0, 0), 15), ((48, 30), 20), ((24, 16), 200)])
-def test_fill_takes_the_pixels_whose_centres_lie_in_the_polygon(seed, middle, spread):
+def test_fill_selects_the_pixels_with_centres_in_the_polygon(seed, middle, spread):
     points = np.random.default_rng(seed).normal(middle, spread, (8, 2))
     polygon = points[ConvexHull(points).vertices]
     for outline in (polygon, polygon[::-1]):
-        np.testing.assert_array_equal(fill(outline, (48, 32)), crossings_are_odd(polygon, (48, 32)))
+        np.testing.assert_array_equal(fill(outline, (48, 32)), inside_by_crossing_number(polygon, (48, 32)))
 
 
 def test_fill_of_a_rectangle_counts_pixel_centres():
@@ -81,7 +81,7 @@ def area(polygon: np.ndarray) -> float:
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, 1.2, 2.9])
 @pytest.mark.parametrize("position", [(0, 0, 10), (3, 1, 8), (-5, -2, 40), (20, 0, 12)])
-def test_the_hull_of_a_box_in_front_is_that_of_its_corners(position, angle):
+def test_the_hull_of_a_box_in_front_equals_that_of_its_corners(position, angle):
     hull = hull_of(box(position, angle=angle), np.eye(4), K)
     pixels = seen(surface(box(position, angle=angle)))
     expected = ConvexHull(pixels)
@@ -91,7 +91,7 @@ def test_the_hull_of_a_box_in_front_is_that_of_its_corners(position, angle):
     )
 
 
-def test_the_hull_of_an_axis_aligned_box_is_known_in_closed_form():
+def test_the_hull_of_an_axis_aligned_box_matches_its_closed_form():
     """A box of 2 x 2 x 2 m, its near face 4 m away: the near face hides the far one."""
     hull = hull_of(box((0, 0, 5), (2.0, 2.0, 2.0)), np.eye(4), K)
     corners = {(160.0 + x, 90.0 + y) for x in (-50.0, 50.0) for y in (-52.5, 52.5)}
@@ -115,7 +115,7 @@ def test_a_box_that_straddles_the_camera_plane_is_clipped_at_the_near_plane(posi
 
 
 def fill_of_hull_of(pixels: np.ndarray) -> np.ndarray:
-    return crossings_are_odd(pixels[ConvexHull(pixels).vertices], (320, 180))
+    return inside_by_crossing_number(pixels[ConvexHull(pixels).vertices], (320, 180))
 
 
 @pytest.mark.parametrize("z", [-3.0, -0.7])
@@ -151,7 +151,7 @@ def rays_of(frame: Frame, world: World) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cast_mask(frame: Frame, world: World, category: str, alone: bool = False) -> np.ndarray:
-    """The pixels (h, w) in which a thing of the world is what the camera sees; `alone`: were nothing before it."""
+    """The pixels (h, w) in which an object of the world is visible; `alone`: ignoring occlusion."""
     origin, rays = rays_of(frame, world)
     mine = [thing for thing in world.things if thing.category == category]
     others = [thing for thing in world.things if thing.category != category]
@@ -175,7 +175,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     ],
 )
 @pytest.mark.parametrize("index", [0, 1, 4, 7])
-def test_labels_of_the_tiny_drive_lie_where_its_things_are_seen(tiny_scene, category, label, index):
+def test_labels_of_the_tiny_drive_match_its_visible_objects(tiny_scene, category, label, index):
     frame = tiny_scene.frames[index]
     seen_alone = cast_mask(frame, World(), category, alone=True)
     labels = label_image(tiny_scene, frame, SIZE)
@@ -187,8 +187,8 @@ def test_labels_of_the_tiny_drive_lie_where_its_things_are_seen(tiny_scene, cate
     assert iou(marked, seen_alone & ~nearer_thing) > 0.6
 
 
-def test_a_thing_in_an_image_between_key_frames_is_labelled_where_it_is_then(tiny_scene):
-    """Not where it is at the nearest key frame, 215 ms before."""
+def test_an_object_between_key_frames_is_labelled_at_its_interpolated_position(tiny_scene):
+    """Not at its position at the nearest key frame, 215 ms earlier."""
     frame = next(f for f in tiny_scene.frames if not f.is_key_frame)
     marked = label_image(tiny_scene, frame, SIZE) == LABELS["moving_car"]
     now = cast_mask(frame, World(), "vehicle.car", alone=True)
@@ -224,7 +224,7 @@ def test_boxes_of_unknown_visibility_are_kept(tmp_path):
 
 @pytest.mark.parametrize(("distance", "expected"), [(79.5, "parked_other_vehicle"), (80.5, "left_out")])
 def test_boxes_beyond_80_metres_are_left_out(tmp_path, distance, expected):
-    """From the camera, 1.7 m before the car's origin less what the car drives in 35 ms, to the box's centre."""
+    """Distance from the camera (1.7 m before the ego origin, minus the path driven in 35 ms) to the box centre."""
     camera_x = 1.7 - 0.035 * World().speed
     truck = Thing("vehicle.truck", (8.0, 3.0, 4.0), (camera_x + distance, 0.0, CAMERA_AT[2]))
     assert names(labels_at_start([truck], tmp_path)) == {"static", expected}
@@ -266,7 +266,7 @@ def only(scene: Scene, category: str) -> tuple[Track, ...]:
     return tuple(track for track in scene.tracks if track.category == category)
 
 
-def test_a_left_out_box_hides_what_stands_behind_it(tmp_path):
+def test_a_left_out_box_occludes_boxes_behind_it(tmp_path):
     hidden = Thing("vehicle.car", (4.0, 2.0, 1.6), (10.0, 0.0, 0.8), visibility="1")
     behind = Thing("vehicle.car", (4.0, 1.0, 1.0), (20.0, 0.0, 0.8))
     assert names(labels_at_start([hidden, behind], tmp_path)) == {"static", "left_out"}
@@ -293,7 +293,7 @@ def test_a_box_is_labelled_by_class_and_speed(tmp_path, category, velocity, expe
     assert classed(category)[0].is_dynamic == (expected != "static")
 
 
-def test_no_box_in_the_image_leaves_it_static(tmp_path):
+def test_an_image_without_boxes_is_static(tmp_path):
     behind = Thing("vehicle.car", (4.0, 2.0, 1.6), (-12.0, 0.0, 0.8))
     assert names(labels_at_start([behind], tmp_path)) == {"static"}
 
@@ -307,11 +307,11 @@ def masks_of(labels: np.ndarray) -> dict[str, np.ndarray]:
     return {region: region_mask(labels, region) for region in REGIONS}
 
 
-def test_the_protocols_regions_are_there():
+def test_the_protocols_regions_are_defined():
     assert set(REGIONS) == {"all", "static", "vehicle", "car", "moving_vehicle", "parked_vehicle", "moving_human"}
 
 
-def test_regions_partition_as_the_protocol_says():
+def test_regions_partition_the_image_as_in_the_protocol():
     labels = np.arange(256, dtype=np.uint8).reshape(16, 16) % len(LABELS)
     masks = masks_of(labels)
     assert not (masks["static"] & masks["vehicle"]).any()
@@ -327,7 +327,7 @@ def test_regions_partition_as_the_protocol_says():
     assert masks["all"][labels != LABELS["own_car"]].all()
 
 
-def test_regions_of_the_tiny_drive_cover_the_image_but_for_what_is_left_out_or_still(tiny_scene):
+def test_regions_of_the_tiny_drive_cover_the_image_except_left_out_and_static_people(tiny_scene):
     labels = label_image(tiny_scene, tiny_scene.frames[0], SIZE)
     masks = masks_of(labels)
     parts = masks["static"].astype(int) + masks["vehicle"] + masks["moving_human"] + (labels == LABELS["left_out"])

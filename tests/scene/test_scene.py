@@ -1,4 +1,4 @@
-"""scene.json: a scene returns to the last bit, a bad file is named with its rule, and times find their key frames."""
+"""scene.json: exact round trips, messages that name an invalid file and its rule, and the nearest key frame."""
 
 import dataclasses
 import doctest
@@ -14,7 +14,7 @@ from drivesplat.scene.sensors import Camera, Lidar
 
 
 def pose(seed: int) -> np.ndarray:
-    """Numbers without a short decimal spelling."""
+    """A pose of numbers without a short decimal representation."""
     return np.random.default_rng(seed).normal(0.0, 1e3, (4, 4))
 
 
@@ -50,18 +50,18 @@ def assert_same_record(a, b) -> None:
             assert x == y and type(x) is type(y), field.name
 
 
-def test_a_scene_returns_to_the_last_bit(tmp_path):
+def test_a_scene_round_trips_exactly(tmp_path):
     scene = some_scene()
     write_scene(tmp_path / "scene.json", scene)
     assert_same_record(read_scene(tmp_path / "scene.json"), scene)
 
 
-def test_the_tiny_drive_returns_to_the_last_bit(tmp_path, tiny_scene):
+def test_the_tiny_drive_round_trips_exactly(tmp_path, tiny_scene):
     write_scene(tmp_path / "scene.json", tiny_scene)
     assert_same_record(read_scene(tmp_path / "scene.json"), tiny_scene)
 
 
-def test_a_scene_without_frame_range_sweeps_or_tracks_returns(tmp_path):
+def test_a_scene_without_frame_range_sweeps_or_tracks_round_trips(tmp_path):
     scene = dataclasses.replace(some_scene(), sweeps=(), tracks=(), key_frame_range=None)
     write_scene(tmp_path / "scene.json", scene)
     assert_same_record(read_scene(tmp_path / "scene.json"), scene)
@@ -104,7 +104,7 @@ def without(key):
         lambda content: None,
     ],
 )
-def test_json_that_is_no_scene_of_this_schema_is_refused_naming_file_and_rule(tmp_path, edit):
+def test_json_of_another_schema_is_refused_naming_file_and_rule(tmp_path, edit):
     write_scene(tmp_path / "scene.json", some_scene())
     content = edit(json.loads((tmp_path / "scene.json").read_text()))
     (tmp_path / "scene.json").write_text(json.dumps(content))

@@ -1,4 +1,4 @@
-"""What a reader of the figures is told of a drive that stands, lies in the dark, or on which nothing moves."""
+"""Warnings for a drive that stands, is dark, or in which nothing moves."""
 
 import dataclasses
 import logging
@@ -17,7 +17,7 @@ DAY = 0.4
 
 
 def at(scene: Scene, places: Callable[[float], tuple[float, float]], between: bool = True) -> Scene:
-    """The scene with its own car at `places` of seconds."""
+    """The scene with the ego vehicle at `places`, a function of seconds."""
     frames = []
     for frame in scene.frames:
         pose = frame.ego_to_world.copy()
@@ -26,7 +26,7 @@ def at(scene: Scene, places: Callable[[float], tuple[float, float]], between: bo
     return dataclasses.replace(scene, frames=tuple(frame for frame in frames if between or frame.is_key_frame))
 
 
-WAYS = {
+PATHS = {
     "drives on": (lambda s: (4.0 * s, 0.0), 18.0, 0.0),
     "stands": (lambda s: (7.0, 3.0), 0.0, 4.5),
     "stands, its pose creeping": (lambda s: (0.05 * np.sin(9 * s), 0.02 * s), 0.1, 4.5),
@@ -34,24 +34,24 @@ WAYS = {
     "drives off late": (lambda s: (0.0, max(0.0, s - 3.0) * 4.0), 6.0, 3.0),
     "there and back": (lambda s: (10.0 - 5.0 * abs(s - 2.0), 0.0), 12.5, 0.0),
 }
-"""Where the car is, how far it came, and for how long it stood; the tiny drive takes 4.5 s."""
+"""Position by seconds, largest displacement in metres, and standing time in seconds; the tiny drive takes 4.5 s."""
 
 
-@pytest.mark.parametrize(("way", "metres", "stands"), WAYS.values(), ids=WAYS)
+@pytest.mark.parametrize(("path", "metres", "stands"), PATHS.values(), ids=PATHS)
 @pytest.mark.parametrize("between", [True, False])
-def test_how_far_a_car_came_and_how_long_it_stood(tiny_scene, way, metres, stands, between):
-    scene = at(tiny_scene, way, between)
+def test_displacement_and_standing_time_of_a_path(tiny_scene, path, metres, stands, between):
+    scene = at(tiny_scene, path, between)
     assert max_displacement(scene) == pytest.approx(metres, abs=0.11 if metres else 1e-9)
     assert standing_time(scene) == pytest.approx(stands) and duration(scene) == pytest.approx(4.5)
 
 
-def test_of_a_single_image_nothing_is_far_or_long(tiny_scene):
+def test_a_single_image_has_no_displacement_and_no_duration(tiny_scene):
     scene = dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:1])
     assert (max_displacement(scene), standing_time(scene), duration(scene)) == (0.0, 0.0, 0.0)
 
 
 def still(scene: Scene, *categories: str) -> Scene:
-    """The scene with tracks of some classes alone, all of which stand."""
+    """The scene with tracks of the given classes only, all static."""
     tracks = (
         dataclasses.replace(track, object_to_world=np.repeat(track.object_to_world[:1], len(track.timestamps), axis=0))
         for track in scene.tracks
@@ -70,7 +70,7 @@ STANDS, HALF, DARK, STILL, BARE = (
 CASES = {
     "an ordinary drive": (lambda scene: scene, DAY, []),
     "standing": (lambda scene: at(scene, lambda s: (1.0, 2.0)), DAY, [STANDS]),
-    "standing for long": (lambda scene: at(scene, WAYS["drives off late"][0]), DAY, [HALF]),
+    "standing for long": (lambda scene: at(scene, PATHS["drives off late"][0]), DAY, [HALF]),
     "standing for a while": (lambda scene: at(scene, lambda s: (max(0.0, s - 1.5) * 4.0, 0.0)), DAY, []),
     "night": (lambda scene: scene, 0.11, [DARK]),
     "dusk": (lambda scene: scene, 0.21, []),
@@ -88,7 +88,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(("change", "brightness", "expected"), CASES.values(), ids=CASES)
-def test_each_circumstance_is_one_sentence_and_others_are_none(tiny_scene, change, brightness, expected):
+def test_each_warning_is_one_sentence_and_ordinary_drives_have_none(tiny_scene, change, brightness, expected):
     found = scene_warnings(change(tiny_scene), brightness)
     assert [sentence[: len(start)] for sentence, start in zip(found, expected, strict=True)] == expected
     assert not any("\n" in sentence for sentence in found)
@@ -102,8 +102,8 @@ def test_luminance_is_the_mean_luma_of_the_images(tiny_scene, tmp_path, color):
     assert luminance(dataclasses.replace(tiny_scene, frames=frames)) == pytest.approx(expected, abs=1e-6)
 
 
-def test_luminance_is_that_of_the_whole_drive(tiny_scene, tmp_path):
-    """Its second half in the dark; as many of its images are looked at as of the first."""
+def test_luminance_is_averaged_over_the_whole_drive(tiny_scene, tmp_path):
+    """Its second half is dark and has as many sampled images as the first."""
     Image.new("RGB", (96, 54), (0, 0, 0)).save(tmp_path / "dark.png")
     Image.new("RGB", (96, 54), (204, 204, 204)).save(tmp_path / "light.png")
     paths = [str(tmp_path / ("light.png" if i < 9 else "dark.png")) for i in range(18)]
@@ -121,7 +121,7 @@ def test_luminance_is_that_of_the_whole_drive(tiny_scene, tmp_path):
     ],
     ids=["ordinary", "stands", "dark", "nothing moves"],
 )
-def test_the_extraction_warns_in_a_line_each(tmp_path, caplog, world, expected):
+def test_the_extraction_logs_one_line_per_warning(tmp_path, caplog, world, expected):
     with caplog.at_level(logging.WARNING, logger="drivesplat.preprocess.extract"):
         scene_at(write_world(tmp_path, world))
     messages = [record.getMessage() for record in caplog.records]

@@ -1,4 +1,4 @@
-"""What is held out: the table of the measuring protocol, checked image by image."""
+"""The hold-out of the measuring protocol, checked image by image."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ INTERVAL = 500_000
 
 
 def drive(key_frames: int, cameras=("CAM_FRONT", "CAM_BACK"), between: int = 5) -> Scene:
-    """A drive whose cameras fire at their own delays after the key frame, `between` images between key frames."""
+    """A drive whose cameras have individual delays after the key frame, with `between` images between key frames."""
     frames, sweeps = [], []
     for c, camera in enumerate(cameras):
         for step in range((key_frames - 1) * (between + 1) + 1):
@@ -69,7 +69,7 @@ def test_a_frame_in_both_groups_belongs_to_the_block(last_block):
 
 
 @pytest.mark.parametrize(("every_nth", "offset"), [(8, 8), (8, 9), (1, 1), (4, 4)])
-def test_an_offset_that_would_never_hold_out_anything_is_refused(every_nth, offset):
+def test_an_offset_that_holds_out_nothing_is_refused(every_nth, offset):
     with pytest.raises(ValidationError, match="offset must be under every_nth"):
         HoldoutSettings(every_nth=every_nth, offset=offset)
 
@@ -99,7 +99,7 @@ def test_all_cameras_images_of_a_held_out_timestamp_are_held_out():
     assert groups == {(c, i): HELD_OUT.get(i, "train") for c in ("CAM_FRONT", "CAM_BACK") for i in range(10)}
 
 
-def test_images_between_key_frames_are_excluded_where_nearer_than_half_an_interval_to_a_held_out_one():
+def test_images_between_key_frames_are_excluded_within_half_an_interval_of_a_held_out_one():
     scene = drive(10)
     between = [(f, g) for f, g in zip(scene.frames, frame_groups(scene, HOLDOUT), strict=True) if not f.is_key_frame]
     assert {group for _, group in between} == {"train", "excluded"}
@@ -108,7 +108,7 @@ def test_images_between_key_frames_are_excluded_where_nearer_than_half_an_interv
         assert group == ("excluded" if near else "train"), frame.token
 
 
-def test_an_image_exactly_half_way_to_a_held_out_key_frame_may_be_trained_on():
+def test_an_image_exactly_half_an_interval_from_a_held_out_key_frame_is_a_training_image():
     scene = drive(4, cameras=("CAM_FRONT",), between=1)
     groups = frame_groups(scene, HoldoutSettings(every_nth=0, last_block=1))
     assert [f.timestamp for f in scene.frames] == [i * INTERVAL // 2 for i in range(7)]
@@ -125,7 +125,7 @@ def test_lidar_sweeps_are_held_out_like_images():
             assert group == ("excluded" if near else "train"), sweep.token
 
 
-def test_a_missing_image_shifts_no_other_images_group():
+def test_a_missing_image_does_not_change_the_groups_of_others():
     scene = drive(10)
     whole = dict(zip((f.token for f in scene.frames), frame_groups(scene, HOLDOUT), strict=True))
     thinned = dataclasses.replace(scene, frames=scene.frames[3:20] + scene.frames[23:])

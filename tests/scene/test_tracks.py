@@ -1,4 +1,4 @@
-"""Where an object is between its annotations: the measuring protocol's rules, against closed forms."""
+"""Poses of objects between annotations by the measuring protocol's rules, compared with closed forms."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_interpolation_is_linear_in_position_and_in_the_angle_about_the_shortest
     assert_pose(interpolate(start, end, fraction), 0.3 + 0.8 * fraction, expected)
 
 
-def test_interpolation_turns_the_short_way():
+def test_interpolation_rotates_along_the_shortest_arc():
     start, end = rigid(turned(3.0), np.zeros(3)), rigid(turned(-3.0), np.zeros(3))
     assert_pose(interpolate(start, end, 0.5), np.pi, np.zeros(3))
 
@@ -62,7 +62,7 @@ def test_interpolation_about_a_tilted_axis_is_rodrigues_rotation():
     np.testing.assert_allclose(interpolate(start, end, 0.25)[:3, :3], base @ rodrigues(angle / 4), atol=1e-9)
 
 
-def test_the_inverse_of_a_rigid_transform_undoes_it():
+def test_the_inverse_cancels_a_rigid_transform():
     transforms = np.stack([rigid(turned(0.4), np.array([1.0, 2.0, 3.0])), rigid(turned(-2.0), np.array([9.0, 0, -1]))])
     np.testing.assert_allclose(inverse(transforms) @ transforms, np.broadcast_to(np.eye(4), (2, 4, 4)), atol=1e-12)
     points = np.array([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
@@ -76,7 +76,7 @@ def test_between_key_frames_the_position_is_linear_and_the_rotation_slerps(secon
     assert_pose(box.object_to_world, 0.2 + 0.6 * share, [2.0 * share, 1.0 * share, 0.5 * share])
 
 
-def test_each_segment_uses_its_own_ends():
+def test_each_segment_interpolates_its_own_ends():
     it = track([0, 1, 2], [(0, 0, 0), (1.0, 0, 0), (1.0, 4.0, 0)])
     np.testing.assert_allclose(box_at(it, at(0.25), INTERVAL).object_to_world[:3, 3], [0.5, 0.0, 0.0])
     np.testing.assert_allclose(box_at(it, at(0.75), INTERVAL).object_to_world[:3, 3], [1.0, 2.0, 0.0])
@@ -94,14 +94,14 @@ def test_up_to_half_an_interval_beyond_an_end_the_end_segments_motion_continues(
 
 
 @pytest.mark.parametrize("beyond", [0.2501, 0.5, 10.0])
-def test_more_than_half_an_interval_beyond_an_end_it_is_absent(beyond):
+def test_the_object_is_absent_more_than_half_an_interval_beyond_an_end(beyond):
     for it in (track([3, 4, 5], [(0, 0, 0), (1.0, 0, 0), (1.0, 2.0, 0)]), track([3, 4, 5], [(0, 0, 0)] * 3)):
         assert box_at(it, at(2.5 + beyond), INTERVAL) is None
         assert box_at(it, at(1.5 - beyond), INTERVAL) is None
 
 
 @pytest.mark.parametrize("offset", [-0.25, -0.1, 0.0, 0.2, 0.25])
-def test_a_single_box_holds_still(offset):
+def test_a_single_box_is_static(offset):
     box = box_at(track([2], [(5.0, 6.0, 7.0)], [0.4]), at(1.0 + offset), INTERVAL)
     assert_pose(box.object_to_world, 0.4, [5.0, 6.0, 7.0])
     assert box.speed == 0.0 and not box.moves
@@ -113,29 +113,29 @@ def test_a_single_box_is_absent_beyond_half_an_interval(offset):
 
 
 GAP = ([0, 1, 3, 4], [(0, 0, 0), (1.0, 0, 0), (30.0, 0, 0), (34.0, 0, 0)])
-"""Key frame 2 does not hold the object."""
+"""The object is not annotated at key frame 2."""
 
 
 @pytest.mark.parametrize(
     ("seconds", "x"), [(0.5, 1.0), (0.7, 1.4), (0.75, 1.5), (1.25, 28.0), (1.3, 28.4), (1.5, 30.0), (1.75, 32.0)]
 )
-def test_before_a_gap_the_motion_continues_and_after_it_it_begins_anew(seconds, x):
+def test_the_motion_continues_into_a_gap_and_a_new_run_begins_after_it(seconds, x):
     np.testing.assert_allclose(box_at(track(*GAP), at(seconds), INTERVAL).object_to_world[:3, 3], [x, 0, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("seconds", [0.76, 1.0, 1.24])
-def test_within_a_gap_it_is_absent(seconds):
+def test_the_object_is_absent_within_a_gap(seconds):
     assert box_at(track(*GAP), at(seconds), INTERVAL) is None
 
 
-def test_a_gap_leaves_a_lone_box_that_holds_still():
+def test_a_single_box_beside_a_gap_is_static():
     it = track([0, 1, 3], [(0, 0, 0), (1.0, 0, 0), (30.0, 0, 0)])
     box = box_at(it, at(1.6), INTERVAL)
     np.testing.assert_array_equal(box.object_to_world[:3, 3], [30.0, 0, 0])
     assert box.speed == 0.0
 
 
-def test_speed_is_horizontal_and_that_of_the_segment():
+def test_speed_is_the_horizontal_speed_of_the_segment():
     it = track([0, 1], [(0, 0, 0), (1.5, 2.0, 7.0)])
     for seconds in (-0.25, 0.0, 0.3, 0.5, 0.75):
         assert box_at(it, at(seconds), INTERVAL).speed == pytest.approx(5.0)
@@ -144,7 +144,7 @@ def test_speed_is_horizontal_and_that_of_the_segment():
 @pytest.mark.parametrize(
     ("seconds", "visibility"), [(-0.2, 1), (0.0, 1), (0.24, 1), (0.26, 3), (0.6, 3), (0.9, 4), (1.2, 4)]
 )
-def test_visibility_is_that_of_the_nearer_annotation(seconds, visibility):
+def test_visibility_is_that_of_the_nearest_annotation(seconds, visibility):
     it = track([0, 1, 2], [(0, 0, 0)] * 3, visibility=[1, 3, 4])
     assert box_at(it, at(seconds), INTERVAL).visibility == visibility
 
@@ -165,11 +165,11 @@ def test_visibility_is_that_of_the_nearer_annotation(seconds, visibility):
         ("static_object.bicycle_rack", 5.0, False),
     ],
 )
-def test_vehicles_move_above_1_metre_a_second_and_people_above_0_3(category, speed, moves):
+def test_vehicles_move_above_1_metre_per_second_and_people_above_0_3(category, speed, moves):
     assert Box("it", *classed(category), np.ones(3), np.eye(4), speed, 4).moves is moves
 
 
-def test_a_box_moves_while_it_moves_and_a_track_that_ever_moves_does():
+def test_a_box_moves_by_its_current_speed_and_a_track_by_any_of_its_boxes():
     starts = track([0, 1, 2], [(0, 0, 0), (0.1, 0, 0), (3.1, 0, 0)])
     assert not box_at(starts, at(0.25), INTERVAL).moves
     assert box_at(starts, at(0.75), INTERVAL).moves
@@ -178,7 +178,7 @@ def test_a_box_moves_while_it_moves_and_a_track_that_ever_moves_does():
     assert not ever_moves(track([0], [(0, 0, 0)]))
 
 
-def test_a_jump_across_a_gap_is_no_motion():
+def test_a_jump_across_a_gap_is_not_motion():
     assert not ever_moves(track([0, 1, 3, 4], [(0, 0, 0), (0, 0, 0), (30.0, 0, 0), (30.0, 0, 0)]))
 
 
@@ -189,7 +189,7 @@ def test_corners_are_half_the_size_from_the_centre_along_the_objects_axes():
     assert {tuple(np.round(corner, 9)) for corner in box.corners} == expected
 
 
-def test_the_boxes_of_the_tiny_drive_are_where_its_things_are(tiny_scene):
+def test_the_boxes_of_the_tiny_drive_match_its_objects(tiny_scene):
     from helpers.tiny_world import ORIGIN, START_US, World
 
     seconds = 1.1
