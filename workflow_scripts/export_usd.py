@@ -1,4 +1,4 @@
-"""checkpoint.npz as scene.usdz: Gaussians in OpenUSD's schema, what moves among them, and the recording camera."""
+"""checkpoint.npz as scene.usdz: static and dynamic Gaussians in OpenUSD's schema, and the recording camera."""
 
 from drivesplat.workflow.job import job
 from drivesplat.export.usd_asset import export_usd

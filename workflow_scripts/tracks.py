@@ -1,4 +1,4 @@
-"""scene.json as tracks.csv and tracks.png: what moves, and by which id."""
+"""scene.json as tracks.csv and tracks.png: the dynamic objects and their ids."""
 
 from drivesplat.workflow.job import job
 from drivesplat.inspection.figures import save_figure

@@ -17,7 +17,7 @@ FITTED_STEPS = 4
 STANDSTILL_SPEED = 0.5
 """Speed (m/s) below which a track counts as standing at its end; annotation noise of 5 cm stays below it."""
 MIN_TURNING_SPEED = 1.0
-"""Speed (m/s) from which a change of direction is fitted; below, it cannot be told from annotation noise."""
+"""Speed (m/s) from which a change of direction is fitted; below, it is indistinguishable from annotation noise."""
 SLOPE_DISTANCE = 20.0
 """Distance (metres) over which the slope at an end is measured; a shorter track is extrapolated at constant height."""
 
