@@ -56,6 +56,24 @@ def test_force_overwrites_a_changed_config(changed):
     assert (changed / "config.yaml").read_text() == config_yaml()
 
 
+def test_new_settings_come_into_a_config_that_has_no_others(tmp_path):
+    whole = config_yaml()
+    lines = whole.splitlines(keepends=True)
+    (new,) = (i for i, line in enumerate(lines) if line.startswith("  usd_gaussians:"))
+    (tmp_path / "config.yaml").write_text("".join(lines[: new - 1] + lines[new + 1 :]))
+    assert main([], tmp_path) == 0 and (tmp_path / "config.yaml").read_text() == whole
+
+
+@pytest.mark.parametrize("old", ["  usd_gaussians: 1000000\n", "# Maximum number of Gaussians in viewer.html"])
+def test_a_config_of_a_user_with_lines_of_its_own_is_kept_though_it_lacks_settings(tmp_path, old):
+    lines = config_yaml().splitlines(keepends=True)
+    lacking = "".join(line for line in lines if not line.startswith("results_dir:"))
+    changed = lacking.replace(old, old[:-1] + "7" + old[-1:])
+    assert changed != lacking
+    (tmp_path / "config.yaml").write_text(changed)
+    assert main([], tmp_path) == 1 and (tmp_path / "config.yaml").read_text() == changed
+
+
 def test_absent_files_are_written(tmp_path):
     assert main([], tmp_path) == 0 and main([], tmp_path) == 0
     assert (tmp_path / "config.yaml").read_text() == config_yaml()

@@ -105,7 +105,7 @@ def _restore_background(params: dict[str, torch.Tensor], definition: PartDefinit
 
 
 def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
-    actors = [actor for actor in init.actors if len(actor.points)]
+    actors = [actor for actor in init.actors if actor.part == Actors.name and len(actor.points)]
     if not actors:
         return None
     tracks = [ActorTrack(actor.id, actor.size, actor.motion) for actor in actors]

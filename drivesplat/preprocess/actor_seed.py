@@ -15,7 +15,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.sweeps import training_returns
-from drivesplat.scene.actor_record import ActorRecord, ActorRecords
+from drivesplat.scene.actor_record import RULE, ActorRecord, ActorRecords
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.regions import MIN_PIXELS, hulls_in, owner_image
@@ -23,11 +23,10 @@ from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
+from drivesplat.settings.train import STAGE_OF_PART, PartName
 
 log = logging.getLogger(__name__)
 
-ACTORS = "actors"
-"""The part of the model that represents actors."""
 UNSEEN = 127
 """Grey level of an actor whose points no image shows."""
 
@@ -38,9 +37,10 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
     for mover in sorted(dynamic_objects(scene), key=lambda mover: mover.track.id):
-        if job.actors.part_of(mover.track.object_class) == ACTORS:
+        part = job.actors.part_of(mover.track.object_class)
+        if STAGE_OF_PART.get(part) == RULE:
             random = np.random.default_rng((job.random_seed, order[mover.track.id]))
-            seeds.append(Seed(mover, *gathered_points(scene, mover, sweeps, job.actors, random)))
+            seeds.append(Seed(mover, part, *gathered_points(scene, mover, sweeps, job.actors, random)))
     for view in actor_views(scene, job, ego_mask):
         for seed in seeds:
             seed.add_view(view)
@@ -113,8 +113,8 @@ class Seed:
     A point has the colour of its nearest camera among those whose image shows the actor at the point's pixel.
     """
 
-    def __init__(self, mover: DynamicObject, points: np.ndarray, lidar: int):
-        self.mover = mover
+    def __init__(self, mover: DynamicObject, part: PartName, points: np.ndarray, lidar: int):
+        self.mover, self._part = mover, part
         self.seen, self.pixels = False, 0
         self._points, self._lidar = points, lidar
         self._colors = np.zeros((len(points), 3), dtype=np.uint8)
@@ -148,4 +148,5 @@ class Seed:
             points_rgb=np.where(shown[:, None], self._colors, mean).astype(np.uint8),
             lidar_points=self._lidar,
             pixels=self.pixels,
+            part=self._part,
         )

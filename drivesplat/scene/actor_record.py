@@ -24,7 +24,7 @@ class ActorRecord:
     in seconds since the scene's first image, `points` in the object's frame (metres) and their colours.
 
     The first `lidar_points` points are LiDAR returns. `pixels` is the number of pixels that show the actor, over all
-    training images at training size.
+    training images at training size. `part` names the part of a model that represents the actor.
     """
 
     id: str
@@ -35,6 +35,7 @@ class ActorRecord:
     points_rgb: UInt8[np.ndarray, "p 3"]
     lidar_points: int
     pixels: int
+    part: str = "actors"
 
     def to_plain(self) -> dict[str, Any]:
         """The record as plain containers and arrays."""

@@ -1,4 +1,4 @@
-"""Writes config.yaml and config.schema.json from the settings records; keeps a config.yaml that was changed."""
+"""Writes config.yaml and config.schema.json from the settings records; keeps a config.yaml with changed values."""
 
 import argparse
 import difflib
@@ -97,13 +97,19 @@ def _bounds(field: FieldInfo) -> str:
     return ", ".join(found)
 
 
+def _only_lacks(present: Sequence[str], generated: Sequence[str]) -> bool:
+    """Whether `present` has all its lines in `generated`, in order: nothing of it is lost when new settings come in."""
+    rest = iter(generated)
+    return all(line in rest for line in present)
+
+
 def main(arguments: Sequence[str], folder: Path = ROOT) -> int:
-    """Writes both files into `folder`; returns the exit status, 1 where config.yaml has other content and is kept."""
+    """Writes both files into `folder`; returns the exit status, 1 where config.yaml has lines of its own and stays."""
     parser = argparse.ArgumentParser("python -m drivesplat.settings.config_document", description=__doc__)
     parser.add_argument("--force", action="store_true", help="overwrite config.yaml even if it differs")
     force, path, text = parser.parse_args(arguments).force, folder / "config.yaml", config_yaml()
     present = path.read_text(encoding="utf-8") if path.exists() else text
-    if present != text and not force:
+    if present != text and not force and not _only_lacks(present.splitlines(), text.splitlines()):
         lines = (value.splitlines(keepends=True) for value in (present, text))
         sys.stdout.writelines(difflib.unified_diff(*lines, "config.yaml", "config.yaml as generated"))
         print(

@@ -8,7 +8,8 @@ from drivesplat.settings import Settings
 
 PartName = Literal["background", "actors"]
 STAGE_OF_PART: dict[PartName, str] = {"actors": "actors"}
-"""The parts whose Gaussians are objects that move, and the stage that finds these objects in a scene."""
+"""The parts whose Gaussians are objects that move, and the stage that finds these objects in a scene. The settings of
+such a part are the field of TrainSettings with its name."""
 SkyKind = Literal["none", "mask", "cubemap"]
 
 
@@ -267,7 +268,7 @@ class TrainSettings(Settings):
 
     def without_moving_parts(self) -> "TrainSettings":
         """These settings with those of moving parts at their defaults, for methods without moving parts."""
-        fields = ("actors", "entropy_weight", "dynamic_weight")
+        fields = (*STAGE_OF_PART, "entropy_weight", "dynamic_weight")
         return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
 
 

@@ -67,7 +67,7 @@ def stage_settings(config: Config, stage: str, scene: str, method: str | None = 
     Raises ValueError for an unknown stage, ConfigError for an unknown scene.
     """
     if stage not in _STAGES:
-        raise ValueError(f"no stage is called {stage!r}")
+        raise ValueError(f"no stage is called {stage!r}; add it to _STAGES in drivesplat/workflow/stages.py")
     there, dataset = for_scene(config, scene, method), config.dataset_of(scene)
     place = Place(there, dataset, scene if stage in OF_ONE_SCENE else "", method or "", film or "")
     return canonical_json(_record(stage, place).model_dump(mode="json"))

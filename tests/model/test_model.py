@@ -1,5 +1,6 @@
 """Cameras, Gaussians from seed points, composition over a sky, and a model saved and rebuilt."""
 
+import dataclasses
 from dataclasses import fields
 
 import numpy as np
@@ -416,6 +417,18 @@ def test_seeds_are_thinned_to_a_reproducible_subset():
         own = actors.params["means"].detach()[actors.params["owner"] == i].numpy()
         points = {tuple(row) for row in actor_record(a_track(), count, seed=i).points}
         assert len({tuple(row) for row in own} & points) == len(own) > 20
+
+
+def test_the_part_actors_takes_the_records_of_its_own_objects():
+    record = actor_record(track_of(motion_through(np.array([0.0, 1.0]), np.zeros((2, 3))), "a"))
+    others = dataclasses.replace(record, id="b", part="another")
+    assert [part.name for part in street_of(record, others).parts] == ["background", "actors"]
+    assert street_of(record, others).parts[1].definition().tracks[0].id == "a"
+    assert [part.name for part in street_of(others).parts] == ["background"]
+
+
+def street_of(*records: ActorRecord) -> SplatModel:
+    return build_model(model_init(parser_record(20), *records), ("background", "actors"), "none", TrainSettings())
 
 
 @pytest.mark.parametrize("records", [[], [actor_record(track_of(motion_through([0.0], [[0.0, 0.0, 0.0]])), 0)]])

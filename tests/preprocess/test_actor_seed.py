@@ -35,6 +35,7 @@ from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings, ObjectClassName
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.train import STAGE_OF_PART
 
 CAR = World().things[0]
 """A car ahead of the ego vehicle: 4 x 2 x 1.6 m, its rear initially 4.8 m from the camera."""
@@ -400,6 +401,15 @@ def test_actors_are_sorted_by_id_and_their_random_points_are_independent(tmp_pat
     assert alone[0].points.tobytes() != alone[1].points.tobytes()
     for one, same in zip(alone, all_three[::2], strict=True):
         np.testing.assert_array_equal(one.points, same.points)
+
+
+def test_each_actor_names_its_part_among_all_parts_that_the_stage_finds_objects_for(tmp_path, monkeypatch):
+    walker = Thing("human.pedestrian.adult", (0.6, 0.6, 1.9), (8.0, 0.0, 0.95), (4.2, 0.0))
+    scene = drive(tmp_path, CAR, walker)
+    assert {actor.category: actor.part for actor in actors_of(scene, job())} == {"vehicle.car": "actors"}
+    monkeypatch.setitem(STAGE_OF_PART, "background", "actors")
+    parts = {actor.category: actor.part for actor in actors_of(scene, job())}
+    assert parts == {"vehicle.car": "actors", "human.pedestrian.adult": "background"}
 
 
 def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
