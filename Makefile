@@ -2,6 +2,7 @@
 # make setup      .venv with all packages; compiles gsplat where there is an NVIDIA GPU (idempotent; docs/installation.md)
 # make doctor     check the machine and suggest remedies
 # make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
+# make test-slow whole runs and fits that make test leaves out (two cores: three minutes)
 # make test-gpu   tests that need a GPU: the rasterizers agree, trainings resume
 # make test-slurm one scene through a real SLURM, started on this machine for the test (root on Debian; docs/cluster.md)
 # make test-batch ten synthetic drives, one of them broken, as a batch (two cores: a quarter of an hour)
@@ -9,7 +10,7 @@
 # make quality    RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
 # make speed      FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
 # make config     config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
-.PHONY: demo setup doctor test lint test-gpu test-slurm test-batch bench quality speed config
+.PHONY: demo setup doctor test test-slow lint test-gpu test-slurm test-batch bench quality speed config
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -26,7 +27,10 @@ doctor:
 	@bash scripts/doctor.sh $(CONFIG)
 
 test: setup lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu and not slurm and not batch"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu and not slurm and not batch and not slow"
+
+test-slow: setup
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow
 
 lint: setup
 	$(BIN)/ruff check .

@@ -294,6 +294,7 @@ RECIPES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("quality")
 def test_recipes_run_to_a_table_with_failures_and_only_failed_ones_run_again(tmp_path):

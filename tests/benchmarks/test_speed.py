@@ -283,6 +283,7 @@ def measured(tmp_path_factory):
     return copy
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("speed")
 def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record(measured):
@@ -305,6 +306,7 @@ def test_the_command_trains_and_measures_both_recipes_and_writes_page_and_record
     assert page == markdown(record) and "| `plain` |" in page and "| `vanilla` |" in page
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("speed")
 def test_the_timed_training_equals_that_of_rule_train(measured, tmp_path, monkeypatch):

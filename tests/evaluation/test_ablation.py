@@ -473,6 +473,7 @@ def test_the_target_plans_one_training_per_variant_and_seed(copy):
     assert sorted(metrics) == ["street", "vanilla"]
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("ablation")
 def test_the_ablation_runs_to_a_table_and_fails_in_one_line_if_protocols_differ(copy):

@@ -41,8 +41,8 @@ def test_a_drive_whose_lidar_is_gone_is_measured_with_the_count_beside_it(tmp_pa
 
 
 def test_a_small_card_is_asked_for_what_its_preset_was_measured_to_take_and_something_more():
-    """The peak is README's, of the preset for 8 GB; the CUDA context alone adds half a gigabyte to it."""
+    """docs/measured.md has the peak of the preset; the CUDA context adds half a gigabyte to it."""
     preset = yaml.safe_load((REPOSITORY / "presets/8gb.yaml").read_text())
-    (peak,) = re.findall(r"^\| `8gb` \|.*\| ([0-9.]+) GB \|", (REPOSITORY / "README.md").read_text(), re.M)
+    (peak,) = re.findall(r"^\| `8gb` \|.*\| ([0-9.]+) GB \|", (REPOSITORY / "docs/measured.md").read_text(), re.M)
     asked = load(preset).device.min_free_gb
     assert float(peak) + 0.5 <= asked < load({}).device.min_free_gb == 8

@@ -52,6 +52,7 @@ def at_work(copy: WorkflowCopy) -> subprocess.Popen:
     return running
 
 
+@pytest.mark.slow
 def test_a_training_that_outlives_a_killed_run_is_named_and_never_doubled(copy):
     running = at_work(copy)
     running.kill()
@@ -67,6 +68,7 @@ def test_a_training_that_outlives_a_killed_run_is_named_and_never_doubled(copy):
     assert done.returncode == 0 and "Nothing to be done" in done.stdout, "no lock is left, and nothing is broken"
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_takes_its_training_along_and_the_next_one_goes_on(copy):
     running = at_work(copy)
     assert "another run is working in results/" in told(copy.run("report")), "meanwhile there is no second one"

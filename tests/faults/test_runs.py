@@ -176,6 +176,7 @@ def test_a_bad_image_is_named_with_its_sample(copy, damage):
     assert not (copy.folder / "results/0001/scene.json").exists()
 
 
+@pytest.mark.slow
 def test_missing_lidar_stops_and_names_it_or_is_counted_where_told_to_go_on(copy):
     (copy.folder / "data/samples/LIDAR_TOP/0001__0002.pcd.bin").unlink()
     line = told(copy.run("results/0001/parser.pkl"))
@@ -187,6 +188,7 @@ def test_missing_lidar_stops_and_names_it_or_is_counted_where_told_to_go_on(copy
     assert copy.read("results/0001/metrics.json")["protocol"]["lidar_missing"] == 1
 
 
+@pytest.mark.slow
 def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
     copy.config["device"] = "auto"
     copy.write_config()
@@ -198,6 +200,7 @@ def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
 LOOKS = ("parts.mp4", "ghost_panel.png", "with_car.png", "splat.ply", "parts/parts.json", "scene.usdz", "viewer.html")
 
 
+@pytest.mark.slow
 def test_a_scene_without_vehicles_gets_nulls(tmp_path):
     """By a method with actors, too, whose parts are then filmed with an empty third picture."""
     training = TINY_TRAINING | {"iterations": 20}
@@ -232,6 +235,7 @@ def trained(tmp_path_factory) -> WorkflowCopy:
     return copy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ffmpeg", "words"),
     [(None, ["cannot be started"]), (FFMPEG_THAT_DIES, ["exit status 3", "x264: no space for a reference frame"])],
@@ -286,6 +290,7 @@ LOOK_SCRIPTS = {
 """Scripts, and a file of each that it cannot write."""
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_looks_and_each_names_its_file(trained):
     """A limit on the size of the job's files stands in for a disk without room: the same write fails the same way.
     Python, which before 3.13 keeps half a file of bytecode then, is to write none."""
@@ -413,6 +418,7 @@ def test_a_second_run_in_one_folder_is_refused(copy):
     assert copy.run("results/0001/scene.json").returncode == 0
 
 
+@pytest.mark.slow
 def test_a_killed_training_resumes_and_ends_as_an_uninterrupted_one(tmp_path):
     training = TINY_TRAINING | {"iterations": 120, "checkpoint_every": 10}
     whole = WorkflowCopy.make(tmp_path / "whole", methods=VANILLA, train=training)

@@ -8,7 +8,7 @@ import pytest
 from helpers.tiny_world import World
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
-pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("scenes")]
+pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("scenes")]
 
 FIGURES = ("metrics", "report")
 NEW_SCENE = {

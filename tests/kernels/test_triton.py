@@ -263,6 +263,7 @@ def stretch(model):
         scales += 0.5 * torch.randn(scales.shape, generator=generator)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", [False, True])
 def test_a_training_with_triton_agrees_with_one_without(body, monkeypatch):
     """Two iterations of background, cars and a cube map, with every term of the loss, and the own car's body."""

@@ -63,6 +63,7 @@ def test_many_uncached_modules_are_reported():
     assert not of(replace(WORKSTATION, uncached_modules=30), "bytecode")
 
 
+@pytest.mark.slow
 def test_modules_without_cached_bytecode_are_counted(tmp_path):
     script = (
         "import sys, json, http.server; from drivesplat.machine.doctor.facts import _uncached_modules as f; print(f())"

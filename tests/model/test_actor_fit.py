@@ -20,7 +20,7 @@ from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSett
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 COUNT, SIZE = 14, np.array([2.0, 1.2, 1.0])
 SPREAD, OPACITY = 0.12, 0.9

@@ -47,7 +47,7 @@ from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
 from drivesplat.training.views import Guides, TrainingView, load_views
 from drivesplat.workflow.stages import stage_settings
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 AFFINE = ExposureSettings(kind="affine", sigma_gain=0.2, sigma_offset=0.05, learning_rate=0.1)
 GAINS = torch.tensor([1.25, 1.1, 0.8])

@@ -8,7 +8,7 @@ from drivesplat.lidar.depth_record import read_lidar_depth
 from drivesplat.lidar.free_space_record import read_free_space
 from drivesplat.scene.actor_record import read_actors
 
-pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("inputs")]
+pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("inputs")]
 
 ACTORS = ["background", "actors"]
 HELD = {"train": {"depth_weight": 0.01, "road_weight": 0.1, "floaters": {"free_space": True}}}

@@ -124,6 +124,7 @@ def test_time_is_spelled_for_people(seconds, text):
     assert spelled(seconds) == text
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 def test_a_run_is_estimated_before_and_accounted_for_after_it(tmp_path):
     copy = WorkflowCopy.make(tmp_path / "workflow", methods={"vanilla": {}})

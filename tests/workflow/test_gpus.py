@@ -224,5 +224,5 @@ def test_a_rules_job_on_the_cpu_holds_none(tmp_path, monkeypatch):
 
 def rules_job(kind: str) -> Job:
     resources = SimpleNamespace(device=DeviceSettings(kind=kind).model_dump_json())
-    nothing = dict.fromkeys(("input", "output", "log", "wildcards", "threads", "rule", "params"))
-    return Job(SimpleNamespace(**nothing, resources=resources))
+    nothing = dict.fromkeys(("log", "wildcards", "threads", "rule", "params"))
+    return Job(SimpleNamespace(**nothing, input=[], output=[], resources=resources))

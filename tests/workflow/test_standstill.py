@@ -18,7 +18,7 @@ from drivesplat.rendering.trajectory import film_path
 from drivesplat.settings.inspection import PanelJob, RemovalJob
 from drivesplat.settings.render import FilmJob
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 WORLDS = {
     "stands": World(key_frames=8, speed=0.0),

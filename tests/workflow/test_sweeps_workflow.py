@@ -5,7 +5,7 @@ from helpers.small_runs import BASE
 from helpers.tiny_world import World
 from helpers.workflow_copy import WorkflowCopy
 
-pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("sweeps_workflow")]
+pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("sweeps_workflow")]
 
 FROM_EXTRACTION_ON = {
     "extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "train", "evaluate",
