@@ -1,9 +1,11 @@
 """Records between stages, made by hand."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from drivesplat.io.array_file import write_arrays
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.scene.masks import MasksRecord
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
@@ -31,3 +33,11 @@ def training_record_of(images: int, **fields: Any) -> TrainingRecord:
         "held_out_frames": {}, "scene": SceneInfo("0001", "tiny", "v1.0-mini", "nuscenes"), "seed": SeedInfo(),
     }  # fmt: skip
     return TrainingRecord(**{**defaults, **fields})
+
+
+def write_invalid(path: Path, content: Any) -> None:
+    """Writes bytes as they are and a dict as an array file; anything else as an empty file, None as no file."""
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else b"")
+    if isinstance(content, dict):
+        write_arrays(path, content)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.records import write_invalid
 from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, drive, scene_at, seconds_of, true_depths
 from helpers.tiny_world import CAMERA_AT, Thing, World
 
@@ -339,10 +340,7 @@ GRID = {"lower": np.zeros(3), "voxel": 0.3, "shape": np.array([9, 9, 9]), "keys"
 )  # fmt: skip
 def test_an_invalid_file_is_refused_with_its_name_and_rule(tmp_path, content):
     path = tmp_path / "free_space.npz"
-    if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else b"")
-    if isinstance(content, dict):
-        write_arrays(path, content)
+    write_invalid(path, content)
     with pytest.raises(ResultError, match=r"free_space\.npz: .*the rule 'free_space' rebuilds it"):
         read_free_space(path)
     write_arrays(path, GRID)

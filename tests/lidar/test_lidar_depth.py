@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.records import write_invalid
 from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, Speeding, drive, scene_at, seconds_of, shows, true_depths
 from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
 from drivesplat.errors import ResultError
-from drivesplat.io.array_file import write_arrays
 from drivesplat.lidar.depth import split_sweep
 from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth, write_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
@@ -317,10 +317,7 @@ def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
 )  # fmt: skip
 def test_an_invalid_file_is_refused_with_its_name_and_rule(tmp_path, content):
     path = tmp_path / "lidar_depth.npz"
-    if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else b"")
-    if isinstance(content, dict):
-        write_arrays(path, content)
+    write_invalid(path, content)
     with pytest.raises(ResultError, match=r"lidar_depth\.npz: .*the rule 'lidar_depth' rebuilds it"):
         read_lidar_depth(path)
 

@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from helpers.records import write_invalid
 from helpers.small_drives import (
     HELD_OUT,
     NOTHING_HELD_OUT,
@@ -24,7 +25,6 @@ from PIL import Image
 from pydantic import ValidationError
 
 from drivesplat.errors import ResultError
-from drivesplat.io.array_file import write_arrays
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors, write_actors
@@ -463,10 +463,7 @@ def test_a_static_drive_has_an_empty_record_of_actors(tmp_path):
 )  # fmt: skip
 def test_an_invalid_record_is_named_with_its_rule(tmp_path, content):
     path = tmp_path / "actors.npz"
-    if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else b"")
-    if isinstance(content, dict):
-        write_arrays(path, content)
+    write_invalid(path, content)
     with pytest.raises(ResultError, match=r"actors\.npz: .*the rule 'actors' rebuilds it"):
         read_actors(path)
 
