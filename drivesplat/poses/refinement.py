@@ -24,8 +24,6 @@ def refine_or_keep(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO
     required = job.refine_poses.enabled is True or job.refine_poses.start == "images"
     try:
         from drivesplat.poses.refine import refine_poses  # imports pycolmap
-
-        return refine_poses(scene, job, ego_mask, threads)
     except ImportError as error:
         reason = f"pycolmap or pyceres cannot be imported ({error})"
         if required:
@@ -33,10 +31,13 @@ def refine_or_keep(scene: Scene, job: RefinePosesJob, ego_mask: EgoMask = NO_EGO
                 f"scene {scene.name}: poses cannot be refined: {reason}; install them (envs/drivesplat.yaml has the "
                 "versions), or set refine_poses: {enabled: false}"
             ) from error
-    except DatasetError as error:
-        if required:
-            raise
-        reason = str(error)
+    else:
+        try:
+            return refine_poses(scene, job, ego_mask, threads)
+        except DatasetError as error:
+            if required:
+                raise
+            reason = str(error)
     log.warning("scene %s: poses stay as they are: %s", scene.name, reason)
     record = {**record_header(scene, job, reason), **dict.fromkeys(MEASURED), "corrections": []}
     return Refinement(scene, record, no_points())
