@@ -1,19 +1,24 @@
-"""Recordings of the street: images, LiDAR sweeps, visibility, ground truth, and the poses and boxes of the tables."""
+"""Recordings of the street: images, LiDAR sweeps, visibility, and the poses and boxes of the tables."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.imaging import DemoCamera, depth_and_objects, render, to_bytes
-from drivesplat.demo.lidar import scan
-from drivesplat.demo.lighting import Light, daylight, lamplight
-from drivesplat.demo.raycast import EmbreeLayer, StreetSnapshot
-from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor, image_height
-from drivesplat.demo.street import StreetObject, build_street
+from drivesplat.demo.optics.imaging import DemoCamera, Picture, geometry, render, to_bytes
+from drivesplat.demo.optics.lidar import Scan, ScanPattern, returns, scan, scan_pattern
+from drivesplat.demo.optics.lighting import Light, daylight, lamplight
+from drivesplat.demo.optics.raycast import RayCaster, Rays, StreetSnapshot
+from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time
+from drivesplat.demo.street.edited import Variation, edited
+from drivesplat.demo.street.objects import EGO_BODY, StreetObject
+from drivesplat.demo.street.street import build_street
 from drivesplat.scene.images import project
 from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.settings.edit import Edit
 from drivesplat.settings.world import WorldSettings
 
 STREET_TO_GLOBAL = rigid(Rotation.from_euler("z", 0.62).as_matrix(), np.array([812.4, 1437.9, 0.0]))
@@ -22,99 +27,144 @@ NIGHT_NOISE = 0.012
 SURFACE_POINTS = 60
 
 
+@dataclass(frozen=True)
+class Viewpoint:
+    """What is recorded or true: the drive as it was (None) or after an `edit`, without the object of the name `without`
+    if given, seen from `left` metres to the left of the ego vehicle."""
+
+    edit: str | None = None
+    without: str | None = None
+    left: float = 0.0
+
+
+RECORDED = Viewpoint()
+
+
 class Recorder:
     """Records the street of `world`. Deterministic: each recording has its own random generator."""
 
-    def __init__(self, world: WorldSettings):
-        self.world = world
+    def __init__(self, world: WorldSettings, edits: Mapping[str, Edit] | None = None):
+        self.world, self.edits = world, dict(edits or {})
         self.street = build_street(world)
-        self.objects = tuple(sorted(self.street.objects, key=lambda item: item.moves))
+        self.objects = self.street.objects
+        self._variations: dict[str | None, tuple[Variation, RayCaster]] = {}
 
-    @cached_property
-    def _static(self) -> EmbreeLayer:
-        return EmbreeLayer([item for item in self.objects if not item.moves], 0.0)
+    def variation(self, edit: str | None = None) -> Variation:
+        """The street and the ego path of the drive, or of an edit of it."""
+        return self._variation(edit)[0]
 
-    def snapshot(self, seconds: float, without: str | None = None) -> StreetSnapshot:
-        """The street at a time, without the moving object of that name if given."""
-        return StreetSnapshot([item for item in self.objects if item.name != without], seconds, self._static)
+    def _variation(self, edit: str | None) -> tuple[Variation, RayCaster]:
+        if edit not in self._variations:
+            changed = edited(self.street, self.world, self.edits[edit], edit) if edit else Variation(self.street)
+            self._variations[edit] = changed, RayCaster(changed.street.objects)
+        return self._variations[edit]
 
-    def ego_to_street(self, seconds: float) -> np.ndarray:
-        """True ego pose (4, 4)."""
-        return self.street.ego.pose_at(seconds)
+    def snapshot(self, seconds: np.ndarray, view: Viewpoint = RECORDED, for_lidar: bool = False) -> StreetSnapshot:
+        """The street at the times `seconds` (m,), as cameras see it."""
+        without = {name for name in (view.without, None if for_lidar else EGO_BODY) if name}
+        return self._variation(view.edit)[1].at(np.atleast_1d(np.asarray(seconds, dtype=np.float64)), without)
 
-    def light(self, seconds: float) -> Light:
+    def ego_to_street(self, seconds: np.ndarray, view: Viewpoint = RECORDED) -> np.ndarray:
+        """True ego poses (m, 4, 4) at `seconds` (m,), moved to the left as the viewpoint states."""
+        poses = self.variation(view.edit).ego_poses(np.atleast_1d(np.asarray(seconds, dtype=np.float64)))
+        return poses @ rigid(np.eye(3), np.array([0.0, view.left, 0.0]))
+
+    def ego_pose(self, seconds: float) -> np.ndarray:
+        """The true ego pose (4, 4) of the drive at one time."""
+        return self.ego_to_street(np.array([seconds]))[0]
+
+    def light(self, seconds: float, view: Viewpoint = RECORDED) -> Light:
         """Light sources at a time."""
-        if self.world.night:
-            return lamplight(self.street.lamps, self.ego_to_street(seconds))
-        return daylight(self._random("light"))
+        ego = self.variation(view.edit).ego_poses(np.array([seconds]))[0]
+        light = lamplight(self.street.lamps, ego) if self.world.night else daylight(self._random("light"))
+        return light._replace(wet=float(self.world.wet))
 
-    def camera(self, sensor: DemoSensor, seconds: float, left: float = 0.0) -> DemoCamera:
-        """The camera at a time, shifted by `left` metres to the left of the ego vehicle."""
-        sensor_to_ego = rigid(np.eye(3), np.array([0.0, left, 0.0])) @ sensor.sensor_to_ego
-        width, pose = self.world.width, self.ego_to_street(seconds) @ sensor_to_ego
+    def camera(self, sensor: DemoSensor, seconds: float, view: Viewpoint = RECORDED) -> DemoCamera:
+        """The camera of an image with this timestamp. With a rolling shutter, each row has its own time and pose."""
+        width, height = self.world.width, image_height(self.world.width)
+        rows = (np.arange(height) - height // 2) / max(height - 1, 1) * self.world.readout_s
+        times = seconds + (rows if self.world.readout_s else np.zeros(1))
+        poses = self.ego_to_street(times, view) @ sensor.sensor_to_ego
         gains = self.world.exposures.get(sensor.channel, (1.0, 1.0, 1.0))
-        return DemoCamera(sensor.intrinsics(width), pose, width, image_height(width), gains)
+        return DemoCamera(sensor.intrinsics(width), times, poses, width, height, gains)
+
+    def picture(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> Picture:
+        """The image without sensor noise, with depth, objects and classes."""
+        seconds = time_us * 1e-6
+        camera = self.camera(sensor, seconds, view)
+        snapshot = self.snapshot(camera.seconds, view)
+        return render(snapshot, self.light(seconds, view), camera, self.world.samples_per_pixel)
+
+    def geometry(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> Picture:
+        """Depth, objects and classes of an image."""
+        camera = self.camera(sensor, time_us * 1e-6, view)
+        return geometry(self.snapshot(camera.seconds, view), camera)
+
+    def to_bytes(self, radiance: np.ndarray, sensor: DemoSensor, time_us: int) -> np.ndarray:
+        """The recorded image (h, w, 3) uint8 of a radiance, with the sensor's noise."""
+        return to_bytes(radiance, NIGHT_NOISE if self.world.night else 0.0, self._random(sensor.channel, time_us))
 
     def image(self, sensor: DemoSensor, time_us: int) -> np.ndarray:
         """The recorded image (h, w, 3) uint8."""
-        seconds = time_us * 1e-6
-        radiance = self._render(self.snapshot(seconds), seconds, self.camera(sensor, seconds))
-        return to_bytes(radiance, NIGHT_NOISE if self.world.night else 0.0, self._random(sensor.channel, time_us))
+        return self.to_bytes(self.picture(sensor, time_us).radiance, sensor, time_us)
 
-    def _render(self, snapshot: StreetSnapshot, seconds: float, camera: DemoCamera) -> np.ndarray:
-        return render(snapshot, self.light(seconds), camera, self.world.samples_per_pixel)
+    @cached_property
+    def pattern(self) -> ScanPattern:
+        """The rays of a revolution of the LiDAR."""
+        return scan_pattern(self.world.lidar, self.world.lidar_hz)
 
-    def truth(self, sensor: DemoSensor, time_us: int, left: float) -> dict[str, np.ndarray]:
-        """Ground truth of one image, without sensor noise: `lateral`, the view from `left` metres to the left, and
-        `without_leading`, the view without the leading vehicle and its shadow, (h, w, 3) uint8; `depth` (h, w) in
-        metres; `objects` (h, w), indices."""
-        seconds = time_us * 1e-6
-        camera, snapshot = self.camera(sensor, seconds), self.snapshot(seconds)
-        depth, objects = depth_and_objects(snapshot, camera)
-        lateral = self._render(snapshot, seconds, self.camera(sensor, seconds, left))
-        truth = {"lateral": to_bytes(lateral), "depth": depth, "objects": objects}
-        if self.street.leading:
-            without = self.snapshot(seconds, self.street.leading)
-            truth["without_leading"] = to_bytes(self._render(without, seconds, camera))
-        return truth
+    def scan(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> Scan:
+        """The revolution that ends at a time, or happens at it if the LiDAR does not spin."""
+        times, poses = self._firings(sensor, time_us, view)
+        snapshot = self.snapshot(times, view, for_lidar=True)
+        random = self._random(sensor.channel, time_us)
+        return scan(snapshot, self.pattern, poses, times, self.world.lidar, float(self.world.wet), random)
 
-    def sweep(self, sensor: DemoSensor, time_us: int) -> tuple[np.ndarray, np.ndarray]:
-        """The returns (n, 5) of a revolution (`lidar.scan`) and their number by object (objects,)."""
-        seconds = time_us * 1e-6
-        sensor_to_street = self.ego_to_street(seconds) @ sensor.sensor_to_ego
-        points, objects = scan(self.snapshot(seconds), sensor_to_street, self._random(sensor.channel, time_us))
-        return points, np.bincount(objects, minlength=len(self.objects))
+    def sweep(self, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> np.ndarray:
+        """The returns (n, 5) of a revolution; see `lidar.returns`."""
+        return self.returns(self.scan(sensor, time_us, view), sensor, time_us, view)
+
+    def returns(self, found: Scan, sensor: DemoSensor, time_us: int, view: Viewpoint = RECORDED) -> np.ndarray:
+        """The recorded returns (n, 5) of a scan."""
+        _, poses = self._firings(sensor, time_us, view)
+        at_timestamp = self.ego_to_street(np.array([time_us * 1e-6]), view)[0] @ sensor.sensor_to_ego
+        return returns(found, self.pattern, poses, at_timestamp)
+
+    def _firings(self, sensor: DemoSensor, time_us: int, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
+        """Time (steps,) and pose, sensor to street (steps, 4, 4), of each azimuth step of a revolution."""
+        times = time_us * 1e-6 + self.pattern.offsets
+        return times, self.ego_to_street(times, view) @ sensor.sensor_to_ego
 
     def visible_fractions(self, index: int) -> np.ndarray:
-        """The visible fraction of each object (objects,) within the images of key frame `index`."""
+        """The visible fraction of each object (objects,) within the images of key frame `index`, of all six cameras
+        whether they record or not."""
         visible, inside = np.zeros(len(self.objects)), np.zeros(len(self.objects))
         for sensor in SENSORS:
             if sensor.is_camera:
-                seconds = (index * KEY_FRAME_US + sensor.delay_us) * 1e-6
+                seconds = (key_frame_time(self.world, index) + sensor.delay_us) * 1e-6
                 self._count_points(self.camera(sensor, seconds), seconds, visible, inside)
         return visible / np.maximum(inside, 1)
 
     def _count_points(self, camera: DemoCamera, seconds: float, visible: np.ndarray, inside: np.ndarray) -> None:
         """Adds the number of surface points of each object that lie inside the image, and of those that are visible."""
-        snapshot = self.snapshot(seconds)
+        time, snapshot = np.array([seconds]), self.snapshot(seconds)
+        center = camera.pose[:3, 3]
         for number, item in enumerate(self.objects):
             if item.category is None:
                 continue
-            mesh = item.mesh_at(seconds)
-            mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-            samples = trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0]
-            points = apply(snapshot.poses[number], samples)
-            pixels, depth = project(points, inverse(camera.camera_to_street), camera.intrinsics)
+            points = surface_points(item, time)
+            pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
             limit = np.array([camera.width, camera.height]) - 0.5
-            rays = points[(depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)] - camera.center
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            visible[number] += (snapshot.cast(camera.center, rays).object == number).sum()
-            inside[number] += len(rays)
+            toward = points[(depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)] - center
+            toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+            rays = Rays(time, center[None], toward, np.zeros(len(toward), np.int32))
+            visible[number] += (snapshot.cast(rays).object == number).sum() if len(toward) else 0
+            inside[number] += len(toward)
 
     def ego_to_global(self, seconds: float) -> np.ndarray:
         """The ego pose (4, 4) in the tables. `world.pose_noise` gives it the errors of nuScenes: z = 0, and smooth
         errors of roll, pitch and position."""
-        pose = STREET_TO_GLOBAL @ self.ego_to_street(seconds)
+        pose = STREET_TO_GLOBAL @ self.ego_pose(seconds)
         if self.world.pose_noise:
             phases = self._random("poses").uniform(0, 2 * np.pi, (4, 2))
             waves = np.sin(2 * np.pi * seconds / np.array([7.0, 2.9]) + phases) @ [0.8, 0.5]
@@ -127,10 +177,17 @@ class Recorder:
     def box_to_global(self, item: StreetObject, seconds: float) -> np.ndarray:
         """The pose (4, 4) of an object's box centre in the tables. Annotations are relative to the ego vehicle, so a
         box has the error of the ego pose."""
-        center = rigid(np.eye(3), np.array([0.0, 0.0, item.mesh.size[2] / 2]))
-        box_to_ego = inverse(self.ego_to_street(seconds)) @ item.path.pose_at(seconds) @ center
+        box_to_ego = inverse(self.ego_pose(seconds)) @ item.box_poses(np.array([seconds]))[0]
         return self.ego_to_global(seconds) @ box_to_ego
 
     def _random(self, *name: str | int) -> np.random.Generator:
         words = [n if isinstance(n, int) else sum(ord(c) * 31**i for i, c in enumerate(n)) for n in name]
         return np.random.default_rng([self.world.random_seed, *(w % 2**32 for w in words)])
+
+
+def surface_points(item: StreetObject, time: np.ndarray) -> np.ndarray:
+    """Points (SURFACE_POINTS, 3) on the surface of an object in the street frame, at `time` (1,)."""
+    poses, meshes = item.piece_poses(time)[0], item.body.pieces
+    triangles = np.concatenate([apply(p, m.triangles.reshape(-1, 3)) for p, m in zip(poses, meshes, strict=True)])
+    mesh = trimesh.Trimesh(triangles, np.arange(len(triangles)).reshape(-1, 3), process=False)
+    return trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0]

@@ -6,16 +6,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from drivesplat.editing.actor_path import ActorPath, recorded_path
+from drivesplat.editing.placed_path import placed_motion
 from drivesplat.editing.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.tracks import short_ids
-from drivesplat.settings.edit import Duplicate, Edit, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
+from drivesplat.settings.edit import Duplicate, Edit, Place, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 
 MIN_DISTANCE = 0.5
 """Metres; an actor that moves less counts as standing, since annotations are noisy."""
 LOOKAHEAD = 60.0
 """Seconds past the end of a track in which that distance counts."""
+ORIGIN = np.eye(4)[None]
+"""The ego pose of a drive that begins at the world's origin."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +53,17 @@ class EditedActor:
 
 
 def edited_actors(
-    actors: Sequence[EditedActor], edit: Edit, where: str, other_ids: Collection[str] = ()
-) -> list[EditedActor]:
+    actors: Sequence[EditedActor], edit: Edit, where: str, other_ids: Collection[str] = (),
+    ego_to_world: np.ndarray = ORIGIN,
+) -> list[EditedActor]:  # fmt: skip
     """The recorded `actors` after all steps of an edit: in their order without the removed ones, then the duplicates.
 
-    `other_ids` are those of tracks that cannot be edited; no duplicate may have one. Raises ConfigError, one line that
+    `other_ids` are those of tracks that cannot be edited; no duplicate may have one. `ego_to_world` (n, 4, 4) are the
+    ego poses of the drive, for steps that place a copy. Raises ConfigError, one line that
     starts with `where` (the scene and the edit), if a step names an unknown track, changes nothing or contradicts an
     earlier step.
     """
-    state = _EditState({actor.id: actor for actor in actors}, {}, frozenset(other_ids))
+    state = _EditState({actor.id: actor for actor in actors}, {}, frozenset(other_ids), ego_to_world)
     for number, step in enumerate(edit.steps, start=1):
         try:
             state = _after_step(state, step, number)
@@ -73,11 +78,13 @@ class _StepError(Exception):
 
 @dataclass(frozen=True)
 class _EditState:
-    """The actors after some steps by id; per removed id the number of the step that removed it; ids of other tracks."""
+    """The actors after some steps by id; per removed id the number of the step that removed it; ids of other tracks;
+    the ego poses (n, 4, 4)."""
 
     actors: dict[str, EditedActor]
     removed: dict[str, int]
     other_ids: frozenset[str]
+    ego_to_world: np.ndarray
 
     def find(self, name: str) -> EditedActor:
         """The actor with that id, or the only one whose id starts with it."""
@@ -114,7 +121,11 @@ def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
         case Swap():
             return _swapped(state, actor, change)
         case Duplicate():
-            return _duplicated(state, actor, change)
+            return _copied(state, actor, change, apply_duplicate(actor.path, change))
+        case Place():
+            height = float(actor.size[2])
+            path = recorded_path(placed_motion(change, state.ego_to_world, height), height)
+            return _copied(state, actor, change, path)
         case Rescale():
             scale, size = actor.scale * change.factor, actor.size * change.factor
             return state.with_actors(replace(actor, scale=scale, size=size, edited=True))
@@ -168,12 +179,11 @@ def _swapped(state: _EditState, actor: EditedActor, swap: Swap) -> _EditState:
     return state.with_actors(replace(actor, path=other.path, edited=True), replace(other, path=actor.path, edited=True))
 
 
-def _duplicated(state: _EditState, actor: EditedActor, duplicate: Duplicate) -> _EditState:
+def _copied(state: _EditState, actor: EditedActor, copy: Duplicate | Place, path: ActorPath) -> _EditState:
     taken = [*state.actors, *state.removed]
-    if duplicate.name in taken:
+    if copy.name in taken:
         used = ", ".join(short_ids(taken).values())
-        raise _StepError(f"the name {duplicate.name!r} in 'as' is already used; names in use: {used}")
-    if duplicate.name in state.other_ids:
-        raise _StepError(f"the name {duplicate.name!r} in 'as' is the id of another track; choose another name")
-    path = apply_duplicate(actor.path, duplicate)
-    return state.with_actors(replace(actor, id=duplicate.name, path=path, edited=True))
+        raise _StepError(f"the name {copy.name!r} in 'as' is already used; names in use: {used}")
+    if copy.name in state.other_ids:
+        raise _StepError(f"the name {copy.name!r} in 'as' is the id of another track; choose another name")
+    return state.with_actors(replace(actor, id=copy.name, path=path, edited=True))

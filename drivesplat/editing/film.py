@@ -18,7 +18,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
-from drivesplat.rendering.trajectory import CameraPath, film_path
+from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames
 from drivesplat.scene.images import write_png
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
@@ -57,7 +57,9 @@ def render_edit(
     where = f"scene {scene.name}, edit {files.film.stem!r}"
     actors = editable_actors(model, scene, where)
     editable = {actor.id for actor in actors}
-    edited = edited_actors(actors, job.edit, where, {track.id for track in scene.tracks} - editable)
+    ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, job.camera)])
+    others = {track.id for track in scene.tracks} - editable
+    edited = edited_actors(actors, job.edit, where, others, ego_to_world)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     recorded = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     left, right = (Shot(scene, cameras, job, job.tile(2)) for cameras in (recorded, path))

@@ -1,9 +1,10 @@
-"""Ground truth of a synthetic world: views from beside the path, images without the leading car, depth, instances.
+"""Ground truth of a synthetic world: images, depth, instances and classes from the recorded path and from beside it, of
+the drive as it was and of edited drives; LiDAR scans ray by ray.
 
-`truth/truth.json` below a dataset's root lists these images for each key frame of one camera. They are lossless and
-free of sensor noise.
+`truth/truth.json` below a dataset's root lists the files. Images are lossless and free of sensor noise.
 """
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 from drivesplat.errors import ResultError
 from drivesplat.io.storage import read_json, unreadable, write_json
 
-SCHEMA = 1
+SCHEMA = 2
 TRUTH_FILE = "truth/truth.json"
 """Below a dataset's root."""
 RULE = "demo_world"
@@ -20,38 +21,84 @@ RULE = "demo_world"
 
 @dataclass(frozen=True)
 class TruthFrame:
-    """The truth of one key frame: the token of its image's sample_data, its index, file names, and camera poses (4, 4)
-    in the dataset's global frame. `without_leading` is None without a leading car."""
+    """The truth of one key frame in one view: the token of the recorded image's sample_data (of a held-out camera: that
+    it would have), its index, the camera pose (4, 4) in the dataset's global frame, and file names.
+
+    `image` is None where it is the recorded one. `depth`: 16 bits, units of 1/256 metre along the optical axis up to
+    256 m, 0 for the sky (KITTI's convention). `instances`: 8 bits, a key of `Truth.instances`, 0 for scenery.
+    `classes`: 8 bits, a key of `Truth.classes`.
+    """
 
     sample_data: str
     sample_index: int
-    lateral: str
-    without_leading: str | None
+    camera_to_global: list[list[float]]
+    image: str | None
     depth: str
     instances: str
-    camera_to_global: list[list[float]]
-    lateral_camera_to_global: list[list[float]]
+    classes: str
 
 
 @dataclass(frozen=True)
-class Truth:
-    """The content of truth.json. `lateral_left_m`: offset in metres of the lateral view to the ego vehicle's left;
-    `leading`: the instance missing from `without_leading`, None without a leading car; `instances`: token by number in
-    the instance images."""
+class TruthView:
+    """The key frames of `camera` seen from `left_m` metres to the left of its recorded path, of the drive as it was or
+    after the edit of that name, without the instance `without` if given."""
 
-    scene: str
     camera: str
-    width: int
-    height: int
-    samples_per_pixel: int
-    lateral_left_m: float
-    leading: str | None
-    instances: dict[str, str]
+    left_m: float
+    edit: str | None
+    without: str | None
     frames: tuple[TruthFrame, ...]
 
     def by_image(self) -> dict[str, TruthFrame]:
         """The frames by the token of their image's sample_data."""
         return {frame.sample_data: frame for frame in self.frames}
+
+
+@dataclass(frozen=True)
+class TruthScan:
+    """A LiDAR scan: the token of its sample_data, its key frame, offset and edit as of a view, and the name of an .npz
+    file. Its arrays (beams, steps), one entry per ray of the pattern: `range` without noise in metres (float32,
+    infinite without a hit), `intensity` in [0, 1], `instance` as in instance images, `returned`."""
+
+    sample_data: str
+    sample_index: int
+    left_m: float
+    edit: str | None
+    file: str
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The content of truth.json. `leading`: the instance of the vehicle ahead, None without one; `instances`: token by
+    number in the instance images; `classes`: name by number in the class images; `pattern`: the name of an .npz file
+    with `elevations` (beams,), `azimuths` (steps,) in radians and `offsets` (steps,), seconds of each ray after its
+    sweep's timestamp; None without scans."""
+
+    scene: str
+    width: int
+    height: int
+    samples_per_pixel: int
+    leading: str | None
+    instances: dict[str, str]
+    classes: dict[str, str]
+    views: tuple[TruthView, ...]
+    pattern: str | None
+    scans: tuple[TruthScan, ...]
+
+    def recorded(self, camera: str) -> TruthView | None:
+        """The view of a camera from its own path."""
+        return next((view for view in self._of(camera) if not view.left_m and view.without is None), None)
+
+    def lateral(self, camera: str) -> list[TruthView]:
+        """The views of a camera from beside its path."""
+        return [view for view in self._of(camera) if view.left_m]
+
+    def without_leading(self, camera: str) -> TruthView | None:
+        """The view of a camera without the vehicle ahead."""
+        return next((view for view in self._of(camera) if view.without is not None), None)
+
+    def _of(self, camera: str) -> Iterator[TruthView]:
+        return (view for view in self.views if view.camera == camera and view.edit is None)
 
 
 def write_truth_file(root: Path, truth: Truth) -> None:
@@ -65,13 +112,19 @@ def read_truth(path: str | Path) -> Truth:
     try:
         if content.pop("schema") != SCHEMA:
             raise ValueError("it has another schema")
-        frames = tuple(TruthFrame(**frame) for frame in content.pop("frames"))
-        for frame in frames:
-            if any(np.shape(pose) != (4, 4) for pose in (frame.camera_to_global, frame.lateral_camera_to_global)):
-                raise ValueError(f"a pose of key frame {frame.sample_index} is no 4x4 matrix")
-        return Truth(**content, frames=frames)
+        views = tuple(_view(view) for view in content.pop("views"))
+        scans = tuple(TruthScan(**scan) for scan in content.pop("scans"))
+        return Truth(**content, views=views, scans=scans)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise unreadable(path, RULE, f"not a record of truth ({error})") from error
+
+
+def _view(content: dict) -> TruthView:
+    frames = tuple(TruthFrame(**frame) for frame in content.pop("frames"))
+    for frame in frames:
+        if np.shape(frame.camera_to_global) != (4, 4):
+            raise ValueError(f"the pose of key frame {frame.sample_index} is no 4x4 matrix")
+    return TruthView(**content, frames=frames)
 
 
 def truth_image(path: str | Path, name: str) -> Path:

@@ -132,6 +132,33 @@ class Duplicate(Settings):
     """Delay of the copy (seconds)."""
 
 
+Waypoint = tuple[
+    Annotated[float, Field(ge=-60, le=600)], Annotated[float, Field(ge=-500, le=500)],
+    Annotated[float, Field(ge=-100, le=100)],
+]  # fmt: skip
+"""Seconds; metres ahead and metres to the left of the ego vehicle at the scene's first image."""
+
+
+class Place(Settings):
+    """Places a copy of the track on a given path. Later steps may name the copy."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
+
+    track: Id
+    name: Id = Field(alias="as")
+    """The copy's id: letters, digits, '_', '-' and '.'."""
+    path: tuple[Waypoint, ...] = Field(min_length=1)
+    """Points of its path, in time order. One point: it stands there, facing as the ego vehicle did."""
+    yaw: float = Field(0.0, ge=-360, le=360)
+    """Rotation to its left about its vertical axis (degrees)."""
+
+    @model_validator(mode="after")
+    def _times_increase(self) -> "Place":
+        if any(later[0] <= earlier[0] for earlier, later in zip(self.path[:-1], self.path[1:], strict=True)):
+            raise ValueError("the seconds of 'path' must increase from point to point")
+        return self
+
+
 class Rescale(Settings):
     """Scales the track about the centre of its floor."""
 
@@ -156,7 +183,7 @@ class Ego(Gradual):
         return self
 
 
-Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Rescale | Ego
+Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | Rescale | Ego
 
 
 class Step(Settings):
@@ -169,6 +196,7 @@ class Step(Settings):
     shift: Shift | None = None
     swap: Swap | None = None
     duplicate: Duplicate | None = None
+    place: Place | None = None
     rescale: Rescale | None = None
     ego: Ego | None = None
 

@@ -53,8 +53,9 @@ def _step(step: Any, where: str) -> Step:
     record = Step.model_fields[kind].annotation.__args__[0]
     keys = [field.alias or name for name, field in record.model_fields.items()]
     checked = Step(**{kind: validated(record, fields, f"{where}: ", keys=keys)})
-    if checked.duplicate is not None:
-        name = _name(checked.duplicate.name, f"{where}: 'as'")
+    copy = checked.duplicate or checked.place
+    if copy is not None:
+        name = _name(copy.name, f"{where}: 'as'")
         if name in RESERVED:
             raise ConfigError(f"{where}: 'as' {name!r} is a name kept for the camera's car; choose another")
     return checked

@@ -2,20 +2,53 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.edit import Edit
 
-Channel = Literal[
-    "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT", "LIDAR_TOP"
+CameraChannel = Literal[
+    "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT"
 ]  # fmt: skip
 
 Gain = Annotated[float, Field(gt=0, le=8)]
 
 
+Channel = CameraChannel | Literal["LIDAR_TOP"]
+Offset = Annotated[float, Field(ge=-6, le=6)]
+
+
+class WorldLidarSettings(Settings):
+    """The LiDAR of a synthetic world."""
+
+    beams: Literal[32, 64] = 32
+    """32: the HDL-32E of nuScenes; 64: the HDL-64E of KITTI."""
+    spins: bool = False
+    """Each ray leaves at its own time of the revolution, which ends at the sweep's timestamp. false = all at the
+    timestamp."""
+    divergence_mrad: float = Field(0.0, ge=0, le=10)
+    """Full angle of a beam in milliradians (HDL-32E: 3). A beam that grazes an edge returns the stronger of its echoes.
+    0 = a line."""
+    ego_returns: bool = False
+    """Beams also hit the ego vehicle."""
+
+
+class WorldTruthSettings(Settings):
+    """The ground truth of a synthetic world, written below truth/."""
+
+    cameras: tuple[CameraChannel, ...] = ("CAM_FRONT",)
+    """Cameras with truth at key frames. A camera that is not among those that record is a held-out camera."""
+    lateral_m: tuple[Offset, ...] = (2.0, -2.0, 4.0)
+    """Offsets of the lateral views to the left of the recorded one, in metres."""
+    lidar: bool = False
+    """Write the scans of key frames, ray by ray: range without noise, intensity, instance, and whether it returned."""
+    edits: tuple[str, ...] | None = ()
+    """Names of edits in the scene's edits file whose truth is written. null = all. docs/editing.md"""
+
+
 class WorldSettings(Settings):
     """A synthetic street in nuScenes format, generated at the dataset's dataroot, with ground truth that recorded
-    drives lack."""
+    drives lack. docs/world.md"""
 
     random_seed: int = Field(0, ge=0, lt=2**31)
     """Random seed of placement and colours."""
@@ -23,19 +56,42 @@ class WorldSettings(Settings):
     """Width of all images in pixels (nuScenes: 1600). The height is 9/16 of it."""
     samples_per_pixel: int = Field(4, ge=1, le=64)
     """Rays per pixel, evenly spread. By day each has a shadow ray."""
-    key_frames: int = Field(20, ge=2, le=40)
-    """Number of key frames, at 2 Hz, of all six cameras and the LiDAR."""
+    cameras: tuple[CameraChannel, ...] | None = None
+    """Cameras that record. null = those of the setting `cameras`."""
+    key_frames: int = Field(20, ge=2, le=400)
+    """Number of key frames."""
+    key_frame_hz: Literal[2, 10] = 2
+    """Key frames a second: 2 as nuScenes, 10 as Waymo and KITTI."""
+    image_hz: Literal[10, 12, 20] = 12
+    """Images a second of cameras in `sweeps`; a multiple of key_frame_hz."""
+    lidar_hz: Literal[10, 20] = 20
+    """Revolutions of the LiDAR a second."""
     sweeps: tuple[Channel, ...] = ("CAM_FRONT",)
-    """Sensors that also record between key frames: cameras at 12 Hz, the LiDAR at 20 Hz."""
+    """Sensors that also record between key frames."""
+    readout_s: float = Field(0.0, ge=0, le=0.1)
+    """Seconds from the first row of an image to the last (rolling shutter, downwards). Timestamps are those of the
+    middle row. 0 = all rows at once."""
     vehicles: int = Field(2, ge=0, le=6)
     """Number of moving vehicles. The first drives ahead of the ego vehicle; the others are oncoming or further ahead.
     """
-    pedestrians: int = Field(1, ge=0, le=6)
-    """Number of walking pedestrians."""
+    pedestrians: int = Field(10, ge=0, le=24)
+    """Number of walking pedestrians, who come into view of the front camera one after the other."""
+    bystanders: int = Field(0, ge=0, le=12)
+    """Number of people who stand and turn."""
+    cyclists: int = Field(0, ge=0, le=4)
+    """Number of cyclists."""
+    dogs: int = Field(0, ge=0, le=4)
+    """Number of dogs, each beside a pedestrian."""
     parked: int = Field(9, ge=0, le=16)
     """Number of parked vehicles."""
+    traffic: Literal["free", "queue"] = "free"
+    """'queue': the ego vehicle creeps in a queue at close range, in place of `vehicles`."""
     ego: Literal["drives", "stands"] = "drives"
     """Motion of the ego vehicle."""
+    bend_deg: float = Field(0.0, ge=-60, le=60)
+    """Angle of a bend of the road to the left."""
+    grade: float = Field(0.0, ge=-0.12, le=0.12)
+    """Slope of the road ahead: metres of height per metre."""
     own_car: bool = False
     """Show the rear of the ego vehicle at the lower edge of CAM_BACK's images."""
     exposures: dict[Channel, tuple[Gain, Gain, Gain]] = Field(default_factory=dict)
@@ -43,13 +99,33 @@ class WorldSettings(Settings):
     cameras have 1. They imitate cameras with independent exposure and white balance."""
     night: bool = False
     """Street lamps, headlights and sensor noise instead of the sun."""
+    wet: bool = False
+    """A wet road, which mirrors the sky and returns little to the LiDAR."""
     pose_noise: bool = False
     """Give ego poses the errors of nuScenes: z = 0, roll and pitch off by half a degree, positions by centimetres."""
+    class_maps: bool = False
+    """Write class and sky maps of all images to semantic/ and sky/ below dataroot, for masks.semantic_folder and
+    masks.sky_folder."""
+    lidar: WorldLidarSettings = Field(default_factory=WorldLidarSettings)
+    truth: WorldTruthSettings = Field(default_factory=WorldTruthSettings)
+
+    @model_validator(mode="after")
+    def _rates_are_multiples(self) -> "WorldSettings":
+        if self.image_hz % self.key_frame_hz:
+            raise ValueError(f"image_hz is {self.image_hz}, no multiple of key_frame_hz ({self.key_frame_hz})")
+        return self
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the drive."""
+        return (self.key_frames - 1) / self.key_frame_hz
 
 
 class WorldJob(Settings):
-    """Settings of the rule `demo_world`: name of the scene, name of the folder of tables, and the street."""
+    """Settings of the rule `demo_world`: name of the scene, name of the folder of tables, the street, and the edits
+    whose truth is written."""
 
     scene: str
     version: str
     world: WorldSettings
+    edits: dict[str, Edit] = Field(default_factory=dict)

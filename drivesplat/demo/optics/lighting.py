@@ -5,14 +5,15 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from drivesplat.demo.materials import LEAVES, compiled, fractal, surface, value_noise
+from drivesplat.demo.optics.materials import LEAVES, ROAD_, compiled, fractal, surface, value_noise
 
 
 class Light(NamedTuple):
     """Light sources in linear units, in the street frame (metres, unit vectors).
 
     `sun_direction` points to the sun; `bounce` is light from below; `lamps` (m, 3) are positions. `headlight_origin`
-    and `headlight_direction` are those of the ego vehicle. `emission` scales the emission of surfaces.
+    and `headlight_direction` are those of the ego vehicle. `emission` scales the emission of surfaces; `wet` in [0, 1] is
+    the share of the road under water.
     """
 
     sun_direction: np.ndarray
@@ -28,6 +29,7 @@ class Light(NamedTuple):
     headlight_direction: np.ndarray
     headlight: float
     emission: float
+    wet: float = 0.0
 
 
 def daylight(random: np.random.Generator) -> Light:
@@ -101,28 +103,28 @@ def lamp_irradiance(px, py, pz, nx, ny, nz, light):
 @compiled
 @no_type_check
 def shade(
-    directions, origin, distance, objects, face, normal, lit, to_object, material, color, pixel_angle, light, out
-):
-    """Fills `out` (n, 3) with the radiance that arrives at `origin` (3,) along rays `directions` (n, 3).
+    directions, origins, moment, distance, face, normal, weights, lit, texture, texture_normal, material, color,
+    pixel_angle, light, out,
+):  # fmt: skip
+    """Fills `out` (n, 3) with the radiance that arrives along rays `directions` (n, 3) at `origins` (m, 3) of `moment`
+    (n,).
 
-    `distance`, `objects`, `face`, `normal`: see `raycast.RayHits`. `to_object`, `material`, `color`: see
-    `raycast.StreetSnapshot`. `lit` (n,): whether the sun is visible from the hit. `pixel_angle`: radians between rays.
+    `distance`, `face`, `normal`, `weights`: see `raycast.RayHits`. `texture`, `texture_normal`, `material`, `color`:
+    see `raycast.RayCaster`. `lit` (n,): whether the sun is visible from the hit. `pixel_angle`: radians between rays.
     """
     for i in range(len(directions)):
-        d = directions[i]
-        if objects[i] < 0:
+        d, f = directions[i], face[i]
+        if f < 0:
             out[i, 0], out[i, 1], out[i, 2] = sky_color(d[0], d[1], d[2], light)
             continue
-        far = distance[i]
-        px, py, pz = origin[0] + far * d[0], origin[1] + far * d[1], origin[2] + far * d[2]
+        far, start = distance[i], origins[moment[i]]
+        px, py, pz = start[0] + far * d[0], start[1] + far * d[1], start[2] + far * d[2]
         nx, ny, nz, facing = facing_normal(normal[i], d)
-        m = to_object[objects[i]]
-        x, y, z = rotated(m, px, py, pz)
-        x, y, z = x + m[0, 3], y + m[1, 3], z + m[2, 3]
+        x, y, z = texture_point(texture[f], weights[i])
         footprint = far * pixel_angle / math.sqrt(facing)
-        kind, base = material[face[i]], color[face[i]]
+        kind, base, flat = material[f], color[f], texture_normal[f]
         r, g, b, mirror, emission = surface(
-            kind, base[0], base[1], base[2], x, y, z, *rotated(m, nx, ny, nz), footprint
+            kind, base[0], base[1], base[2], x, y, z, flat[0], flat[1], flat[2], footprint
         )
         if kind == LEAVES:  # leaves have all orientations
             nx += 0.9 * fractal(x, y, z + 5.0, 0.5, footprint)
@@ -131,6 +133,9 @@ def shade(
         sunny = max(0.0, dot(light.sun_direction, nx, ny, nz)) if lit[i] else 0.0
         lamp = lamp_irradiance(px, py, pz, nx, ny, nz, light)
         up, reflection, fresnel = 0.5 + 0.5 * nz, (0.0, 0.0, 0.0), 0.0
+        if kind == ROAD_:  # a film of water
+            mirror += light.wet
+            r, g, b = r * (1 - 0.5 * light.wet), g * (1 - 0.5 * light.wet), b * (1 - 0.5 * light.wet)
         if mirror > 0.0:  # Schlick's approximation; only the sky is reflected
             fresnel = mirror * (0.05 + 0.95 * (1 - facing) ** 5)
             rx, ry, rz = d[0] + 2 * facing * nx, d[1] + 2 * facing * ny, d[2] + 2 * facing * nz
@@ -147,6 +152,18 @@ def shade(
 
 @compiled
 @no_type_check
+def texture_point(corners, weights):
+    """The point x, y, z of a face with `corners` (3, 3) at barycentric `weights` (2,) of the second and the third."""
+    u, v = weights[0], weights[1]
+    first = 1.0 - u - v
+    x = first * corners[0, 0] + u * corners[1, 0] + v * corners[2, 0]
+    y = first * corners[0, 1] + u * corners[1, 1] + v * corners[2, 1]
+    z = first * corners[0, 2] + u * corners[1, 2] + v * corners[2, 2]
+    return x, y, z
+
+
+@compiled
+@no_type_check
 def facing_normal(normal, direction):
     """The unit normal x, y, z on the viewer's side, and its cosine to the ray, at least 0.04."""
     length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2) + 1e-30
@@ -155,13 +172,6 @@ def facing_normal(normal, direction):
     if along > 0:
         nx, ny, nz = -nx, -ny, -nz
     return nx, ny, nz, max(0.04, abs(along))
-
-
-@compiled
-@no_type_check
-def rotated(m, x, y, z):
-    """A direction x, y, z rotated by the transform `m` (4, 4)."""
-    return dot(m[0], x, y, z), dot(m[1], x, y, z), dot(m[2], x, y, z)
 
 
 @compiled

@@ -9,7 +9,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from drivesplat.demo.meshes import Material
+from drivesplat.demo.shapes.mesh import Material
 from drivesplat.kernels.cache import kernel
 
 compiled = kernel(fastmath=True)
@@ -20,7 +20,7 @@ CROSSING = (46.0, 49.0)
 WINDOW = (3.2, 3.0)
 """Width and height (metres) of the cells of a facade, one window each."""
 
-PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES = (int(m) for m in Material)
+PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES, METAL_, SIGN_ = (int(m) for m in Material)
 
 
 @compiled

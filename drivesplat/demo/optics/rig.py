@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivesplat.scene.rigid import rigid
+from drivesplat.settings.world import WorldSettings
 
 FULL_WIDTH, FULL_HEIGHT = 1600, 900
-KEY_FRAME_US = 500_000
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,6 @@ class DemoSensor:
     delay_us: int
     focal: float = 0.0
     center: tuple[float, float] = (0.0, 0.0)
-    per_key_frame: int = 6
-    """Recordings per key frame."""
 
     @property
     def rotation(self) -> np.ndarray:
@@ -52,7 +50,7 @@ class DemoSensor:
 
 
 SENSORS = (
-    DemoSensor("LIDAR_TOP", (0.944, 0.0, 1.84), (0.7078, -0.0065, 0.0106, -0.7063), 0, per_key_frame=10),
+    DemoSensor("LIDAR_TOP", (0.944, 0.0, 1.84), (0.7078, -0.0065, 0.0106, -0.7063), 0),
     DemoSensor("CAM_FRONT_LEFT", (1.524, 0.495, 1.509), (0.6757, -0.6736, 0.2121, -0.2112), -43_100, 1272.6,
                (826.6, 479.8)),
     DemoSensor("CAM_FRONT", (1.701, 0.016, 1.511), (0.4998, -0.5030, 0.4998, -0.4974), -35_500, 1266.4, (816.3, 491.5)),
@@ -71,11 +69,23 @@ def image_height(width: int) -> int:
     return round(width * FULL_HEIGHT / FULL_WIDTH)
 
 
-def trigger_times(sensor: DemoSensor, key_frames: int, sweeps: bool) -> list[tuple[int, bool, int]]:
+def key_frame_time(world: WorldSettings, index: int) -> int:
+    """Microseconds from the start of the drive to key frame `index`."""
+    return round(index * 1_000_000 / world.key_frame_hz)
+
+
+def recording_sensors(world: WorldSettings) -> tuple[DemoSensor, ...]:
+    """The LiDAR and the cameras that record."""
+    channels = world.cameras or ()
+    return tuple(sensor for sensor in SENSORS if not sensor.is_camera or sensor.channel in channels)
+
+
+def trigger_times(sensor: DemoSensor, world: WorldSettings) -> list[tuple[int, bool, int]]:
     """For each recording: microseconds since the start of the drive, whether it is a key frame, and the index of the
     key frame it belongs to."""
-    steps = sensor.per_key_frame if sweeps else 1
+    rate = world.image_hz if sensor.is_camera else world.lidar_hz
+    steps = rate // world.key_frame_hz if sensor.channel in world.sweeps else 1
     return [
-        (round(i * KEY_FRAME_US / steps) + sensor.delay_us, i % steps == 0, -(-i // steps))
-        for i in range((key_frames - 1) * steps + 1)
+        (round(i * 1_000_000 / (steps * world.key_frame_hz)) + sensor.delay_us, i % steps == 0, -(-i // steps))
+        for i in range((world.key_frames - 1) * steps + 1)
     ]

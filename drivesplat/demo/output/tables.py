@@ -3,7 +3,6 @@
 Schema: https://www.nuscenes.org/nuscenes (nuScenes schema), as nuscenes-devkit 1.2 reads it.
 """
 
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +10,14 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.rig import DemoSensor
+from drivesplat.demo.optics.rig import DemoSensor
+from drivesplat.demo.tokens import instance_token, token
 from drivesplat.io.storage import write_json
 from drivesplat.readers.nuscenes.layout import TABLES
 
 MAP = "maps/empty.png"
 ATTRIBUTES = ("vehicle.moving", "vehicle.parked", "pedestrian.moving")
 VISIBILITY = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
-
-
-def token(*name: Any) -> str:
-    """The token of a record: 32 hexadecimal digits of a hash of its name."""
-    return hashlib.sha256(" ".join(map(str, name)).encode()).hexdigest()[:32]
 
 
 def visibility_level(fraction: float) -> str:
@@ -113,7 +108,7 @@ class NuScenesTables:
         visible: float, lidar_points: int,
     ) -> None:  # fmt: skip
         """Adds a box at key frame `index`: pose (4, 4) of its centre; `size` (3,): length, width, height in metres."""
-        instance = token(self.scene, "instance", name)
+        instance = instance_token(self.scene, name)
         row = self._add_linked(
             "sample_annotation", (name,), token(self.scene, "annotation", name, index),
             sample_token=token(self.scene, "sample", index), instance_token=instance,

@@ -1,67 +1,147 @@
-"""Ground truth of the key frames of one camera: another view, the leading vehicle removed, depth, instances.
+"""Writes the ground truth of a world; `drivesplat.readers.truth` describes the files."""
 
-`truth/truth.json` lists the PNGs per key frame. Images are lossless and free of sensor noise. `depth`: 16 bits, units
-of 1/256 metre along the optical axis up to 256 m, 0 for the sky (KITTI's convention). `instances`: 8 bits, a key of
-`instances`, 0 for scenery. Objects beyond the annotation range have an instance too.
-"""
-
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
-from drivesplat.demo.rig import DemoSensor, image_height
-from drivesplat.demo.tables import token
-from drivesplat.readers.truth import TRUTH_FILE, Truth, TruthFrame, write_truth_file
+from drivesplat.demo.optics.imaging import Picture, to_bytes
+from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time
+from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
+from drivesplat.demo.shapes.mesh import SurfaceClass
+from drivesplat.demo.tokens import instance_token, token
+from drivesplat.io.storage import atomic_write
+from drivesplat.readers.truth import TRUTH_FILE, Truth, TruthFrame, TruthScan, TruthView, write_truth_file
 from drivesplat.scene.images import write_png
 
-LEFT = 2.0
-"""Distance (metres) of the lateral view to the left of the recorded one."""
 DEPTH_UNIT = 256.0
+LIDAR = SENSORS[0]
+PATTERN_FILE = "lidar/pattern.npz"
 
 
-def write_truth_frame(
-    root: Path, recorder: Recorder, sensor: DemoSensor, index: int, time_us: int, sample_data: str
-) -> TruthFrame:
-    """Renders and writes the ground truth of key frame `index`."""
-    truth = recorder.truth(sensor, time_us, LEFT)
-    depth = np.where(np.isfinite(truth["depth"]), truth["depth"] * DEPTH_UNIT, 0.0)
-    images = {
-        "lateral": truth["lateral"],
-        "without_leading": truth.get("without_leading"),
-        "depth": np.clip(depth + 0.5, 0, 65535).astype(np.uint16),
-        "instances": np.array([0, *_instance_numbers(recorder)])[truth["objects"] + 1].astype(np.uint8),
-    }
-    names = {kind: f"{kind}/{index:04}.png" if image is not None else None for kind, image in images.items()}
+@dataclass(frozen=True)
+class TruthPlan:
+    """A view to write: its camera and viewpoint, and the folder below truth/."""
+
+    sensor: DemoSensor
+    viewpoint: Viewpoint
+    folder: str
+
+
+@dataclass(frozen=True)
+class ScanPlan:
+    """LiDAR scans to write: their viewpoint, and the folder below truth/."""
+
+    viewpoint: Viewpoint
+    folder: str
+
+
+def planned_views(recorder: Recorder) -> list[TruthPlan]:
+    """The views of each camera with truth: recorded, lateral, without the leading vehicle, edited."""
+    plans, settings = [], recorder.world.truth
+    viewpoints = {"recorded": Viewpoint(), **_lateral(recorder)}
+    if recorder.street.leading:
+        viewpoints["without_leading"] = Viewpoint(without=recorder.street.leading)
+    viewpoints |= {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+    for sensor in SENSORS:
+        if sensor.channel in settings.cameras:
+            plans += [TruthPlan(sensor, view, f"{sensor.channel}/{name}") for name, view in viewpoints.items()]
+    return plans
+
+
+def planned_scans(recorder: Recorder) -> list[ScanPlan]:
+    """The scans of the LiDAR: recorded, from beside, edited; none unless the settings ask for them."""
+    if not recorder.world.truth.lidar:
+        return []
+    viewpoints = {"recorded": Viewpoint(), **_lateral(recorder)}
+    viewpoints |= {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+    return [ScanPlan(view, f"lidar/{name}") for name, view in viewpoints.items()]
+
+
+def _lateral(recorder: Recorder) -> dict[str, Viewpoint]:
+    offsets = dict.fromkeys(offset for offset in recorder.world.truth.lateral_m if offset)
+    return {f"{'left' if m > 0 else 'right'}_{abs(m):g}m": Viewpoint(left=m) for m in offsets}
+
+
+def write_frame(root: Path, recorder: Recorder, scene: str, plan: TruthPlan, index: int) -> TruthFrame:
+    """Renders and writes the truth of key frame `index` in a view."""
+    sensor, view = plan.sensor, plan.viewpoint
+    time_us = key_frame_time(recorder.world, index) + sensor.delay_us
+    recorded = view == Viewpoint() and sensor.channel in (recorder.world.cameras or ())
+    picture = (recorder.geometry if recorded else recorder.picture)(sensor, time_us, view)
+    images = {"depth": _depth(picture), "instances": _instances(recorder, scene, view, picture)}
+    images["classes"] = picture.classes
+    if not recorded:
+        images["image"] = to_bytes(picture.radiance)
+    names = {kind: f"{plan.folder}/{kind}/{index:04}.png" for kind in images}
     for kind, name in names.items():
-        if name:
-            write_png((root / TRUTH_FILE).parent / name, images[kind])
-    poses = {}
-    for kind, left in (("", 0.0), ("lateral_", LEFT)):
-        camera = recorder.camera(sensor, time_us * 1e-6, left)
-        poses[f"{kind}camera_to_global"] = (STREET_TO_GLOBAL @ camera.camera_to_street).tolist()
-    return TruthFrame(sample_data, index, **names, **poses)
+        write_png((root / TRUTH_FILE).parent / name, images[kind])
+    pose = STREET_TO_GLOBAL @ recorder.camera(sensor, time_us * 1e-6, view).pose
+    sample_data = token(scene, sensor.channel, time_us)
+    return TruthFrame(sample_data, index, pose.tolist(), **{"image": None, **names})
 
 
-def _instance_numbers(recorder: Recorder) -> list[int]:
-    """The instance number of each object: from 1 for annotated classes, 0 for scenery."""
-    annotated = np.array([item.category is not None for item in recorder.objects])
-    return (np.cumsum(annotated) * annotated).tolist()
+def _depth(picture: Picture) -> np.ndarray:
+    depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNIT, 0.0)
+    return np.clip(depth + 0.5, 0, 65535).astype(np.uint16)
 
 
-def write_truth(root: Path, recorder: Recorder, scene: str, camera: str, frames: list[TruthFrame]) -> None:
-    """Writes truth.json."""
-    numbers = zip(_instance_numbers(recorder), recorder.objects, strict=True)
-    leading, world = recorder.street.leading, recorder.world
+def _instances(recorder: Recorder, scene: str, view: Viewpoint, picture: Picture) -> np.ndarray:
+    return _numbers_of_objects(recorder, scene, view)[picture.objects + 1]
+
+
+def instance_numbers(recorder: Recorder, scene: str) -> dict[str, int]:
+    """The number of each annotated object by its token, from 1; the objects of the drive first, then those that edits
+    add."""
+    streets = [recorder.variation(edit).street for edit in (None, *recorder.edits)]
+    names = dict.fromkeys(item.name for street in streets for item in street.objects if item.category)
+    return {instance_token(scene, name): number for number, name in enumerate(names, start=1)}
+
+
+def _numbers_of_objects(recorder: Recorder, scene: str, view: Viewpoint) -> np.ndarray:
+    """The instance number (objects + 1,) of each object of a view's street; the first entry is that of the sky."""
+    numbers = instance_numbers(recorder, scene)
+    objects = recorder.variation(view.edit).street.objects
+    return np.array([0, *(numbers.get(instance_token(scene, item.name), 0) for item in objects)], dtype=np.uint8)
+
+
+def write_scan(root: Path, recorder: Recorder, scene: str, plan: ScanPlan, index: int) -> TruthScan:
+    """Casts and writes the LiDAR scan of key frame `index`."""
+    time_us = key_frame_time(recorder.world, index) + LIDAR.delay_us
+    found = recorder.scan(LIDAR, time_us, plan.viewpoint)
+    name = f"{plan.folder}/{index:04}.npz"
+    with atomic_write((root / TRUTH_FILE).parent / name) as file:
+        np.savez_compressed(
+            file,
+            range=found.range.astype(np.float32),
+            intensity=found.intensity.astype(np.float32),
+            instance=_numbers_of_objects(recorder, scene, plan.viewpoint)[found.object + 1],
+            returned=found.returned,
+        )
+    view = plan.viewpoint
+    return TruthScan(token(scene, LIDAR.channel, time_us), index, view.left, view.edit, name)
+
+
+def write_truth(
+    root: Path, recorder: Recorder, scene: str, views: Iterable[TruthView], scans: Iterable[TruthScan]
+) -> None:
+    """Writes truth.json, and the pattern of the scans."""
+    world, leading, scans = recorder.world, recorder.street.leading, tuple(scans)
+    if scans:
+        pattern = recorder.pattern
+        with atomic_write((root / TRUTH_FILE).parent / PATTERN_FILE) as file:
+            np.savez(file, elevations=pattern.elevations, azimuths=pattern.azimuths, offsets=pattern.offsets)
     truth = Truth(
         scene=scene,
-        camera=camera,
         width=world.width,
         height=image_height(world.width),
         samples_per_pixel=world.samples_per_pixel,
-        lateral_left_m=LEFT,
-        leading=token(scene, "instance", leading) if leading else None,
-        instances={str(n): token(scene, "instance", item.name) for n, item in numbers if n},
-        frames=tuple(frames),
+        leading=instance_token(scene, leading) if leading else None,
+        instances={str(number): token for token, number in instance_numbers(recorder, scene).items()},
+        classes={str(int(c)): c.name.lower() for c in SurfaceClass},
+        views=tuple(views),
+        pattern=PATTERN_FILE if scans else None,
+        scans=scans,
     )
     write_truth_file(root, truth)

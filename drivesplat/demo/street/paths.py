@@ -1,74 +1,112 @@
-"""Paths along the street. Street frame: metres, x along the road, y to the left, z up, the road at z = 0."""
+"""Paths of objects along the road: poses and the distance travelled, at any time."""
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from drivesplat.demo.street.road import STRAIGHT, Road
 from drivesplat.scene.rigid import rigid
 
 LANE_CENTER = 1.75
-"""Traffic drives on the right: at y = -LANE_CENTER along x, at +LANE_CENTER against it."""
+"""Traffic drives on the right: at t = -LANE_CENTER along s, at +LANE_CENTER against it."""
+SUSPENSION = ((0.25, 5.1, 0.0), (0.2, 3.7, 1.0), (0.012, 6.3, 0.0))
+"""Amplitude (degrees, degrees, metres), angular frequency (1/s) and phase of pitch, roll and heave."""
+
+
+class Path(Protocol):
+    """The motion of an object."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pose changes with time."""
+
+    def poses(self, seconds: np.ndarray) -> np.ndarray:
+        """Object to street (n, 4, 4): on the ground, facing along the path."""
+
+    def distance(self, seconds: np.ndarray) -> np.ndarray:
+        """Metres travelled since second 0 (n,)."""
 
 
 @dataclass(frozen=True)
 class StreetPath:
-    """A path from `x`, `y` (metres) at second 0 with `speed` (m/s, negative: against x).
+    """A path from `s`, `t` (metres, road coordinates) at second 0 with `speed` (m/s, negative: against s).
 
-    Speed varies by `surge` (m/s) and y by `sway` (metres), both sinusoidally over `period` seconds. `heading` (radians)
-    applies at speed 0. `suspension` adds the pitch, roll and heave of a sprung vehicle while it drives.
+    Speed varies by `surge` (m/s) and t by `sway` (metres), both sinusoidally over `period` seconds. At speed 0 the
+    object faces `heading` (radians to the left of the road) and turns by +-`turning` radians over the same period.
+    `suspension` adds the pitch, roll and heave of a sprung vehicle while it drives.
     """
 
-    x: float
-    y: float
+    s: float
+    t: float
     speed: float = 0.0
     surge: float = 0.0
     sway: float = 0.0
     period: float = 8.0
     heading: float = 0.0
+    turning: float = 0.0
     suspension: bool = False
+    road: Road = STRAIGHT
 
-    def pose_at(self, seconds: float) -> np.ndarray:
-        """Object to street (4, 4): on the ground, facing along the path."""
-        omega = 2 * math.pi / self.period
-        x = self.x + self.speed * seconds + self.surge / omega * (1 - math.cos(omega * seconds))
-        y = self.y + self.sway * math.sin(omega * seconds)
-        vx = self.speed + self.surge * math.sin(omega * seconds)
-        vy = self.sway * omega * math.cos(omega * seconds)
-        heading = math.atan2(vy, vx) if self.speed else self.heading
-        pose = rigid(Rotation.from_euler("z", heading).as_matrix(), np.array([x, y, 0.0]))
+    @property
+    def moves(self) -> bool:
+        return self.speed != 0.0 or self.turning != 0.0
+
+    def poses(self, seconds: np.ndarray) -> np.ndarray:
+        phase = self._omega * seconds
+        t = self.t + self.sway * np.sin(phase)
+        if self.speed:
+            forward, left = self.speed + self.surge * np.sin(phase), self.sway * self._omega * np.cos(phase)
+            # where the object comes to rest the direction stays that of its drive
+            yaw = np.arctan2(left, np.where(np.abs(forward) < 1e-3, self.speed, forward))
+        else:
+            yaw = self.heading + self.turning * np.sin(phase)
+        poses = self.road.poses(self.along(seconds), t, yaw)
         if self.suspension and self.speed:
-            pitch, roll = 0.25 * math.sin(5.1 * seconds), 0.2 * math.sin(3.7 * seconds + 1.0)
-            pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("yx", [pitch, roll], degrees=True).as_matrix()
-            pose[2, 3] = 0.012 * math.sin(6.3 * seconds + 0.5)
-        return pose
+            pitch, roll, heave = (a * np.sin(w * seconds + p) for a, w, p in SUSPENSION)
+            poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_euler(
+                "xy", np.stack([roll, pitch], axis=-1), degrees=True
+            ).as_matrix()
+            poses[:, 2, 3] += heave
+        return poses
+
+    def distance(self, seconds: np.ndarray) -> np.ndarray:
+        return np.abs(self.along(seconds) - self.s)
+
+    @property
+    def _omega(self) -> float:
+        return 2 * np.pi / self.period
+
+    def along(self, seconds: np.ndarray) -> np.ndarray:
+        """Road coordinate s (n,) in metres."""
+        surge = self.surge / self._omega * (1 - np.cos(self._omega * seconds))
+        return self.s + self.speed * seconds + surge
 
 
-def ego_path(drives: bool) -> StreetPath:
-    """The path of the ego vehicle."""
-    if drives:
-        return StreetPath(0.0, -LANE_CENTER, 8.0, 0.6, 0.12, 9.0, suspension=True)
-    return StreetPath(12.0, -LANE_CENTER)
+@dataclass(frozen=True)
+class GivenPath:
+    """A path of given poses: `poses_at` maps seconds (n,) to object to street (n, 4, 4)."""
+
+    poses_at: Callable[[np.ndarray], np.ndarray]
+    moves: bool = True
+
+    def poses(self, seconds: np.ndarray) -> np.ndarray:
+        return self.poses_at(seconds)
+
+    def distance(self, seconds: np.ndarray) -> np.ndarray:
+        times = np.linspace(0.0, max(float(seconds.max(initial=0.0)), 1e-3), 200)
+        steps = np.linalg.norm(np.diff(self.poses_at(times)[:, :2, 3], axis=0), axis=1)
+        return np.interp(seconds, times, np.concatenate([[0.0], np.cumsum(steps)]))
 
 
-def vehicle_paths(count: int, ego_drives: bool) -> list[StreetPath]:
-    """The paths of `count` vehicles: the first drives ahead of the ego vehicle; oncoming ones and further ones ahead
-    follow alternately."""
-    starts = ((13.0, 8.6), (42.0, 9.2), (70.0, 9.0)) if ego_drives else ((24.0, 4.0), (48.0, 6.0), (76.0, 6.5))
-    paths = []
-    for i, (x, speed) in enumerate(starts):
-        paths.append(StreetPath(x, -LANE_CENTER, speed, 1.2, 0.1, 7.0 + i))
-        paths.append(StreetPath(96.0 + 42.0 * i, LANE_CENTER, -(9.0 + 0.7 * i), 0.7, 0.1, 8.0))
-    return paths[:count]
+def fixed_pose(path: Path) -> np.ndarray:
+    """The pose (4, 4) of a path at second 0."""
+    return path.poses(np.zeros(1))[0]
 
 
-def pedestrian_paths(count: int, random: np.random.Generator) -> list[StreetPath]:
-    """The paths of `count` pedestrians: alternately along x on the right sidewalk and against x on the left, between
-    lamps and trees."""
-    paths = []
-    for i in range(count):
-        side = (-1) ** (i + 1)
-        x, y = 22.0 + 13.0 * i + random.uniform(-2, 2), side * random.uniform(7.02, 7.12)
-        paths.append(StreetPath(x, y, -side * random.uniform(1.2, 1.6)))
-    return paths
+def carried(path: Path, offset: np.ndarray) -> GivenPath:
+    """The path of something fixed to an object, `offset` (3,) metres from its origin in its own frame."""
+    shift = rigid(np.eye(3), offset)
+    return GivenPath(lambda seconds: path.poses(seconds) @ shift, path.moves)
