@@ -12,10 +12,11 @@ from drivesplat.demo.optics.imaging import DemoCamera, Picture, geometry, render
 from drivesplat.demo.optics.lidar import Scan, ScanPattern, returns, scan, scan_pattern
 from drivesplat.demo.optics.lighting import Light, daylight, lamplight
 from drivesplat.demo.optics.raycast import RayCaster, Rays, StreetSnapshot
-from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time
+from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time, recording_sensors
 from drivesplat.demo.street.edited import Variation, edited
 from drivesplat.demo.street.objects import EGO_BODY, StreetObject
 from drivesplat.demo.street.street import build_street
+from drivesplat.demo.tokens import instance_token
 from drivesplat.scene.images import project
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.settings.edit import Edit
@@ -41,10 +42,10 @@ RECORDED = Viewpoint()
 
 
 class Recorder:
-    """Records the street of `world`. Deterministic: each recording has its own random generator."""
+    """Records the street of `world` as the drive `scene`. Deterministic: each recording has its own random generator."""
 
-    def __init__(self, world: WorldSettings, edits: Mapping[str, Edit] | None = None):
-        self.world, self.edits = world, dict(edits or {})
+    def __init__(self, world: WorldSettings, scene: str = "demo", edits: Mapping[str, Edit] | None = None):
+        self.world, self.scene, self.edits = world, scene, dict(edits or {})
         self.street = build_street(world)
         self.objects = self.street.objects
         self._variations: dict[str | None, tuple[Variation, RayCaster]] = {}
@@ -55,9 +56,18 @@ class Recorder:
 
     def _variation(self, edit: str | None) -> tuple[Variation, RayCaster]:
         if edit not in self._variations:
-            changed = edited(self.street, self.world, self.edits[edit], edit) if edit else Variation(self.street)
+            changed = self._edited(edit) if edit else Variation(self.street)
             self._variations[edit] = changed, RayCaster(changed.street.objects)
         return self._variations[edit]
+
+    def _edited(self, edit: str) -> Variation:
+        delays = [sensor.delay_us for sensor in recording_sensors(self.world) if sensor.is_camera]
+        film_start = min(delays, default=0) * 1e-6
+        return edited(self.street, self.scene, self.edits[edit], edit, self.world.seconds, film_start)
+
+    def instance(self, name: str) -> str:
+        """The token of an object: the id of its track."""
+        return instance_token(self.scene, name)
 
     def snapshot(self, seconds: np.ndarray, view: Viewpoint = RECORDED, for_lidar: bool = False) -> StreetSnapshot:
         """The street at the times `seconds` (m,), as cameras see it."""

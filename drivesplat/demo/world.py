@@ -10,12 +10,23 @@ import numpy as np
 from PIL import Image
 
 from drivesplat.demo.marker import prepare_folder
+from drivesplat.demo.optics.rig import DemoSensor, image_height, key_frame_time, recording_sensors, trigger_times
+from drivesplat.demo.output.class_maps import write_class_maps
+from drivesplat.demo.output.disk_space import require_space, world_bytes
+from drivesplat.demo.output.tables import NuScenesTables
+from drivesplat.demo.output.truth import (
+    ScanPlan,
+    TruthPlan,
+    planned_scans,
+    planned_views,
+    write_frame,
+    write_scan,
+    write_truth,
+)  # fmt: skip
+from drivesplat.demo.placed import require_free_places
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
-from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor, image_height, trigger_times
-from drivesplat.demo.tables import NuScenesTables
-from drivesplat.demo.truth import write_truth, write_truth_frame
 from drivesplat.io.storage import Provenance, atomic_write, canonical_json, sha256_text
-from drivesplat.readers.truth import TruthFrame
+from drivesplat.readers.truth import TruthFrame, TruthScan, TruthView
 from drivesplat.settings.world import WorldJob, WorldSettings
 
 log = logging.getLogger(__name__)
@@ -23,7 +34,6 @@ log = logging.getLogger(__name__)
 START_US = 1_767_225_600_000_000
 ANNOTATED_RANGE = 80.0
 """Objects farther from the ego vehicle than this (metres) have no box."""
-TRUTH_CAMERA = "CAM_FRONT"
 JPEG_QUALITY = 95
 
 
@@ -40,27 +50,33 @@ class SensorFile:
 
 
 def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int = 1) -> None:
-    """Writes the dataset below `root`: images, sweeps, truth/, and last the tables.
+    """Writes the dataset below `root`: images, sweeps, truth/, class maps if asked for, and last the tables.
 
     The tables contain a digest of the provenance, so results are remade when the images are. Equal settings give equal
-    bytes for any number of processes (`workers`). Raises ConfigError where `root` holds other files, ResultError where
-    the disk is full.
+    bytes for any number of processes (`workers`). Raises ConfigError where `root` holds other files or an edit does not
+    fit the street, ResultError where the disk is full or has no space for the world.
     """
+    recorder = Recorder(job.world, job.scene, job.edits)
+    require_free_places(recorder)
     prepare_folder(root, provenance)
-    world, recorder = job.world, Recorder(job.world)
     source = sha256_text(canonical_json(provenance["stages"]))
-    tables = NuScenesTables(job.scene, _description(world), source, START_US, SENSORS, world.width)
-    for index in range(world.key_frames):
-        tables.add_sample(index, index * KEY_FRAME_US)
-    files = [file for sensor in SENSORS for file in _sensor_files(tables, recorder, sensor)]
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _start_worker, (world, root)) as pool:
+    tables = NuScenesTables(job.scene, _description(job.world), source, START_US, job.world)
+    for index in range(job.world.key_frames):
+        tables.add_sample(index, key_frame_time(job.world, index))
+    files = [file for sensor in recording_sensors(job.world) for file in _sensor_files(tables, recorder, sensor)]
+    views, scans = planned_views(recorder), planned_scans(recorder)
+    images = sum(file.sensor.is_camera for file in files)
+    require_space(root, world_bytes(job.world, images, len(files) - images, len(views), len(scans)))
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _start_worker, (recorder, root)) as pool:
         counts = pool.map(_write_file, files)
-        visible = pool.map(_visible_fractions, range(world.key_frames))
-        truths = pool.map(_write_truth, [f for f in files if f.sensor.channel == TRUTH_CAMERA and f.is_key_frame])
+        visible = pool.map(_visible_fractions, range(job.world.key_frames))
+        frames = [pool.map(_write_frame, *_per_key_frame(plan, job.world)) for plan in views]
+        sweeps = [pool.map(_write_scan, *_per_key_frame(plan, job.world)) for plan in scans]
         lidar = {f.index: n for f, n in zip(files, counts, strict=True) if n is not None and f.is_key_frame}
         for index, fractions in enumerate(visible):
             _annotate(tables, recorder, index, fractions, lidar[index])
-        write_truth(root, recorder, job.scene, TRUTH_CAMERA, list(truths))
+        true_views = [_view(recorder, plan, tuple(found)) for plan, found in zip(views, frames, strict=True)]
+        write_truth(root, recorder, true_views, [scan for found in sweeps for scan in found])
     tables.write(root, job.version)
     log.info("%d recordings, %d boxes in %s", len(files), len(tables.rows["sample_annotation"]), root)
 
@@ -68,8 +84,8 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
 def _description(world: WorldSettings) -> str:
     light = "night" if world.night else "day"
     return (
-        f"Synthetic street, {light}, own car {world.ego}, {world.vehicles} moving vehicles, "
-        f"{world.pedestrians} pedestrians"
+        f"Synthetic street, {light}, the ego vehicle {world.ego}, {world.traffic} traffic, {world.vehicles} moving "
+        f"vehicles, {world.pedestrians} pedestrians"
     )
 
 
@@ -78,7 +94,7 @@ def _sensor_files(tables: NuScenesTables, recorder: Recorder, sensor: DemoSensor
     world = recorder.world
     size = (world.width, image_height(world.width)) if sensor.is_camera else (0, 0)
     files = []
-    for time_us, is_key, index in trigger_times(sensor, world.key_frames, sensor.channel in world.sweeps):
+    for time_us, is_key, index in trigger_times(sensor, world):
         pose = recorder.ego_to_global(time_us * 1e-6)
         row = tables.add_data(sensor, index, time_us, is_key, pose, size)
         files.append(SensorFile(sensor, time_us, is_key, index, *row))
@@ -89,44 +105,60 @@ def _annotate(
     tables: NuScenesTables, recorder: Recorder, index: int, visible: np.ndarray, lidar_points: np.ndarray
 ) -> None:
     """Adds the boxes of key frame `index`: objects in range that a camera or the LiDAR sees."""
-    seconds = index * KEY_FRAME_US * 1e-6
-    ego = STREET_TO_GLOBAL @ recorder.ego_to_street(seconds)
+    seconds = key_frame_time(recorder.world, index) * 1e-6
+    ego = STREET_TO_GLOBAL @ recorder.ego_pose(seconds)
     for item, fraction, points in zip(recorder.objects, visible.tolist(), lidar_points.tolist(), strict=True):
         if item.category is None or not (fraction or points):
             continue
         box = recorder.box_to_global(item, seconds)
         if np.linalg.norm((box - ego)[:2, 3]) <= ANNOTATED_RANGE:
-            tables.add_annotation(
-                item.name, item.category, item.attribute, index, box, item.mesh.size, fraction, points
-            )
+            tables.add_annotation(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
+
+
+def _per_key_frame(plan: TruthPlan | ScanPlan, world: WorldSettings) -> tuple[list[TruthPlan | ScanPlan], range]:
+    return [plan] * world.key_frames, range(world.key_frames)
+
+
+def _view(recorder: Recorder, plan: TruthPlan, frames: tuple[TruthFrame, ...]) -> TruthView:
+    view = plan.viewpoint
+    without = recorder.instance(view.without) if view.without else None
+    return TruthView(plan.sensor.channel, view.left, view.edit, without, frames)
 
 
 _worker: tuple[Recorder, Path]
 """In a worker process: the recorder and the dataset's root."""
 
 
-def _start_worker(world: WorldSettings, root: Path) -> None:
+def _start_worker(recorder: Recorder, root: Path) -> None:
     global _worker
-    _worker = Recorder(world), root
+    _worker = recorder, root
 
 
 def _write_file(file: SensorFile) -> np.ndarray | None:
     """Writes an image or a sweep. Returns the number of LiDAR returns per object, None for images."""
     recorder, root = _worker
     with atomic_write(root / file.path) as target:
-        if file.sensor.is_camera:
-            image = recorder.image(file.sensor, file.time_us)
-            Image.fromarray(image).save(target, "JPEG", quality=JPEG_QUALITY)
-            return None
-        points, counts = recorder.sweep(file.sensor, file.time_us)
-        target.write(points.tobytes())
-        return counts
+        if not file.sensor.is_camera:
+            scan = recorder.scan(file.sensor, file.time_us)
+            target.write(recorder.returns(scan, file.sensor, file.time_us).tobytes())
+            return np.bincount(scan.object[scan.returned], minlength=len(recorder.objects))
+        picture = recorder.picture(file.sensor, file.time_us)
+        image = recorder.to_bytes(picture.radiance, file.sensor, file.time_us)
+        Image.fromarray(image).save(target, "JPEG", quality=JPEG_QUALITY)
+    if recorder.world.class_maps:
+        write_class_maps(root, file.sensor.channel, file.path, picture.classes)
+    return None
 
 
 def _visible_fractions(index: int) -> np.ndarray:
     return _worker[0].visible_fractions(index)
 
 
-def _write_truth(file: SensorFile) -> TruthFrame:
+def _write_frame(plan: TruthPlan, index: int) -> TruthFrame:
     recorder, root = _worker
-    return write_truth_frame(root, recorder, file.sensor, file.index, file.time_us, file.token)
+    return write_frame(root, recorder, plan, index)
+
+
+def _write_scan(plan: ScanPlan, index: int) -> TruthScan:
+    recorder, root = _worker
+    return write_scan(root, recorder, plan, index)

@@ -191,6 +191,23 @@ def _subject(at: Place) -> dict[str, Any]:
     return {"subject": at.config.subjects.get(at.scene, SubjectSettings())}
 
 
+def _world(at: Place) -> dict[str, Any]:
+    """Raises ConfigError where an edit whose truth is asked for does not exist."""
+    world, edits = at.dataset.world, scene_edits(at.config, at.scene)
+    assert world is not None
+    wanted = edits if world.truth.edits is None else world.truth.edits
+    for name in wanted:
+        if name not in edits:
+            raise ConfigError(no_such_edit(at.scene, name, edits))
+    cameras = at.config.cameras if world.cameras is None else world.cameras
+    return {
+        "scene": at.scene,
+        "version": at.dataset.version,
+        "world": world.model_copy(update={"cameras": cameras}),
+        "edits": {name: edits[name] for name in wanted},
+    }
+
+
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
     """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
     path = config.datasets[config.dataset_of(scene)].edits.get(scene)
@@ -210,7 +227,7 @@ def no_such_film(config: Config, whose: str, name: str) -> str:
 
 
 _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
-    "demo_world": (WorldJob, lambda at: {"scene": at.scene, "version": at.dataset.version, "world": at.dataset.world}),
+    "demo_world": (WorldJob, _world),
     "extract": (SceneSource, _scene_source),
     "own_car": (EgoMaskJob, _ego_mask),
     "refine_poses": (RefinePosesJob, _lidar_rays),

@@ -179,7 +179,7 @@ def infrared(material, visible, mirror, facing, wet):
         return 1.5
     if material == GLASS:
         return 0.02 + 0.6 * facing**40
-    if material == PAINT or material == METAL_:
+    if material in (PAINT, METAL_):
         return 0.05 + 0.6 * visible + 0.3 * facing**20
     if material == ROAD_:
         return visible * (1.0 - 0.85 * wet * (1.0 - facing**4))

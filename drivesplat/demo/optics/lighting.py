@@ -12,8 +12,8 @@ class Light(NamedTuple):
     """Light sources in linear units, in the street frame (metres, unit vectors).
 
     `sun_direction` points to the sun; `bounce` is light from below; `lamps` (m, 3) are positions. `headlight_origin`
-    and `headlight_direction` are those of the ego vehicle. `emission` scales the emission of surfaces; `wet` in [0, 1] is
-    the share of the road under water.
+    and `headlight_direction` are those of the ego vehicle. `emission` scales the emission of surfaces; `wet` in [0, 1]
+    is the share of the road under water.
     """
 
     sun_direction: np.ndarray

@@ -4,7 +4,7 @@ Objects that stand still share one Embree scene in the street frame. A moving pi
 which rays are transformed with the pose of the piece at their time. No scene is built twice.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import no_type_check
 
@@ -15,9 +15,10 @@ from embreex.rtcore_scene import EmbreeScene
 from drivesplat.demo.shapes.mesh import ColoredMesh
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.kernels.cache import kernel
-from drivesplat.scene.rigid import apply, inverse
 
 NO_HIT = -1
+SAMPLED_TIMES = 60
+"""Number of times at which the extent of a body is measured."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,6 @@ class EmbreePiece:
         self.scene = EmbreeScene()
         self._triangles = [TriangleMesh(self.scene, mesh.triangles.astype(np.float32)) for mesh in meshes]
         self.owners, self.first_faces = np.array(owners, np.int32), np.array(first_faces)
-        spheres = [mesh.bounding_sphere for mesh in meshes]
-        self.center, self.radius = spheres[0] if len(spheres) == 1 else (np.zeros(3), np.inf)
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
         """Embree's hits of rays (n, 3) in the scene's frame."""
@@ -72,6 +71,17 @@ class EmbreePiece:
     def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Whether rays (n, 3) in the scene's frame hit anything: (n,) bool."""
         return self.scene.run(origins.astype(np.float32), directions.astype(np.float32), query="OCCLUDED") == 0
+
+
+@dataclass(frozen=True)
+class MovingObject:
+    """A moving object: its index, its pieces, and a sphere in its own frame that its pieces never leave."""
+
+    number: int
+    item: StreetObject
+    pieces: tuple[EmbreePiece, ...]
+    center: np.ndarray
+    radius: float
 
 
 class RayCaster:
@@ -83,20 +93,21 @@ class RayCaster:
 
     def __init__(self, objects: Sequence[StreetObject]):
         self.objects = tuple(objects)
-        meshes: list[ColoredMesh] = []
-        self._moving: list[tuple[int, int, EmbreePiece]] = []
-        static, owners, firsts, count = [], [], [], 0
+        meshes = [mesh for item in self.objects for mesh in item.body.pieces]
+        first_faces = iter(np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).tolist())
+        static: list[tuple[ColoredMesh, int, int]] = []
+        self._moving = []
         for number, item in enumerate(self.objects):
-            for piece, mesh in enumerate(item.body.pieces):
-                if item.moves:
-                    self._moving.append((number, piece, EmbreePiece([mesh], [number], [count])))
-                else:
-                    static.append(mesh.transformed(item.piece_poses(np.zeros(1))[0, piece]))
-                    owners.append(number)
-                    firsts.append(count)
-                meshes.append(mesh)
-                count += len(mesh.faces)
-        self._static = EmbreePiece(static, owners, firsts) if static else None
+            firsts = [next(first_faces) for _ in item.body.pieces]
+            if item.moves:
+                pieces = zip(item.body.pieces, firsts, strict=True)
+                scenes = tuple(EmbreePiece([mesh], [number], [first]) for mesh, first in pieces)
+                self._moving.append(MovingObject(number, item, scenes, *_bounding_sphere(item)))
+            else:
+                poses = item.piece_poses(np.zeros(1))[0]
+                placed = (mesh.transformed(pose) for mesh, pose in zip(item.body.pieces, poses, strict=True))
+                static += [(mesh, number, first) for mesh, first in zip(placed, firsts, strict=True)]
+        self._static = EmbreePiece(*zip(*static, strict=True)) if static else None
         self.material = np.concatenate([mesh.material for mesh in meshes])
         self.color = np.concatenate([mesh.color for mesh in meshes])
         self.surface_class = np.concatenate([mesh.surface_class for mesh in meshes])
@@ -115,15 +126,12 @@ class StreetSnapshot:
 
     def __init__(self, caster: RayCaster, seconds: np.ndarray, without: Collection[str]):
         self.caster = caster
-        poses: dict[int, np.ndarray] = {}
-        self._pieces = []
-        for number, piece, scene in caster._moving:
-            item = caster.objects[number]
-            if item.name in without:
-                continue
-            if number not in poses:
-                poses[number] = item.piece_poses(seconds)
-            self._pieces.append((poses[number][:, piece], scene))
+        self._moving = []
+        for moving in caster._moving:
+            if moving.item.name not in without:
+                poses = moving.item.poses(seconds)
+                centers = poses[:, :3, :3] @ moving.center + poses[:, :3, 3]
+                self._moving.append((moving, centers, moving.item.piece_poses(seconds)))
 
     def cast(self, rays: Rays) -> RayHits:
         """The first hit of each ray."""
@@ -132,39 +140,59 @@ class StreetSnapshot:
             np.full(count, np.inf), np.full(count, NO_HIT, np.int32), np.full(count, NO_HIT, np.int64),
             np.zeros((count, 3)), np.zeros((count, 2)),
         )  # fmt: skip
-        static = self.caster._static
-        if static is not None:
-            _keep_nearer(hits, static, static.intersect(rays.starts(), rays.directions), None, None)
-        for poses, piece in self._pieces:
-            chosen, origins, directions = _in_frame_of(piece, poses, rays.origins, rays.directions, rays.moment)
-            if len(chosen):
-                _keep_nearer(hits, piece, piece.intersect(origins, directions), chosen, poses[rays.moment[chosen]])
+        if self.caster._static is not None:
+            static = self.caster._static
+            _keep_nearer(hits, static, static.intersect(rays.starts(), rays.directions), np.arange(count), None)
+        for piece, poses, chosen in self._near(rays.directions, rays.moment, rays.origins, per_ray=False):
+            start, at = rays.origins[rays.moment[chosen]], rays.moment[chosen]
+            origins, toward = _in_frame(poses[:, :3, :3], poses[:, :3, 3], at, start, rays.directions[chosen])
+            _keep_nearer(hits, piece, piece.intersect(origins, toward), chosen, poses[at])
         return hits
 
     def unoccluded(self, points: np.ndarray, direction: np.ndarray, moment: np.ndarray) -> np.ndarray:
         """Whether nothing lies beyond each of `points` (n, 3) along `direction` (3,), at the time of `moment` (n,):
         (n,) bool."""
-        directions, free = np.broadcast_to(direction, points.shape), np.ones(len(points), dtype=bool)
+        directions = np.ascontiguousarray(np.broadcast_to(direction, points.shape))
+        free = np.ones(len(points), dtype=bool)
         if self.caster._static is not None:
             free &= ~self.caster._static.occluded(points, directions)
-        for poses, piece in self._pieces:
-            chosen, origins, toward = _in_frame_of(piece, poses, points, directions, moment, own_origins=True)
-            chosen_free = free[chosen]
-            if chosen_free.any():
-                kept = chosen[chosen_free]
-                free[kept] = ~piece.occluded(origins[chosen_free], toward[chosen_free])
+        for piece, poses, near in self._near(directions, moment, points, per_ray=True):
+            chosen = near[free[near]]
+            args = moment[chosen], points[chosen], directions[chosen]
+            free[chosen] = ~piece.occluded(*_in_frame(poses[:, :3, :3], poses[:, :3, 3], *args))
         return free
+
+    def _near(
+        self, directions: np.ndarray, moment: np.ndarray, origins: np.ndarray, per_ray: bool
+    ) -> Iterator[tuple[EmbreePiece, np.ndarray, np.ndarray]]:
+        """Each moving piece that rays may hit, with its poses (m, 4, 4) to the street and the indices of these rays.
+        `origins` are those of moments (m, 3), or of rays (n, 3) where `per_ray`."""
+        for moving, centers, poses in self._moving:
+            chosen = _passing(directions, moment, origins, per_ray, centers, moving.radius**2)
+            if len(chosen):
+                for number, piece in enumerate(moving.pieces):
+                    yield piece, poses[:, number], chosen
+
+
+def _bounding_sphere(item: StreetObject) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius of a sphere in an object's frame around all its pieces, at the times sampled."""
+    center = np.array([0.0, 0.0, item.size[2] / 2])
+    poses = item.body.poses(np.linspace(0.0, 6.0, SAMPLED_TIMES), np.linspace(0.0, 10.0, SAMPLED_TIMES))
+    radius = 0.0
+    for number, mesh in enumerate(item.body.pieces):
+        middle, extent = mesh.bounding_sphere
+        places = poses[:, number, :3, :3] @ middle + poses[:, number, :3, 3]
+        radius = max(radius, float(np.linalg.norm(places - center, axis=1).max()) + extent)
+    return center, 1.02 * radius
 
 
 def _keep_nearer(
-    hits: RayHits, piece: EmbreePiece, found: dict[str, np.ndarray], chosen: np.ndarray | None, poses: np.ndarray | None
+    hits: RayHits, piece: EmbreePiece, found: dict[str, np.ndarray], chosen: np.ndarray, poses: np.ndarray | None
 ) -> None:
-    """Enters Embree's hits of the rays `chosen` (all if None) that are nearer than those known. `poses` (chosen, 4, 4)
-    is the piece's frame to street."""
-    known = hits.distance if chosen is None else hits.distance[chosen]
-    nearer = np.flatnonzero((found["geomID"] >= 0) & (found["tfar"] < known))
-    rows = nearer if chosen is None else chosen[nearer]
-    geometry = found["geomID"][nearer]
+    """Enters Embree's hits of the rays `chosen` (k,) that are nearer than those known. `poses` (k, 4, 4): the piece's
+    frame to street; None if that is the same."""
+    nearer = np.flatnonzero((found["geomID"] >= 0) & (found["tfar"] < hits.distance[chosen]))
+    rows, geometry = chosen[nearer], found["geomID"][nearer]
     hits.distance[rows] = found["tfar"][nearer]
     hits.object[rows] = piece.owners[geometry]
     hits.face[rows] = found["primID"][nearer] + piece.first_faces[geometry]
@@ -173,40 +201,40 @@ def _keep_nearer(
     hits.weights[rows, 0], hits.weights[rows, 1] = found["u"][nearer], found["v"][nearer]
 
 
-def _in_frame_of(
-    piece: EmbreePiece, poses: np.ndarray, origins: np.ndarray, directions: np.ndarray, moment: np.ndarray,
-    own_origins: bool = False,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """The indices (k,) of the rays that may hit a moving piece, with their origins and directions (k, 3) in its frame.
-    `poses` (m, 4, 4): the piece to street. `origins` are those of moments (m, 3), or with `own_origins` of rays."""
-    rotations, centers = np.ascontiguousarray(poses[:, :3, :3]), poses[:, :3, 3]
-    return _local_rays(directions, moment, origins, own_origins, rotations, centers, piece.center, piece.radius**2)
+@kernel
+@no_type_check
+def _passing(directions, moment, origins, per_ray, centers, squared_radius):
+    """The indices of the rays that pass a sphere; its centre (m, 3) depends on the ray's moment."""
+    chosen = np.empty(len(directions), np.int64)
+    count = 0
+    for i in range(len(directions)):
+        m = moment[i]
+        source = i if per_ray else m
+        x, y, z = (
+            centers[m, 0] - origins[source, 0],
+            centers[m, 1] - origins[source, 1],
+            centers[m, 2] - origins[source, 2],
+        )
+        along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
+        beside = x * x + y * y + z * z - (along * along if along > 0.0 else 0.0)
+        if beside <= squared_radius:
+            chosen[count] = i
+            count += 1
+    return chosen[:count].copy()
 
 
 @kernel
 @no_type_check
-def _local_rays(directions, moment, origins, own_origins, rotations, positions, center, squared_radius):
-    """The indices of the rays that pass a sphere around `center` (3,) in a frame, and these rays in that frame. The
-    frame's `rotations` (m, 3, 3) and `positions` (m, 3) depend on the ray's moment."""
-    chosen = np.empty(len(directions), np.int64)
-    starts = np.empty((len(directions), 3), np.float32)
-    toward = np.empty((len(directions), 3), np.float32)
-    count = 0
-    start, ray = np.empty(3), np.empty(3)
-    for i in range(len(directions)):
+def _in_frame(rotations, positions, moment, origins, directions):
+    """Origins and directions (n, 3) float32 of rays in a frame, whose `rotations` (m, 3, 3) and `positions` (m, 3)
+    depend on the ray's moment."""
+    starts, toward = np.zeros((len(moment), 3), np.float32), np.zeros((len(moment), 3), np.float32)
+    for i in range(len(moment)):
         m = moment[i]
-        source = i if own_origins else m
         for c in range(3):
-            start[c] = ray[c] = 0.0
+            start = ray = 0.0
             for r in range(3):
-                start[c] += rotations[m, r, c] * (origins[source, r] - positions[m, r])
-                ray[c] += rotations[m, r, c] * directions[i, r]
-        x, y, z = center[0] - start[0], center[1] - start[1], center[2] - start[2]
-        squared = x * x + y * y + z * z
-        along = x * ray[0] + y * ray[1] + z * ray[2]
-        if squared <= squared_radius or (along > 0.0 and squared - along * along <= squared_radius):
-            chosen[count] = i
-            for c in range(3):
-                starts[count, c], toward[count, c] = start[c], ray[c]
-            count += 1
-    return chosen[:count], starts[:count], toward[:count]
+                start += rotations[m, r, c] * (origins[i, r] - positions[m, r])
+                ray += rotations[m, r, c] * directions[i, r]
+            starts[i, c], toward[i, c] = start, ray
+    return starts, toward

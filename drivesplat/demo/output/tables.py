@@ -10,13 +10,18 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.optics.rig import DemoSensor
+from drivesplat.demo.optics.lidar import scan_pattern
+from drivesplat.demo.optics.rig import DemoSensor, recording_sensors
 from drivesplat.demo.tokens import instance_token, token
 from drivesplat.io.storage import write_json
 from drivesplat.readers.nuscenes.layout import TABLES
+from drivesplat.settings.world import WorldSettings
 
 MAP = "maps/empty.png"
-ATTRIBUTES = ("vehicle.moving", "vehicle.parked", "pedestrian.moving")
+ATTRIBUTES = (
+    "vehicle.moving", "vehicle.parked", "vehicle.stopped", "pedestrian.moving", "pedestrian.standing",
+    "cycle.with_rider",
+)  # fmt: skip
 VISIBILITY = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
 
 
@@ -28,9 +33,7 @@ def visibility_level(fraction: float) -> str:
 class NuScenesTables:
     """The tables of one drive. `scene` is its name without `scene-`; `source` becomes part of the log's name."""
 
-    def __init__(
-        self, scene: str, description: str, source: str, start_us: int, sensors: tuple[DemoSensor, ...], width: int
-    ):
+    def __init__(self, scene: str, description: str, source: str, start_us: int, world: WorldSettings):
         self.scene = scene
         self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
         log = {"logfile": f"demo-{source}", "vehicle": "demo", "date_captured": "2026-01-01", "location": "demo"}
@@ -40,8 +43,8 @@ class NuScenesTables:
             self._add("visibility", level, level=name, description=f"visible fraction {name[1:]} %")
         for attribute in ATTRIBUTES:
             self._add("attribute", token(attribute), name=attribute, description="")
-        for sensor in sensors:
-            self._sensor(sensor, width)
+        for sensor in recording_sensors(world):
+            self._sensor(sensor, world)
         self._scene_row = self._add(
             "scene", token(scene), log_token=token(scene, "log"), nbr_samples=0, first_sample_token="",
             last_sample_token="", name=f"scene-{scene}", description=description,
@@ -63,13 +66,25 @@ class NuScenesTables:
         self._last[(table, *chain)] = row
         return row
 
-    def _sensor(self, sensor: DemoSensor, width: int) -> None:
+    def _sensor(self, sensor: DemoSensor, world: WorldSettings) -> None:
+        """`readout_s`, `readout_direction`, `beam_elevations` and `azimuth_steps` are additions to nuScenes' schema."""
         modality = "camera" if sensor.is_camera else "lidar"
         self._add("sensor", token("sensor", sensor.channel), channel=sensor.channel, modality=modality)
+        if sensor.is_camera:
+            shutter = {"readout_s": world.readout_s, "readout_direction": "down"}
+            details = {
+                "camera_intrinsic": sensor.intrinsics(world.width).tolist(),
+                **(shutter if world.readout_s else {}),
+            }
+        else:
+            pattern = scan_pattern(world.lidar, world.lidar_hz)
+            steps = len(pattern.azimuths)
+            details = {
+                "camera_intrinsic": [], "beam_elevations": pattern.elevations.tolist(), "azimuth_steps": steps,
+            }  # fmt: skip
         self._add(
             "calibrated_sensor", token("calibrated", sensor.channel), sensor_token=token("sensor", sensor.channel),
-            translation=list(sensor.translation), rotation=sensor.rotation.tolist(),
-            camera_intrinsic=sensor.intrinsics(width).tolist() if sensor.is_camera else [],
+            translation=list(sensor.translation), rotation=sensor.rotation.tolist(), **details,
         )  # fmt: skip
 
     def add_sample(self, index: int, time_us: int) -> None:

@@ -10,7 +10,7 @@ from drivesplat.demo.optics.imaging import Picture, to_bytes
 from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
 from drivesplat.demo.shapes.mesh import SurfaceClass
-from drivesplat.demo.tokens import instance_token, token
+from drivesplat.demo.tokens import token
 from drivesplat.io.storage import atomic_write
 from drivesplat.readers.truth import TRUTH_FILE, Truth, TruthFrame, TruthScan, TruthView, write_truth_file
 from drivesplat.scene.images import write_png
@@ -64,13 +64,13 @@ def _lateral(recorder: Recorder) -> dict[str, Viewpoint]:
     return {f"{'left' if m > 0 else 'right'}_{abs(m):g}m": Viewpoint(left=m) for m in offsets}
 
 
-def write_frame(root: Path, recorder: Recorder, scene: str, plan: TruthPlan, index: int) -> TruthFrame:
+def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> TruthFrame:
     """Renders and writes the truth of key frame `index` in a view."""
     sensor, view = plan.sensor, plan.viewpoint
     time_us = key_frame_time(recorder.world, index) + sensor.delay_us
     recorded = view == Viewpoint() and sensor.channel in (recorder.world.cameras or ())
     picture = (recorder.geometry if recorded else recorder.picture)(sensor, time_us, view)
-    images = {"depth": _depth(picture), "instances": _instances(recorder, scene, view, picture)}
+    images = {"depth": _depth(picture), "instances": _instances(recorder, view, picture)}
     images["classes"] = picture.classes
     if not recorded:
         images["image"] = to_bytes(picture.radiance)
@@ -78,7 +78,7 @@ def write_frame(root: Path, recorder: Recorder, scene: str, plan: TruthPlan, ind
     for kind, name in names.items():
         write_png((root / TRUTH_FILE).parent / name, images[kind])
     pose = STREET_TO_GLOBAL @ recorder.camera(sensor, time_us * 1e-6, view).pose
-    sample_data = token(scene, sensor.channel, time_us)
+    sample_data = token(recorder.scene, sensor.channel, time_us)
     return TruthFrame(sample_data, index, pose.tolist(), **{"image": None, **names})
 
 
@@ -87,26 +87,26 @@ def _depth(picture: Picture) -> np.ndarray:
     return np.clip(depth + 0.5, 0, 65535).astype(np.uint16)
 
 
-def _instances(recorder: Recorder, scene: str, view: Viewpoint, picture: Picture) -> np.ndarray:
-    return _numbers_of_objects(recorder, scene, view)[picture.objects + 1]
+def _instances(recorder: Recorder, view: Viewpoint, picture: Picture) -> np.ndarray:
+    return _numbers_of_objects(recorder, view)[picture.objects + 1]
 
 
-def instance_numbers(recorder: Recorder, scene: str) -> dict[str, int]:
+def instance_numbers(recorder: Recorder) -> dict[str, int]:
     """The number of each annotated object by its token, from 1; the objects of the drive first, then those that edits
     add."""
     streets = [recorder.variation(edit).street for edit in (None, *recorder.edits)]
     names = dict.fromkeys(item.name for street in streets for item in street.objects if item.category)
-    return {instance_token(scene, name): number for number, name in enumerate(names, start=1)}
+    return {recorder.instance(name): number for number, name in enumerate(names, start=1)}
 
 
-def _numbers_of_objects(recorder: Recorder, scene: str, view: Viewpoint) -> np.ndarray:
+def _numbers_of_objects(recorder: Recorder, view: Viewpoint) -> np.ndarray:
     """The instance number (objects + 1,) of each object of a view's street; the first entry is that of the sky."""
-    numbers = instance_numbers(recorder, scene)
+    numbers = instance_numbers(recorder)
     objects = recorder.variation(view.edit).street.objects
-    return np.array([0, *(numbers.get(instance_token(scene, item.name), 0) for item in objects)], dtype=np.uint8)
+    return np.array([0, *(numbers.get(recorder.instance(item.name), 0) for item in objects)], dtype=np.uint8)
 
 
-def write_scan(root: Path, recorder: Recorder, scene: str, plan: ScanPlan, index: int) -> TruthScan:
+def write_scan(root: Path, recorder: Recorder, plan: ScanPlan, index: int) -> TruthScan:
     """Casts and writes the LiDAR scan of key frame `index`."""
     time_us = key_frame_time(recorder.world, index) + LIDAR.delay_us
     found = recorder.scan(LIDAR, time_us, plan.viewpoint)
@@ -116,16 +116,14 @@ def write_scan(root: Path, recorder: Recorder, scene: str, plan: ScanPlan, index
             file,
             range=found.range.astype(np.float32),
             intensity=found.intensity.astype(np.float32),
-            instance=_numbers_of_objects(recorder, scene, plan.viewpoint)[found.object + 1],
+            instance=_numbers_of_objects(recorder, plan.viewpoint)[found.object + 1],
             returned=found.returned,
         )
     view = plan.viewpoint
-    return TruthScan(token(scene, LIDAR.channel, time_us), index, view.left, view.edit, name)
+    return TruthScan(token(recorder.scene, LIDAR.channel, time_us), index, view.left, view.edit, name)
 
 
-def write_truth(
-    root: Path, recorder: Recorder, scene: str, views: Iterable[TruthView], scans: Iterable[TruthScan]
-) -> None:
+def write_truth(root: Path, recorder: Recorder, views: Iterable[TruthView], scans: Iterable[TruthScan]) -> None:
     """Writes truth.json, and the pattern of the scans."""
     world, leading, scans = recorder.world, recorder.street.leading, tuple(scans)
     if scans:
@@ -133,12 +131,12 @@ def write_truth(
         with atomic_write((root / TRUTH_FILE).parent / PATTERN_FILE) as file:
             np.savez(file, elevations=pattern.elevations, azimuths=pattern.azimuths, offsets=pattern.offsets)
     truth = Truth(
-        scene=scene,
+        scene=recorder.scene,
         width=world.width,
         height=image_height(world.width),
         samples_per_pixel=world.samples_per_pixel,
-        leading=instance_token(scene, leading) if leading else None,
-        instances={str(number): token for token, number in instance_numbers(recorder, scene).items()},
+        leading=recorder.instance(leading) if leading else None,
+        instances={str(number): token for token, number in instance_numbers(recorder).items()},
         classes={str(int(c)): c.name.lower() for c in SurfaceClass},
         views=tuple(views),
         pattern=PATTERN_FILE if scans else None,

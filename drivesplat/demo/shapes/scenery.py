@@ -4,7 +4,17 @@ import numpy as np
 import trimesh
 
 from drivesplat.demo.shapes.mesh import (
-    BARK, METAL, TYRE, Color, ColoredMesh, Material, Numbers, SurfaceClass, box, concatenate, cylinder, ellipsoid,
+    BARK,
+    METAL,
+    TYRE,
+    Color,
+    ColoredMesh,
+    Material,
+    Numbers,
+    box,
+    concatenate,
+    cylinder,
+    ellipsoid,
     uniform,
 )  # fmt: skip
 from drivesplat.demo.shapes.vehicles import HEADLIGHT

@@ -3,7 +3,18 @@
 from collections.abc import Sequence
 
 from drivesplat.demo.shapes.mesh import (
-    METAL, TYRE, Color, ColoredMesh, Material, Numbers, SurfaceClass, box, concatenate, cylinder, hull, symmetric_hull,
+    METAL,
+    TYRE,
+    Color,
+    ColoredMesh,
+    Material,
+    Numbers,
+    SurfaceClass,
+    box,
+    concatenate,
+    cylinder,
+    hull,
+    symmetric_hull,
 )  # fmt: skip
 
 TAIL_LIGHT, HEADLIGHT, WINDSCREEN = (0.75, 0.05, 0.04), (0.95, 0.95, 0.85), (0.02, 0.025, 0.03)

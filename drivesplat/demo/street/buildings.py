@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from drivesplat.demo.street.layout import SIDEWALK, WINDOW
 from drivesplat.demo.shapes.mesh import Color, ColoredMesh
 from drivesplat.demo.shapes.scenery import building
+from drivesplat.demo.street.layout import SIDEWALK, WINDOW
 from drivesplat.demo.street.road import Road
 
 ALONG = (-80.0, 260.0)

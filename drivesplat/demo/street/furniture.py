@@ -31,6 +31,6 @@ def furniture(road: Road, lamps: np.ndarray, random: np.random.Generator) -> lis
     found = [road.place(scenery.street_lamp(6.5, -np.sign(t) * 1.5), s, t) for s, t in lamps]
     found += [road.place(scenery.sign(color), s + random.uniform(-3, 3), -6.5) for s, color in SIGNS]
     found += [
-        road.place(scenery.bin(), s, side * 6.4) for s, side in ((17.0, 1), (52.0, -1), (81.0, 1), (110.0, -1))
+        road.place(scenery.litter_bin(), s, side * 6.4) for s, side in ((17.0, 1), (52.0, -1), (81.0, 1), (110.0, -1))
     ]
     return found

@@ -66,9 +66,9 @@ class StreetPath:
         poses = self.road.poses(self.along(seconds), t, yaw)
         if self.suspension and self.speed:
             pitch, roll, heave = (a * np.sin(w * seconds + p) for a, w, p in SUSPENSION)
-            poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_euler(
-                "xy", np.stack([roll, pitch], axis=-1), degrees=True
-            ).as_matrix()
+            poses[:, :3, :3] = (
+                poses[:, :3, :3] @ Rotation.from_euler("xy", np.stack([roll, pitch], axis=-1), degrees=True).as_matrix()
+            )
             poses[:, 2, 3] += heave
         return poses
 

@@ -40,9 +40,7 @@ def _encounter(
     return second, float(ego.along(np.array([second]))[0]) + spread
 
 
-def _walker(
-    world: WorldSettings, road: Road, ego: StreetPath, index: int, random: np.random.Generator
-) -> StreetObject:
+def _walker(world: WorldSettings, road: Road, ego: StreetPath, index: int, random: np.random.Generator) -> StreetObject:
     side = (-1) ** (index + 1)
     second, place = _encounter(world, ego, index, world.pedestrians, random)
     if ego.speed <= 3.0:  # nobody passes: they keep a distance of their own

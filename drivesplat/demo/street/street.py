@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-
 from drivesplat.demo.shapes import scenery
 from drivesplat.demo.shapes.body import RigidBody
 from drivesplat.demo.shapes.mesh import concatenate
@@ -73,5 +72,3 @@ def road_of(world: WorldSettings) -> Road:
 def street_with(street: Street, objects: tuple[StreetObject, ...]) -> Street:
     """The street with other objects."""
     return replace(street, objects=tuple(sorted(objects, key=lambda item: item.moves)))
-
-

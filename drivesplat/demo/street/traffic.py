@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivesplat.demo.street.layout import CROSSING, LANE, ROAD
 from drivesplat.demo.shapes.body import RigidBody
 from drivesplat.demo.shapes.vehicles import vehicle
+from drivesplat.demo.street.layout import CROSSING, LANE, ROAD
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import LANE_CENTER, StreetPath
 from drivesplat.demo.street.road import Road
@@ -42,12 +42,14 @@ def free_traffic(world: WorldSettings, road: Road, random: np.random.Generator) 
         paths.append(StreetPath(s, -LANE_CENTER, speed, 1.2, 0.1, 7.0 + i, road=road))
         paths.append(StreetPath(96.0 + 42.0 * i, LANE_CENTER, -(9.0 + 0.7 * i), 0.7, 0.1, 8.0, road=road))
     kinds = ("van" if i % 3 == 2 else "car" for i in range(world.vehicles))
-    return [_vehicle(f"vehicle {i}", kind, path, random) for i, (kind, path) in enumerate(zip(kinds, paths))]
+    return [
+        _vehicle(f"vehicle {i}", kind, path, random) for i, (kind, path) in enumerate(zip(kinds, paths, strict=False))
+    ]
 
 
 def queue(world: WorldSettings, road: Road, random: np.random.Generator) -> list[StreetObject]:
-    """Vehicles at close range in both lanes: those ahead creep like the ego vehicle, every third oncoming one stands.
-    """
+    """Vehicles at close range in both lanes. Those ahead creep as the ego vehicle does; every third oncoming one
+    stands."""
     ego = ego_path(world, road)
     objects, front = [], ego.s + EGO_REACH[1]
     for i, (kind, gap) in enumerate(QUEUE_AHEAD):

@@ -24,6 +24,7 @@ from drivesplat.settings.extract import SceneSource
 
 READER = "nuscenes"
 KEY_FRAME_HZ = 2.0
+"""The rate of a drive with one key frame."""
 LIDAR = "LIDAR_TOP"
 BEAM_ELEVATIONS = np.radians(np.linspace(-30.67, 10.67, 32))
 AZIMUTH_STEPS = 1085
@@ -59,7 +60,7 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
         sweeps=(),
         tracks=(),
         poses=READER,
-        key_frame_hz=KEY_FRAME_HZ,
+        key_frame_hz=_key_frame_hz(times),
         key_frame_range=list(frames) if frames else None,
     )
     images = [f for camera in cameras for f in _frames(tables, root, samples, camera, source.sweeps, scene)]
@@ -69,14 +70,32 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
         frames=tuple(images),
         sweeps=sweeps,
         tracks=tuple(_tracks(tables, samples, origin)),
-        cameras=tuple({frame.camera: _camera(frame) for frame in images}.values()),
-        lidars=(Lidar(LIDAR, BEAM_ELEVATIONS, AZIMUTH_STEPS),) if sweeps else (),
+        cameras=tuple({frame.camera: _camera(tables, frame) for frame in images}.values()),
+        lidars=(_lidar(tables, sweeps[0]),) if sweeps else (),
     )
 
 
-def _camera(frame: Frame) -> Camera:
-    """The camera of a frame; nuScenes' images are rectified, its readout times are unknown."""
-    return Camera(frame.camera, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5))
+def _camera(tables: Any, frame: Frame) -> Camera:
+    """The camera of a frame. nuScenes' images are rectified; only synthetic worlds state readout times."""
+    sensor = _calibration(tables, frame.token)
+    readout = {name: sensor.get(name) for name in ("readout_s", "readout_direction")}
+    return Camera(frame.camera, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5), **readout)
+
+
+def _lidar(tables: Any, sweep: Sweep) -> Lidar:
+    """The LiDAR of a sweep: nuScenes' own, unless a synthetic world states its beams."""
+    sensor = _calibration(tables, sweep.token)
+    elevations = np.array(sensor.get("beam_elevations", BEAM_ELEVATIONS), dtype=np.float64)
+    return Lidar(LIDAR, elevations, sensor.get("azimuth_steps", AZIMUTH_STEPS))
+
+
+def _calibration(tables: Any, sample_data: str) -> dict:
+    return _get(tables, "calibrated_sensor", _get(tables, "sample_data", sample_data)["calibrated_sensor_token"])
+
+
+def _key_frame_hz(times: np.ndarray) -> float:
+    """The nominal rate of key frames: nuScenes' is 2 Hz within a tenth; synthetic worlds have others."""
+    return float(round(1e6 / np.median(np.diff(times)))) if len(times) > 1 else KEY_FRAME_HZ
 
 
 def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
