@@ -42,23 +42,25 @@ RECORDED = Viewpoint()
 
 
 class Recorder:
-    """Records the street of `world` as the drive `scene`. Deterministic: each recording has its own random generator."""
+    """Records the street of `world` as the drive `scene`. Each recording has its own random generator."""
 
     def __init__(self, world: WorldSettings, scene: str = "demo", edits: Mapping[str, Edit] | None = None):
         self.world, self.scene, self.edits = world, scene, dict(edits or {})
         self.street = build_street(world)
         self.objects = self.street.objects
-        self._variations: dict[str | None, tuple[Variation, RayCaster]] = {}
+        self._variations: dict[str | None, Variation] = {None: Variation(self.street)}
+        self._casters: dict[str | None, RayCaster] = {}
 
     def variation(self, edit: str | None = None) -> Variation:
         """The street and the ego path of the drive, or of an edit of it."""
-        return self._variation(edit)[0]
-
-    def _variation(self, edit: str | None) -> tuple[Variation, RayCaster]:
         if edit not in self._variations:
-            changed = self._edited(edit) if edit else Variation(self.street)
-            self._variations[edit] = changed, RayCaster(changed.street.objects)
+            self._variations[edit] = self._edited(edit)
         return self._variations[edit]
+
+    def _caster(self, edit: str | None) -> RayCaster:
+        if edit not in self._casters:
+            self._casters[edit] = RayCaster(self.variation(edit).street.objects)
+        return self._casters[edit]
 
     def _edited(self, edit: str) -> Variation:
         delays = [sensor.delay_us for sensor in recording_sensors(self.world) if sensor.is_camera]
@@ -72,7 +74,7 @@ class Recorder:
     def snapshot(self, seconds: np.ndarray, view: Viewpoint = RECORDED, for_lidar: bool = False) -> StreetSnapshot:
         """The street at the times `seconds` (m,), as cameras see it."""
         without = {name for name in (view.without, None if for_lidar else EGO_BODY) if name}
-        return self._variation(view.edit)[1].at(np.atleast_1d(np.asarray(seconds, dtype=np.float64)), without)
+        return self._caster(view.edit).at(np.atleast_1d(np.asarray(seconds, dtype=np.float64)), without)
 
     def ego_to_street(self, seconds: np.ndarray, view: Viewpoint = RECORDED) -> np.ndarray:
         """True ego poses (m, 4, 4) at `seconds` (m,), moved to the left as the viewpoint states."""

@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from drivesplat.demo.output.tables import NuScenesTables
 from drivesplat.demo.output.truth import (
     ScanPlan,
     TruthPlan,
+    key_frames_of,
     planned_scans,
     planned_views,
     write_frame,
@@ -67,11 +69,11 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
     views, scans = planned_views(recorder), planned_scans(recorder)
     images = sum(file.sensor.is_camera for file in files)
     require_space(root, world_bytes(job.world, images, len(files) - images, len(views), len(scans)))
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _start_worker, (recorder, root)) as pool:
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _start_worker, (job, root)) as pool:
         counts = pool.map(_write_file, files)
         visible = pool.map(_visible_fractions, range(job.world.key_frames))
-        frames = [pool.map(_write_frame, *_per_key_frame(plan, job.world)) for plan in views]
-        sweeps = [pool.map(_write_scan, *_per_key_frame(plan, job.world)) for plan in scans]
+        frames = [pool.map(_write_frame, repeat(plan), key_frames_of(recorder, plan)) for plan in views]
+        sweeps = [pool.map(_write_scan, repeat(plan), range(job.world.key_frames)) for plan in scans]
         lidar = {f.index: n for f, n in zip(files, counts, strict=True) if n is not None and f.is_key_frame}
         for index, fractions in enumerate(visible):
             _annotate(tables, recorder, index, fractions, lidar[index])
@@ -115,10 +117,6 @@ def _annotate(
             tables.add_annotation(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
 
 
-def _per_key_frame(plan: TruthPlan | ScanPlan, world: WorldSettings) -> tuple[list[TruthPlan | ScanPlan], range]:
-    return [plan] * world.key_frames, range(world.key_frames)
-
-
 def _view(recorder: Recorder, plan: TruthPlan, frames: tuple[TruthFrame, ...]) -> TruthView:
     view = plan.viewpoint
     without = recorder.instance(view.without) if view.without else None
@@ -129,9 +127,9 @@ _worker: tuple[Recorder, Path]
 """In a worker process: the recorder and the dataset's root."""
 
 
-def _start_worker(recorder: Recorder, root: Path) -> None:
+def _start_worker(job: WorldJob, root: Path) -> None:
     global _worker
-    _worker = recorder, root
+    _worker = Recorder(job.world, job.scene, job.edits), root
 
 
 def _write_file(file: SensorFile) -> np.ndarray | None:

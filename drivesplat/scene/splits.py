@@ -8,6 +8,8 @@ from drivesplat.scene.scene import Scene
 from drivesplat.settings.holdout import HoldoutSettings
 
 Group = Literal["train", "interpolation", "extrapolation", "excluded"]
+NEIGHBOURHOOD_HZ = 5.0
+"""Key frames a second from which `holdout.neighbourhood_s` applies."""
 HELD_OUT_GROUPS: tuple[Group, Group] = ("interpolation", "extrapolation")
 
 
@@ -21,21 +23,24 @@ def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[
 def group_of_times(
     scene: Scene, timestamps: np.ndarray, sample_indices: np.ndarray, is_key_frame: np.ndarray, holdout: HoldoutSettings
 ) -> list[Group]:
-    """The group of each image or sweep: that of its index for a key frame; between key frames, 'excluded' if nearer
-    than half a key-frame interval to a held-out one, else 'train'.
+    """The group of each image or sweep: that of a held-out key frame; 'excluded' if nearer to one than the
+    neighbourhood; else 'train'.
 
+    The neighbourhood is half a key-frame interval below NEIGHBOURHOOD_HZ, else `holdout.neighbourhood_s`.
     `timestamps` (n,) microseconds, `sample_indices` (n,), `is_key_frame` (n,).
     """
     held_out = held_out_key_frames(len(scene.key_frame_timestamps), holdout)
     group_of_key_frame = {i: group for group, indices in held_out.items() for i in indices}
     held_out_times = scene.key_frame_timestamps[sorted(group_of_key_frame)]
+    dense = scene.key_frame_hz >= NEIGHBOURHOOD_HZ
+    neighbourhood = holdout.neighbourhood_s * 1e6 if dense else scene.key_frame_interval / 2.0
     groups: list[Group] = []
     for time, index, key in zip(timestamps, sample_indices, is_key_frame, strict=True):
-        if key:
-            groups.append(group_of_key_frame.get(int(index), "train"))
+        if key and int(index) in group_of_key_frame:
+            groups.append(group_of_key_frame[int(index)])
         else:
-            near = np.any(np.abs(held_out_times - time) < scene.key_frame_interval / 2.0)
-            groups.append("excluded" if near else "train")
+            near = np.any(np.abs(held_out_times - time) < neighbourhood)
+            groups.append("excluded" if near and (dense or not key) else "train")
     return groups
 
 

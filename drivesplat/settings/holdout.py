@@ -12,6 +12,9 @@ class HoldoutSettings(Settings):
     """See every_nth. Must be less than every_nth. 0 would hold out the first key frame, which has no predecessor."""
     last_block: int = Field(4, ge=0)
     """Number of key frames held out at the end of the drive: group 'extrapolation'. 0 = none."""
+    neighbourhood_s: float = Field(0.25, ge=0, le=5)
+    """Time in seconds around a held-out key frame in which nothing is trained on, for datasets with 5 key frames a
+    second or more. Below that rate it is half the interval between key frames."""
 
     @model_validator(mode="after")
     def _offset_within_period(self) -> "HoldoutSettings":

@@ -10,15 +10,10 @@ from typing import no_type_check
 import numpy as np
 
 from drivesplat.demo.shapes.mesh import Material
+from drivesplat.demo.street.layout import CROSSING, CURB, LANE, ROAD, SIDEWALK, WINDOW
 from drivesplat.kernels.cache import kernel
 
 compiled = kernel(fastmath=True)
-
-LANE, ROAD, CURB, SIDEWALK = 3.5, 5.9, 6.15, 9.5
-"""Distances of outer edges from the centre line (metres)."""
-CROSSING = (46.0, 49.0)
-WINDOW = (3.2, 3.0)
-"""Width and height (metres) of the cells of a facade, one window each."""
 
 PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES, METAL_, SIGN_ = (int(m) for m in Material)
 

@@ -14,10 +14,13 @@ from drivesplat.demo.tokens import token
 from drivesplat.io.storage import atomic_write
 from drivesplat.readers.truth import TRUTH_FILE, Truth, TruthFrame, TruthScan, TruthView, write_truth_file
 from drivesplat.scene.images import write_png
+from drivesplat.scene.rigid import apply, inverse
 
 DEPTH_UNIT = 256.0
 LIDAR = SENSORS[0]
 PATTERN_FILE = "lidar/pattern.npz"
+CLEARANCE = 0.3
+"""Metres between a camera and the box of an object below which an image shows next to nothing else."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,22 @@ def planned_scans(recorder: Recorder) -> list[ScanPlan]:
     viewpoints = {"recorded": Viewpoint(), **_lateral(recorder)}
     viewpoints |= {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
     return [ScanPlan(view, f"lidar/{name}") for name, view in viewpoints.items()]
+
+
+def key_frames_of(recorder: Recorder, plan: TruthPlan) -> list[int]:
+    """The key frames of a view: all but those at which its camera is inside an object or about to touch one."""
+    return [i for i in range(recorder.world.key_frames) if not _touches(recorder, plan, i)]
+
+
+def _touches(recorder: Recorder, plan: TruthPlan, index: int) -> bool:
+    seconds = np.array([(key_frame_time(recorder.world, index) + plan.sensor.delay_us) * 1e-6])
+    center = (recorder.ego_to_street(seconds, plan.viewpoint)[0] @ plan.sensor.sensor_to_ego)[:3, 3]
+    for item in recorder.variation(plan.viewpoint.edit).street.objects:
+        if item.category and item.name != plan.viewpoint.without:
+            beside = np.abs(apply(inverse(item.box_poses(seconds)[0]), center[None])[0])
+            if (beside < item.size / 2 + CLEARANCE).all():
+                return True
+    return False
 
 
 def _lateral(recorder: Recorder) -> dict[str, Viewpoint]:

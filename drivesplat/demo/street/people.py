@@ -5,6 +5,7 @@ import numpy as np
 from drivesplat.demo.shapes.animals import Dog
 from drivesplat.demo.shapes.cyclist import Cyclist
 from drivesplat.demo.shapes.people import Person
+from drivesplat.demo.street.layout import WALKWAY, WALL_SIDE
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import StreetPath
 from drivesplat.demo.street.road import Road
@@ -13,9 +14,8 @@ from drivesplat.settings.world import WorldSettings
 WALKING_SPEED = {-1: 1.25, 1: 1.45}
 """Speed (m/s) of all pedestrians on a side of the road, so that they keep their distances."""
 CYCLING_SPEED = 4.2
-WALKWAY, WALL_SIDE, ROAD_EDGE = 7.07, 9.2, 3.2
-"""Distances (metres) from the centre line: of pedestrians, between lamps and trees; of people who stand by the houses;
-of cyclists, between the lane and parked vehicles."""
+CYCLE_LANE = 3.4
+"""Distance (metres) of cyclists from the centre line."""
 AHEAD = (8.0, 13.0)
 """Nearest and farthest metres ahead of the camera at which someone is placed at their moment."""
 DOG_LEAD = 1.4
@@ -70,7 +70,7 @@ def _cyclist(
     side = (-1) ** (index + 1)
     second, place = _encounter(world, ego, index, world.cyclists, random)
     speed = -side * CYCLING_SPEED
-    path = StreetPath(place - speed * second, side * ROAD_EDGE, speed, road=road)
+    path = StreetPath(place - speed * second, side * CYCLE_LANE, speed, road=road)
     return StreetObject(f"cyclist {index}", Cyclist.drawn(random), path, "vehicle.bicycle", "cycle.with_rider")
 
 

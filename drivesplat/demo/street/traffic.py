@@ -6,7 +6,7 @@ import numpy as np
 
 from drivesplat.demo.shapes.body import RigidBody
 from drivesplat.demo.shapes.vehicles import vehicle
-from drivesplat.demo.street.layout import CROSSING, LANE, ROAD
+from drivesplat.demo.street.layout import CROSSING, PARKING
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import LANE_CENTER, StreetPath
 from drivesplat.demo.street.road import Road
@@ -74,7 +74,7 @@ def parked(world: WorldSettings, road: Road, cones: np.ndarray, random: np.rando
     clear = [(s, side) for s, side in drawn if side > 0 or np.abs(cones[:, 0] - s).min() > 5.0]
     objects = []
     for i, (s, side) in enumerate(clear[: world.parked]):
-        t = side * ((LANE + ROAD) / 2 + random.uniform(-0.1, 0.1))
+        t = side * (PARKING + random.uniform(-0.1, 0.1))
         path = StreetPath(s, t, heading=0.0 if side < 0 else np.pi, road=road)
         objects.append(_vehicle(f"parked {i}", "van" if i % 5 == 4 else "car", path, random, "vehicle.parked"))
     return objects
