@@ -8,6 +8,8 @@ from drivesplat.settings.edit import Place
 
 KNOT_HZ = 10.0
 """Poses a second of the motion."""
+STANDS_S = 3600.0
+"""Seconds for which a copy on a path of one point is present."""
 MIN_STEP = 1e-3
 """Metres; a shorter step has no direction."""
 
@@ -20,7 +22,7 @@ def placed_motion(place: Place, ego_to_world: np.ndarray, height: float) -> Moti
     """
     points = np.array(place.path)
     if len(points) == 1:
-        times = points[0, :1] + np.array([0.0, 1.0])
+        times = points[0, :1] + np.array([0.0, STANDS_S])
         positions = np.repeat(points[:, 1:], 2, axis=0)
     else:
         times = np.linspace(points[0, 0], points[-1, 0], max(2, int(KNOT_HZ * np.ptp(points[:, 0])) + 1))
