@@ -1,80 +1,121 @@
-"""Pedestrians, bystanders, cyclists and dogs: placed where the front camera sees them, one after the other."""
+"""Pedestrians, bystanders, cyclists and dogs: placed where the front camera sees them in held-out frames."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from drivesplat.demo.shapes.animals import Dog
 from drivesplat.demo.shapes.cyclist import Cyclist
 from drivesplat.demo.shapes.people import Person
-from drivesplat.demo.street.layout import WALKWAY, WALL_SIDE
+from drivesplat.demo.street.layout import CYCLE_LANE, ROADSIDE, SIDEWALK_PATH, WALL_SIDE
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import StreetPath
 from drivesplat.demo.street.road import Road
+from drivesplat.scene.splits import held_out_key_frames
+from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.world import WorldSettings
 
-WALKING_SPEED = {-1: 1.25, 1: 1.45}
-"""Speed (m/s) of all pedestrians on a side of the road, so that they keep their distances."""
 CYCLING_SPEED = 4.2
-CYCLE_LANE = 3.4
-"""Distance (metres) of cyclists from the centre line."""
-AHEAD = (8.0, 13.0)
-"""Nearest and farthest metres ahead of the camera at which someone is placed at their moment."""
+BYSTANDER_AHEAD, CYCLIST_AHEAD = 15.0, 9.0
+"""Metres ahead of the ego vehicle at which they are placed."""
 DOG_LEAD = 1.4
 """Metres that a dog is ahead of its owner."""
+AT_ONCE_S, ABREAST = 0.45, 1.5
+"""People within so many seconds take different walkways, and more than these keep so many metres between them."""
+
+
+@dataclass(frozen=True)
+class Walkway:
+    """Where pedestrians walk: `t` metres to the left of the centre line, at `speed` m/s along the road; one is placed
+    `ahead` metres of the ego vehicle, just within the front camera's field of view. All in one walkway have the same
+    speed, so that they keep their distances."""
+
+    t: float
+    speed: float
+    ahead: float
+
+
+WALKWAYS = (
+    Walkway(-ROADSIDE, -1.25, 8.0),
+    Walkway(-SIDEWALK_PATH, 1.45, 12.0),
+    Walkway(ROADSIDE, 1.3, 12.0),
+    Walkway(SIDEWALK_PATH, -1.4, 18.0),
+)
+
+
+@dataclass(frozen=True)
+class Encounter:
+    """The second of the drive at which somebody is close ahead of the ego vehicle, and how many are before them within
+    AT_ONCE_S."""
+
+    second: float
+    before: int
 
 
 def people(world: WorldSettings, road: Road, ego: StreetPath, random: np.random.Generator) -> list[StreetObject]:
-    """All of them. Each is `AHEAD` of the ego vehicle at a moment of their own, evenly spread over the drive."""
-    walkers = [_walker(world, road, ego, i, random) for i in range(world.pedestrians)]
-    standing = [_bystander(world, road, ego, i, random) for i in range(world.bystanders)]
-    cyclists = [_cyclist(world, road, ego, i, random) for i in range(world.cyclists)]
+    """Pedestrians, bystanders, cyclists and dogs."""
+    walkers = [_walker(i, met, road, ego, random) for i, met in enumerate(encounters(world, world.pedestrians))]
+    standing = [_bystander(i, met, road, ego, random) for i, met in enumerate(encounters(world, world.bystanders))]
+    cyclists = [_cyclist(i, met, road, ego, random) for i, met in enumerate(encounters(world, world.cyclists))]
     dogs = [_dog(i, walkers[i], random) for i in range(min(world.dogs, len(walkers)))]
     return [*walkers, *standing, *cyclists, *dogs]
 
 
-def _encounter(
-    world: WorldSettings, ego: StreetPath, index: int, count: int, random: np.random.Generator
-) -> tuple[float, float]:
-    """The second of the drive at which one of `count` is ahead of the ego vehicle, and their place s (metres) then."""
-    second = (index + 0.5) / count * world.seconds
-    spread = random.uniform(*AHEAD) if ego.speed > 3.0 else random.uniform(AHEAD[0] - 2.0, AHEAD[1] + 12.0)
-    return second, float(ego.along(np.array([second]))[0]) + spread
+def encounters(world: WorldSettings, count: int) -> list[Encounter]:
+    """When each of `count` people is met: one half at frames that the default protocol holds out between training
+    frames, the other at frames of its last block."""
+    groups = held_out_key_frames(world.key_frames, HoldoutSettings())
+    between, last = groups["interpolation"], groups["extrapolation"]
+    half = -(-count // 2) if between else 0
+    shares = ((between, half), (last, count - half))
+    frames = [frames[k * len(frames) // share] for frames, share in shares for k in range(share)]
+    seconds = [frame / world.key_frame_hz for frame in frames]
+    return [
+        Encounter(second, sum(abs(second - earlier) < AT_ONCE_S for earlier in seconds[:i]))
+        for i, second in enumerate(seconds)
+    ]
 
 
-def _walker(world: WorldSettings, road: Road, ego: StreetPath, index: int, random: np.random.Generator) -> StreetObject:
-    side = (-1) ** (index + 1)
-    second, place = _encounter(world, ego, index, world.pedestrians, random)
-    if ego.speed <= 3.0:  # nobody passes: they keep a distance of their own
-        place = ego.s + AHEAD[0] - 2.0 + 3.5 * (index // 2) + 0.5 * side
-    speed = -side * WALKING_SPEED[side]
-    t = side * (WALKWAY + random.uniform(-0.05, 0.05))
-    path = StreetPath(place - speed * second, t, speed, road=road)
+def _place(ego: StreetPath, met: Encounter, ahead: float) -> float:
+    """The place s (metres) of an encounter."""
+    return float(ego.along(np.array([met.second]))[0]) + ahead
+
+
+def _walker(
+    index: int, met: Encounter, road: Road, ego: StreetPath, random: np.random.Generator
+) -> StreetObject:  # fmt: skip
+    row, number = divmod(met.before, len(WALKWAYS))
+    walkway = WALKWAYS[number]
+    start = _place(ego, met, walkway.ahead + ABREAST * row) - walkway.speed * met.second
+    path = StreetPath(start, walkway.t, walkway.speed, road=road)
     body = Person.drawn(random, walks=True)
     return StreetObject(f"pedestrian {index}", body, path, "human.pedestrian.adult", "pedestrian.moving")
 
 
 def _bystander(
-    world: WorldSettings, road: Road, ego: StreetPath, index: int, random: np.random.Generator
-) -> StreetObject:
-    side = (-1) ** index
-    _, place = _encounter(world, ego, index, world.bystanders, random)
-    turning, period = random.uniform(0.6, 1.2), random.uniform(5.0, 8.0)
-    heading = -side * np.pi / 2
-    path = StreetPath(place, side * WALL_SIDE, heading=heading, turning=turning, period=period, road=road)
+    index: int, met: Encounter, road: Road, ego: StreetPath, random: np.random.Generator
+) -> StreetObject:  # fmt: skip
+    side = (-1) ** (met.before + 1)
+    place = _place(ego, met, BYSTANDER_AHEAD + ABREAST * (met.before // 2))
+    path = StreetPath(
+        place, side * WALL_SIDE, heading=-side * np.pi / 2, turning=random.uniform(0.6, 1.2),
+        period=random.uniform(5.0, 8.0), road=road,
+    )  # fmt: skip
     body = Person.drawn(random, walks=False)
     return StreetObject(f"bystander {index}", body, path, "human.pedestrian.adult", "pedestrian.standing")
 
 
 def _cyclist(
-    world: WorldSettings, road: Road, ego: StreetPath, index: int, random: np.random.Generator
-) -> StreetObject:
+    index: int, met: Encounter, road: Road, ego: StreetPath, random: np.random.Generator
+) -> StreetObject:  # fmt: skip
     side = (-1) ** (index + 1)
-    second, place = _encounter(world, ego, index, world.cyclists, random)
     speed = -side * CYCLING_SPEED
-    path = StreetPath(place - speed * second, side * CYCLE_LANE, speed, road=road)
+    place = _place(ego, met, CYCLIST_AHEAD + 2 * ABREAST * (met.before // 2))
+    path = StreetPath(place - speed * met.second, side * CYCLE_LANE, speed, road=road)
     return StreetObject(f"cyclist {index}", Cyclist.drawn(random), path, "vehicle.bicycle", "cycle.with_rider")
 
 
 def _dog(index: int, owner: StreetObject, random: np.random.Generator) -> StreetObject:
     walk = owner.path
     path = StreetPath(walk.s + np.sign(walk.speed) * DOG_LEAD, walk.t, walk.speed, road=walk.road)
-    return StreetObject(f"dog {index}", Dog.drawn(random), path, "animal", None)
+    return StreetObject(f"dog {index}", Dog.drawn(random), path, "animal")

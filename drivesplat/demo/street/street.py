@@ -18,7 +18,7 @@ from drivesplat.demo.street.road import STRAIGHT, Road
 from drivesplat.demo.street.traffic import ego_path, free_traffic, parked, queue
 from drivesplat.settings.world import WorldSettings
 
-CONES = np.array([(57.0, -4.6), (59.5, -4.3), (62.0, -4.0)])
+CONES = np.array([(57.0, -5.0), (59.5, -4.75), (62.0, -4.5)])
 BEND_RADIUS = 90.0
 """Metres."""
 BEND_START, RISE = 55.0, (15.0, 110.0)
