@@ -30,8 +30,8 @@ rule lpips_backbone:
 rule evaluate:
     """
     Renders the held-out images of the evaluated camera and measures PSNR, SSIM and LPIPS over static and dynamic pixels;
-    on a synthetic world also a lateral view and the removal of the leading car, compared with the ground truth. Writes
-    one held-out image as recorded and as rendered.
+    on a synthetic world also lateral views, their depth, and the removal of the leading car, compared with the ground
+    truth. Writes one held-out image as recorded and as rendered.
     """
     input:
         scene=plan.scene,

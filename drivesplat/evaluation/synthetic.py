@@ -1,5 +1,5 @@
-"""Renderings compared with the truth of a synthetic world: views from beside the recorded path, and the street without
-the leading car."""
+"""Renderings compared with the truth of a synthetic world: images and depth from beside the recorded path, and the
+street without the leading car."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -7,16 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
+from PIL import Image, UnidentifiedImageError
 
+from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads
 from drivesplat.io.prefetch import prefetch
+from drivesplat.io.storage import unreadable
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
-from drivesplat.readers.truth import Truth, TruthFrame, truth_image
+from drivesplat.readers.truth import RULE, Truth, TruthFrame, TruthView, truth_image
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
@@ -24,8 +29,11 @@ from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at
 
-LATERAL_REGIONS = ("all", "static")
+LATERAL_REGIONS = ("all", "static", "moving_vehicle")
 REMOVAL_REGIONS = ("box", "outside")
+DEPTH_UNITS_PER_METRE = 256.0
+DEPTH_LIMIT = 65535
+"""The largest value of a 16-bit depth image; farther depths are clipped to it."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +44,49 @@ class DriveTruth:
     path: Path
     recording: PreparedDrive
 
-    def frames(self, camera: str) -> Iterator[tuple[int, TruthFrame]]:
-        """The indices of the images of `camera` that have truth, each with its truth."""
-        by_image = self.truth.by_image()
+    def frames(self, view: TruthView) -> Iterator[tuple[int, TruthFrame]]:
+        """The indices of the recorded images that a view has truth for, each with its truth."""
+        by_image = view.by_image()
         for index, frame in enumerate(self.recording.scene.frames):
-            if frame.camera == camera and frame.token in by_image:
+            if frame.token in by_image:
                 yield index, by_image[frame.token]
+
+    def lateral_frames(self, view: TruthView) -> Iterator[tuple[int, Frame, TruthFrame]]:
+        """The indices of the recorded images that a lateral view has truth for, each as taken from that view's offset,
+        with its truth.
+
+        The offset from the recorded pose is that between the true poses, so that errors of recorded poses do not shift
+        the view against its true image.
+        """
+        recorded = self.truth.recorded(view.camera)
+        true_poses = {token: frame.camera_to_global for token, frame in recorded.by_image().items()} if recorded else {}
+        for index, truth in self.frames(view):
+            if truth.sample_data in true_poses:
+                frame, true_pose = self.recording.frame(index), np.array(true_poses[truth.sample_data])
+                offset = inverse(true_pose) @ np.array(truth.camera_to_global)
+                yield index, dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ offset), truth
 
     def image(self, name: str, size: tuple[int, int]) -> np.ndarray:
         """A true image (h, w, 3) in [0, 1] at `size` (width, height)."""
         return read_image(truth_image(self.path, name), size) / 255.0
+
+    def depth(self, name: str, size: tuple[int, int], mask: np.ndarray) -> PixelDepths:
+        """The true depth of the pixels of a mask (h, w) bool, at `size` (width, height) by nearest neighbour; without
+        pixels of the sky and those beyond the range of the image's format.
+
+        Raises ResultError that names the image if it is not one of 16-bit depth.
+        """
+        path = truth_image(self.path, name)
+        try:
+            with Image.open(path) as image:
+                if not image.mode.startswith("I"):
+                    raise ValueError(f"its mode is {image.mode}")
+                values = np.asarray(image).astype(np.uint16)
+        except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+            raise unreadable(path, RULE, f"not a 16-bit depth image ({error})", delete=self.path) from error
+        values = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        rows, columns = np.nonzero(mask & (values > 0) & (values < DEPTH_LIMIT))
+        return PixelDepths(rows, columns, values[rows, columns] / DEPTH_UNITS_PER_METRE)
 
     def leading_in(self, index: int) -> tuple[Box, np.ndarray] | None:
         """The box of the leading car in an image and the pixels (h, w) bool of its hull; None if it is not visible."""
@@ -57,6 +98,18 @@ class DriveTruth:
         hull = hull_of(box, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
         inside = fill(hull, size) if hull is not None else np.zeros(0, dtype=bool)
         return (box, inside) if inside.any() else None
+
+
+@dataclass(frozen=True)
+class LateralRendering:
+    """The rendering `image` (h, w, 3) and its `depth` (h, w) in metres from beside recorded image `index`: from the
+    camera of `frame`, with the `truth` of that view."""
+
+    index: int
+    frame: Frame
+    truth: TruthFrame
+    image: np.ndarray
+    depth: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -87,32 +140,37 @@ def rendered_with_depth(model: SplatModel, view: View) -> tuple[np.ndarray, np.n
 def lateral_metrics(
     model: SplatModel, known: DriveTruth, camera: str, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any] | None:
-    """The metrics over all key frames of `camera`, by the distance to the left in metres from which they are rendered;
-    None without truth. Moving objects are known from boxes, whatever masks the user supplies for recorded images.
+    """The metrics of each lateral view of `camera` by its offset, in metres to the left (negative: to the right); None
+    without truth."""
+    views = known.truth.lateral(camera)
+    found = {str(float(view.left_m)): _lateral_view_metrics(model, known, view, lpips_map, device) for view in views}
+    return {offset: metrics for offset, metrics in found.items() if metrics} or None
 
-    The offset from the recorded pose is that between the true poses, so that errors of recorded poses do not shift the
-    view against its true image.
-    """
-    metrics, recording = RegionMetrics(lpips_map, LATERAL_REGIONS), known.recording
-    frames = list(known.frames(camera))
 
-    def renderings() -> Iterator[tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]]:
-        for index, truth in frames:
-            frame = recording.frame(index)
-            to_left = inverse(np.array(truth.camera_to_global)) @ np.array(truth.lateral_camera_to_global)
-            aside = dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ to_left)
-            pose = torch.from_numpy(aside.camera_to_world).float().to(device)
-            view = dataclasses.replace(view_of(recording.record, index, device), camera_to_world=pose)
-            yield aside, rendered(model, view), truth, recording.size(index)
+def _lateral_view_metrics(
+    model: SplatModel, known: DriveTruth, view: TruthView, lpips_map: LpipsMap | None, device: torch.device
+) -> dict[str, Any] | None:
+    """The metrics of a lateral view over all its key frames by region, and `depth`, over static pixels; None without
+    key frames. Moving objects are known from boxes, whatever masks the user supplies for recorded images."""
+    metrics, depth, recording = RegionMetrics(lpips_map, LATERAL_REGIONS), DepthErrors(), known.recording
+    frames = list(known.lateral_frames(view))
 
-    def measure(one: tuple[Frame, np.ndarray, TruthFrame, tuple[int, int]]) -> dict[str, FrameErrors]:
-        aside, image, truth, size = one
-        masks = region_masks(label_image(recording.scene, aside, size))
-        return metrics.measure(image, known.image(truth.lateral, size), masks)
+    def renderings() -> Iterator[LateralRendering]:
+        for index, frame, truth in frames:
+            pose = torch.from_numpy(frame.camera_to_world).float().to(device)
+            seen = dataclasses.replace(view_of(recording.record, index, device), camera_to_world=pose)
+            yield LateralRendering(index, frame, truth, *rendered_with_depth(model, seen))
 
-    for errors in prefetch(measure, renderings(), measuring_threads()):
+    def measure(one: LateralRendering) -> tuple[dict[str, FrameErrors], np.ndarray, PixelDepths]:
+        size = recording.size(one.index)
+        masks = region_masks(label_image(recording.scene, one.frame, size))
+        errors = metrics.measure(one.image, known.image(one.truth.image, size), masks)
+        return errors, one.depth, known.depth(one.truth.depth, size, masks["static"])
+
+    for errors, rendered_depth, true_depth in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(errors)
-    return {str(known.truth.lateral_left_m): metrics.summary()} if frames else None
+        depth.add(rendered_depth, true_depth)
+    return {**metrics.summary(), **depth.summary()} if frames else None
 
 
 def removal_metrics(
@@ -121,12 +179,14 @@ def removal_metrics(
     """The rendering without the leading car against the true empty street, over all key frames of `camera` that see
     the car: metrics of the pixels in its `box` and `outside`. `not_removed` holds those of the unchanged model, the
     trivial baseline. None without truth."""
-    recording = known.recording
+    recording, empty = known.recording, known.truth.without_leading(camera)
+    if empty is None:
+        return None
     removed, untouched = RegionMetrics(lpips_map, REMOVAL_REGIONS), RegionMetrics(lpips_map, REMOVAL_REGIONS)
 
     def renderings() -> Iterator[RemovalRenderings]:
-        for index, truth in known.frames(camera):
-            seen = known.leading_in(index) if truth.without_leading else None
+        for index, truth in known.frames(empty):
+            seen = known.leading_in(index)
             if seen is None:
                 continue
             box, inside = seen
@@ -135,7 +195,7 @@ def removal_metrics(
                 gaussians = model.gaussians_at(view.time)
                 kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
             pictures = rendered(model, view, kept), rendered(model, view, gaussians)
-            yield RemovalRenderings(index, truth.without_leading, inside, *pictures)
+            yield RemovalRenderings(index, truth.image, inside, *pictures)
 
     def measure(one: RemovalRenderings) -> tuple[dict[str, FrameErrors], dict[str, FrameErrors]]:
         street, ego_mask = known.image(one.street, recording.size(one.index)), recording.ego_mask(one.index)
