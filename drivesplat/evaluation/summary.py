@@ -24,9 +24,10 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
             gap = method[group].get("gap_db")
             if (static := _psnr(method[group], "static")) is not None:
                 lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_moving_vehicles(method[group], gap)}")
-        for metres, regions in method.get("lateral", {}).items():
-            if (static := _psnr(regions, "static")) is not None:
-                lines.append(f"{name}, from {float(metres):g} m to the left, against truth: static {static:.1f} dB")
+        for offset, view in method.get("lateral", {}).items():
+            if found := _lateral_figures(view):
+                metres, side = abs(float(offset)), "left" if float(offset) > 0 else "right"
+                lines.append(f"{name}, from {metres:g} m to the {side}, against truth: {', '.join(found)}")
         removal = method.get("removal", {})
         removed, before = (_psnr(regions, "box") for regions in (removal, removal.get("not_removed", {})))
         if removed is not None and before is not None:
@@ -68,6 +69,16 @@ def _caveats(drive: dict[str, Any]) -> list[str]:
 def _psnr(regions: dict[str, Any], region: str) -> float | None:
     """The PSNR of a region, None if it is null or missing."""
     return (regions.get(region) or {}).get("psnr")
+
+
+def _lateral_figures(view: dict[str, Any]) -> list[str]:
+    """The figures of a lateral view that are not null."""
+    names = {"static": "static", "moving_vehicle": "moving vehicles"}
+    psnrs = {name: _psnr(view, region) for region, name in names.items()}
+    found = [f"{name} {psnr:.1f} dB" for name, psnr in psnrs.items() if psnr is not None]
+    if depth := view.get("depth"):
+        found.append(f"depth off by {depth['median_relative_error']:.1%} in the median".replace("%", " %"))
+    return found
 
 
 def _moving_vehicles(group: dict[str, Any], gap: float | None) -> str:

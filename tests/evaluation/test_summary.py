@@ -58,6 +58,23 @@ def test_figures_against_ground_truth_are_reported():
     assert expected in lines
 
 
+def test_each_lateral_offset_is_a_sentence_with_its_side_and_all_its_figures():
+    full = {"static": {"psnr": 22.7}, "moving_vehicle": {"psnr": 14.0}, "depth": {"median_relative_error": 0.0312}}
+    lateral = {
+        "2.0": full,
+        "-2.0": {"static": {"psnr": 21.0}, "moving_vehicle": None, "depth": None},
+        "4.0": {"static": None, "moving_vehicle": None, "depth": {"median_relative_error": 0.25}},
+        "-0.5": {"static": None, "moving_vehicle": None, "depth": None},
+    }
+    lines = sentences({"methods": {"vanilla": {**method(), "lateral": lateral}}}, "m.json")
+    assert [line for line in lines if "against truth" in line] == [
+        "vanilla, from 2 m to the left, against truth: static 22.7 dB, moving vehicles 14.0 dB, "
+        "depth off by 3.1 % in the median",
+        "vanilla, from 2 m to the right, against truth: static 21.0 dB",
+        "vanilla, from 4 m to the left, against truth: depth off by 25.0 % in the median",
+    ]
+
+
 def test_existing_films_and_images_are_listed_last_by_method(tmp_path):
     """Only existing files are listed; methods without files are not mentioned."""
     made = {"vanilla": ("viewer.html", "original.mp4", "train.json", "removal.png"), "plain": ("ghost_panel.png",)}
