@@ -1,8 +1,8 @@
-"""Renderings against synthetic ground truth: the figures of simple models can be computed from the PNGs."""
+"""Renderings against the truth of a tiny world: the figures of simple models can be computed from the PNGs."""
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,28 +10,29 @@ import numpy as np
 import pytest
 import torch
 from helpers.hand_made import Own, recording_of, round_gaussians, write_labels
+from helpers.hand_made_truth import LEADING, OFFSETS, aside, write_array, write_truth
 from helpers.records import EMPTY_CHECKPOINT, EMPTY_MASKS
+from helpers.small_drives import scene_at, seconds_of, true_depths
+from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, ORIGIN, World, write_world
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.evaluation.evaluate import EvaluationInputs, truth_metrics
-from drivesplat.evaluation.metrics import RegionMetrics, measuring_threads
+from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, RegionMetrics, measuring_threads
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.model.view import View, view_of
-from drivesplat.preprocess.extract import extract_scene
-from drivesplat.readers.truth import Truth, TruthFrame, read_truth, truth_image
+from drivesplat.readers.truth import TruthFrame, TruthView, read_truth, truth_image
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at, boxes_at
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.inspection import RemovalSettings
@@ -47,19 +48,17 @@ LIDAR = LidarDepthJob(
 )  # fmt: skip
 OWN_CAR_ROWS = 12
 """Number of rows at the lower edge of the masks that show the ego vehicle."""
+WORLD = World(key_frames=6, width=160, height=90)
 
 
 @pytest.fixture(scope="module")
-def known(demo_root, tmp_path_factory) -> DriveTruth:
-    source = SceneSource(
-        dataset="demo", reader="nuscenes", version="v1.0-mini", scene="demo", frames=None,
-        cameras=("CAM_FRONT", "CAM_BACK"), sweeps=False, on_missing="stop",
-    )  # fmt: skip
-    scene = extract_scene(source, demo_root)
+def known(tmp_path_factory) -> DriveTruth:
+    root = write_world(tmp_path_factory.mktemp("tiny"), WORLD)
+    scene = scene_at(root, sweeps=False)
     labels = np.full((90, 160), LABELS["static"], dtype=np.uint8)
     labels[90 - OWN_CAR_ROWS :] = LABELS["own_car"]
     masks = write_labels(tmp_path_factory.mktemp("masks"), scene, labels)
-    path = demo_root / "truth" / "truth.json"
+    path = write_truth(root, WORLD, scene)
     return DriveTruth(read_truth(path), path, recording_of(scene, masks, **HOLDOUT.model_dump()))
 
 
@@ -72,9 +71,18 @@ def purple(places) -> Background:
     return round_gaussians(places, 0.3, 0.98, (0.9, 0.1, 0.9))
 
 
+def frames_of(known: DriveTruth, view: TruthView) -> list[tuple[Frame, TruthFrame]]:
+    return list(zip(known.recording.scene.frames, view.frames, strict=True))
+
+
 def front_frames(known: DriveTruth) -> list[tuple[Frame, TruthFrame]]:
-    frames = [frame for frame in known.recording.scene.frames if frame.camera == "CAM_FRONT"]
-    return list(zip(frames, known.truth.frames, strict=True))
+    return frames_of(known, known.truth.recorded("CAM_FRONT"))
+
+
+def lateral_frames(known: DriveTruth, left: float) -> list[tuple[Frame, TruthFrame]]:
+    """The frames of the lateral view at an offset."""
+    (view,) = (view for view in known.truth.lateral("CAM_FRONT") if view.left_m == left)
+    return frames_of(known, view)
 
 
 def pixels_of(known: DriveTruth, name: str) -> np.ndarray:
@@ -92,10 +100,29 @@ def rays_meet(box: Box, camera_to_world: np.ndarray, frame: Frame) -> np.ndarray
     return (enter < leave) & (leave > 0)
 
 
-def lateral_pose(known: DriveTruth, truth: TruthFrame) -> np.ndarray:
-    pose = np.array(truth.lateral_camera_to_global)
+def pose_in_scene(known: DriveTruth, truth: TruthFrame) -> np.ndarray:
+    pose = np.array(truth.camera_to_global)
     pose[:3, 3] -= known.recording.scene.origin
     return pose
+
+
+def movable_boxes(known: DriveTruth, frame: Frame) -> list[Box]:
+    return [box for box in boxes_at(known.recording.scene, frame.timestamp) if box.object_class.is_dynamic]
+
+
+def static_pixels(known: DriveTruth, frame: Frame, pose: np.ndarray) -> np.ndarray:
+    """The pixels (h, w) outside all boxes of movable objects, as seen from a pose."""
+    return ~np.any([rays_meet(box, pose, frame) for box in movable_boxes(known, frame)], axis=0)
+
+
+def static_masks(known: DriveTruth, left: float) -> list[np.ndarray]:
+    frames = lateral_frames(known, left)
+    return [static_pixels(known, frame, pose_in_scene(known, truth)) for frame, truth in frames]
+
+
+def depths_of(known: DriveTruth, left: float) -> list[np.ndarray]:
+    """The values of the depth images of a lateral view."""
+    return [np.asarray(Image.open(known.path.parent / truth.depth)) for _, truth in lateral_frames(known, left)]
 
 
 def leading_box(known: DriveTruth, frame: Frame) -> Box:
@@ -109,13 +136,16 @@ def by_hand(color, images: list[np.ndarray], masks: list[np.ndarray]) -> float:
     return -10.0 * np.log10(errors.mean())
 
 
-def test_a_constant_colours_lateral_psnr_follows_from_the_pngs(known):
+@pytest.mark.parametrize("left", OFFSETS)
+def test_a_constant_colours_lateral_psnr_follows_from_the_pngs(known, left):
     result = lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)
-    assert list(result) == ["2.0"] and result["2.0"].keys() == {"all", "static"}
-    images = [pixels_of(known, truth.lateral) for _, truth in front_frames(known)]
+    assert list(result) == ["2.0", "-2.0", "4.0"]
+    found = result[str(left)]
+    assert found.keys() == {"all", "static", "moving_vehicle", "depth"}
+    images = [pixels_of(known, truth.image) for _, truth in lateral_frames(known, left)]
     everywhere = [np.ones((90, 160), dtype=bool)] * 6
-    assert result["2.0"]["all"]["psnr"] == pytest.approx(by_hand(GREY, images, everywhere), abs=1e-4)
-    assert result["2.0"]["all"]["pixels"] == 6 * 90 * 160
+    assert found["all"]["psnr"] == pytest.approx(by_hand(GREY, images, everywhere), abs=1e-4)
+    assert found["all"]["pixels"] == 6 * 90 * 160
     similarity = [
         structural_similarity(
             np.broadcast_to(GREY, image.shape), image, data_range=1.0, channel_axis=2, gaussian_weights=True,
@@ -123,22 +153,41 @@ def test_a_constant_colours_lateral_psnr_follows_from_the_pngs(known):
         )[1].mean()
         for image in images
     ]  # fmt: skip
-    assert result["2.0"]["all"]["ssim"] == pytest.approx(np.mean(similarity), abs=1e-5)
-    assert result["2.0"]["all"]["lpips"] is None
+    assert found["all"]["ssim"] == pytest.approx(np.mean(similarity), abs=1e-5)
+    assert found["all"]["lpips"] is None
+    others = [result[str(other)]["all"]["psnr"] for other in OFFSETS if other != left]
+    assert min(abs(found["all"]["psnr"] - psnr) for psnr in others) > 0.01, "the offsets must differ"
 
 
-def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known):
+@pytest.mark.parametrize("left", OFFSETS)
+def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known, left):
     """They are outside all boxes of movable objects, as seen by the lateral camera and not the recorded one."""
-    images, static, recorded = [], [], []
-    for frame, truth in front_frames(known):
-        boxes = [box for box in boxes_at(known.recording.scene, frame.timestamp) if box.object_class.is_dynamic]
-        images.append(pixels_of(known, truth.lateral))
-        for masks, pose in ((static, lateral_pose(known, truth)), (recorded, frame.camera_to_world)):
-            masks.append(~np.any([rays_meet(box, pose, frame) for box in boxes], axis=0))
-    result = lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)["2.0"]["static"]
+    frames, static = lateral_frames(known, left), static_masks(known, left)
+    recorded = [static_pixels(known, frame, frame.camera_to_world) for frame, _ in frames]
+    images = [pixels_of(known, truth.image) for _, truth in frames]
+    result = lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)[str(left)]["static"]
     assert result["pixels"] == pytest.approx(sum(mask.sum() for mask in static), rel=1e-4)
     assert result["psnr"] == pytest.approx(by_hand(GREY, images, static), abs=0.005)
     assert sum((a != b).sum() for a, b in zip(static, recorded, strict=True)) > 300, "the two views must differ"
+
+
+@pytest.mark.parametrize("left", OFFSETS)
+def test_pixels_of_moving_vehicles_are_those_of_the_car_ahead_seen_from_beside_the_path(known, left):
+    """Neither the parked truck nor the pedestrian counts, nor pixels where one of them is nearer."""
+    images, masks = [], []
+    for frame, truth in lateral_frames(known, left):
+        pose, boxes = pose_in_scene(known, truth), movable_boxes(known, frame)
+        distances = [np.linalg.norm(box.object_to_world[:3, 3] - pose[:3, 3]) for box in boxes]
+        reached = [
+            np.where(rays_meet(box, pose, frame), distance, np.inf)
+            for box, distance in zip(boxes, distances, strict=True)
+        ]
+        car = next(i for i, box in enumerate(boxes) if box.track_id == LEADING)
+        masks.append((np.argmin(reached, axis=0) == car) & np.isfinite(reached[car]))
+        images.append(pixels_of(known, truth.image))
+    result = lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)[str(left)]["moving_vehicle"]
+    assert result["pixels"] == pytest.approx(sum(mask.sum() for mask in masks), abs=6)
+    assert result["psnr"] == pytest.approx(by_hand(GREY, images, masks), abs=0.02)
 
 
 class Watched(SplatModel):
@@ -153,27 +202,22 @@ class Watched(SplatModel):
         return super().render(view, *arguments, **options)
 
 
-def ego_to_global(tables, sample_data: str) -> np.ndarray:
-    pose = tables.get("ego_pose", tables.get("sample_data", sample_data)["ego_pose_token"])
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(np.roll(pose["rotation"], -1)).as_matrix()
-    matrix[:3, 3] = pose["translation"]
-    return matrix
+def views_by_offset(model: Watched) -> dict[float, list[View]]:
+    """The requested views of the lateral offsets, which are rendered in the order of the truth."""
+    assert len(model.views) == 6 * len(OFFSETS)
+    return {left: model.views[6 * i : 6 * i + 6] for i, left in enumerate(OFFSETS)}
 
 
-def test_the_lateral_view_is_two_metres_to_the_left_of_the_ego_vehicle(known, demo_tables):
+@pytest.mark.parametrize("left", OFFSETS)
+def test_lateral_views_are_at_their_offset_to_the_left_of_the_ego_vehicle(known, left):
+    """The ego vehicle drives along x; y is its left."""
     model = Watched()
     lateral_metrics(model, known, "CAM_FRONT", None, CPU)
-    assert len(model.views) == 6
-    for view, (frame, truth) in zip(model.views, front_frames(known), strict=True):
+    for view, frame in zip(views_by_offset(model)[left], known.recording.scene.frames, strict=True):
+        place = ORIGIN + WORLD.ego_at(seconds_of(frame.timestamp)) + CAMERA_AT + [0.0, left, 0.0]
         pose = view.camera_to_world.double().numpy()
-        pose[:3, 3] += known.recording.scene.origin
-        recorded = frame.camera_to_world.copy()
-        recorded[:3, 3] += known.recording.scene.origin
-        ego = ego_to_global(demo_tables, truth.sample_data)
-        step = np.linalg.inv(ego) @ pose - np.linalg.inv(ego) @ recorded
-        np.testing.assert_allclose(step[:3, 3], [0.0, 2.0, 0.0], atol=2e-5)
-        np.testing.assert_allclose(pose[:3, :3], recorded[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(pose[:3, 3] + known.recording.scene.origin, place, atol=2e-5)
+        np.testing.assert_allclose(pose[:3, :3], CAMERA_TO_EGO, atol=1e-6)
         assert view.time == pytest.approx(known.recording.scene.seconds(frame.timestamp), abs=1e-6)
         assert (view.width, view.height) == (160, 90)
 
@@ -190,39 +234,211 @@ def nudged(known: DriveTruth, seed: int) -> DriveTruth:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_with_pose_errors_the_lateral_view_is_relative_to_the_recorded_pose(known, demo_tables, seed):
-    """The camera moves along the ego vehicle's y axis and does not rotate."""
+def test_with_pose_errors_lateral_views_are_relative_to_the_recorded_pose(known, seed):
+    """The camera looks forward; its x axis points to the right."""
     model, off = Watched(), nudged(known, seed)
     lateral_metrics(model, off, "CAM_FRONT", None, CPU)
-    assert len(model.views) == 6
-    for view, (frame, truth) in zip(model.views, front_frames(off), strict=True):
-        data = demo_tables.get("sample_data", truth.sample_data)
-        w, x, y, z = demo_tables.get("calibrated_sensor", data["calibrated_sensor_token"])["rotation"]
-        to_left = Rotation.from_quat([x, y, z, w]).inv().apply([0.0, 2.0, 0.0])
-        step = np.linalg.inv(frame.camera_to_world) @ view.camera_to_world.double().numpy()
-        np.testing.assert_allclose(step, rigid(np.eye(3), to_left), atol=2e-5)
-        true_pose = lateral_pose(off, truth)
-        assert np.abs(view.camera_to_world.numpy() - true_pose).max() > 0.05, "the true view is elsewhere"
+    for left, views in views_by_offset(model).items():
+        for view, (frame, truth) in zip(views, lateral_frames(off, left), strict=True):
+            step = np.linalg.inv(frame.camera_to_world) @ view.camera_to_world.double().numpy()
+            np.testing.assert_allclose(step, rigid(np.eye(3), np.array([-left, 0.0, 0.0])), atol=2e-5)
+            true_pose = pose_in_scene(off, truth)
+            assert np.abs(view.camera_to_world.numpy() - true_pose).max() > 0.05, "the true view is elsewhere"
 
 
 def test_with_pose_errors_dynamic_boxes_are_masked_in_the_rendered_view(known):
     """Static pixels are those outside the boxes in the rendered view."""
     model, off = Watched(), nudged(known, 0)
-    result = lateral_metrics(model, off, "CAM_FRONT", None, CPU)["2.0"]["static"]
-    count = 0
-    for view, (frame, _) in zip(model.views, front_frames(off), strict=True):
-        boxes = [box for box in boxes_at(off.recording.scene, frame.timestamp) if box.object_class.is_dynamic]
-        pose = view.camera_to_world.double().numpy()
-        count += (~np.any([rays_meet(box, pose, frame) for box in boxes], axis=0)).sum()
-    assert result["pixels"] == pytest.approx(count, rel=1e-4)
+    result = lateral_metrics(model, off, "CAM_FRONT", None, CPU)
+    for left, views in views_by_offset(model).items():
+        poses = [view.camera_to_world.double().numpy() for view in views]
+        masks = [static_pixels(off, *pair) for pair in zip(off.recording.scene.frames, poses, strict=True)]
+        assert result[str(left)]["static"]["pixels"] == pytest.approx(sum(mask.sum() for mask in masks), rel=1e-4)
+
+
+class Deep(SplatModel):
+    """A flat model with a depth (h, w) of `depth_of` a view."""
+
+    def __init__(self, depth_of: Callable[[View], np.ndarray]):
+        super().__init__([round_gaussians([])], ConstantSky(torch.tensor(GREY), 1e-2))
+        self._depth_of = depth_of
+
+    def render(self, view: View, *arguments: Any, **options: Any) -> Picture:
+        picture = super().render(view, *arguments, **options)
+        return dataclasses.replace(picture, depth=torch.from_numpy(self._depth_of(view)).float())
+
+
+def depth_figure(known: DriveTruth, left: float, depth_of: Callable[[View], np.ndarray]) -> dict[str, Any] | None:
+    return lateral_metrics(Deep(depth_of), known, "CAM_FRONT", None, CPU)[str(left)]["depth"]
+
+
+def left_of(view: View) -> float:
+    """The offset at which a view is rendered; the ego vehicle drives along y = 0."""
+    return round(float(view.camera_to_world[1, 3]), 3)
+
+
+def frame_of(known: DriveTruth, view: View) -> Frame:
+    scene = known.recording.scene
+    return min(scene.frames, key=lambda frame: abs(scene.seconds(frame.timestamp) - view.time))
+
+
+def true_depth_of(known: DriveTruth) -> Callable[[View], np.ndarray]:
+    """The depth of a view, cast from where it is rendered; 5 m in the sky."""
+
+    def depth(view: View) -> np.ndarray:
+        values = true_depths(aside(WORLD, left_of(view)), frame_of(known, view))[..., 0]
+        return np.where(np.isfinite(values), values, 5.0)
+
+    return depth
+
+
+@pytest.mark.parametrize("left", OFFSETS)
+def test_the_depth_error_is_the_median_over_static_pixels_of_known_depth(known, left):
+    """A rendering that is 10 m deep everywhere. Neither the sky nor what is beyond the 16 bits has a known depth."""
+
+    def figure(of_left: float) -> tuple[float, int]:
+        pairs = zip(depths_of(known, of_left), static_masks(known, of_left), strict=True)
+        values = np.concatenate([depth[mask & (depth > 0) & (depth < 65535)] for depth, mask in pairs]) / 256.0
+        return np.median(np.abs(10.0 - values) / values), len(values)
+
+    values = np.stack(depths_of(known, left))
+    assert (values == 0).sum() > 1000 and (values == 65535).sum() > 100
+    found, (median, pixels) = depth_figure(known, left, lambda _: np.full((90, 160), 10.0)), figure(left)
+    assert found.keys() == {"median_relative_error", "pixels"}
+    assert found["median_relative_error"] == pytest.approx(median, rel=2e-4)
+    assert found["pixels"] == pytest.approx(pixels, rel=1e-4)
+    others = [figure(other)[0] for other in OFFSETS if other != left]
+    assert min(abs(other - median) for other in others) > 1e-3 * median, "the offsets must differ"
+
+
+@pytest.mark.parametrize("left", OFFSETS)
+def test_the_true_depth_has_no_error(known, left):
+    assert depth_figure(known, left, true_depth_of(known))["median_relative_error"] < 2e-4
+
+
+@pytest.mark.parametrize("left", OFFSETS)
+def test_moving_pixels_and_the_sky_have_no_part_in_the_depth_error(known, left):
+    """Their depth is wrong ninefold; that of the rest by a random share."""
+    true, random, spared = true_depth_of(known), np.random.default_rng(0), []
+
+    def wrong(view: View) -> np.ndarray:
+        frame, pose = frame_of(known, view), view.camera_to_world.double().numpy()
+        sky = np.isinf(true_depths(aside(WORLD, left_of(view)), frame)[..., 0])
+        counts = static_pixels(known, frame, pose) & ~sky
+        shares = random.uniform(0.0, 0.2, counts.shape)
+        if left_of(view) == left:
+            spared.append(np.where(counts, shares, np.nan)[true(view) < 255.9])
+        return true(view) * np.where(counts, 1.0 + shares, 10.0)
+
+    found = depth_figure(known, left, wrong)["median_relative_error"]
+    shares = np.concatenate(spared)
+    assert found == pytest.approx(np.nanmedian(shares), rel=2e-3)
+    everywhere = np.median(np.nan_to_num(shares, nan=9.0))
+    assert everywhere > 1.05 * found, "other pixels must be many"
+
+
+def with_depths(known: DriveTruth, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> DriveTruth:
+    """The truth with other depth images, in `folder`."""
+    views = []
+    for number, view in enumerate(known.truth.lateral("CAM_FRONT")):
+        frames = []
+        for frame, values in zip(view.frames, depths_of(known, view.left_m), strict=True):
+            path = folder / f"{number}_{frame.sample_index}.png"
+            write_array(path, change(values))
+            frames.append(dataclasses.replace(frame, depth=str(path)))
+        views.append(dataclasses.replace(view, frames=tuple(frames)))
+    return with_views(known, known.truth.recorded("CAM_FRONT"), *views)
+
+
+def with_views(known: DriveTruth, *views: TruthView) -> DriveTruth:
+    return dataclasses.replace(known, truth=dataclasses.replace(known.truth, views=views))
+
+
+@pytest.mark.parametrize(("a_frame", "known_enough"), [(166, False), (167, True)])
+def test_a_depth_error_over_too_few_pixels_is_null(known, tmp_path, a_frame, known_enough):
+    """Only pixels of the last rows have depth, where no view has a box, in six frames."""
+
+    def little(values: np.ndarray) -> np.ndarray:
+        kept = np.zeros_like(values)
+        rows, columns = np.divmod(np.arange(a_frame), 26)
+        kept[83 + rows, 40 + columns] = 1000
+        return kept
+
+    assert 6 * 166 < MIN_REGION_PIXELS <= 6 * 167
+    result = lateral_metrics(flat_model(), with_depths(known, tmp_path, little), "CAM_FRONT", None, CPU)
+    for found in result.values():
+        assert found["static"]["pixels"] > 10_000
+        assert (found["depth"] is not None) == known_enough
+    assert json.dumps(result, allow_nan=False)
+
+
+def test_a_rendering_without_depth_has_a_finite_error(known):
+    """Nothing is rendered: depth 0."""
+    for found in lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU).values():
+        assert found["depth"]["median_relative_error"] == pytest.approx(1.0)
+
+
+def test_at_another_size_true_depth_is_not_averaged_across_edges(known):
+    """Every pixel of half the size has a depth of one of the four pixels that it covers."""
+    truth = lateral_frames(known, 2.0)[3][1]
+    values = depths_of(known, 2.0)[3] / 256.0
+    found = known.depth(truth.depth, (80, 45), np.ones((45, 80), dtype=bool))
+    blocks = values.reshape(45, 2, 80, 2).transpose(0, 2, 1, 3).reshape(45, 80, 4)
+    assert np.isin(blocks, [0.0, 65535 / 256.0]).all(axis=2).sum() + len(found) >= 45 * 80 - 200 and len(found) > 1000
+    assert (np.abs(blocks[found.rows, found.columns] - found.depth[:, None]).min(axis=1) < 1e-6).all()
+
+
+def test_a_smaller_rendering_is_compared_with_resized_truth(known):
+    halved = dataclasses.replace(known, recording=recording_of(known.recording.scene, width=80))
+    small = lateral_metrics(Deep(lambda _: np.full((45, 80), 10.0)), halved, "CAM_FRONT", None, CPU)
+    large = lateral_metrics(Deep(lambda _: np.full((90, 160), 10.0)), known, "CAM_FRONT", None, CPU)
+    for offset, found in small.items():
+        assert found["all"]["pixels"] == 6 * 45 * 80
+        whole = large[offset]["depth"]
+        assert found["depth"]["median_relative_error"] == pytest.approx(whole["median_relative_error"], rel=0.1)
+        assert found["depth"]["pixels"] == pytest.approx(whole["pixels"] / 4, rel=0.03)
+
+
+@pytest.mark.parametrize("how", ["of 8 bits", "truncated"])
+def test_an_invalid_depth_image_is_named_with_its_rule(known, tmp_path, how):
+    bad = with_depths(known, tmp_path, lambda values: values)
+    path = tmp_path / "0_2.png"
+    if how == "of 8 bits":
+        write_array(path, np.zeros((90, 160), dtype=np.uint8))
+    else:
+        path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ResultError, match=r"0_2\.png: not a 16-bit depth image.*delete .*truth\.json.*demo_world"):
+        lateral_metrics(flat_model(), bad, "CAM_FRONT", None, CPU)
+
+
+def test_frames_are_matched_by_their_image_and_not_by_their_place(known):
+    """The recorded view is listed backwards, a lateral view without its first frame."""
+    recorded, (left, *_) = known.truth.recorded("CAM_FRONT"), known.truth.lateral("CAM_FRONT")
+    shuffled = with_views(
+        known,
+        dataclasses.replace(left, frames=left.frames[1:]),
+        dataclasses.replace(recorded, frames=recorded.frames[::-1]),
+    )
+    model = Watched()
+    result = lateral_metrics(model, shuffled, "CAM_FRONT", None, CPU)
+    assert list(result) == ["2.0"] and result["2.0"]["all"]["pixels"] == 5 * 90 * 160
+    for view, frame in zip(model.views, known.recording.scene.frames[1:], strict=True):
+        np.testing.assert_allclose(
+            view.camera_to_world[:, 3].numpy() - frame.camera_to_world[:, 3], [0, 2, 0, 0], atol=2e-5
+        )
+
+
+def test_without_the_recorded_poses_there_are_no_lateral_figures(known):
+    alone = with_views(known, *known.truth.lateral("CAM_FRONT"))
+    assert lateral_metrics(flat_model(), alone, "CAM_FRONT", None, CPU) is None
 
 
 def hulls(known: DriveTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Per key frame: the street without the leading car, and the pixels inside and outside its box (no ego vehicle)."""
     free = np.arange(90)[:, None] < 90 - OWN_CAR_ROWS
-    for frame, truth in front_frames(known):
+    for frame, truth in frames_of(known, known.truth.without_leading("CAM_FRONT")):
         inside = rays_meet(leading_box(known, frame), frame.camera_to_world, frame)
-        yield pixels_of(known, truth.without_leading), inside & free, ~inside & free
+        yield pixels_of(known, truth.image), inside & free, ~inside & free
 
 
 def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known):
@@ -367,22 +583,17 @@ def test_a_recorded_drive_is_not_compared_with_ground_truth(known):
     assert truth_metrics(flat_model(), inputs_of(known, known.path), job, None, CPU) == {}
 
 
-def test_frames_with_ground_truth_are_those_of_its_camera(known):
-    numbers = [index for index, _ in known.frames("CAM_FRONT")]
+def test_frames_with_ground_truth_are_those_that_were_recorded(known):
     frames = known.recording.scene.frames
-    assert numbers == [index for index, frame in enumerate(frames) if frame.camera == "CAM_FRONT"] and len(numbers) == 6
-    assert [truth.sample_data for _, truth in known.frames("CAM_FRONT")] == [frames[i].token for i in numbers]
-    assert not list(known.frames("CAM_BACK"))
+    for view in (known.truth.recorded("CAM_FRONT"), *known.truth.lateral("CAM_FRONT")):
+        assert [index for index, _ in known.frames(view)] == list(range(6))
+        assert [truth.sample_data for _, truth in known.frames(view)] == [frame.token for frame in frames]
+    assert not list(known.frames(known.truth.recorded("CAM_BACK")))
 
 
-def changed(known: DriveTruth, leading: str | None = None, **changes: Any) -> DriveTruth:
-    """The truth with every frame changed."""
-    frames = tuple(dataclasses.replace(frame, **changes) for frame in known.truth.frames)
-    return dataclasses.replace(known, truth=dataclasses.replace(known.truth, frames=frames, leading=leading))
-
-
-def test_a_street_without_a_leading_car_has_a_lateral_view_and_no_removal(known):
-    alone = changed(known, without_leading=None)
+def test_a_street_without_a_leading_car_has_lateral_views_and_no_removal(known):
+    views = tuple(view for view in known.truth.views if view.without is None)
+    alone = dataclasses.replace(known, truth=dataclasses.replace(known.truth, views=views, leading=None))
     assert removal_metrics(flat_model(), alone, "CAM_FRONT", MARGIN, None, CPU) is None
     assert lateral_metrics(flat_model(), alone, "CAM_FRONT", None, CPU)["2.0"]["all"]["pixels"] == 6 * 90 * 160
 
@@ -407,19 +618,25 @@ def good(known: DriveTruth) -> dict[str, Any]:
 
 def damaged(content: dict[str, Any], how: str) -> str:
     """truth.json, spoilt."""
+    view = content["views"][0]
+
+    def first_view(**changes: Any) -> str:
+        return json.dumps({**content, "views": [{**view, **changes}]})
+
     spoilt = {
         "empty": "",
         "truncated": json.dumps(content)[:-40],
         "a list": "[]",
         "a word": '"truth"',
         "null": "null",
-        "of another schema": json.dumps({**content, "schema": 2}),
+        "of another schema": json.dumps({**content, "schema": 1}),
         "without schema": json.dumps({k: v for k, v in content.items() if k != "schema"}),
-        "without camera": json.dumps({k: v for k, v in content.items() if k != "camera"}),
+        "without views": json.dumps({k: v for k, v in content.items() if k != "views"}),
         "with a foreign field": json.dumps({**content, "colour": "red"}),
-        "without frames": json.dumps({**content, "frames": None}),
-        "with frames by name": json.dumps({**content, "frames": {"0": content["frames"][0]}}),
-        "with a short frame": json.dumps({**content, "frames": [{"sample_data": "a"}]}),
+        "without frames": first_view(frames=None),
+        "with frames by name": first_view(frames={"0": view["frames"][0]}),
+        "with a short frame": first_view(frames=[{"sample_data": "a"}]),
+        "with a foreign field of a view": first_view(colour="red"),
     }
     return spoilt[how]
 
@@ -427,8 +644,9 @@ def damaged(content: dict[str, Any], how: str) -> str:
 @pytest.mark.parametrize(
     "how",
     [
-        "empty", "truncated", "a list", "a word", "null", "of another schema", "without schema", "without camera",
+        "empty", "truncated", "a list", "a word", "null", "of another schema", "without schema", "without views",
         "with a foreign field", "without frames", "with frames by name", "with a short frame",
+        "with a foreign field of a view",
     ],
 )  # fmt: skip
 def test_an_invalid_truth_file_is_refused_naming_file_and_rule(known, tmp_path, how):
@@ -441,7 +659,7 @@ def test_an_invalid_truth_file_is_refused_naming_file_and_rule(known, tmp_path, 
 
 def test_invalid_poses_in_a_truth_file_are_refused_naming_file_and_rule(known, tmp_path):
     content = good(known)
-    content["frames"][0]["lateral_camera_to_global"] = [[1.0, 0.0]]
+    content["views"][1]["frames"][0]["camera_to_global"] = [[1.0, 0.0]]
     path = tmp_path / "truth.json"
     path.write_text(json.dumps(content))
     with pytest.raises(ResultError, match="demo_world"):
@@ -462,22 +680,31 @@ def test_a_missing_truth_is_refused_naming_file_and_rule(tmp_path):
 
 def test_truth_json_is_read_completely(known):
     content, truth = good(known), read_truth(known.path)
-    assert content.pop("schema") == 1
-    frames = content.pop("frames")
-    assert [dataclasses.asdict(frame) for frame in truth.frames] == frames
-    assert {key: getattr(truth, key) for key in content} == content
-    assert isinstance(truth, Truth) and list(truth.by_image()) == [frame["sample_data"] for frame in frames]
+    assert content.pop("schema") == 2
+    assert json.loads(json.dumps(dataclasses.asdict(truth))) == content
+    tokens = [frame["sample_data"] for frame in content["views"][0]["frames"]]
+    assert list(truth.recorded("CAM_FRONT").by_image()) == tokens and len(tokens) == 6
+
+
+def with_image(known: DriveTruth, name: str) -> DriveTruth:
+    """The truth with another image in every frame."""
+    views = [
+        dataclasses.replace(view, frames=tuple(dataclasses.replace(frame, image=name) for frame in view.frames))
+        for view in known.truth.views
+    ]
+    return with_views(known, *views)
 
 
 def test_a_missing_ground_truth_image_is_named_with_its_rule(known):
-    assert truth_image(known.path, known.truth.frames[0].lateral).is_file()
+    assert truth_image(known.path, lateral_frames(known, 2.0)[0][1].image).is_file()
     with pytest.raises(ResultError, match=r"lateral/9999\.png.*demo_world"):
-        lateral_metrics(flat_model(), changed(known, lateral="lateral/9999.png"), "CAM_FRONT", None, CPU)
+        lateral_metrics(flat_model(), with_image(known, "lateral/9999.png"), "CAM_FRONT", None, CPU)
 
 
 def test_a_truncated_ground_truth_image_is_named(known, tmp_path):
-    (tmp_path / "half.png").write_bytes((known.path.parent / known.truth.frames[0].lateral).read_bytes()[:400])
-    moved = dataclasses.replace(changed(known, lateral="half.png"), path=tmp_path / "truth.json")
+    whole = known.path.parent / lateral_frames(known, 2.0)[0][1].image
+    (tmp_path / "half.png").write_bytes(whole.read_bytes()[:400])
+    moved = dataclasses.replace(with_image(known, "half.png"), path=tmp_path / "truth.json")
     with pytest.raises((ResultError, DatasetError), match=r"half\.png"):
         lateral_metrics(flat_model(), moved, "CAM_FRONT", None, CPU)
 

@@ -335,12 +335,13 @@ def test_depths_of_the_demo_world_agree_with_its_ground_truth(demo_root):
     m, and nearly all of moving objects."""
     scene = demo_scene(demo_root)
     truth = read_truth(demo_root / "truth/truth.json")
+    records = truth.recorded("CAM_FRONT").by_image()
     moving = {mover.track.id for mover in dynamic_objects(scene)}
     numbers = [int(number) for number, track in truth.instances.items() if track in moving]
     errors, allowed, own = [], [], []
     told = job(NOTHING_HELD_OUT, margin=0.2, spacing=LidarDepthSettings().ray_spacing)
     for frame, image in zip(scene.frames, lidar_depths(scene, told), strict=True):
-        record = truth.by_image()[frame.token]
+        record = records[frame.token]
         depth, things = (
             np.asarray(Image.open(demo_root / "truth" / name)) for name in (record.depth, record.instances)
         )

@@ -52,9 +52,13 @@ def test_metrics_come_from_nothing_on_the_cpu(finished):
 
 def test_what_only_a_synthetic_world_knows_is_measured_too(finished):
     result = finished.read(TARGET)["methods"]["vanilla"]
-    assert set(result["lateral"]) == {"2.0"} and set(result["lateral"]["2.0"]) == {"all", "static"}
-    assert result["lateral"]["2.0"]["all"]["pixels"] == 6 * 128 * 72
-    assert result["lateral"]["2.0"]["static"]["psnr"] > 8.0
+    assert set(result["lateral"]) == {"2.0", "-2.0", "4.0"}
+    for view in result["lateral"].values():
+        assert set(view) == {"all", "static", "moving_vehicle", "depth"}
+        assert view["all"]["pixels"] == 6 * 128 * 72
+        assert view["static"]["psnr"] > 8.0
+        assert 0.0 < view["depth"]["median_relative_error"] < 0.5
+        assert 1000 < view["depth"]["pixels"] < view["static"]["pixels"]
     removal = result["removal"]
     assert set(removal) == {"box", "outside", "not_removed"} and set(removal["not_removed"]) == {"box", "outside"}
     for region in ("box", "outside"):
@@ -67,7 +71,9 @@ def test_the_world_and_its_truth_lie_at_the_dataroot(finished):
     assert {path.name for path in root.iterdir()} == {
         "maps", "samples", "sweeps", "truth", "v1.0-mini", "world.json"
     }  # fmt: skip
-    assert len(json.loads((root / "truth/truth.json").read_text())["frames"]) == 6
+    views = json.loads((root / "truth/truth.json").read_text())["views"]
+    assert [view["left_m"] for view in views if view["without"] is None] == [0.0, 2.0, -2.0, 4.0]
+    assert all(len(view["frames"]) == 6 for view in views)
 
 
 def test_a_second_call_plans_nothing(finished):
