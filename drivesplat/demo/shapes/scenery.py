@@ -60,3 +60,8 @@ def cone() -> ColoredMesh:
     mesh = trimesh.creation.cone(0.17, 0.7, sections=16)
     base = box((-0.2, -0.2, 0), (0.2, 0.2, 0.04), Material.PLAIN, TYRE)
     return concatenate([base, uniform(mesh, Material.STRIPES, (0.8, 0.25, 0.03))])
+
+
+def litter_bin() -> ColoredMesh:
+    """A litter bin."""
+    return cylinder((0, 0, 0), (0, 0, 0.95), 0.28, Material.PLAIN, (0.05, 0.12, 0.06))

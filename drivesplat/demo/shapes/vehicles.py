@@ -95,3 +95,23 @@ def _lights(size: Numbers, z: float) -> list[ColoredMesh]:
 
 def _vehicle(parts: Sequence[ColoredMesh]) -> ColoredMesh:
     return concatenate(parts).classified(SurfaceClass.VEHICLE)
+
+
+PAINTS: tuple[Color, ...] = (
+    (0.5, 0.5, 0.52), (0.55, 0.06, 0.05), (0.05, 0.12, 0.35), (0.03, 0.03, 0.04), (0.7, 0.7, 0.68), (0.08, 0.22, 0.14),
+    (0.6, 0.4, 0.05),
+)  # fmt: skip
+
+
+def vehicle(kind, random):
+    """Provisional."""
+    color = PAINTS[random.integers(len(PAINTS))]
+    if kind != "car":
+        return van((5.4, 2.05, 2.5), (0.7, 0.7, 0.68)), "vehicle.truck"
+    size = (random.uniform(4.2, 4.8), random.uniform(1.78, 1.9), random.uniform(1.45, 1.6))
+    return car(size, color), "vehicle.car"
+
+
+def ego_vehicle():
+    """Provisional."""
+    return box((-0.6, -0.85, 0.3), (3.4, 0.85, 1.5), Material.PAINT, (0.5, 0.5, 0.5)).classified(SurfaceClass.VEHICLE)
