@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from drivesplat.demo.shapes.mesh import ColoredMesh
 
 
+@runtime_checkable
 class Body(Protocol):
     """The rigid pieces of an object and their motion in the object's frame (metres, x forward, y left, z up, the ground
     at z = 0)."""

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivesplat.demo.street.road import STRAIGHT, Road
-from drivesplat.scene.rigid import rigid
 
 LANE_CENTER = 1.75
 """Traffic drives on the right: at t = -LANE_CENTER along s, at +LANE_CENTER against it."""
@@ -16,6 +15,7 @@ SUSPENSION = ((0.25, 5.1, 0.0), (0.2, 3.7, 1.0), (0.012, 6.3, 0.0))
 """Amplitude (degrees, degrees, metres), angular frequency (1/s) and phase of pitch, roll and heave."""
 
 
+@runtime_checkable
 class Path(Protocol):
     """The motion of an object."""
 
@@ -99,14 +99,3 @@ class GivenPath:
         times = np.linspace(0.0, max(float(seconds.max(initial=0.0)), 1e-3), 200)
         steps = np.linalg.norm(np.diff(self.poses_at(times)[:, :2, 3], axis=0), axis=1)
         return np.interp(seconds, times, np.concatenate([[0.0], np.cumsum(steps)]))
-
-
-def fixed_pose(path: Path) -> np.ndarray:
-    """The pose (4, 4) of a path at second 0."""
-    return path.poses(np.zeros(1))[0]
-
-
-def carried(path: Path, offset: np.ndarray) -> GivenPath:
-    """The path of something fixed to an object, `offset` (3,) metres from its origin in its own frame."""
-    shift = rigid(np.eye(3), offset)
-    return GivenPath(lambda seconds: path.poses(seconds) @ shift, path.moves)
