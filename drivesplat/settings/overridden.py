@@ -11,6 +11,8 @@ def without_effect(config: Config, places: Iterable[tuple[str, str]]) -> list[st
     of a scene and a method, or of a scene and an empty name. Overrides of ablation variants are not reported."""
     given, defaults = dict(_leaves(config.model_dump())), dict(_leaves(Config().model_dump()))
     told = {key: value for key, value in given.items() if defaults.get(key) != value}
+    if not told:
+        return []
     sentences: dict[str, None] = {}
     scenes = {(config.dataset_of(scene), method): scene for scene, method in places if scene in config.dataset_names}
     for (dataset, method), scene in sorted(scenes.items()):

@@ -166,6 +166,22 @@ class Plan(Outputs):
             return self.report(targets).scenes
         return [scene for scene in scenes if scene is not None]
 
+    def scenes_and_methods(self, targets: list[str]) -> set[tuple[str, str]]:
+        """The pairs of scene and method that targets concern, and every such scene with an empty method: those of the
+        batch for a rule's name, a report or no target. Reads no result."""
+        pairs: set[tuple[str, str]] = set()
+        for target in targets or [""]:
+            scene, (_, *rest) = self._scene_of(target), self._inside_results(target)
+            if target == DOWNLOAD:
+                continue
+            if scene in self.config.scenes:
+                of_all = rest == ["metrics.json"]
+                methods = [method for method in self.config.methods if of_all or method in rest[:1]]
+                pairs |= {(scene, method) for method in ("", *methods)}
+            else:
+                pairs |= {(one, method) for one in self.config.batch_scenes for method in ("", *self.config.methods)}
+        return pairs
+
     def _scene_of(self, target: str) -> str | None:
         """The scene of a target: empty for a rule's name, None for a file outside the results of scenes."""
         for dataset, scene in self.worlds.items():

@@ -63,3 +63,15 @@ def test_a_run_says_so_before_its_estimate(tmp_path):
     lines = [line for line in asked.stdout.splitlines() if line.startswith("drivesplat: ")]
     assert lines[0].startswith("drivesplat: train.iterations: 60 does not hold for method vanilla"), asked.stdout
     assert " jobs, time not measured yet, " in lines[1]
+
+
+@pytest.mark.workflow
+def test_it_is_reported_once_by_a_dry_run_by_a_run_and_when_nothing_is_to_be_done(tmp_path):
+    """The job of the run reads the Snakefile again, in a process of its own, and does not repeat it."""
+    data = {"dataroot": "data", "scenes": ["0001"], "overrides": {"train": {"iterations": 7}}}
+    copy, expected = WorkflowCopy.make(tmp_path / "workflow", datasets={"nuscenes": data}), "Nothing to be done"
+    runs = [copy.run("results/0001/scene.json", flags=flags) for flags in (("-n",), (), (), ("-n",))]
+    assert [expected in run.stdout for run in runs] == [False, False, True, True], [run.stdout for run in runs]
+    for run in runs:
+        (sentence,) = (line for line in run.stdout.splitlines() if "does not hold for" in line)
+        assert sentence.startswith("drivesplat: train.iterations: 60 does not hold for dataset nuscenes, where ")

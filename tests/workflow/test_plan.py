@@ -235,3 +235,26 @@ def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_
         made.report(others).refuse_empty()
     (tmp_path / "a1/metrics.json").touch()
     made.report(["report"]).refuse_empty()
+
+
+# ---- targets
+
+
+EVERY_METHOD = ("", "street", "vanilla")
+
+
+@pytest.mark.parametrize(
+    ("targets", "scenes", "methods"),
+    [
+        ([], ("a1", "a2", "b1"), EVERY_METHOD),
+        (["films"], ("a1", "a2", "b1"), EVERY_METHOD),
+        (["elsewhere/gap_report.html"], ("a1", "a2", "b1"), EVERY_METHOD),
+        (["elsewhere/a2/metrics.json"], ("a2",), EVERY_METHOD),
+        (["elsewhere/a2/street/original.mp4"], ("a2",), ("", "street")),
+        (["elsewhere/a1/seed.ply", "elsewhere/b1/masks/masks.json"], ("a1", "b1"), ("",)),
+        (["download_nuscenes_mini"], (), EVERY_METHOD),
+    ],
+)
+def test_targets_concern_these_scenes_and_methods(targets, scenes, methods):
+    expected = {(scene, method) for scene in scenes for method in methods}
+    assert plan().scenes_and_methods(targets) == expected
