@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.chromium import CHROMIUM, chromium
+from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import COURSES, TURNING, Traffic, own_gaussians, placed
 from helpers.records import EMPTY_CHECKPOINT
@@ -37,7 +37,6 @@ SHOWN_WITHOUT_WORDS = """new Promise((done) => {
   const look = () => document.documentElement.dataset.shown === "yes" ? done() : setTimeout(look, 20);
   look();
 }).then(() => document.querySelectorAll("p").forEach((p) => (p.hidden = true)))"""
-in_a_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium for viewer.html: apt-get install chromium")
 
 
 def splats(count: int = COUNT, sh_degree: int = 2) -> Gaussians:
