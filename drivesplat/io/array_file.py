@@ -5,28 +5,32 @@ JSON: {"$array": name} stands for an array, {"$tuple": [...]} for a tuple, {"$it
 whose keys are not text.
 """
 
+import dataclasses
 import json
 import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
 from drivesplat.io.storage import atomic_write, unreadable
+from drivesplat.io.typed_record import field_values, typed_record
 
 CONTENT = "content"
 MAX_DIMENSIONS = 8
 
+R = TypeVar("R")
+
 
 def write_arrays(
     path: str | Path,
-    content: dict[str, Any],
+    content: Any,
     kind: type = np.ndarray,
     to_array: Callable[[Any], np.ndarray] = lambda array: array,
 ) -> None:
-    """Writes plain containers, scalars and arrays, atomically; `kind` is the class of arrays in `content`.
+    """Writes plain containers, scalars, arrays and dataclasses of them, atomically; `kind` is the class of arrays.
 
     Raises TypeError for anything else, ResultError naming `path` where the disk is full.
     """
@@ -38,6 +42,8 @@ def write_arrays(
                 raise ValueError(f"two arrays are called {name}")
             arrays[name] = to_array(value)
             return {"$array": name}
+        if dataclasses.is_dataclass(value):
+            value = field_values(value)
         if type(value) in (list, tuple):
             items = [packed(item, f"{name}/{i}") for i, item in enumerate(value)]
             return items if type(value) is list else {"$tuple": items}
@@ -81,6 +87,16 @@ def read_arrays(
     except Exception as error:  # zip, numpy and JSON each fail in their own ways
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise unreadable(path, rule, f"not a file of arrays of this workflow ({reason})") from error
+
+
+def read_typed_arrays(path: str | Path, rule: str, kind: type[R], what: str) -> R:
+    """Reads a dataclass that `write_arrays` wrote. Raises ResultError naming `path`, `rule` and `what` the record holds
+    where the file is invalid."""
+    content = read_arrays(path, rule)
+    try:
+        return typed_record(kind, content)
+    except (TypeError, ValueError) as error:
+        raise unreadable(path, rule, f"not a record of {what} ({error})") from error
 
 
 def _unpacked(plain: Any, arrays: dict[str, np.ndarray], from_array: Callable[[np.ndarray], Any]) -> Any:

@@ -11,7 +11,7 @@ import io
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -99,8 +99,9 @@ def sha256_file(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_json(path: str | Path, value: Any) -> None:
-    text = json.dumps(value, indent=1, allow_nan=False)
+def write_json(path: str | Path, value: Any, plain: Callable[[Any], Any] | None = None) -> None:
+    """Writes JSON; `plain` makes JSON types of what is none."""
+    text = json.dumps(value, indent=1, allow_nan=False, default=plain)
     with atomic_write(path) as file:
         file.write(text.encode() + b"\n")
 
