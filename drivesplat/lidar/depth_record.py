@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivesplat.io.array_file import read_typed_arrays, write_arrays
+from drivesplat.io.array_file import read_typed_arrays
 from drivesplat.io.storage import Provenance
 
 RULE = "lidar_depth"
@@ -34,11 +34,6 @@ class LidarDepthRecord:
 
     images: list[PixelDepths]
     provenance: Provenance = field(default_factory=dict)
-
-
-def write_lidar_depth(path: str | Path, record: LidarDepthRecord) -> None:
-    """Writes lidar_depth.npz."""
-    write_arrays(path, record)
 
 
 def read_lidar_depth(path: str | Path) -> LidarDepthRecord:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64
 
-from drivesplat.io.array_file import read_typed_arrays, write_arrays
+from drivesplat.io.array_file import read_typed_arrays
 from drivesplat.io.storage import Provenance, unreadable
 
 RULE = "free_space"
@@ -28,11 +28,6 @@ class FreeSpace:
     voxel: float
     keys: Int64[np.ndarray, " k"]
     provenance: Provenance = field(default_factory=dict)
-
-
-def write_free_space(path: str | Path, record: FreeSpace) -> None:
-    """Writes free_space.npz."""
-    write_arrays(path, record)
 
 
 def read_free_space(path: str | Path) -> FreeSpace:

@@ -10,8 +10,8 @@ from scipy.ndimage import median_filter
 from scipy.spatial import QhullError, cKDTree
 
 from drivesplat.lidar.coloring import visible
-from drivesplat.lidar.nearest_sweep import nearest_returns
 from drivesplat.lidar.occlusion import patches, unhidden
+from drivesplat.lidar.sweeps import nearest_returns
 from drivesplat.poses.mapping import ImagePoints, MappedImages
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics, project

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivesplat.io.array_file import read_typed_arrays, write_arrays
+from drivesplat.io.array_file import read_typed_arrays
 from drivesplat.io.storage import Provenance
 
 RULE = "refine_poses"
@@ -76,11 +76,6 @@ def no_points() -> TriangulatedPoints:
     """The record of a refinement that was rejected."""
     none = np.empty(0, dtype=np.int64)
     return TriangulatedPoints(np.empty((0, 3)), none, none)
-
-
-def write_triangulated(path: str | Path, record: TriangulatedPoints) -> None:
-    """Writes triangulated.npz."""
-    write_arrays(path, record)
 
 
 def read_triangulated(path: str | Path) -> TriangulatedPoints:

@@ -14,7 +14,7 @@ import numpy as np
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
-from drivesplat.lidar.sweeps import training_returns
+from drivesplat.lidar.sweeps import returns_of
 from drivesplat.scene.actor_record import RULE, ActorRecord, ActorRecords
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
@@ -33,7 +33,7 @@ UNSEEN = 127
 
 def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MASK) -> ActorRecords:
     """The actors of a scene, without provenance. Dynamic objects that no training image shows are left out."""
-    sweeps = training_returns(scene, job.holdout, job.own_car_radius)
+    sweeps = returns_of(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
     for mover in sorted(dynamic_objects(scene), key=lambda mover: mover.track.id):

@@ -25,8 +25,7 @@ from scipy import ndimage
 from skimage.measure import approximate_polygon, find_contours
 
 from drivesplat.lidar.coloring import in_image
-from drivesplat.lidar.nearest_sweep import nearest_returns
-from drivesplat.lidar.sweeps import training_sweeps
+from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
 from drivesplat.scene.ego_mask import Outline, enclosed
 from drivesplat.scene.images import continuous_intrinsics, pixel_rays, read_image
 from drivesplat.scene.rigid import inverse
@@ -98,7 +97,7 @@ class ComparedImages:
         """From a scene's training images and training sweeps."""
         frames = (scene.frames[i] for i in training_images(scene, search.holdout))
         moving = spaced_frames([frame for frame in frames if frame.camera == camera])
-        sweeps = tuple(training_sweeps(scene, search.holdout))
+        sweeps = tuple(sweeps_of(scene, search.holdout))
         return cls(tuple(moving), sweeps, scene.key_frame_interval, search.own_car_radius)
 
     @property

@@ -23,7 +23,7 @@ import numpy as np
 from drivesplat.errors import ConfigError
 from drivesplat.lidar.dynamic_objects import dynamic_objects
 from drivesplat.lidar.free_space_record import FreeSpace
-from drivesplat.lidar.sweeps import training_returns
+from drivesplat.lidar.sweeps import returns_of
 from drivesplat.lidar.traversal import OCCUPIED, count_passing, empty_voxels
 from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.scene.scene import Scene
@@ -66,7 +66,7 @@ def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: Triangulate
 def lidar_rays(scene: Scene, job: FreeSpaceJob) -> Rays:
     """The rays of the training sweeps, from each sweep's sensor; returns of the ego vehicle are left out."""
     movers, rays = dynamic_objects(scene), []
-    for sweep, points in training_returns(scene, job.holdout, job.own_car_radius):
+    for sweep, points in returns_of(scene, job.holdout, job.own_car_radius):
         static = np.ones(len(points), dtype=bool)
         for mover in movers:
             static &= ~mover.near(points, scene.seconds(sweep.timestamp), job.box_margin)

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.lidar.nearest_sweep import nearest_returns
-from drivesplat.lidar.sweeps import training_sweeps
+from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
 from drivesplat.preprocess.sky_mask import sky_mask
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
@@ -41,7 +40,7 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
-    groups, training = frame_groups(scene, job.holdout), training_sweeps(scene, job.holdout)
+    groups, training = frame_groups(scene, job.holdout), sweeps_of(scene, job.holdout)
 
     def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
         size = target_size(frame, job.images)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from drivesplat.io.array_file import read_typed_arrays, write_arrays
+from drivesplat.io.array_file import read_typed_arrays
 from drivesplat.io.storage import Provenance
 from drivesplat.scene.motion import Motion
 
@@ -42,11 +42,6 @@ class ActorRecords:
 
     actors: list[ActorRecord]
     provenance: Provenance = field(default_factory=dict)
-
-
-def write_actors(path: str | Path, record: ActorRecords) -> None:
-    """Writes actors.npz."""
-    write_arrays(path, record)
 
 
 def read_actors(path: str | Path) -> ActorRecords:

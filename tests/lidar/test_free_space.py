@@ -15,7 +15,7 @@ from helpers.tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.array_file import write_arrays
-from drivesplat.lidar.free_space_record import FreeSpace, read_free_space, write_free_space
+from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.lidar.traversal import OCCUPIED, count_passing
 from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.preprocess.free_space import Rays, camera_rays, free_space_record, lidar_rays, proven_empty, proving
@@ -319,7 +319,7 @@ def test_held_out_sweeps_prove_nothing(tiny_root, tmp_path):
 
 def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
     record = dataclasses.replace(free_space_record(tiny_scene, job()), provenance={"stages": {}})
-    write_free_space(tmp_path / "free_space.npz", record)
+    write_arrays(tmp_path / "free_space.npz", record)
     again = read_free_space(tmp_path / "free_space.npz")
     assert (again.voxel, again.provenance) == (record.voxel, record.provenance)
     for name in ("lower", "shape", "keys"):

@@ -13,8 +13,9 @@ from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
 from drivesplat.errors import ResultError
+from drivesplat.io.array_file import write_arrays
 from drivesplat.lidar.depth import split_sweep
-from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth, write_lidar_depth
+from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
 from drivesplat.lidar.occlusion import patches, unhidden
 from drivesplat.preprocess.extract import extract_scene
@@ -297,14 +298,14 @@ def test_moving_people_are_dynamic_and_parked_vehicles_are_static(tiny_scene):
 def test_a_drive_without_lidar_has_a_record_without_depths(root, tmp_path):
     shutil.rmtree(root / "samples" / "LIDAR_TOP")
     scene = scene_at(root)
-    write_lidar_depth(tmp_path / "lidar_depth.npz", LidarDepthRecord(lidar_depths(scene, job())))
+    write_arrays(tmp_path / "lidar_depth.npz", LidarDepthRecord(lidar_depths(scene, job())))
     images = read_lidar_depth(tmp_path / "lidar_depth.npz").images
     assert len(images) == len(scene.frames) and not any(len(image.depth) for image in images)
 
 
 def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
     record = LidarDepthRecord(lidar_depths(tiny_scene, job()), {"stages": {}})
-    write_lidar_depth(tmp_path / "lidar_depth.npz", record)
+    write_arrays(tmp_path / "lidar_depth.npz", record)
     assert pickle.dumps(read_lidar_depth(tmp_path / "lidar_depth.npz")) == pickle.dumps(record)
     assert pickle.dumps(lidar_depths(tiny_scene, job())) == pickle.dumps(record.images)
 

@@ -25,10 +25,11 @@ from PIL import Image
 from pydantic import ValidationError
 
 from drivesplat.errors import ResultError
+from drivesplat.io.array_file import write_arrays
 from drivesplat.io.typed_record import field_values
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors, write_actors
+from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.object_class import ObjectClass
@@ -439,7 +440,7 @@ def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
 
 def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, tmp_path):
     record = dataclasses.replace(actors_record(tiny_scene, job()), provenance={"stages": {}})
-    write_actors(tmp_path / "actors.npz", record)
+    write_arrays(tmp_path / "actors.npz", record)
     read = read_actors(tmp_path / "actors.npz")
     assert_same(read, record)
     (actor,) = read.actors
@@ -452,7 +453,7 @@ def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, tmp_path
 
 
 def test_a_static_drive_has_an_empty_record_of_actors(tmp_path):
-    write_actors(tmp_path / "actors.npz", actors_record(drive(tmp_path, PARKED), job()))
+    write_arrays(tmp_path / "actors.npz", actors_record(drive(tmp_path, PARKED), job()))
     assert read_actors(tmp_path / "actors.npz").actors == []
 
 

@@ -17,8 +17,7 @@ from drivesplat.io.point_cloud import PointCloud
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
 from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.far_points import far_points, uncovered
-from drivesplat.preprocess.lidar_seed import color_view, lidar_points, seed_points
+from drivesplat.preprocess.lidar_seed import color_view, far_points, lidar_points, seed_points, uncovered
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import project
