@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.held_out import held_out_images, measured_images
 from drivesplat.evaluation.lpips_map import load_lpips
-from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
+from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.sample_pair import SamplePair, render_sample_pair
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered_with_depth

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and LPIPS pooled over regions, as the measuring protocol defines them.
+"""PSNR, SSIM and LPIPS pooled over regions, and errors of depth, as the measuring protocol defines them.
 
 Maps are computed per frame and accumulated per region, so memory does not grow with the number of frames.
 """
@@ -13,6 +13,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from drivesplat.errors import ResultError
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.scene.regions import REGIONS
 
 MIN_REGION_PIXELS = 1000
@@ -162,3 +163,25 @@ def gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
     if static is None or moving is None or static["psnr"] is None or moving["psnr"] is None:
         return None
     return static["psnr"] - moving["psnr"]
+
+
+class DepthErrors:
+    """Relative errors of rendered depth over a group of images: `add` each image with LiDAR depth, then `summary`."""
+
+    def __init__(self) -> None:
+        self._errors: list[np.ndarray] = []
+
+    def add(self, rendered: np.ndarray, known: PixelDepths) -> None:
+        """Adds a rendered depth image (h, w) in metres and its LiDAR depth."""
+        found = rendered[known.rows, known.columns].astype(np.float64)
+        self._errors.append(np.abs(found - known.depth) / known.depth)
+
+    def summary(self) -> dict[str, Any]:
+        """`depth`: the median of |rendered - LiDAR| / LiDAR over all `pixels` of the group with LiDAR depth, None if
+        there are too few; an empty record if no image has LiDAR depth."""
+        if not self._errors:
+            return {}
+        errors = np.concatenate(self._errors)
+        if len(errors) < MIN_REGION_PIXELS:
+            return {"depth": None}
+        return {"depth": {"median_relative_error": float(np.median(errors)), "pixels": len(errors)}}

@@ -6,7 +6,8 @@ import pytest
 import torch
 from helpers.trainings import folders_of, recorded_views, settings_of, untrained
 
-from drivesplat.training.clock import ITERATION, OTHER, UNTIMED, Clock, StageClock
+from benchmarks.speed.stage_clock import OTHER, StageClock
+from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -17,7 +18,7 @@ CPU = torch.device("cpu")
 def time_passes(monkeypatch):
     """Lets the time of clocks pass by so many seconds."""
     now = [100.0]
-    monkeypatch.setattr("drivesplat.training.clock.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("benchmarks.speed.stage_clock.time.perf_counter", lambda: now[0])
 
     def by(seconds: float) -> None:
         now[0] += seconds
