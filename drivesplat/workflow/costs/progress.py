@@ -15,7 +15,6 @@ from drivesplat.workflow.job_logs import has_begun, is_cut_short
 EVERY_S = 30.0
 MAX_NAMED = 4
 """Running jobs that are named at most."""
-TAIL_BYTES = 4096
 _PROGRESS = re.compile(r"([\d.]+) %, [\d.]+ it/s, (\d+) s left")
 """The progress that a training logs (`drivesplat.training.monitor`)."""
 
@@ -79,17 +78,10 @@ class RunProgress:
     def _of_running(self, job: JobId, expected: float | None, now: float) -> tuple[float | None, float | None]:
         """The percentage of a running job where its log tells it, and the seconds it still needs where known."""
         elapsed = now - self._since.setdefault(job, now)
-        told = _PROGRESS.findall(_tail(self._logs[job])) if job.stage == TRAIN else []
+        told = _PROGRESS.findall(self._logs[job].read_text("utf-8")) if job.stage == TRAIN else []
         if told:
             return float(told[-1][0]), float(told[-1][1])
         return None, None if expected is None else max(0.0, expected - elapsed)
-
-
-def _tail(path: Path) -> str:
-    with open(path, "rb") as file:
-        file.seek(0, 2)
-        file.seek(max(0, file.tell() - TAIL_BYTES))
-        return file.read().decode(errors="replace")
 
 
 def watch(progress: RunProgress, every_s: float = EVERY_S) -> threading.Event:
