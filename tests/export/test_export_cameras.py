@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.export.cameras_json import cameras_record
+from drivesplat.export.splat_asset import cameras_record
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.io.storage import write_json
 from drivesplat.preprocess.parser import training_record

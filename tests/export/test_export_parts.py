@@ -21,9 +21,8 @@ from helpers.hand_made_traffic import (
 from helpers.records import EMPTY_CHECKPOINT
 
 from drivesplat.export import splat_asset
-from drivesplat.export.parts_json import write_parts
 from drivesplat.export.sampled_motion import sample_motion
-from drivesplat.export.splat_asset import SplatFiles, export_splat
+from drivesplat.export.splat_asset import SplatFiles, export_splat, write_parts
 from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, trained_gaussians, trained_groups
 from drivesplat.export.unique_names import unique_names

@@ -16,11 +16,10 @@ from helpers.records import EMPTY_CHECKPOINT
 from pxr import Gf, Kind, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 from scipy.spatial.transform import Rotation
 
-from drivesplat.export import usd_asset
+from drivesplat.export import usd
 from drivesplat.export.sampled_motion import sample_motion
 from drivesplat.export.trained_parts import SampledGroup
-from drivesplat.export.usd import splat_stage, write_usdz
-from drivesplat.export.usd_asset import export_usd
+from drivesplat.export.usd import export_usd, splat_stage, write_usdz
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.export import ExportJob
 
@@ -43,7 +42,7 @@ def scene(tiny_scene):
 def package(tmp_path_factory, scene):
     path = tmp_path_factory.mktemp("usd") / "scene.usdz"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(usd_asset, "trained_model", lambda _: street())
+        monkeypatch.setattr(usd, "trained_model", lambda _: street())
         export_usd(path, EMPTY_CHECKPOINT, scene, ExportJob(eval_camera="CAM_FRONT", gaussians=1000), PROVENANCE)
     return path
 
@@ -241,7 +240,7 @@ def test_an_object_may_have_the_name_of_the_camera():
 
 def test_the_budget_is_shared_by_all_groups_and_an_empty_object_is_valid(tmp_path, scene, monkeypatch):
     """The two wide, opaque Gaussians of the background cover most."""
-    monkeypatch.setattr(usd_asset, "trained_model", lambda _: street())
+    monkeypatch.setattr(usd, "trained_model", lambda _: street())
     monkeypatch.setattr("helpers.hand_made_traffic.own_gaussians", lambda *_: some_gaussians(12, 1, 0)[slice(0, 1)])
     job = ExportJob(eval_camera="CAM_FRONT", gaussians=2)
     export_usd(tmp_path / "scene.usdz", EMPTY_CHECKPOINT, scene, job, PROVENANCE)
