@@ -48,7 +48,7 @@ def sealed(stages: dict[str, Any], inputs: dict[str, str]) -> Provenance:
         "settings_sha256": sha256_text(canonical_json({name: stage["settings"] for name, stage in stages.items()})),
         "code_sha256": sha256_text(canonical_json({name: stage["code"] for name, stage in stages.items()})),
         "inputs_sha256": sha256_text(canonical_json(inputs)),
-        "versions": {name: _version(name) for name in VERSIONS_OF},
+        "versions": {name: package_version(name) for name in VERSIONS_OF},
         "stages": stages,
         "inputs": inputs,
     }
@@ -81,7 +81,8 @@ def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
     return {key: item for name, child in value.items() for key, item in _flat(child, f"{prefix}{name}.").items()}
 
 
-def _version(package: str) -> str | None:
+def package_version(package: str) -> str | None:
+    """The version of an installed package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -13,10 +13,10 @@ from drivesplat.io import storage
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.provenance.record import differences
-from drivesplat.report.failures import why_missing
 from drivesplat.report.statistics import gap_closed, mean_over_scenes
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.report import ReportJob
+from drivesplat.workflow.job_logs import why_missing
 
 SCHEMA = 2
 REGIONS = ("static", "vehicle", "moving_vehicle")

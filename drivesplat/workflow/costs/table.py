@@ -12,6 +12,7 @@ FILES = ("costs.csv", "costs.json")
 LIMIT_SECONDS = 90 * 60.0
 """Target for the time of a scene; reported, not enforced."""
 ABLATION = "ablation"
+PEAKS = ("max_rss_mb", "gpu_memory_gb")
 COLUMNS = (
     "scene", "method", "stage", "film", "seconds", "seconds_from", "max_rss_mb", "cpu_seconds", "mean_load",
     "gpu_memory_gb", "device", "scene_under_90_minutes",
@@ -29,7 +30,7 @@ def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[s
             continue
         seconds = sum(c.seconds for c in counted)
         trainings = [c for c in counted if c.job.stage == TRAIN]
-        memory = {name: [v for c in counted if (v := getattr(c, name)) is not None] for name in _PEAKS}
+        memory = {name: [v for c in counted if (v := getattr(c, name)) is not None] for name in PEAKS}
         totals.append(
             {
                 "scene": scene,
@@ -44,9 +45,6 @@ def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[s
             }
         )
     return totals
-
-
-_PEAKS = ("max_rss_mb", "gpu_memory_gb")
 
 
 def costs_record(results: Path, methods: Collection[str]) -> dict[str, Any]:
