@@ -35,7 +35,7 @@ from drivesplat.settings.train import CoarseToFineSettings
 from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
 from drivesplat.training.train import TrainingFolders, train
-from drivesplat.workflow.gpus import hold_card
+from drivesplat.workflow.gpus import hold_gpu
 
 Times = dict[str, Any]
 WHOLE_IMAGES = CoarseToFineSettings(quarter_until=0.0, half_until=0.0)
@@ -161,14 +161,14 @@ def _profile_folder(task: Task) -> Path:
 @contextmanager
 def held_device(settings: DeviceSettings) -> Iterator[torch.device]:
     """The device that the settings choose, with no other job of this workflow on it and with its kernels loaded."""
-    card = hold_card(1) if settings.kind != "cpu" else None
+    lock = hold_gpu(1) if settings.kind != "cpu" else None
     try:
         device = choose_device(settings)
         load_kernels(device)
         yield device
     finally:
-        if card is not None:
-            card.close()
+        if lock is not None:
+            lock.close()
 
 
 def load_kernels(device: torch.device) -> None:

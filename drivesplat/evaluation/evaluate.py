@@ -18,7 +18,7 @@ from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.sample_pair import SamplePair, render_sample_pair
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
-from drivesplat.lidar.depth import clouds_of, depths_in
+from drivesplat.lidar.depth import depths_in, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
@@ -146,7 +146,7 @@ def held_out_depths(recording: PreparedDrive, camera: str, job: LidarDepthJob) -
     """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
     missing."""
     scene = recording.scene
-    clouds = {cloud.sample_index: cloud for cloud in clouds_of(scene, job, HELD_OUT_GROUPS)}
+    clouds = {cloud.sample_index: cloud for cloud in split_sweeps(scene, job, HELD_OUT_GROUPS)}
     images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.record, group, camera)]
     owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
     return {i: depths_in(scene, scene.frames[i], cloud, job, recording.ego_mask(i)) for i, cloud in owned.items()}

@@ -65,11 +65,11 @@ def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: Triangulate
 
 def lidar_rays(scene: Scene, job: FreeSpaceJob) -> Rays:
     """The rays of the training sweeps, from each sweep's sensor; returns of the ego vehicle are left out."""
-    movers, rays = dynamic_objects(scene), []
+    objects, rays = dynamic_objects(scene), []
     for sweep, points in returns_of(scene, job.holdout, job.own_car_radius):
         static = np.ones(len(points), dtype=bool)
-        for mover in movers:
-            static &= ~mover.near(points, scene.seconds(sweep.timestamp), job.box_margin)
+        for item in objects:
+            static &= ~item.near(points, scene.seconds(sweep.timestamp), job.box_margin)
         origins = np.broadcast_to(sweep.sensor_to_world[:3, 3], points.shape)
         rays.append(Rays(origins, points, static))
     return Rays.joined(rays)

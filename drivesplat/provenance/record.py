@@ -22,7 +22,7 @@ def provenance(
     merged = combine(upstream)
     merged["stages"][stage] = {"settings": settings, "code": code}
     merged["inputs"].update(inputs)
-    return sealed(merged["stages"], merged["inputs"])
+    return with_digests(merged["stages"], merged["inputs"])
 
 
 def combine(records: Iterable[Provenance]) -> Provenance:
@@ -39,10 +39,10 @@ def combine(records: Iterable[Provenance]) -> Provenance:
             )
         stages |= record["stages"]
         inputs |= record["inputs"]
-    return sealed(stages, inputs)
+    return with_digests(stages, inputs)
 
 
-def sealed(stages: dict[str, Any], inputs: dict[str, str]) -> Provenance:
+def with_digests(stages: dict[str, Any], inputs: dict[str, str]) -> Provenance:
     """The record with the digests that `metrics.json` specifies."""
     return {
         "settings_sha256": sha256_text(canonical_json({name: stage["settings"] for name, stage in stages.items()})),

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 @contextmanager
-def sole_trainer(folder: Path) -> Iterator[None]:
+def training_lock(folder: Path) -> Iterator[None]:
     """Keeps a second trainer out of `folder`; the kernel frees the lock when this process ends, however it ends.
 
     Raises TrainingError naming the process that holds it, ResultError where the folder cannot be written.

@@ -169,7 +169,7 @@ def run_training(
     """Trains and writes both files, or raises and writes neither. The resume state is kept after a failure, and where
     the parent process was killed meanwhile: Snakemake did not see this training end and will run it again."""
     started_by = os.getppid()
-    with resume_state.sole_trainer(files.resume):
+    with resume_state.training_lock(files.resume):
         device = choose_device(device_settings)
         begun = prepare(inputs, job, device)
         fingerprint = sha256_text(

@@ -23,7 +23,7 @@ from drivesplat.provenance.file_digests import (
 from drivesplat.provenance.record import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.workflow.gpus import hold_card
+from drivesplat.workflow.gpus import hold_gpu
 
 S = TypeVar("S", bound=Settings)
 
@@ -46,7 +46,7 @@ class Job:
         self._rule: str = snakemake.rule
         self._params = snakemake.params
         self._resources = snakemake.resources
-        self._card: BinaryIO | None = None
+        self._gpu: BinaryIO | None = None
         self._read: dict[str, str] = {}
         self._members = {str(path): member_states(path) for path in self.output}
         self._dataset: dict[str, dict[str, str]] = {}
@@ -70,8 +70,8 @@ class Job:
         """The device to run on; not part of the settings, since it changes no result. Reserves a GPU for the job until
         it ends, where there is one, and hides all others."""
         settings = DeviceSettings.model_validate_json(self._resources.device)
-        if settings.kind != "cpu" and self._card is None:  # a second lock would wait for the first
-            self._card = hold_card(settings.jobs_per_card)
+        if settings.kind != "cpu" and self._gpu is None:  # a second lock would wait for the first
+            self._gpu = hold_gpu(settings.jobs_per_card)
         return settings
 
     def provenance(self, *upstream: Provenance, inputs: dict[str, str] | None = None) -> Provenance:

@@ -17,7 +17,7 @@ from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
-from drivesplat.workflow.gpus import any_card
+from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
@@ -74,7 +74,7 @@ class Plan(Outputs):
             device = for_scene(self.config, scene).device.model_dump(mode="json")
             if self.config.datasets[name].world is not None and device["kind"] == "auto":
                 device["kind"] = "any"
-            on_gpu = device["kind"] != "cpu" and (device["kind"] != "any" or any_card())
+            on_gpu = device["kind"] != "cpu" and (device["kind"] != "any" or any_gpu())
             self._devices[name] = canonical_json(device), int(on_gpu)
         return self._devices[name]
 

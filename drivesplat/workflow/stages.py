@@ -130,8 +130,8 @@ def _scene_source(at: Place) -> dict[str, Any]:
 def _ego_mask(at: Place) -> dict[str, Any]:
     config, kind = at.config, at.config.masks.own_car
     polygons = config.masks.own_car_polygons if kind != "none" else {}
-    spared = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
-    cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *spared})
+    excluded = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
+    cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *excluded})
     search = EgoMaskSearch(cameras=cameras, holdout=config.holdout, **_lidar(at, "own_car_radius"))
     return {"polygons": polygons, "search": search if cameras else None}
 

@@ -339,7 +339,7 @@ def test_seeds_are_trained_in_parallel_on_several_gpus(tmp_path, monkeypatch):
     file, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
     assert command.in_series(tasks, 1) == [tasks]
     assert [{task.seed for task in series} for series in command.in_series(tasks, 2)] == [{4}, {5}]
-    monkeypatch.setattr(command, "visible_cards", lambda: 2)
+    monkeypatch.setattr(command, "visible_gpus", lambda: 2)
     monkeypatch.setattr(SnakemakeRun, "start", lambda *_: Outcome(0))
     monkeypatch.setattr(command, "write", lambda record, _: record["runs"])
     monkeypatch.setattr(command, "speed", lambda _, measured, profiles: {"runs": list(measured)})

@@ -17,7 +17,7 @@ from drivesplat.io.array_file import write_arrays
 from drivesplat.lidar.depth import split_sweep
 from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
-from drivesplat.lidar.occlusion import patches, unhidden
+from drivesplat.lidar.occlusion import patches, unoccluded
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.readers.truth import read_truth
@@ -156,7 +156,7 @@ def test_a_return_occludes_farther_returns_in_its_window(row, column, depth, see
     metre."""
     rows, columns, depths = np.array([50, row]), np.array([60, column]), np.array([10.0, depth])
     halves = np.array([[7.2, 4.8], [0.0, 0.0]])
-    assert unhidden(rows, columns, depths, halves, (100, 100))[1] == seen
+    assert unoccluded(rows, columns, depths, halves, (100, 100))[1] == seen
 
 
 def test_windows_grow_as_depth_decreases():

@@ -15,10 +15,10 @@ from drivesplat.preprocess import ego_mask as search_module
 from drivesplat.preprocess.ego_mask import (
     ComparedImages,
     camera_outlines,
+    contrasts,
     ego_mask_record,
     find_outlines,
     outlines_of,
-    stands_out,
 )
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.ego_mask import EgoMask, enclosed, read_ego_mask
@@ -207,8 +207,8 @@ def test_a_gradual_increase_of_variation_is_not_a_border(unseen):
     drive = ComparedImages.of(unseen, "CAM_BACK", LOOKING)
     rows = np.arange(90.0)[:, None].repeat(160, axis=1)
     lower = rows >= 70
-    assert stands_out(lower, np.where(lower, 4.0, 20.0), drive)
-    assert not stands_out(lower, 4.0 + 0.5 * (89.0 - rows), drive)
+    assert contrasts(lower, np.where(lower, 4.0, 20.0), drive)
+    assert not contrasts(lower, 4.0 + 0.5 * (89.0 - rows), drive)
 
 
 # ---- what is told

@@ -91,7 +91,7 @@ def print_whether_torchs_compiler_is_read(folder: str) -> None:
 
 def hold_the_lock(folder: str) -> None:
     """For a subprocess: a trainer that works until it is killed."""
-    with resume_state.sole_trainer(Path(folder)):
+    with resume_state.training_lock(Path(folder)):
         print("held", flush=True)
         signal.pause()
 
@@ -515,20 +515,20 @@ def test_a_second_trainer_is_refused_naming_the_first_and_a_killed_one_frees_the
     finally:
         holder.kill()
         holder.communicate()
-    with resume_state.sole_trainer(tmp_path / "resume"):
+    with resume_state.training_lock(tmp_path / "resume"):
         assert_refused(tmp_path / "resume", os.getpid())
 
 
 def assert_refused(folder: Path, process: int) -> None:
     refusal = rf"process {process} is still training in .*{folder.name}"
-    with pytest.raises(TrainingError, match=refusal), resume_state.sole_trainer(folder):
+    with pytest.raises(TrainingError, match=refusal), resume_state.training_lock(folder):
         pass
 
 
 def test_a_trainer_that_fails_frees_the_folder(tmp_path):
-    with pytest.raises(EndedError), resume_state.sole_trainer(tmp_path):
+    with pytest.raises(EndedError), resume_state.training_lock(tmp_path):
         raise EndedError
-    with resume_state.sole_trainer(tmp_path):
+    with resume_state.training_lock(tmp_path):
         pass
 
 

@@ -14,7 +14,7 @@ from helpers import REPOSITORY
 
 from drivesplat.workflow.job import Job
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.workflow.gpus import visible_cards
+from drivesplat.workflow.gpus import visible_gpus
 
 CARD_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 
@@ -33,7 +33,7 @@ def four_cards(monkeypatch):
 
 
 def test_all_cards_count_where_none_is_hidden(four_cards):
-    assert visible_cards() == 4
+    assert visible_gpus() == 4
 
 
 @pytest.mark.parametrize("variable", CARD_VARIABLES)
@@ -51,17 +51,17 @@ def test_all_cards_count_where_none_is_hidden(four_cards):
 )
 def test_hidden_cards_do_not_count_and_there_is_always_one(four_cards, monkeypatch, variable, value, cards):
     monkeypatch.setenv(variable, value)
-    assert visible_cards() == cards
+    assert visible_gpus() == cards
 
 
 def test_an_empty_list_hides_all_nvidia_cards(four_cards, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert visible_cards() == 1
+    assert visible_gpus() == 1
 
 
 def test_a_machine_without_cards_schedules_one_gpu_job_at_a_time(four_cards, monkeypatch):
     monkeypatch.setattr(Path, "glob", lambda *_: iter(()))
-    assert visible_cards() == 1
+    assert visible_gpus() == 1
 
 
 def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path):
@@ -73,21 +73,21 @@ def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path
         Path("/sys/class/kfd/kfd/topology/nodes"): [tmp_path / str(node) / "gpu_id" for node in range(4)],
     }
     monkeypatch.setattr(Path, "glob", lambda self, *_: iter(found[self]))
-    assert visible_cards() == 2
+    assert visible_gpus() == 2
 
 
 def test_counting_cards_does_not_import_torch():
     """Planning takes about a second; torch takes longer."""
-    counting = "from drivesplat.workflow.gpus import visible_cards; visible_cards()"
+    counting = "from drivesplat.workflow.gpus import visible_gpus; visible_gpus()"
     script = f"import sys; {counting}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, check=True)
 
 
 HOLD = """
 import logging, os, sys, time
-from drivesplat.workflow.gpus import hold_card
+from drivesplat.workflow.gpus import hold_gpu
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
-lock = hold_card(int(sys.argv[1]))
+lock = hold_gpu(int(sys.argv[1]))
 print("holds", os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
 time.sleep(float(sys.argv[2]))
 """

@@ -78,9 +78,9 @@ class RunProgress:
     def _of_running(self, job: JobId, expected: float | None, now: float) -> tuple[float | None, float | None]:
         """The percentage of a running job where its log tells it, and the seconds it still needs where known."""
         elapsed = now - self._since.setdefault(job, now)
-        told = _PROGRESS.findall(self._logs[job].read_text("utf-8")) if job.stage == TRAIN else []
-        if told:
-            return float(told[-1][0]), float(told[-1][1])
+        logged = _PROGRESS.findall(self._logs[job].read_text("utf-8")) if job.stage == TRAIN else []
+        if logged:
+            return float(logged[-1][0]), float(logged[-1][1])
         return None, None if expected is None else max(0.0, expected - elapsed)
 
 

@@ -46,7 +46,7 @@ class RunCosts:
             for sentence in without_effect(self._plan.config, self._plan.scenes_and_methods(wanted)):
                 _say(sentence)
 
-    def tell_estimate(self) -> bool:
+    def print_estimate(self) -> bool:
         """Prints the estimate in full if ESTIMATE is a target. Returns whether it is."""
         if ESTIMATE not in self._targets:
             return False
