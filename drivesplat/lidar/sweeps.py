@@ -11,7 +11,7 @@ from drivesplat.scene.rigid import apply
 from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.scene.splits import Group, sweep_groups
 from drivesplat.scene.tracks import Box
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 
 
 def sweeps_of(scene: Scene, holdout: HoldoutSettings, groups: tuple[Group, ...] = ("train",)) -> list[Sweep]:

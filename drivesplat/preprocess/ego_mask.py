@@ -31,7 +31,7 @@ from drivesplat.scene.images import continuous_intrinsics, pixel_rays, read_imag
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import training_images
-from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 
 Group = Literal["train", "interpolation", "extrapolation", "excluded"]
 HELD_OUT_GROUPS: tuple[Group, Group] = ("interpolation", "extrapolation")

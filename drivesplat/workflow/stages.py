@@ -17,16 +17,15 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
-from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import ExportJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
+from drivesplat.settings.images import ParserJob
 from drivesplat.settings.inspection import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
-from drivesplat.settings.masks import MaskJob
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob

@@ -18,7 +18,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.splits import frame_groups
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 
 

@@ -35,10 +35,8 @@ from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.parser import training_record
 from drivesplat.settings.config import load
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
-from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
 from drivesplat.training.exposure_init import initial_gains, log_gains
 from drivesplat.training.losses import loss_terms

@@ -25,9 +25,9 @@ from drivesplat.scene.ego_mask import EgoMask, enclosed, read_ego_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.config import load
-from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch
 from drivesplat.workflow.stages import stage_settings
 
 CAMERAS = ("CAM_BACK", "CAM_BACK_RIGHT", "CAM_FRONT")

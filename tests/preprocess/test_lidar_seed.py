@@ -27,8 +27,7 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.scene.tracks import Box, box_at, moving_tracks
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 
 HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}
