@@ -6,7 +6,6 @@ Colours come from training images that show the actor. Held-out images and sweep
 """
 
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +42,8 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
             seeds.append(
                 Seed(dynamic_object, part, *gathered_points(scene, dynamic_object, sweeps, job.actors, random))
             )
-    for view in actor_views(scene, job, ego_mask):
+    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
+    for view in prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames):
         for seed in seeds:
             seed.add_view(view)
     unseen = [seed.dynamic_object.track.id for seed in seeds if not seed.seen]
@@ -89,12 +89,6 @@ class ActorView:
     owners: np.ndarray
     tracks: dict[str, int]
     seen: set[str]
-
-
-def actor_views(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask) -> Iterator[ActorView]:
-    """The training images, prefetched one by one."""
-    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
-    return prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames)
 
 
 def actor_view(scene: Scene, frame: Frame, job: ActorSeedJob, ego_mask: EgoMask) -> ActorView:

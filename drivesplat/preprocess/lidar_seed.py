@@ -7,7 +7,6 @@ sweeps contribute neither LiDAR positions nor colours.
 """
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +60,8 @@ def seed_points(
     }
     positions, times = (np.concatenate(columns) for columns in zip(*sources.values(), strict=True))
     source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
-    colors, seen = color_by_visibility(positions, times, color_views(scene, frames, job.images, ego_mask))
+    views = prefetch(lambda frame: color_view(scene, frame, job.images, ego_mask), frames)  # all exceed memory
+    colors, seen = color_by_visibility(positions, times, views)
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
@@ -132,13 +132,6 @@ def triangulated_points(scene: Scene, job: SeedJob, record: TriangulatedPoints) 
     times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
     chosen = record.seen_in(training)
     return record.points[chosen], record.mean_over_views(training, times)[chosen]
-
-
-def color_views(
-    scene: Scene, frames: list[Frame], images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK
-) -> Iterator[ColorView]:
-    """The frames as sources of colour, one by one: at 12 Hz all of them together exceed memory."""
-    return prefetch(lambda frame: color_view(scene, frame, images, ego_mask), frames)
 
 
 def color_view(scene: Scene, frame: Frame, images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK) -> ColorView:
