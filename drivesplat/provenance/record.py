@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import Provenance, canonical_json, sha256_file, sha256_text
+from drivesplat.io.storage import Provenance, canonical_json, leaves, sha256_file, sha256_text
 
 VERSIONS_OF = ("torch", "gsplat", "numpy", "nuscenes-devkit", "lpips", "pycolmap")
 
@@ -62,7 +62,7 @@ def differences(expected: dict[str, Any], found: dict[str, Any], shared_only: bo
             if not shared_only:
                 lines.append(f"{stage}: {'not in this result' if stage in expected else 'no longer in the config'}")
             continue
-        a, b = (_flat(side[stage]["settings"]) for side in (expected, found))
+        a, b = (leaves(side[stage]["settings"]) for side in (expected, found))
         for key in sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key)):
             lines.append(f"{stage}: {key} is {b.get(key)!r} in the result, {a.get(key)!r} now")
         if expected[stage]["code"] != found[stage]["code"]:
@@ -73,12 +73,6 @@ def differences(expected: dict[str, Any], found: dict[str, Any], shared_only: bo
 def digests_of(files: Iterable[str | Path]) -> str:
     """One digest for a set of files, by name and content."""
     return sha256_text(canonical_json({Path(file).name: sha256_file(file) for file in files}))
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {prefix.rstrip("."): value}
-    return {key: item for name, child in value.items() for key, item in _flat(child, f"{prefix}{name}.").items()}
 
 
 def package_version(package: str) -> str | None:

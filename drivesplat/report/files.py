@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from drivesplat.io.storage import atomic_write, write_json
+from drivesplat.io.storage import atomic_write, write_csv, write_json
 from drivesplat.report.console import console_table
-from drivesplat.report.gaps import gap_report, write_csv
+from drivesplat.report.gaps import COLUMNS, gap_report
 from drivesplat.report.html import report_page
 from drivesplat.report.media import collect_media
 from drivesplat.settings.report import ReportJob
@@ -24,7 +24,7 @@ def write_report(
     report = gap_report(list(metrics), job, results / "logs")
     media = collect_media([*pictures, *links], results)
     write_json(record, report)
-    write_csv(table, report)
+    write_csv(table, COLUMNS, report["rows"])
     with atomic_write(page) as file:
         file.write(report_page(report, media, _costs(results, job)).encode())
     print(console_table(report), flush=True)

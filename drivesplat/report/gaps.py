@@ -9,7 +9,6 @@ from typing import Any
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.comparison import GROUP_PLACES
-from drivesplat.io import storage
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.provenance.record import differences
@@ -64,11 +63,6 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
         "missing": missing,
         "protocols": protocols,
     }
-
-
-def write_csv(path: str | Path, report: dict[str, Any]) -> None:
-    """Writes the rows of a report as a table; null figures are empty cells."""
-    storage.write_csv(path, COLUMNS, ({column: row[column] for column in COLUMNS} for row in report["rows"]))
 
 
 COLUMNS = (

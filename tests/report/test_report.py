@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, stages, told
 
+from drivesplat.io.storage import write_csv
 from drivesplat.report.console import console_table
-from drivesplat.report.gaps import gap_report, summary_sentences, write_csv
+from drivesplat.report.gaps import COLUMNS, gap_report, summary_sentences
 
 VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
 VANILLA_B = method(group(26.0, None, 22.0, lpips=0.1), group(23.0), gaussians=3000, seconds=80.0)
@@ -243,7 +244,7 @@ def test_configured_scenes_without_a_result_are_listed(write):
 def test_a_report_without_results_is_written(tmp_path):
     report = gap_report([], expecting("0061"), NO_LOGS)
     assert report["rows"] == report["means"] == [] and [item["scene"] for item in report["missing"]] == ["0061"]
-    write_csv(tmp_path / "gap_report.csv", report)
+    write_csv(tmp_path / "gap_report.csv", COLUMNS, report["rows"])
     assert len((tmp_path / "gap_report.csv").read_text().splitlines()) == 1
     assert "0061" in console_table(report)
 
@@ -265,7 +266,7 @@ def test_a_report_is_json_without_nan(report):
 
 def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
     before = copy.deepcopy(report)
-    write_csv(tmp_path / "gap_report.csv", report)
+    write_csv(tmp_path / "gap_report.csv", COLUMNS, report["rows"])
     with open(Path(tmp_path / "gap_report.csv"), newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     figures = ("static", "vehicle", "moving_vehicle", "gap_db", "lpips")
