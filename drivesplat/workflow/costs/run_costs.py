@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.settings.overridden import without_effect
 from drivesplat.workflow.costs.estimate import (
     Estimate,
     Expectations,
@@ -23,6 +22,7 @@ from drivesplat.workflow.costs.estimate import (
 from drivesplat.workflow.costs.measured import BENCHMARKS, JobId, read_costs
 from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
+from drivesplat.workflow.overridden import without_effect
 from drivesplat.workflow.plan import Plan
 
 COSTS, ESTIMATE = "costs", "estimate"
