@@ -48,11 +48,9 @@ class Rays:
     @classmethod
     def joined(cls, several: Sequence["Rays"]) -> "Rays":
         """Concatenates `several`."""
-        origins, ends = (np.concatenate([np.empty((0, 3)), *(getattr(r, name) for r in several)]) for name in _POINTS)
-        return cls(origins, ends, np.concatenate([np.empty(0, dtype=bool), *(r.static for r in several)]))
-
-
-_POINTS = ("origins", "ends")
+        none = cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, dtype=bool))
+        columns = zip(*((rays.origins, rays.ends, rays.static) for rays in (none, *several)), strict=True)
+        return cls(*map(np.concatenate, columns))
 
 
 def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: TriangulatedPoints | None = None) -> FreeSpace:

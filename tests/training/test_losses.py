@@ -9,8 +9,7 @@ import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, track_of
 from skimage.metrics import structural_similarity
 
-from drivesplat.kernels.color_difference import masked_l1
-from drivesplat.kernels.ssim import ssim, ssim_in_torch
+from drivesplat.kernels.color_difference import masked_l1, ssim, ssim_in_torch
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import Picture, SplatModel
