@@ -11,7 +11,7 @@ import pytest
 from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, stages, told
 
 from drivesplat.io.storage import write_csv
-from drivesplat.report.console import console_table
+from drivesplat.report.files import console_table
 from drivesplat.report.gaps import COLUMNS, gap_report, summary_sentences
 
 VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
