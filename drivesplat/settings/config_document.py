@@ -46,7 +46,7 @@ def config_schema() -> str:
 
 
 def _mapping(record: BaseModel, indent: int, commented: set[tuple[type, str]] | None = None) -> str:
-    """The record's fields. Comments already `told` for an earlier record of the same class are left out."""
+    """The record's fields. Comments already in `commented` for an earlier record of the same class are left out."""
     commented = set() if commented is None else commented
     lines = []
     for name, field in type(record).model_fields.items():
