@@ -3,6 +3,7 @@
 Each part owns its parameters, their learning rates and its densification. A method is a list of parts.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -134,6 +135,12 @@ class Part(nn.Module, ABC):
     def __len__(self) -> int:
         """The number of its Gaussians."""
         return self.row_count - self.preallocated
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree of the spherical harmonics of its colours: `params["shN"]` (n, ..., k - 1, 3) has k = (degree +
+        1)² coefficients with `sh0`."""
+        return math.isqrt(1 + self.params["shN"].shape[-2]) - 1
 
     @property
     def row_count(self) -> int:

@@ -134,9 +134,7 @@ class Trainer:
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        moving = any(part.moves for part in self.model.parts)
-        highest = max(self.settings.gaussians.sh_degree, self.settings.actors.sh_degree if moving else 0)
-        return min(self.step // every, highest)
+        return min(self.step // every, max(part.sh_degree for part in self.model.parts))
 
     def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]

@@ -152,7 +152,7 @@ def _lidar(at: Place, *names: str) -> dict[str, Any]:
 
 def _training(at: Place) -> dict[str, Any]:
     config, method = at.config, at.config.all_methods[at.method]
-    train = config.train if method.moving_parts else config.train.without_moving_parts()
+    train = config.train.for_parts(method.parts)
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
     return {"parts": method.parts, "train": train, "reference_camera": reference}
 

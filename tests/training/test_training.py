@@ -54,10 +54,12 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import (
+    STAGE_OF_PART,
     ActorSettings,
     DefaultSettings,
     FloaterSettings,
     GaussianSettings,
+    McmcSettings,
     TrainJob,
 )
 from drivesplat.training import resume_state
@@ -219,11 +221,19 @@ def test_a_training_is_held_to_flatness_and_the_road():
 
 def test_what_stands_still_knows_no_settings_of_what_moves():
     """So that a change of these leaves trainings without moving parts as they are."""
+    still, all_parts = ("background",), ("background", "actors")
     changed = {"iterations": 70, "depth_weight": 0.2, "sky_bce_weight": 0.3, "opacity_reg": 0.5}
     moving = {"actors": ActorSettings(fourier=2), "entropy_weight": 0.7, "dynamic_weight": 0.9}
     settings = settings_of(**changed, **moving)
-    assert settings.without_moving_parts() == settings_of(**changed)
-    assert {name for name, value in settings if getattr(settings.without_moving_parts(), name) != value} == set(moving)
+    assert settings.for_parts(still) == settings_of(**changed) and settings.for_parts(all_parts) == settings
+    assert {name for name, value in settings if getattr(settings.for_parts(still), name) != value} == set(moving)
+
+
+def test_a_moving_part_knows_no_settings_of_other_moving_parts(monkeypatch):
+    monkeypatch.setitem(STAGE_OF_PART, "mcmc", "actors")
+    settings = settings_of(actors=ActorSettings(fourier=2), mcmc=McmcSettings(growth=0.1), dynamic_weight=0.9)
+    kept = settings.for_parts(("background", "actors"))
+    assert kept == settings.model_copy(update={"mcmc": McmcSettings()})
 
 
 @pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (50, 0.1), (100, 0.01)])
@@ -243,6 +253,15 @@ def test_spherical_harmonics_gain_a_degree_at_a_time(step, degree):
     trainer = Trainer.begin(untrained(settings), recorded_views(), settings, 0, CPU)
     trainer.step = step
     assert trainer.sh_degree() == degree
+
+
+@pytest.mark.parametrize(("still", "moving"), [(0, 2), (2, 1)])
+def test_the_degree_of_spherical_harmonics_grows_to_the_highest_of_any_part(still, moving):
+    settings = settings_of(gaussians=GaussianSettings(sh_degree=still), actors=ActorSettings(sh_degree=moving))
+    trainer = Trainer.begin(untrained_street(settings), recorded_views(), settings, 0, CPU)
+    assert [part.sh_degree for part in trainer.model.parts] == [still, moving]
+    trainer.step = settings.iterations
+    assert trainer.sh_degree() == max(still, moving)
 
 
 # ---- the images
