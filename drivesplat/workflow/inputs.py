@@ -37,10 +37,10 @@ class Inputs:
         dataset = self.config.datasets[name]
         if dataset.world:
             return self.world_tables(name)
-        whole = index(dataset.reader) is None
-        return (
-            list(map(str, layout(dataset.reader).table_files(Path(self._root(name)), dataset.version))) if whole else []
-        )
+        if index(dataset.reader):
+            return []
+        files = layout(dataset.reader).table_files(Path(self._root(name)), dataset.version, wildcards.scene)
+        return [str(file) for file in files]
 
     def scene_tables(self, wildcards: Any) -> list[str]:
         """The file of a scene's own rows of a recorded dataset's tables, where its reader splits them into scenes.

@@ -11,6 +11,7 @@ from helpers import REPOSITORY
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import load
 from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
+from drivesplat.workflow import inputs
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, TRAINING_INPUTS, refines_poses, stage_settings
 
@@ -28,6 +29,20 @@ def plan(**values: Any) -> Plan:
 def taken(made: Plan, scene: str, method: str) -> list[str]:
     at = SimpleNamespace(scene=scene, method=method)
     return [file for stage in TRAINING_INPUTS for file in made.training_input(stage)(at)]
+
+
+def test_a_dataset_without_scene_tables_names_the_files_of_each_scene(monkeypatch):
+    """A scene that is added to it reruns no other."""
+    files = SimpleNamespace(
+        find_root=lambda dataroot, _: Path(dataroot),
+        table_files=lambda root, version, scene: [root / version / scene / "poses.json"],
+    )
+    monkeypatch.setattr(inputs, "layout", lambda _: files)
+    monkeypatch.setattr(inputs, "index", lambda _: None)
+    made = Plan({"datasets": {"a": {"dataroot": "there", "version": "v1", "scenes": ["a1", "a2"]}}}, str(REPOSITORY))
+    for scene in ("a1", "a2"):
+        at = SimpleNamespace(scene=scene)
+        assert made.tables(at) == [f"there/v1/{scene}/poses.json"] and made.scene_tables(at) == []
 
 
 def test_actors_are_an_input_of_methods_with_that_part_alone():

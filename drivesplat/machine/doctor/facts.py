@@ -176,7 +176,8 @@ def _datasets(config: Config) -> tuple[Dataset, ...]:
         files = layout(dataset.reader)
         try:
             root = files.find_root(dataset.dataroot, dataset.version)
-            files.table_files(root, dataset.version)
+            for scene in dataset.scenes:
+                files.table_files(root, dataset.version, scene)
             found.append(Dataset(name, str(root), generated=generated))
         except DriveSplatError as error:
             found.append(Dataset(name, problem=str(error), generated=generated))

@@ -17,7 +17,7 @@ from typing import Any
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import atomic_path, unwritable, write_json
-from drivesplat.readers.nuscenes.layout import TABLES, table_files
+from drivesplat.readers.nuscenes.layout import TABLES, all_tables
 
 SCHEMA = 1
 INDEX = ".index.json"
@@ -52,7 +52,7 @@ def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) 
     Returns at once if no table has changed its size or modification time. The file of a scene that is not in the tables
     names the scenes that are. Raises DatasetError if a table is damaged, ResultError if `folder` cannot be written.
     """
-    files = [(file.name, file.stat()) for file in table_files(root, version)]
+    files = [(file.name, file.stat()) for file in all_tables(root, version)]
     made_from = {
         "schema": SCHEMA,
         "scenes": list(scenes),
