@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
+from os.path import commonpath
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,10 @@ def differences(expected: dict[str, Any], found: dict[str, Any], shared_only: bo
 
 
 def digests_of(files: Iterable[str | Path]) -> str:
-    """One digest for a set of files, by name and content."""
-    return sha256_text(canonical_json({Path(file).name: sha256_file(file) for file in files}))
+    """One digest for a set of files, by content and by path from the folder that holds all of them."""
+    paths = [Path(file).absolute() for file in files]
+    folder = commonpath([path.parent for path in paths]) if paths else ""
+    return sha256_text(canonical_json({path.relative_to(folder).as_posix(): sha256_file(path) for path in paths}))
 
 
 def package_version(package: str) -> str | None:
