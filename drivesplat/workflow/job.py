@@ -81,12 +81,17 @@ class Job:
     def check_inputs(self, dataset: Iterable[str] = ()) -> None:
         """Compares the inputs with what their rules wrote, and the dataset's files of the kinds `dataset` ('images',
         'sweeps') with what `extract` read. Raises ResultError naming an altered file and the rule that rebuilds it."""
-        scene = getattr(self.wildcards, "scene", None)
+        results = self._scene_folder()
         for path in map(str, self.input):
-            self._read[path] = checked_digest(path, warn=scene in Path(path).parts)
+            self._read[path] = checked_digest(path, warn=results is not None and results in Path(path).parents)
         if dataset:
             record = self.input.scene if hasattr(self.input, "scene") else self.input.parser
             check_dataset(Path(record).parent, dataset)
+
+    def _scene_folder(self) -> Path | None:
+        """The folder of the scene's results, in which every file has a record; None for a rule without a scene."""
+        scene, parents = getattr(self.wildcards, "scene", None), Path(next(iter(self.output), "")).parents
+        return next((folder for folder in reversed(parents) if scene and folder.name == scene), None)
 
     def record_dataset(self, **files: Iterable[str | Path]) -> None:
         """Computes the digests of the dataset's `files` by kind, for the record beside the outputs."""

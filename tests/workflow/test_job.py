@@ -3,9 +3,12 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from helpers import REPOSITORY
+
+from drivesplat.workflow.job import Job
 
 AS_A_SCRIPT = """
 snakemake = None
@@ -48,3 +51,19 @@ def test_every_script_imports_the_job_before_the_rest_of_the_library():
         assert heavy[0] == "drivesplat.workflow.job", (
             f"{script.name}: garbage is looked for while {heavy[0]} is imported"
         )
+
+
+@pytest.mark.parametrize("wildcards", [{"scene": "t1"}, {"scene": "t1", "method": "t1"}, {}], ids=str)
+def test_only_results_of_the_scene_are_expected_to_have_a_digest(tmp_path, caplog, wildcards):
+    """A dataset may have a folder of the scene's name, too."""
+    result, own = tmp_path / "results/t1/scene.json", tmp_path / "data/t1/poses.json"
+    for file in (result, own):
+        file.parent.mkdir(parents=True)
+        file.write_text("{}")
+    output = result.parent.joinpath(wildcards.get("method", "."), "own_car.json")
+    told = SimpleNamespace(
+        wildcards=SimpleNamespace(**wildcards), log=[], threads=1, rule="it", params={}, resources={}
+    )
+    told.input, told.output = [str(own), str(result)], [str(output)]
+    Job(told).check_inputs()
+    assert [record.args[0] for record in caplog.records] == ([result] if wildcards else [])
