@@ -119,18 +119,13 @@ class Trainer:
         """The second half of an iteration: each part adds, removes and relocates its Gaussians."""
         info = {} if picture is None else picture.info
         for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
-            densifier.after_step(self.step, optimizers, info, rows, self._coarse)
+            densifier.after_step(self.step, optimizers, info, rows, self.images.factor(self.step) > 1)
         self.step += 1
 
     def end(self) -> None:
         """Drops preallocated rows."""
         for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
             densifier.end(optimizers)
-
-    @property
-    def _coarse(self) -> bool:
-        """Whether this iteration's image is reduced."""
-        return self.images.factor(self.step) > 1
 
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
