@@ -56,7 +56,7 @@ def test_a_stage_that_comes_twice_counts_twice(time_passes):
 
 
 @pytest.mark.parametrize("iterations", [0, 2])
-def test_where_no_iteration_is_left_after_the_warm_up_nothing_is_said(iterations):
+def test_without_an_iteration_after_the_warm_up_nothing_is_logged(iterations):
     clock = StageClock(CPU, warm_up=2)
     for _ in range(iterations):
         with clock.stage(ITERATION):

@@ -127,8 +127,8 @@ def archive(path: Path, compression: int = zipfile.ZIP_STORED, **members: bytes)
 def npy(array: np.ndarray, **header: Any) -> bytes:
     """An array in numpy's format; `header` replaces its header."""
     file = io.BytesIO()
-    told = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape, **header}
-    np.lib.format.write_array_header_1_0(file, told)
+    fields = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape, **header}
+    np.lib.format.write_array_header_1_0(file, fields)
     return file.getvalue() + array.tobytes()
 
 

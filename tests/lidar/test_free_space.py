@@ -260,8 +260,8 @@ def test_space_that_a_vehicle_has_left_is_empty(tmp_path):
     """The centre of a car's first position, which the sensor sees empty two seconds later."""
     scene = drive(tmp_path, GOING)
     assert empty_at(free_space_record(scene, job(NOTHING_HELD_OUT)), [[8.0, 0.0, 1.2], [7.4, 0.3, 1.0]]).all()
-    nobody = dataclasses.replace(scene, tracks=())
-    assert not empty_at(free_space_record(nobody, job(NOTHING_HELD_OUT)), [[7.1, 0.0, 1.2]]).any()
+    without_tracks = dataclasses.replace(scene, tracks=())
+    assert not empty_at(free_space_record(without_tracks, job(NOTHING_HELD_OUT)), [[7.1, 0.0, 1.2]]).any()
 
 
 def test_rays_start_at_the_sensor_of_their_sweep_and_exclude_the_ego_vehicle(tiny_scene):

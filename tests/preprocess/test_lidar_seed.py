@@ -87,8 +87,8 @@ def test_lidar_points_are_exactly_the_static_returns_of_training_sweeps(tiny_sce
             continue
         everything = returns_at(seconds)
         kept = np.hypot(*(everything - World().ego_at(seconds) - [0.9, 0.0, 0.0])[:, :2].T) > 2.5
-        for mover in ("vehicle.car", "human.pedestrian.adult"):
-            in_box = within(everything, mover, seconds, 0.2)
+        for dynamic_class in ("vehicle.car", "human.pedestrian.adult"):
+            in_box = within(everything, dynamic_class, seconds, 0.2)
             assert in_box.any() or seconds > 2.0, "the case must hold returns from the moving object"
             kept &= ~in_box
         assert within(everything[kept], "vehicle.truck", seconds, 0.05).any()

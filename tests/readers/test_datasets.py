@@ -35,7 +35,7 @@ def test_the_tables_of_nuscenes_are_split_into_scenes_and_other_tables_are_read_
 
 
 @pytest.mark.parametrize("module", [layout, reader])
-def test_a_reader_that_is_missing_is_told_in_one_sentence(module):
+def test_a_missing_reader_is_reported_in_one_sentence(module):
     with pytest.raises(
         DatasetError, match=r"^no module drivesplat\.readers\.toy\.\w+ reads datasets of reader: toy; add"
     ):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, stages, told
+from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, report_job, stages
 
 from drivesplat.io.storage import write_csv
 from drivesplat.report.files import console_table
@@ -174,7 +174,7 @@ def test_a_scene_that_kept_its_poses_is_comparable_with_refined_ones(write, orde
     results = {"0061": ("refined", made), "0103": ("nuscenes", made)}
     paths = [write(metrics(scene, {"vanilla": VANILLA_A}, stages, poses=poses))
              for scene, (poses, stages) in list(results.items())[::order]]  # fmt: skip
-    report = gap_report(paths, told({"0061": made, "0103": made}), NO_LOGS)
+    report = gap_report(paths, report_job({"0061": made, "0103": made}), NO_LOGS)
     assert {row["scene"] for row in report["rows"]} == {"0061", "0103"} and report["left_out"] == []
 
 
@@ -184,7 +184,7 @@ def test_a_scene_with_poses_from_images_is_not_comparable(write):
         write(metrics(scene, {"vanilla": VANILLA_A}, made, poses=poses))
         for scene, poses in (("0061", "refined"), ("0103", "images"))
     ]
-    report = gap_report(paths, told({"0061": made, "0103": made}), NO_LOGS)
+    report = gap_report(paths, report_job({"0061": made, "0103": made}), NO_LOGS)
     assert "poses" in left_out(report, "0103")
 
 
@@ -192,7 +192,7 @@ def test_a_scene_without_refinement_is_not_comparable(write):
     made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
     paths = [write(metrics("0061", {"vanilla": VANILLA_A}, made, poses="refined")),
              write(metrics("0103", {"vanilla": VANILLA_A}))]  # fmt: skip
-    report = gap_report(paths, told({"0061": made, "0103": stages()}), NO_LOGS)
+    report = gap_report(paths, report_job({"0061": made, "0103": stages()}), NO_LOGS)
     (left_out,) = report["left_out"]
     assert left_out["scene"] == "0103" and "poses" in left_out["why"]
 
@@ -350,7 +350,7 @@ def test_a_reference_without_a_gap_has_no_closed_fraction(write):
 
 def test_without_a_reference_there_is_no_closed_fraction(write):
     path = write(metrics("0061", {"vanilla": VANILLA_A}))
-    assert gap_report([path], told({"0061": stages()}, reference=None), NO_LOGS)["gap_closed"] == []
+    assert gap_report([path], report_job({"0061": stages()}, reference=None), NO_LOGS)["gap_closed"] == []
 
 
 # ---- why a scene is missing

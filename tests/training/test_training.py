@@ -204,7 +204,7 @@ def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
     assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
 
 
-def test_a_training_is_held_to_flatness_and_the_road():
+def test_a_training_applies_the_flatness_and_road_losses():
     """The terms are among those of an iteration, and pull on the background."""
     settings = settings_of(flatness_weight=0.2, road_weight=0.3)
     poses = np.tile(np.eye(4), (2, 1, 1))
@@ -219,7 +219,7 @@ def test_a_training_is_held_to_flatness_and_the_road():
     assert plain.fit_one()[0].keys() == terms.keys() - {"flatness", "road"}
 
 
-def test_what_stands_still_knows_no_settings_of_what_moves():
+def test_static_methods_have_no_settings_of_dynamic_parts():
     """So that a change of these leaves trainings without moving parts as they are."""
     still, all_parts = ("background",), ("background", "actors")
     changed = {"iterations": 70, "depth_weight": 0.2, "sky_bce_weight": 0.3, "opacity_reg": 0.5}
@@ -275,7 +275,7 @@ def test_every_epoch_sees_every_view_once_in_an_order_of_its_own(count):
     assert epochs == [[view_index(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
 
 
-def test_the_order_of_views_hangs_on_the_seed():
+def test_the_order_of_views_depends_on_the_seed():
     assert [view_index(20, i, seed=1) for i in range(20)] != [view_index(20, i, seed=2) for i in range(20)]
 
 
@@ -469,7 +469,7 @@ FOREIGN = [
 
 
 @pytest.mark.parametrize("kind", FOREIGN)
-def test_a_spoilt_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(kind, tmp_path, caplog):
+def test_a_damaged_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(kind, tmp_path, caplog):
     path = tmp_path / "state.npz"
     spoil(path, kind)
     with caplog.at_level(logging.WARNING):
@@ -490,7 +490,7 @@ def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tm
     assert not (tmp_path / "executed").exists()
 
 
-def test_without_a_resume_state_nothing_is_said(tmp_path, caplog):
+def test_without_a_resume_state_nothing_is_logged(tmp_path, caplog):
     assert resume_state.resumable(tmp_path / "state.npz", "any") is None
     assert caplog.text == ""
 
@@ -511,7 +511,7 @@ def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, m
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_is_told_with_the_files_name_and_keeps_the_earlier_checkpoint(tmp_path):
+def test_a_full_disk_is_reported_with_the_file_name_and_keeps_the_earlier_checkpoint(tmp_path):
     """A limit on the size of files stands for the full disk."""
     path = tmp_path / "state.npz"
     checkpoint_file.save(path, {"step": 1})
@@ -574,7 +574,7 @@ def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoi
 
 @pytest.mark.parametrize("log_every", [1, 50])
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
-def test_it_is_a_training_error_however_rarely_it_is_looked_for(tmp_path, strategy, log_every):
+def test_a_loss_that_is_not_finite_is_a_training_error_however_rarely_it_is_checked(tmp_path, strategy, log_every):
     """Densification comes between the loss that is no number and the check."""
     settings = settings_of(
         strategy,
@@ -673,7 +673,7 @@ def test_tensorboard_holds_every_loss_and_pictures(tmp_path):
     assert {(event.width, event.height) for event in board.Images("recorded_and_rendered")} == {(2 * WIDTH, HEIGHT)}
 
 
-def test_tensorboard_of_a_resumed_training_tells_every_iteration_once(tmp_path):
+def test_tensorboard_of_a_resumed_training_has_every_iteration_once(tmp_path):
     with pytest.raises(EndedError):
         trained(tmp_path, settings_of(), EndingViews(recorded_views(), ENDED_AT))
     trained(tmp_path, settings_of())
@@ -747,9 +747,9 @@ def test_a_finished_training_of_actors_can_be_rendered_from_its_checkpoint_alone
 def test_only_what_a_training_asks_for_is_read(tmp_path, parts, changes, known):
     """Masks are read by the training images; of people that move, too, is known that they do."""
     guides = inputs_in(tmp_path, actors=True).guides(job_of(parts, **changes))
-    told = {name: getattr(guides, name) for name in ("sky", "moving", "lidar")}
-    assert {name for name, images in told.items() if images} == known
-    assert all(list(images) == [0, 1, 3, 4] for images in told.values() if images)
+    by_kind = {name: getattr(guides, name) for name in ("sky", "moving", "lidar")}
+    assert {name for name, images in by_kind.items() if images} == known
+    assert all(list(images) == [0, 1, 3, 4] for images in by_kind.values() if images)
     if "moving" in known:
         assert guides.moving[3][HEIGHT // 2 :].all() and not guides.moving[3][: HEIGHT // 2].any()
     if "sky" in known:

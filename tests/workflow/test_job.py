@@ -24,7 +24,7 @@ with job(told):
 """
 
 
-def said(code: str, folder: Path) -> str:
+def output_of(code: str, folder: Path) -> str:
     """What Python prints that runs `code` in a folder."""
     environment = {"PYTHONPATH": str(REPOSITORY), "PATH": "/usr/bin:/bin"}
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
@@ -34,12 +34,12 @@ def said(code: str, folder: Path) -> str:
 
 @pytest.mark.parametrize(("code", "collects"), [(AS_A_SCRIPT, "False"), (AS_A_LIBRARY, "True")])
 def test_garbage_is_collected_while_all_is_imported_but_by_a_rules_script(code, collects, tmp_path):
-    assert said(code + "print(gc.isenabled())", tmp_path) == collects
+    assert output_of(code + "print(gc.isenabled())", tmp_path) == collects
 
 
 @pytest.mark.parametrize("code", [AS_A_SCRIPT, AS_A_LIBRARY])
 def test_a_job_collects_its_own_garbage_and_looks_through_no_import(code, tmp_path):
-    assert said(code + IN_A_JOB, tmp_path) == "True True"
+    assert output_of(code + IN_A_JOB, tmp_path) == "True True"
 
 
 def test_every_script_imports_the_job_before_the_rest_of_the_library():

@@ -12,37 +12,37 @@ DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
 DEMO, REAL = [("demo", ""), ("demo", "vanilla"), ("demo", "street")], [("0061", "vanilla"), ("0061", "street")]
 
 
-def told(places, **config) -> list[str]:
+def sentences(places, **config) -> list[str]:
     return without_effect(load(merged(DEFAULTS, config)), places)
 
 
-def test_defaults_say_nothing():
-    assert told([*DEMO, *REAL]) == []
+def test_defaults_are_not_reported():
+    assert sentences([*DEMO, *REAL]) == []
 
 
-def test_a_setting_that_a_dataset_sets_for_itself_is_told_once_with_where():
-    assert told(DEMO, train={"iterations": 3000}) == [
+def test_a_setting_that_a_dataset_overrides_is_reported_once_with_its_place():
+    assert sentences(DEMO, train={"iterations": 3000}) == [
         "train.iterations: 3000 does not hold for dataset demo, where datasets.demo.overrides.train.iterations is 1000"
     ]
-    assert told(REAL, train={"iterations": 3000}) == [], "no scene of the demo takes part"
+    assert sentences(REAL, train={"iterations": 3000}) == [], "no scene of the demo takes part"
 
 
-def test_a_setting_that_a_method_sets_for_itself_is_told_for_that_method():
-    (sentence,) = told([*DEMO, *REAL], train={"depth_weight": 0.5})
+def test_a_setting_that_a_method_overrides_is_reported_for_that_method():
+    (sentence,) = sentences([*DEMO, *REAL], train={"depth_weight": 0.5})
     assert sentence.startswith("train.depth_weight: 0.5 does not hold for method street, where methods.street.")
     assert sentence.endswith("is 0.01")
-    assert told([("0061", "vanilla")], train={"depth_weight": 0.5}) == []
+    assert sentences([("0061", "vanilla")], train={"depth_weight": 0.5}) == []
 
 
 @pytest.mark.parametrize("dataset", [{"iterations": 3000}, {"iterations": 3000, "cap_max": 500_000}])
-def test_what_is_given_where_it_holds_is_not_told(dataset):
+def test_a_setting_given_where_it_applies_is_not_reported(dataset):
     overrides = {"datasets": {"demo": {"overrides": {"train": dataset}}}}
-    assert told(DEMO, train={"iterations": 3000}, **overrides) == []
+    assert sentences(DEMO, train={"iterations": 3000}, **overrides) == []
 
 
-def test_a_method_over_a_dataset_is_told_for_both():
+def test_a_setting_overridden_by_dataset_and_method_is_reported_for_both():
     overrides = {"methods": {"vanilla": {"overrides": {"train": {"iterations": 500}}}}}
-    found = told(DEMO, train={"iterations": 3000}, **overrides)
+    found = sentences(DEMO, train={"iterations": 3000}, **overrides)
     assert [line.rsplit(" ", 1)[1] for line in found] == ["1000", "500"], "the demo's, and that method's"
 
 
@@ -53,11 +53,11 @@ def test_variants_of_an_ablation_differ_on_purpose():
 
 
 def test_scenes_that_are_not_configured_and_jobs_of_no_scene_are_passed_over():
-    assert told([("", ""), ("9999", "street")], train={"iterations": 3000}) == []
+    assert sentences([("", ""), ("9999", "street")], train={"iterations": 3000}) == []
 
 
 @pytest.mark.workflow
-def test_a_run_says_so_before_its_estimate(tmp_path):
+def test_a_run_reports_it_before_its_estimate(tmp_path):
     copy = WorkflowCopy.make(tmp_path / "workflow", methods={"vanilla": {"overrides": {"train": {"iterations": 7}}}})
     asked = copy.run("estimate")
     lines = [line for line in asked.stdout.splitlines() if line.startswith("drivesplat: ")]
