@@ -1,16 +1,17 @@
-# make demo       set-up, then the whole workflow on a synthetic drive: no dataset, no GPU, minutes
-# make setup      .venv with all packages; compiles gsplat where there is an NVIDIA GPU (idempotent; docs/installation.md)
-# make doctor     check the machine and suggest remedies
-# make test       set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
-# make test-slow whole runs and fits that make test leaves out (two cores: three minutes)
-# make test-gpu   tests that need a GPU: the rasterizers agree, trainings resume
-# make test-slurm one scene through a real SLURM, started on this machine for the test (root on Debian; docs/cluster.md)
-# make test-batch ten synthetic drives, one of them broken, as a batch (two cores: a quarter of an hour)
-# make bench      the measurements of benchmarks/ against their bounds (two idle cores)
-# make quality    RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
-# make speed      FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
-# make config     config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
-.PHONY: demo setup doctor test test-slow lint test-gpu test-slurm test-batch bench quality speed config
+# make demo         set-up, then the whole workflow on a synthetic drive: no dataset, no GPU, minutes
+# make setup        .venv with all packages; compiles gsplat where there is an NVIDIA GPU (idempotent; docs/installation.md)
+# make doctor       check the machine and suggest remedies
+# make test         set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
+# make test-slow    whole runs and fits that make test leaves out (two cores: three minutes)
+# make test-viewers the exported viewer and the report's page in Chromium (apt-get install chromium)
+# make test-gpu     tests that need a GPU: the rasterizers agree, trainings resume
+# make test-slurm   one scene through a real SLURM, started on this machine for the test (root on Debian; docs/cluster.md)
+# make test-batch   ten synthetic drives, one of them broken, as a batch (two cores: a quarter of an hour)
+# make bench        the measurements of benchmarks/ against their bounds (two idle cores)
+# make quality      RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
+# make speed        FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
+# make config       config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
+.PHONY: demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch bench quality speed config
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -27,10 +28,13 @@ doctor:
 	@bash scripts/doctor.sh $(CONFIG)
 
 test: setup lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu and not slurm and not batch and not slow"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not gpu and not slurm and not batch and not slow and not viewers"
 
 test-slow: setup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow
+
+test-viewers: setup
+	$(BIN)/python -m pytest -m viewers -rs -v
 
 lint: setup
 	$(BIN)/ruff check .

@@ -32,6 +32,7 @@ try:
         across_scenes.refuse_empty()
         if wanted != [COSTS]:
             plan.refuse_absent_data(wanted)
+        run_costs.report_settings_without_effect()
 except DriveSplatError as error:
     sys.exit(f"drivesplat: {error}")
 

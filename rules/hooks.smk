@@ -23,7 +23,7 @@ rule estimate:
 
 onstart:
     if workflow.is_main_process:
-        if run_costs.tell_estimate():
+        if run_costs.print_estimate():
             sys.exit(0)
         try:
             plan.hold_results()

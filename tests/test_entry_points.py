@@ -31,8 +31,8 @@ def test_help_is_printed_and_nothing_else_happens(command, monkeypatch, capsys, 
     config = (REPOSITORY / "config.yaml").stat().st_mtime_ns
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(command, run_name="__main__", alter_sys=True)
-    told = capsys.readouterr().out
-    assert ended.value.code in (0, None) and told.startswith(f"usage: python -m {command} ")
+    printed = capsys.readouterr().out
+    assert ended.value.code in (0, None) and printed.startswith(f"usage: python -m {command} ")
     assert (REPOSITORY / "config.yaml").stat().st_mtime_ns == config and not list(tmp_path.iterdir())
 
 
@@ -46,8 +46,8 @@ def changed(tmp_path) -> Path:
 def test_a_changed_config_is_kept_and_the_difference_is_shown(changed, capsys):
     before = (changed / "config.yaml").read_text()
     assert main([], changed) == 1
-    told = capsys.readouterr()
-    assert "\n-results_dir: elsewhere\n+results_dir: results\n" in told.out and "--force" in told.err
+    printed = capsys.readouterr()
+    assert "\n-results_dir: elsewhere\n+results_dir: results\n" in printed.out and "--force" in printed.err
     assert (changed / "config.yaml").read_text() == before and not (changed / "config.schema.json").exists()
 
 

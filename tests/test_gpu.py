@@ -295,12 +295,12 @@ def print_what_stops(folder: str, strategy: str, fault: str) -> None:
 
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
 @pytest.mark.parametrize(
-    ("fault", "said"), [("not finite", r"^iteration 2: .*ssim.* not finite"), ("none left", r"no Gaussian is left")]
+    ("fault", "pattern"), [("not finite", r"^iteration 2: .*ssim.* not finite"), ("none left", r"no Gaussian is left")]
 )
-def test_a_failing_training_ends_with_a_message(tmp_path, strategy, fault, said):
+def test_a_failing_training_ends_with_a_message(tmp_path, strategy, fault, pattern):
     process = in_subprocess(print_what_stops, str(tmp_path), strategy, fault)
     output, errors = process.communicate(timeout=120)
-    assert re.search(said, output), output + errors[-3000:]
+    assert re.search(pattern, output), output + errors[-3000:]
 
 
 def print_out_of_memory(folder: str, gaussians: str, gigabytes: str) -> None:
@@ -437,12 +437,12 @@ def test_frames_that_cannot_be_captured_are_rendered_without_a_graph(street_film
     model, views, expected = street_film
     together = SplatModel.gaussians_at_time_states
 
-    def asks(self, states):
+    def counting(self, states):
         found = together(self, states)
         assert float(found.means.sum()) < 1e9
         return found
 
-    monkeypatch.setattr(SplatModel, "gaussians_at_time_states", asks)
+    monkeypatch.setattr(SplatModel, "gaussians_at_time_states", counting)
     assert_frames([*film_frames(model, [(view, None) for view in views])], expected)
     (record,) = caplog.records
     assert record.message.startswith("frames of films cannot be captured as a CUDA graph")
@@ -538,12 +538,12 @@ def test_overflowed_lists_are_detected(monkeypatch):
 def test_a_training_that_cannot_be_captured_goes_on_without_graphs(monkeypatch, caplog):
     """As where a term of the loss asks the device something."""
 
-    def asks(*told, terms=trainer_module.loss_terms):
-        found = terms(*told)
+    def counting(*args, terms=trainer_module.loss_terms):
+        found = terms(*args)
         assert float(found["l1"]) >= 0.0
         return found
 
-    monkeypatch.setattr(trainer_module, "loss_terms", asks)
+    monkeypatch.setattr(trainer_module, "loss_terms", counting)
     trainer, losses = trained_with(True, iterations=12)
     assert torch.rand(3, device=GPU).any(), "random numbers can still be drawn"
     (record,) = caplog.records

@@ -1,7 +1,9 @@
 """The project as a whole: pins in one place, planning that stays quick, presets that load."""
 
+import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
 import yaml
@@ -52,3 +54,16 @@ def test_presets_are_valid_over_the_defaults(preset):
 def test_scripts_are_thin():
     for script in (REPOSITORY / "workflow_scripts").glob("*.py"):
         assert len([line for line in script.read_text().splitlines() if line.strip()]) <= 25, script.name
+
+
+def test_each_test_that_make_test_leaves_out_is_run_by_a_target_of_its_own():
+    makefile = (REPOSITORY / "Makefile").read_text()
+    recipes = dict(re.findall(r"^([\w-]+):.*\n((?:\t.*\n)+)", makefile, re.M))
+    left_out = re.findall(r"not (\w+)", recipes["test"])
+    pytest_settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
+    assert [it.partition(":")[0] for it in pytest_settings["markers"] if "(make test-" in it] == left_out
+    for marker in left_out:
+        command = next(line for line in recipes[f"test-{marker}"].splitlines() if f"-m {marker}" in line)
+        (files,) = re.findall(r"tests/\S+", command) or ["tests"]
+        users = (path for path in REPOSITORY.glob("tests/**/*.py") if f"pytest.mark.{marker}" in path.read_text())
+        assert all(path.is_relative_to(REPOSITORY / files) for path in users), marker

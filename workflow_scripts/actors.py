@@ -3,8 +3,8 @@
 import dataclasses
 
 from drivesplat.workflow.job import job
+from drivesplat.io.array_file import write_arrays
 from drivesplat.preprocess.actor_seed import actors_record
-from drivesplat.scene.actor_record import write_actors
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.actor_seed import ActorSeedJob
@@ -13,4 +13,4 @@ with job(snakemake, dataset=("images", "sweeps")) as current:
     scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
     record = actors_record(scene, current.settings(ActorSeedJob), ego_mask)
     provenance = current.provenance(scene.provenance, upstream)
-    write_actors(current.output.actors, dataclasses.replace(record, provenance=provenance))
+    write_arrays(current.output.actors, dataclasses.replace(record, provenance=provenance))

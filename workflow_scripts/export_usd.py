@@ -1,7 +1,7 @@
 """checkpoint.npz as scene.usdz: static and dynamic Gaussians in OpenUSD's schema, and the recording camera."""
 
 from drivesplat.workflow.job import job
-from drivesplat.export.usd_asset import export_usd
+from drivesplat.export.usd import export_usd
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.export import ExportJob

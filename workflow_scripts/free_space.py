@@ -3,7 +3,7 @@
 import dataclasses
 
 from drivesplat.workflow.job import job
-from drivesplat.lidar.free_space_record import write_free_space
+from drivesplat.io.array_file import write_arrays
 from drivesplat.poses.triangulated import read_triangulated
 from drivesplat.preprocess.free_space import free_space_record
 from drivesplat.scene.scene import read_scene
@@ -14,4 +14,4 @@ with job(snakemake, dataset=("sweeps",)) as current:
     triangulated = read_triangulated(current.input.triangulated[0]) if current.input.triangulated else None
     record = free_space_record(scene, current.settings(FreeSpaceJob), triangulated)
     provenance = current.provenance(scene.provenance)
-    write_free_space(current.output.free_space, dataclasses.replace(record, provenance=provenance))
+    write_arrays(current.output.free_space, dataclasses.replace(record, provenance=provenance))

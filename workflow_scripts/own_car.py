@@ -4,7 +4,7 @@ from drivesplat.workflow.job import job
 from drivesplat.io.storage import write_json
 from drivesplat.preprocess.ego_mask import ego_mask_record
 from drivesplat.scene.scene import read_scene
-from drivesplat.settings.ego_mask import EgoMaskJob
+from drivesplat.settings.masks import EgoMaskJob
 
 with job(snakemake, dataset=("images", "sweeps")) as current:
     scene = read_scene(current.input.scene)

@@ -7,7 +7,7 @@ from drivesplat.io.point_cloud import read_ply
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.scene import read_scene
 from drivesplat.scene.training_record import write_training_record
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import ParserJob
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)

@@ -3,9 +3,9 @@
 import dataclasses
 
 from drivesplat.workflow.job import job
+from drivesplat.io.array_file import write_arrays
 from drivesplat.io.storage import write_json
 from drivesplat.poses.refinement import refine_or_keep
-from drivesplat.poses.triangulated import write_triangulated
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene, write_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
@@ -15,5 +15,5 @@ with job(snakemake, dataset=("images", "sweeps")) as current:
     refinement = refine_or_keep(scene, current.settings(RefinePosesJob), ego_mask, current.threads)
     provenance = current.provenance(scene.provenance, upstream)
     write_json(current.output.poses, {**refinement.record, "provenance": provenance})
-    write_triangulated(current.output.points, dataclasses.replace(refinement.points, provenance=provenance))
+    write_arrays(current.output.points, dataclasses.replace(refinement.points, provenance=provenance))
     write_scene(current.output.scene, dataclasses.replace(refinement.scene, provenance=provenance))

@@ -23,7 +23,7 @@ from benchmarks.speed.plan import Task, plan_run, read_speed_file, targets_of, t
 from benchmarks.speed.settings import SpeedFile
 from benchmarks.speed.table import markdown
 from drivesplat.errors import ConfigError
-from drivesplat.workflow.gpus import visible_cards
+from drivesplat.workflow.gpus import visible_gpus
 
 CORES = ("--cores", "all")
 
@@ -36,8 +36,8 @@ def measure(file: SpeedFile, out: Path, arguments: Sequence[str], workflow: Path
     arguments are invalid, or a training fails; earlier measurements stay written.
     """
     require_workflow(workflow)
-    if cards > visible_cards():
-        raise ConfigError(f"--cards {cards}: there are {visible_cards()} GPUs that this process may use")
+    if cards > visible_gpus():
+        raise ConfigError(f"--cards {cards}: there are {visible_gpus()} GPUs that this process may use")
     run, dry_run = plan_run(file, out, workflow), is_dry_run(arguments)
     outcome = run.start(arguments or CORES, workflow, targets_of(run))
     if outcome.status or dry_run:

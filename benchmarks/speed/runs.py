@@ -17,6 +17,7 @@ from benchmarks.speed.plain import PlainRecipe, Schedule, as_model, as_splats, i
 from benchmarks.speed.plain_images import ImageFiles, files_of_size
 from benchmarks.speed.plain_training import CHECKPOINT, fit
 from benchmarks.speed.plan import Task
+from benchmarks.speed.stage_clock import StageClock
 from drivesplat.evaluation.evaluate import evaluate_groups, protocol
 from drivesplat.io.checkpoint_file import load
 from drivesplat.io.storage import read_json
@@ -31,10 +32,10 @@ from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import CoarseToFineSettings
-from drivesplat.training.clock import UNTIMED, Clock, StageClock
+from drivesplat.training.clock import UNTIMED, Clock
 from drivesplat.training.run import TrainingFiles, TrainingInputs, prepare, read_inputs, run_training
 from drivesplat.training.train import TrainingFolders, train
-from drivesplat.workflow.gpus import hold_card
+from drivesplat.workflow.gpus import hold_gpu
 
 Times = dict[str, Any]
 WHOLE_IMAGES = CoarseToFineSettings(quarter_until=0.0, half_until=0.0)
@@ -110,7 +111,7 @@ def training_files(task: Task) -> TrainingFiles:
 
 
 def profile(task: Task, iterations: int) -> dict[str, dict[str, float]]:
-    """`device_ms` and `host_ms` of each stage (`drivesplat.training.clock`) in milliseconds per iteration, over
+    """`device_ms` and `host_ms` of each stage (`benchmarks.speed.stage_clock`) in milliseconds per iteration, over
     iterations that continue a task's training. The continued model is discarded."""
     profiled = _profile_plain if task.recipe == "plain" else _profile_ours
     with held_device(task.device) as device:
@@ -160,14 +161,14 @@ def _profile_folder(task: Task) -> Path:
 @contextmanager
 def held_device(settings: DeviceSettings) -> Iterator[torch.device]:
     """The device that the settings choose, with no other job of this workflow on it and with its kernels loaded."""
-    card = hold_card(1) if settings.kind != "cpu" else None
+    lock = hold_gpu(1) if settings.kind != "cpu" else None
     try:
         device = choose_device(settings)
         load_kernels(device)
         yield device
     finally:
-        if card is not None:
-            card.close()
+        if lock is not None:
+            lock.close()
 
 
 def load_kernels(device: torch.device) -> None:

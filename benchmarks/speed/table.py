@@ -4,6 +4,7 @@ from typing import Any
 
 from benchmarks.speed.compare import FIGURES
 from benchmarks.speed.plan import RECIPES
+from benchmarks.speed.stage_clock import OTHER
 from drivesplat.evaluation.comparison import (
     GROUP_PLACES,
     format_difference,
@@ -13,7 +14,7 @@ from drivesplat.evaluation.comparison import (
     markdown_table,
     measured_groups,
 )
-from drivesplat.training.clock import ITERATION, OTHER
+from drivesplat.training.clock import ITERATION
 
 LEGEND = (
     "Loop: seconds of the training loop. Whole: seconds from parser.pkl to the written files. PSNR in dB on held-out "

@@ -10,7 +10,6 @@ import numpy as np
 
 from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.labels import track_labels
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.part import ActorPlacement
@@ -20,6 +19,7 @@ from drivesplat.rendering.film import Shot, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames
 from drivesplat.scene.images import write_png
+from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
@@ -27,6 +27,8 @@ from drivesplat.settings.render import EditJob, TrajectorySettings
 
 log = logging.getLogger(__name__)
 
+DECIMALS = 6
+"""Decimals of a pose in labels: micrometres, and 1e-4 degrees. More would double the size of the file."""
 COLLISION_MARGIN = 0.5
 """Metres around a box within which a camera sees little but the inside of the object."""
 
@@ -168,6 +170,35 @@ def write_frames(folder: Path, frames: Iterable[np.ndarray]) -> list[str]:
         names.append(f"{folder.name}/{number:06d}.png")
         write_png(folder.parent / names[-1], frame)
     return names
+
+
+def track_labels(
+    scene: Scene, actors: Sequence[EditedActor], editable: set[str], seconds: np.ndarray
+) -> list[dict[str, Any]]:
+    """A record for every actor, then for every other annotated movable object, which stays as recorded: the model has
+    it in its static part. `editable`: the ids of all editable tracks, removed ones included; `seconds` (n,) of frames.
+
+    `size` is length, width, height in metres, `scale` included; `object_to_world` (n times (4, 4)) is at the box
+    centre, rounded to 1e-6, None in frames where the object is absent.
+    """
+    others = (track for track in scene.tracks if track.object_class.is_dynamic and track.id not in editable)
+    recorded = [EditedActor.recorded(t.id, t.category, t.size, Motion.of_track(scene, t)) for t in others]
+    labels = []
+    for i, actor in enumerate((*actors, *recorded)):
+        present, poses = actor.present(seconds), actor.poses(seconds).round(DECIMALS)
+        labels.append(
+            {
+                "id": actor.id,
+                "category": actor.category,
+                "size": actor.size.tolist(),
+                "source": actor.source,
+                "scale": actor.scale,
+                "edited": actor.edited,
+                "editable": i < len(actors),
+                "object_to_world": [pose.tolist() if now else None for now, pose in zip(present, poses, strict=True)],
+            }
+        )
+    return labels
 
 
 def remove_frames(folder: Path) -> None:

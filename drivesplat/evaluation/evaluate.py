@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesplat.evaluation.depth import DepthErrors
+from drivesplat.errors import DatasetError
 from drivesplat.evaluation.drive_summary import summarize_drive
-from drivesplat.evaluation.held_out import held_out_images, measured_images
 from drivesplat.evaluation.lpips_map import load_lpips
-from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
+from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
-from drivesplat.evaluation.sample_pair import SamplePair, render_sample_pair
-from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered_with_depth
+from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
-from drivesplat.lidar.depth import clouds_of, depths_in
+from drivesplat.lidar.depth import depths_in, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
@@ -28,7 +26,7 @@ from drivesplat.model.view import view_of
 from drivesplat.readers.truth import read_truth
 from drivesplat.scene.masks import MasksRecord
 from drivesplat.scene.prepared_drive import PreparedDrive
-from drivesplat.scene.regions import REGIONS, region_masks
+from drivesplat.scene.regions import REGIONS, region_mask, region_masks
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
@@ -51,6 +49,16 @@ class EvaluationInputs:
     masks_record: MasksRecord
     lpips_record: dict[str, Any] | None
     truth: Path | None
+
+
+@dataclass(frozen=True)
+class SamplePair:
+    """Image `index` of a recording, of held-out `group` (or 'train'): `recorded` and `rendered` (h, w, 3) in [0, 1]."""
+
+    group: str
+    index: int
+    recorded: np.ndarray
+    rendered: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -147,7 +155,7 @@ def held_out_depths(recording: PreparedDrive, camera: str, job: LidarDepthJob) -
     """LiDAR depth of the measured images by index, from the sweep of their own key frame; without images whose sweep is
     missing."""
     scene = recording.scene
-    clouds = {cloud.sample_index: cloud for cloud in clouds_of(scene, job, HELD_OUT_GROUPS)}
+    clouds = {cloud.sample_index: cloud for cloud in split_sweeps(scene, job, HELD_OUT_GROUPS)}
     images = [i for group in HELD_OUT_GROUPS for i in held_out_images(recording.record, group, camera)]
     owned = {i: clouds[scene.frames[i].sample_index] for i in images if scene.frames[i].sample_index in clouds}
     return {i: depths_in(scene, scene.frames[i], cloud, job, recording.ego_mask(i)) for i, cloud in owned.items()}
@@ -197,3 +205,39 @@ def _group_metrics(
     for frame in prefetch(measure, renderings(), measuring_threads()):
         metrics.add(frame)
     return {**with_gap(metrics.summary()), **depth.summary()}
+
+
+def render_sample_pair(model: SplatModel, recording: PreparedDrive, camera: str, device: torch.device) -> SamplePair:
+    """The held-out key frame of `camera` with the most pixels of moving vehicles, from the first group with held-out
+    frames; a training key frame if nothing is held out."""
+    group, images = _candidates(recording, camera)
+    moving = [int(region_mask(recording.labels(index), "moving_vehicle").sum()) for index in images]
+    index = images[int(np.argmax(moving))] if any(moving) else images[len(images) // 2]
+    picture = rendered(model, view_of(recording.record, index, device))
+    return SamplePair(group, index, recording.image(index), picture.clip(0.0, 1.0))
+
+
+def _candidates(recording: PreparedDrive, camera: str) -> tuple[str, list[int]]:
+    for group in (*HELD_OUT_GROUPS, "train"):
+        images = held_out_images(recording.record, group, camera)
+        if images:
+            return group, images
+    raise ValueError(f"no key frame of {camera} takes part")
+
+
+def held_out_images(record: TrainingRecord, group: str, camera: str) -> list[int]:
+    """The indices of the images of `group` (or 'train') that are measured: key frames of the evaluated camera.
+
+    Raises DatasetError if the scene lacks that camera.
+    """
+    if camera not in record.camera_names:
+        raise DatasetError(
+            f"eval_camera {camera} is not among the cameras of this run ({', '.join(record.camera_names)})"
+        )
+    wanted = record.camera_names.index(camera)
+    return [int(i) for i in record.splits[group] if record.camera_indices[i] == wanted and record.is_key_frame[i]]
+
+
+def measured_images(record: TrainingRecord, camera: str) -> dict[str, list[int]]:
+    """The indices of the measured images by held-out group. Raises DatasetError as `held_out_images` does."""
+    return {group: held_out_images(record, group, camera) for group in HELD_OUT_GROUPS}

@@ -1,18 +1,18 @@
-"""PSNR, SSIM and LPIPS pooled over regions, as the measuring protocol defines them.
+"""PSNR, SSIM and LPIPS pooled over regions, and errors of depth, as the measuring protocol defines them.
 
-Maps are computed per frame and accumulated per region, so memory does not grow with the number of frames.
+Maps are computed per frame and summed per region, so memory hardly grows with the number of frames.
 """
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from skimage.metrics import structural_similarity
 
 from drivesplat.errors import ResultError
+from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.scene.regions import REGIONS
 
 MIN_REGION_PIXELS = 1000
@@ -66,34 +66,13 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return full.mean(axis=2)
 
 
-@dataclass(frozen=True)
-class FrameErrors:
+class FrameErrors(NamedTuple):
     """A frame's sums of squared error, SSIM and LPIPS over the `pixels` of a region."""
 
     pixels: int
     squared_error: float
     ssim: float
     lpips: float
-
-
-@dataclass
-class _Sums:
-    pixels: int = 0
-    squared_error: float = 0.0
-    ssim: float = 0.0
-    lpips: float = 0.0
-    frame_psnrs: list[float] = field(default_factory=list)
-
-    def add(self, errors: FrameErrors) -> None:
-        if errors.pixels == 0:
-            return
-        self.pixels += errors.pixels
-        self.squared_error += errors.squared_error
-        self.ssim += errors.ssim
-        self.lpips += errors.lpips
-        frame_psnr = psnr(errors.squared_error / errors.pixels)
-        if errors.pixels >= MIN_FRAME_PIXELS and frame_psnr is not None:
-            self.frame_psnrs.append(frame_psnr)
 
 
 class RegionMetrics:
@@ -108,7 +87,7 @@ class RegionMetrics:
 
     def __init__(self, lpips_map: LpipsMap | None, regions: Iterable[str] = REGIONS):
         self._lpips_map = lpips_map
-        self._sums = {region: _Sums() for region in regions}
+        self._frames: dict[str, list[FrameErrors]] = {region: [] for region in regions}
 
     def measure(self, image: np.ndarray, truth: np.ndarray, masks: Mapping[str, np.ndarray]) -> dict[str, FrameErrors]:
         """The errors of a rendered image against a true one, both (h, w, 3) in [0, 1], over each region's mask (h, w)
@@ -125,29 +104,33 @@ class RegionMetrics:
         maps.append(self._lpips_map(image, truth) if self._lpips_map else np.zeros_like(maps[0]))
         return {
             region: FrameErrors(int(masks[region].sum()), *(float(values[masks[region]].sum()) for values in maps))
-            for region in self._sums
+            for region in self._frames
         }
 
     def add(self, frame: Mapping[str, FrameErrors]) -> None:
         """Adds the errors of a frame. Add frames in a fixed order: the sums are then reproducible to the last bit."""
-        for region, sums in self._sums.items():
-            sums.add(frame[region])
+        for region, frames in self._frames.items():
+            frames.append(frame[region])
 
     def summary(self) -> dict[str, dict[str, Any] | None]:
         """A record per region; None for a region with too few pixels."""
-        return {region: self._record(sums) for region, sums in self._sums.items()}
+        return {region: self._record(frames) for region, frames in self._frames.items()}
 
-    def _record(self, sums: _Sums) -> dict[str, Any] | None:
-        if sums.pixels < MIN_REGION_PIXELS:
+    def _record(self, frames: list[FrameErrors]) -> dict[str, Any] | None:
+        one_by_one = np.cumsum([FrameErrors(0, 0.0, 0.0, 0.0), *frames], axis=0)
+        pixels, squared_error, ssim, lpips = one_by_one[-1].tolist()
+        if pixels < MIN_REGION_PIXELS:
             return None
-        pooled = psnr(sums.squared_error / sums.pixels)
+        pooled = psnr(squared_error / pixels)
+        of_frames = [psnr(frame.squared_error / frame.pixels) for frame in frames if frame.pixels >= MIN_FRAME_PIXELS]
+        known = [value for value in of_frames if value is not None]
         return {
             "psnr": pooled,
             **({"identical": True} if pooled is None else {}),
-            "psnr_frame_mean": float(np.mean(sums.frame_psnrs)) if sums.frame_psnrs else None,
-            "ssim": sums.ssim / sums.pixels,
-            "lpips": sums.lpips / sums.pixels if self._lpips_map else None,
-            "pixels": sums.pixels,
+            "psnr_frame_mean": float(np.mean(known)) if known else None,
+            "ssim": ssim / pixels,
+            "lpips": lpips / pixels if self._lpips_map else None,
+            "pixels": int(pixels),
         }
 
 
@@ -162,3 +145,25 @@ def gap_db(regions: dict[str, dict[str, Any] | None]) -> float | None:
     if static is None or moving is None or static["psnr"] is None or moving["psnr"] is None:
         return None
     return static["psnr"] - moving["psnr"]
+
+
+class DepthErrors:
+    """Relative errors of rendered depth over a group of images: `add` each with its known depth, then `summary`."""
+
+    def __init__(self) -> None:
+        self._errors: list[np.ndarray] = []
+
+    def add(self, rendered: np.ndarray, known: PixelDepths) -> None:
+        """Adds a rendered depth image (h, w) in metres and its known depth."""
+        found = rendered[known.rows, known.columns].astype(np.float64)
+        self._errors.append(np.abs(found - known.depth) / known.depth)
+
+    def summary(self) -> dict[str, Any]:
+        """`depth`: the median of |rendered - known| / known over all `pixels` of the group with known depth, None if
+        there are too few; an empty record if no image has known depth."""
+        if not self._errors:
+            return {}
+        errors = np.concatenate(self._errors)
+        if len(errors) < MIN_REGION_PIXELS:
+            return {"depth": None}
+        return {"depth": {"median_relative_error": float(np.median(errors)), "pixels": len(errors)}}

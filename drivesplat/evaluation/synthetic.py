@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
 
-from drivesplat.evaluation.depth import DepthErrors
-from drivesplat.evaluation.metrics import FrameErrors, LpipsMap, RegionMetrics, measuring_threads
+from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import unreadable
 from drivesplat.lidar.depth_record import PixelDepths

@@ -1,22 +1,58 @@
-"""The stage `export`: a trained model as splat.ply and as one PLY per rigid group, with the recorded cameras in
-cameras.json and the motions of objects in parts.json."""
+"""The stage `export`: a trained model as splat.ply, and its rigid groups as one PLY each.
+
+cameras.json has the recorded cameras, which place splat.ply in the world and in time. parts.json has the attributes and
+motions of the groups: other programs can compose the drive at any time, without a vehicle, or with a vehicle at another
+place.
+"""
 
 import logging
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drivesplat.export.cameras_json import cameras_record
-from drivesplat.export.parts_json import write_parts
-from drivesplat.export.splat_ply import write_splat_ply
-from drivesplat.export.trained_parts import digests, trained_gaussians, trained_groups
+from drivesplat.export.sampled_motion import SampledMotion
+from drivesplat.export.splat_ply import note_of, write_splat_ply
+from drivesplat.export.trained_parts import SampledGroup, digests, middle_timestamp, trained_gaussians, trained_groups
+from drivesplat.export.unique_names import unique_names
 from drivesplat.io.storage import Provenance, write_json
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.scene.scene import Scene
+from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.training_record import TrainingRecord
 
 log = logging.getLogger(__name__)
+
+SCHEMA = 1
+GLOBAL = "A position in the dataset's global frame is its world position plus origin."
+CAMERA_CONVENTIONS = {
+    "world": "Metres, z up, the axes of the dataset's global frame; splat.ply is in these coordinates.",
+    "camera": "OpenCV: x right, y down, z forward, metres; pinhole without distortion.",
+    "ego": "The recording vehicle: x forward, y left, z up, on the ground under the rear axle.",
+    "K": "Continuous pixels of an image of width x height: the image's corner is (0, 0), "
+    "the first pixel's centre (0.5, 0.5).",
+    "transforms": "Matrices 4x4, row by row, applied to column vectors: world = camera_to_world camera.",
+    "timestamp": "Microseconds of the dataset's clock; each image has its own, and its poses are those at that time.",
+    "sample_index": "The index of the image's key frame; for other images that of the nearest key frame in time.",
+    "split": "The use of the image: train, held out for interpolation or extrapolation, "
+    "or excluded because a held-out image is near.",
+}
+PART_CONVENTIONS = {
+    "world": "Metres, z up, the axes of the dataset's global frame; files of frame 'world' are in these coordinates.",
+    "object": "Metres, x forward, y left, z up, the origin at the centre of the object's box; files of frame 'object' "
+    "are in these coordinates, and so are the directions of their spherical harmonics.",
+    "transforms": "Matrices 4x4, row by row, applied to column vectors: world = object_to_world object.",
+    "seconds": "Since the first image of any camera, whose timestamp is first_image.",
+    "timestamps": "Microseconds of the dataset's clock: first_image plus the seconds.",
+    "present": "Intervals in seconds in which the object is present; at all other times it is absent.",
+    "samples": "Thirty a second, at every image of cameras.json and at the annotations, while the object is present.",
+    "colors": "Colours that vary with time are those at colors_timestamp, the time of the middle image, "
+    "which is also that of splat.ply.",
+    "size": "Length, width, height of the annotated box in metres; null, like category, if the scene "
+    "has no such track.",
+}
 
 
 @dataclass(frozen=True)
@@ -44,3 +80,109 @@ def export_splat(
     write_json(files.cameras, {**cameras_record(scene, record), "provenance": provenance})
     write_parts(files.parts, groups, scene, provenance)
     log.info("%d Gaussians, %d groups, %d images", len(gaussians), len(groups), len(scene.frames))
+
+
+def cameras_record(scene: Scene, record: TrainingRecord) -> dict[str, Any]:
+    """The images of a scene as plain data in the order of `scene.frames`, of which `record` is the training record.
+
+    Poses and `origin` have full float64 precision; sizes and K are those of the training images.
+    """
+    split_of = {int(i): split for split, images in record.splits.items() for i in images}
+    return {
+        **_scene_header(scene, CAMERA_CONVENTIONS),
+        "key_frame_timestamps": scene.key_frame_timestamps.tolist(),
+        "images": [
+            _image(frame, record.image_names[i], record.image_size(i), record.Ks[i], split_of[i])
+            for i, frame in enumerate(scene.frames)
+        ],
+    }
+
+
+def _image(frame: Frame, name: str, size: tuple[int, int], K: np.ndarray, split: str) -> dict[str, Any]:
+    return {
+        "camera": frame.camera,
+        "timestamp": frame.timestamp,
+        "image": name,
+        "width": size[0],
+        "height": size[1],
+        "K": K.tolist(),
+        "camera_to_world": frame.camera_to_world.tolist(),
+        "ego_to_world": frame.ego_to_world.tolist(),
+        "is_key_frame": frame.is_key_frame,
+        "sample_index": frame.sample_index,
+        "split": split,
+    }
+
+
+def write_parts(path: str | Path, groups: Mapping[str, SampledGroup], scene: Scene, provenance: Provenance) -> None:
+    """Writes every group as a PLY beside `path`, then their record to `path`.
+
+    PLYs of groups of earlier calls that are not written again are removed; other files stay.
+    """
+    folder = Path(path).parent
+    files = {name: f"{stem}.ply" for name, stem in unique_names(groups, _stem).items()}
+    for name, group in groups.items():
+        note = {"scene": scene.name, "piece": name, "frame": _frame(group), **digests(provenance)}
+        write_splat_ply(folder / files[name], group.gaussians, note)
+    _remove_others(folder, set(files.values()))
+    write_json(path, {**_parts_record(groups, files, scene), "provenance": provenance})
+
+
+def _parts_record(groups: Mapping[str, SampledGroup], files: Mapping[str, str], scene: Scene) -> dict[str, Any]:
+    first_image = min(frame.timestamp for frame in scene.frames)
+    return {
+        **_scene_header(scene, PART_CONVENTIONS),
+        "first_image": first_image,
+        "colors_timestamp": middle_timestamp(scene),
+        "parts": [
+            {
+                "name": name,
+                "file": files[name],
+                "gaussians": len(group.gaussians),
+                "sh_degree": group.gaussians.sh_degree,
+                "frame": _frame(group),
+                "category": group.track.category if group.track else None,
+                "size": group.track.size.tolist() if group.track else None,
+                "motion": _motion(group.motion, first_image) if group.motion else None,
+            }
+            for name, group in groups.items()
+        ],
+    }
+
+
+def _motion(motion: SampledMotion, first_image: int) -> dict[str, Any]:
+    return {
+        "present": [list(span) for span in motion.spans],
+        "seconds": motion.seconds.tolist(),
+        "timestamps": (first_image + np.rint(motion.seconds * 1e6).astype(np.int64)).tolist(),
+        "object_to_world": motion.object_to_world.tolist(),
+    }
+
+
+def _frame(group: SampledGroup) -> str:
+    return "object" if group.motion else "world"
+
+
+def _stem(name: str) -> str:
+    """A name as a file name that is valid on every system."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name) or "_"
+
+
+def _remove_others(folder: Path, kept: set[str]) -> None:
+    """Removes PLYs of groups whose file names are not in `kept`."""
+    for file in folder.glob("*.ply"):
+        if file.name not in kept and "piece" in note_of(file):
+            file.unlink()
+
+
+def _scene_header(scene: Scene, conventions: Mapping[str, str]) -> dict[str, Any]:
+    """The first entries of a record of `scene`; `origin` (3,) in metres, with full float64 precision."""
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "dataset": scene.dataset,
+        "version": scene.version,
+        "poses": scene.poses,
+        "conventions": {"global": GLOBAL, **conventions},
+        "origin": scene.origin.tolist(),
+    }

@@ -80,13 +80,13 @@ def _candidates(recording: PreparedDrive, camera: str, settings: SubjectSettings
 
 
 def _not_found_message(recording: PreparedDrive, camera: str, settings: SubjectSettings) -> str:
-    asked = " and ".join(f"{name} {value}" for name, value in settings if value is not None)
+    requested = " and ".join(f"{name} {value}" for name, value in settings if value is not None)
     by_track: dict[str, list[int]] = {}
     for subject in _candidates(recording, camera, SubjectSettings()):
         by_track.setdefault(subject.box.track_id, []).append(subject.frame.sample_index)
     known = "; ".join(f"{track} in {min(frames)}-{max(frames)}" for track, frames in by_track.items())
     return (
-        f"subjects.{recording.scene.name}: {camera} shows no vehicle that matches {asked}; "
+        f"subjects.{recording.scene.name}: {camera} shows no vehicle that matches {requested}; "
         f"moving vehicles with their first and last key frame: {known or 'none'}"
     )
 

@@ -5,31 +5,32 @@ JSON: {"$array": name} stands for an array, {"$tuple": [...]} for a tuple, {"$it
 whose keys are not text.
 """
 
+import dataclasses
 import json
-import math
 import os
-import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
 from drivesplat.io.storage import atomic_write, unreadable
+from drivesplat.io.typed_record import field_values, typed_record
 
 CONTENT = "content"
 MAX_DIMENSIONS = 8
 
+R = TypeVar("R")
+
 
 def write_arrays(
     path: str | Path,
-    content: dict[str, Any],
+    content: Any,
     kind: type = np.ndarray,
     to_array: Callable[[Any], np.ndarray] = lambda array: array,
 ) -> None:
-    """Writes plain containers, scalars and arrays, atomically; `kind` is the class of arrays in `content`.
+    """Writes plain containers, scalars, arrays and dataclasses of them, atomically; `kind` is the class of arrays.
 
     Raises TypeError for anything else, ResultError naming `path` where the disk is full.
     """
@@ -41,6 +42,8 @@ def write_arrays(
                 raise ValueError(f"two arrays are called {name}")
             arrays[name] = to_array(value)
             return {"$array": name}
+        if dataclasses.is_dataclass(value):
+            value = field_values(value)
         if type(value) in (list, tuple):
             items = [packed(item, f"{name}/{i}") for i, item in enumerate(value)]
             return items if type(value) is list else {"$tuple": items}
@@ -86,6 +89,16 @@ def read_arrays(
         raise unreadable(path, rule, f"not a file of arrays of this workflow ({reason})") from error
 
 
+def read_typed_arrays(path: str | Path, rule: str, kind: type[R], what: str) -> R:
+    """Reads a dataclass that `write_arrays` wrote. Raises ResultError naming `path`, `rule` and `what` the record holds
+    where the file is invalid."""
+    content = read_arrays(path, rule)
+    try:
+        return typed_record(kind, content)
+    except (TypeError, ValueError) as error:
+        raise unreadable(path, rule, f"not a record of {what} ({error})") from error
+
+
 def _unpacked(plain: Any, arrays: dict[str, np.ndarray], from_array: Callable[[np.ndarray], Any]) -> Any:
     """The content, whose arrays are taken out of `arrays`."""
     if isinstance(plain, list):
@@ -106,34 +119,16 @@ def _members(file: BinaryIO) -> dict[str, np.ndarray]:
     """All arrays of an archive, by name."""
     with zipfile.ZipFile(file) as archive:
         members = archive.infolist()
-    if sum(member.file_size for member in members) > os.fstat(file.fileno()).st_size:
-        raise ValueError("its members are larger than the file")
-    arrays = {}
-    for member in members:
-        if member.compress_type != zipfile.ZIP_STORED or member.compress_size != member.file_size:
-            raise ValueError(f"{member.filename} is compressed")
-        file.seek(member.header_offset)
-        lengths = struct.unpack("<26xHH", file.read(30))
-        start = member.header_offset + 30 + sum(lengths)
-        arrays[member.filename.removesuffix(".npy")] = _array(file, start, member)
-    return arrays
+        if sum(member.file_size for member in members) > os.fstat(file.fileno()).st_size:
+            raise ValueError("its members are larger than the file")
+        return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
 
 
-def _array(file: BinaryIO, start: int, member: zipfile.ZipInfo) -> np.ndarray:
-    """The array that a member holds, which begins at `start`."""
-    file.seek(start)
-    version = np.lib.format.read_magic(file)
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    header = file.tell() - start
-    if version != (1, 0) or dtype.kind not in "biuf" or len(shape) > MAX_DIMENSIONS or min(shape, default=0) < 0:
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """The array that a member holds."""
+    with archive.open(member) as file:
+        array = np.lib.format.read_array(file, allow_pickle=False)
+        more = file.read(1)  # at its end, zipfile compares the checksum
+    if more or array.dtype.kind not in "biuf" or array.ndim > MAX_DIMENSIONS:
         raise ValueError(f"{member.filename} is no array of numbers")
-    if header + math.prod(shape) * dtype.itemsize != member.file_size:
-        raise ValueError(f"{member.filename} has another size than its header says")
-    flat = np.empty(math.prod(shape), dtype)
-    file.seek(start)
-    checksum = zlib.crc32(file.read(header))
-    if flat.size and file.readinto(flat.view(np.uint8)) != flat.nbytes:
-        raise ValueError(f"{member.filename} is cut short")
-    if zlib.crc32(flat, checksum) != member.CRC:
-        raise ValueError(f"{member.filename} is damaged")
-    return flat.reshape(shape, order="F" if fortran else "C")
+    return array

@@ -1,19 +1,20 @@
-"""Pickles of plain containers, scalars and numpy arrays, read without the unpickler.
+"""Pickles of plain containers, scalars and numpy arrays, read without executing what they name.
 
 A pickle is a program: its unpickler imports and calls what the file names, and numpy's `__setstate__` trusts the layout
-that the file states. Here a small machine executes the few opcodes that plain data needs. It calls nothing that a file
-names; arrays are built from the bytes in the file after dtype and shape have been checked. Sizes are bounded by the
-file's.
+that the file states. Here Python's unpickler executes only the opcodes that plain data needs, and finds classes of this
+module in place of numpy's; arrays are built from the bytes in the file after dtype and shape have been checked. Sizes
+are bounded by the file's.
+
+The unpickler is the one written in Python, `pickle._Unpickler`. The one in C has no table of opcodes to restrict, and
+allocates memory for places and sizes that a file only states.
 """
 
 import io
 import math
 import pickle
-import pickletools
 import re
+import struct
 import sys
-from enum import Enum
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -30,22 +31,13 @@ MAX_DIMENSIONS = 8
 
 _SCALARS = (type(None), bool, int, float, str, bytes)
 _CODE = re.compile(r"[biufSU][1-9][0-9]{0,8}")
-
-
-class _Global(Enum):
-    """What a pickle of plain data refers to by name."""
-
-    DTYPE = "dtype"
-    NDARRAY = "ndarray"
-    RECONSTRUCT = "_reconstruct"
-    FROM_BUFFER = "_frombuffer"
-
-
-_GLOBALS = {("numpy", "dtype"): _Global.DTYPE, ("numpy", "ndarray"): _Global.NDARRAY} | {
-    (f"numpy.{core}.{module}", name.value): name
-    for core in ("core", "_core")  # numpy 1 and 2 name the same package differently
-    for module, name in (("multiarray", _Global.RECONSTRUCT), ("numeric", _Global.FROM_BUFFER))
-}
+_OPCODES = (
+    "PROTO", "FRAME", "STOP", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4",
+    "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "MARK",
+    "MEMOIZE", "BINPUT", "LONG_BINPUT", "BINGET", "LONG_BINGET", "GLOBAL", "STACK_GLOBAL", "EMPTY_LIST", "EMPTY_TUPLE",
+    "TUPLE1", "TUPLE2", "TUPLE3", "TUPLE", "APPEND", "APPENDS", "SETITEM", "SETITEMS", "REDUCE",
+)  # fmt: skip
+"""The opcodes that are executed as usual, by their names in `pickle`."""
 
 
 def write_plain_pickle(path: str | Path, value: Any) -> None:
@@ -62,22 +54,17 @@ def read_plain_pickle(path: str | Path, rule: str) -> Any:
     except OSError as error:
         raise unreadable(path, rule, f"cannot be read ({error.strerror})") from error
     except Exception as error:  # a forged program fails in many ways: every one means "not our file"
-        raise unreadable(path, rule, f"not a pickle of plain data and arrays ({_reason(error)})") from error
-
-
-def _reason(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise unreadable(path, rule, f"not a pickle of plain data and arrays ({reason})") from error
 
 
 def loads(content: bytes) -> Any:
     """The value of a pickle of plain data. Raises an exception of any type where it is none."""
-    machine, file = _Machine(len(content)), io.BytesIO(content)
-    for opcode, argument, _ in islice(pickletools.genops(file), MAX_OPCODES):
-        machine.execute(opcode.name, argument)
-    if file.tell() != len(content):
+    unpickler = _PlainUnpickler(io.BytesIO(content))
+    value = unpickler.load()
+    if unpickler.stack or unpickler.read(1):
         raise pickle.UnpicklingError("something follows its end")
-    (value,) = machine.stack
-    return _Plain().of(value)
+    return _Plain(len(content)).of(value)
 
 
 class _Dtype:
@@ -88,7 +75,7 @@ class _Dtype:
             raise pickle.UnpicklingError("an array has another dtype than numbers or text")
         self.code, self.dtype = code, None
 
-    def build(self, state: tuple) -> None:
+    def __setstate__(self, state: tuple) -> None:
         version, order, *fields, size, _, _ = state
         dtype = np.dtype(order + self.code)
         if (version, *fields) != (3, None, None, None) or order not in "<>|" or size not in (-1, dtype.itemsize):
@@ -97,157 +84,132 @@ class _Dtype:
 
 
 class _Array:
-    """An array under construction."""
+    """An array under construction, in place of the result of numpy's `_reconstruct`: `view` of the file's content, and
+    `copy` for the caller."""
 
-    value: np.ndarray | None = None
+    view: np.ndarray | None = None
+    copy: np.ndarray | None = None
 
+    def __init__(self, kind: type, shape: tuple[int, ...], code: bytes):
+        if (kind, shape, code) != (_Array, (0,), b"b"):
+            raise pickle.UnpicklingError("it calls what no plain data needs")
 
-class _Machine:
-    """Executes pickle opcodes. All arrays together take no more than `size` bytes."""
+    def __setstate__(self, state: tuple) -> None:
+        version, shape, dtype, fortran, content = state
+        if version != 1:
+            raise pickle.UnpicklingError("an array has an unknown version")
+        self._look_at(content, dtype, shape, "F" if fortran else "C")
 
-    def __init__(self, size: int):
-        self.stack: list[Any] = []
-        self._free = size
-        self._below: list[list[Any]] = []
-        self._memo: dict[int, Any] = {}
-
-    def execute(self, name: str, argument: Any) -> None:
-        """Executes an opcode of the protocols 2 to 5, by its name in `pickletools`."""
-        stack = self.stack
-        match name:
-            case "PROTO" | "FRAME" | "STOP":
-                pass
-            case "NONE" | "NEWTRUE" | "NEWFALSE":
-                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[name])
-            case "BININT" | "BININT1" | "BININT2" | "LONG1" | "LONG4" | "BINFLOAT":
-                stack.append(argument)
-            case "SHORT_BINUNICODE" | "BINUNICODE" | "BINUNICODE8":
-                stack.append(argument)
-            case "SHORT_BINBYTES" | "BINBYTES" | "BINBYTES8" | "BYTEARRAY8":
-                stack.append(bytes(argument))
-            case "MARK":
-                self._below.append(stack)
-                self.stack = []
-            case "MEMOIZE":
-                self._memo[len(self._memo)] = stack[-1]
-            case "BINPUT" | "LONG_BINPUT":
-                self._memo[argument] = stack[-1]
-            case "BINGET" | "LONG_BINGET":
-                stack.append(self._memo[argument])
-            case "GLOBAL":
-                stack.append(_named(*argument.split(" ")))
-            case "STACK_GLOBAL":
-                stack.append(_named(*self._pop(2)))
-            case _:
-                self._construct(name)
-
-    def _construct(self, name: str) -> None:
-        stack = self.stack
-        match name:
-            case "EMPTY_LIST" | "EMPTY_DICT" | "EMPTY_TUPLE":
-                stack.append({"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_TUPLE": tuple}[name]())
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                stack.append(tuple(self._pop(int(name[-1]))))
-            case "TUPLE":
-                self.stack, items = self._below.pop(), stack
-                self.stack.append(tuple(items))
-            case "APPEND" | "SETITEM":
-                _extend(stack[-2 if name == "APPEND" else -3], self._pop(1 if name == "APPEND" else 2))
-            case "APPENDS" | "SETITEMS":
-                self.stack, items = self._below.pop(), stack
-                _extend(self.stack[-1], items)
-            case "REDUCE":
-                function, arguments = self._pop(2)
-                stack.append(self._call(function, arguments))
-            case "BUILD":
-                target, state = stack[-2], self._pop(1)[0]
-                self._build(target, state)
-            case _:
-                raise pickle.UnpicklingError(f"it has the opcode {name}")
-
-    def _pop(self, count: int) -> list[Any]:
-        items = self.stack[-count:]
-        del self.stack[-count:]
-        return items
-
-    def _call(self, function: Any, arguments: tuple) -> Any:
-        if function is _Global.DTYPE:
-            return _Dtype(*arguments)
-        if function is _Global.RECONSTRUCT and arguments == (_Global.NDARRAY, (0,), b"b"):
-            return _Array()
-        if function is _Global.FROM_BUFFER:
-            content, dtype, shape, order = arguments
-            return self._array(shape, dtype, order, content)
-        raise pickle.UnpicklingError("it calls what no plain data needs")
-
-    def _build(self, target: Any, state: tuple) -> None:
-        if type(target) is _Dtype:
-            target.build(state)
-        elif type(target) is _Array:
-            version, shape, dtype, fortran, content = state
-            if version != 1:
-                raise pickle.UnpicklingError("an array has an unknown version")
-            target.value = self._array(shape, dtype, "F" if fortran else "C", content)
-        else:
-            raise pickle.UnpicklingError("it sets the state of what has none")
-
-    def _array(self, shape: tuple[int, ...], dtype: _Dtype, order: str, content: bytes) -> np.ndarray:
-        """The array whose elements are `content`. Raises UnpicklingError where that does not fit."""
+    def _look_at(self, content: bytes, dtype: _Dtype, shape: tuple[int, ...], order: str) -> None:
+        """Makes `content` the elements. Raises UnpicklingError where it does not fit."""
         kind = dtype.dtype if type(dtype) is _Dtype else None
         if kind is None or not all(type(n) is int and n >= 0 for n in shape) or len(shape) > MAX_DIMENSIONS:
             raise pickle.UnpicklingError("an array has no dtype or no shape")
         if type(content) is not bytes or math.prod(shape) * kind.itemsize != len(content):
             raise pickle.UnpicklingError("an array has another number of bytes than its shape and dtype")
-        self._free -= len(content)
-        if self._free < 0:
-            raise pickle.UnpicklingError("its arrays are larger than the file")
-        array = np.ndarray(shape, kind, bytearray(content), order=order)
+        self.view = np.ndarray(shape, kind, content, order=order)
         codes, limit = {"b": ("u1", 1), "U": (f"{kind.byteorder}u4", sys.maxunicode)}.get(kind.kind, (None, None))
-        if codes and array.size and (np.frombuffer(content, codes) > limit).any():
+        if codes and self.view.size and (np.frombuffer(content, codes) > limit).any():
             raise pickle.UnpicklingError("an array has elements that are no truth values or characters")
-        return array
 
 
-def _named(module: str, name: str) -> _Global:
-    if (module, name) not in _GLOBALS:
-        raise pickle.UnpicklingError(f"it refers to {module}.{name}")
-    return _GLOBALS[module, name]
+class _Buffer(_Array):
+    """An array in place of the result of numpy's `_frombuffer`."""
+
+    def __init__(self, content: bytes, dtype: _Dtype, shape: tuple[int, ...], order: str):
+        self._look_at(content, dtype, shape, order)
 
 
-def _extend(container: Any, items: list[Any]) -> None:
-    if type(container) is list:
-        container.extend(items)
-    elif type(container) is dict:
-        for key, value in zip(items[::2], items[1::2], strict=True):
-            if type(key) not in _SCALARS:
-                raise pickle.UnpicklingError(f"a key is a {type(key).__name__}")
-            container[key] = value
-    else:
-        raise pickle.UnpicklingError("it adds to what is no container")
+class _Dict(dict):
+    """A dictionary whose keys are scalars: a deep tuple as a key would exhaust the stack of the process."""
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if type(key) not in _SCALARS:
+            raise pickle.UnpicklingError(f"a key is a {type(key).__name__}")
+        super().__setitem__(key, value)
+
+
+_CLASSES = {("numpy", "dtype"): _Dtype, ("numpy", "ndarray"): _Array} | {
+    (f"numpy.{core}.{module}", name): kind
+    for core in ("core", "_core")  # numpy 1 and 2 name the same package differently
+    for module, name, kind in (("multiarray", "_reconstruct", _Array), ("numeric", "_frombuffer", _Buffer))
+}
+
+
+class _Opcodes:
+    """The methods of `_PlainUnpickler` by opcode, at most MAX_OPCODES times."""
+
+    def __init__(self):
+        self._left = MAX_OPCODES
+
+    def __getitem__(self, opcode: int) -> Any:
+        self._left -= 1
+        if opcode not in _METHODS or self._left < 0:
+            raise pickle.UnpicklingError(f"it has the opcode {bytes([opcode])!r}, or more than {MAX_OPCODES} opcodes")
+        return _METHODS[opcode]
+
+
+class _PlainUnpickler(pickle._Unpickler):
+    """Executes the opcodes of plain data in the protocols 2 to 5."""
+
+    def __init__(self, file: io.BytesIO):
+        super().__init__(file)
+        self.dispatch = _Opcodes()
+
+    def find_class(self, module: str, name: str) -> type:
+        if (module, name) not in _CLASSES:
+            raise pickle.UnpicklingError(f"it refers to {module}.{name}")
+        return _CLASSES[module, name]
+
+    def load_dict(self) -> None:
+        self.append(_Dict())
+
+    def load_buffer(self) -> None:
+        self.append(self.read(*struct.unpack("<Q", self.read(8))))
+
+    def load_state(self) -> None:
+        state = self.stack.pop()
+        self.stack[-1].__setstate__(state)
+
+
+_METHODS = {getattr(pickle, name)[0]: pickle._Unpickler.dispatch[getattr(pickle, name)[0]] for name in _OPCODES} | {
+    pickle.EMPTY_DICT[0]: _PlainUnpickler.load_dict,
+    pickle.BYTEARRAY8[0]: _PlainUnpickler.load_buffer,
+    pickle.BUILD[0]: _PlainUnpickler.load_state,
+}
 
 
 class _Plain:
     """Copies containers; raises TypeError for anything but plain containers, scalars and arrays, and for too many or
-    too deep ones. A subclass of one is not plain."""
+    too deep ones. A subclass of one is not plain. Arrays in a file take no more than `size` bytes together."""
 
-    def __init__(self):
-        self._left = MAX_ITEMS
+    def __init__(self, size: int = 0):
+        self._left, self._free = MAX_ITEMS, size
 
     def of(self, value: Any, depth: int = 0) -> Any:
         self._left -= 1
         if self._left < 0 or depth > MAX_DEPTH:
             raise TypeError(f"more than {MAX_ITEMS} items or {MAX_DEPTH} levels are not plain data")
         kind = type(value)
-        if kind is dict:
+        if kind in (dict, _Dict):
             if any(type(key) not in _SCALARS for key in value):
                 raise TypeError("a key is not plain data")
             return {key: self.of(item, depth + 1) for key, item in value.items()}
         if kind in (list, tuple):
             return kind([self.of(item, depth + 1) for item in value])
-        if kind is _Array and value.value is not None:
-            return value.value
+        if kind in (_Array, _Buffer) and value.view is not None:
+            return self._copied(value)
         if kind is np.ndarray and (_CODE.fullmatch(value.dtype.str[1:]) is None or value.ndim > MAX_DIMENSIONS):
             raise TypeError(f"an array of {value.dtype} with {value.ndim} dimensions is not plain data")
         if kind not in (*_SCALARS, np.ndarray):
             raise TypeError(f"{kind.__name__} is not plain data")
         return value
+
+    def _copied(self, array: _Array) -> np.ndarray:
+        """A writable array, one for every reference to it."""
+        if array.copy is None:
+            self._free -= array.view.nbytes
+            if self._free < 0:
+                raise TypeError("its arrays are larger than the file")
+            array.copy = array.view.copy(order="K")
+        return array.copy

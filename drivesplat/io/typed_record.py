@@ -1,17 +1,28 @@
-"""Dataclasses made of what a file holds, once it fits their annotations."""
+"""Dataclasses as the plain data of a file, and made of it once it fits their annotations."""
 
 import dataclasses
 import types
 import typing
+from enum import Enum
+from functools import cache
 from typing import Any, TypeVar
 
+import numpy as np
 from jaxtyping import jaxtyped
 
 R = TypeVar("R")
+_hints = cache(typing.get_type_hints)
 
 
-def typed_record(kind: type[R], values: Any) -> R:
-    """The dataclass `kind` with the `values` (by name) of its fields; further values are ignored.
+def field_values(record: Any) -> dict[str, Any]:
+    """The fields of a dataclass by name; nested dataclasses stay what they are."""
+    return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+
+
+def typed_record(kind: type[R], values: Any, json: bool = False) -> R:
+    """The dataclass `kind` with the `values` (by name) of its fields; further values are ignored. As its
+    annotation says, a dict becomes a dataclass, also within lists and tuples, a list a tuple, and a string a member of
+    an enum. For values from `json` a list also becomes an array, and further values are an error.
 
     Raises ValueError where a field without a default value is missing, or a value has another type, dtype or shape than
     the field's annotation. A dimension has one size in all arrays of the record. Elements of containers are not
@@ -19,11 +30,13 @@ def typed_record(kind: type[R], values: Any) -> R:
     """
     if not isinstance(values, dict):
         raise ValueError(f"it holds a {type(values).__name__}, no record")
-    fields, hints = dataclasses.fields(kind), typing.get_type_hints(kind)
+    fields, hints = dataclasses.fields(kind), _hints(kind)
     lacking = [field.name for field in fields if field.default is dataclasses.MISSING and field.name not in values]
     if lacking:
         raise ValueError(f"it lacks {', '.join(lacking)}")
-    known = {field.name: values[field.name] for field in fields if field.name in values}
+    if json and values.keys() - hints.keys():
+        raise ValueError(f"it has another key {min(values.keys() - hints.keys())!r}")
+    known = {name: _value(hints[name], values[name], json) for name in hints if name in values}
     with jaxtyped("context"):  # which another checked function, called from here, would not see
         for name, value in known.items():
             if not isinstance(value, _classes(hints[name])):
@@ -31,10 +44,29 @@ def typed_record(kind: type[R], values: Any) -> R:
     return kind(**known)
 
 
+def _value(hint: Any, value: Any, json: bool) -> Any:
+    """A plain value as an annotation has it; unchanged where the annotation does not fit."""
+    for member in _members(hint):
+        origin = typing.get_origin(member) or member
+        if dataclasses.is_dataclass(origin) and value is not None:
+            return typed_record(origin, value, json)
+        if origin in (list, tuple) and isinstance(value, (list, tuple)):
+            return origin(_value(typing.get_args(member)[0], item, json) for item in value)
+        if json and isinstance(value, list) and getattr(origin, "array_type", None) is np.ndarray:
+            return np.array(value, dtype=origin.dtypes[0])
+        if isinstance(origin, type) and issubclass(origin, Enum):
+            return origin(value)
+    return value
+
+
+def _members(hint: Any) -> tuple[Any, ...]:
+    """The members of a union; another annotation as its only one."""
+    return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+
+
 def _classes(hint: Any) -> tuple[type, ...]:
     """The classes that values of an annotation may have."""
-    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    members = (typing.get_origin(member) or member for member in (typing.get_args(hint) if union else (hint,)))
+    members = (typing.get_origin(member) or member for member in _members(hint))
     return tuple(member if isinstance(member, type) else object for member in members)
 
 

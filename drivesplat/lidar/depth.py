@@ -7,7 +7,7 @@ import numpy as np
 from drivesplat.lidar.coloring import visible
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
-from drivesplat.lidar.occlusion import patches, unhidden
+from drivesplat.lidar.occlusion import patches, unoccluded
 from drivesplat.lidar.sweeps import returns_of
 from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.regions import fill, hulls_in
@@ -29,8 +29,8 @@ class Cloud:
     dynamic: list[tuple[DynamicObject, np.ndarray]]
 
 
-def clouds_of(scene: Scene, job: LidarDepthJob, groups: tuple[Group, ...]) -> list[Cloud]:
-    """The sweeps of the given groups, split into static and dynamic returns, in time order."""
+def split_sweeps(scene: Scene, job: LidarDepthJob, groups: tuple[Group, ...]) -> list[Cloud]:
+    """Splits the sweeps of the given groups into static and dynamic returns, in time order."""
     objects = dynamic_objects(scene)
     return [
         split_sweep(sweep, points, scene.seconds(sweep.timestamp), objects, job.box_margin)
@@ -64,7 +64,7 @@ def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body
     shape, intrinsics = (size[1], size[0]), continuous_intrinsics(frame, size)
     index, rows, columns, depth = visible(points, inverse(frame.camera_to_world), intrinsics, shape)
     ranges = np.linalg.norm(points[index] - cloud.origin, axis=1)
-    front = unhidden(rows, columns, depth, patches(ranges, depth, intrinsics, job.ray_spacing), shape)
+    front = unoccluded(rows, columns, depth, patches(ranges, depth, intrinsics, job.ray_spacing), shape)
     index, rows, columns, depth = index[front], rows[front], columns[front], depth[front]
     boxes = box_depths(scene, frame, size, {item.track.id for item, _ in cloud.dynamic})
     kept = (index >= len(cloud.static)) | (depth < boxes[rows, columns])

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivesplat.io.array_file import read_arrays, write_arrays
-from drivesplat.io.storage import Provenance, unreadable
-from drivesplat.io.typed_record import typed_record
+from drivesplat.io.array_file import read_typed_arrays
+from drivesplat.io.storage import Provenance
 
 RULE = "lidar_depth"
 
@@ -37,16 +36,6 @@ class LidarDepthRecord:
     provenance: Provenance = field(default_factory=dict)
 
 
-def write_lidar_depth(path: str | Path, record: LidarDepthRecord) -> None:
-    """Writes lidar_depth.npz."""
-    write_arrays(path, {**vars(record), "images": [vars(image) for image in record.images]})
-
-
 def read_lidar_depth(path: str | Path) -> LidarDepthRecord:
     """Reads lidar_depth.npz. Raises ResultError, naming the file and its rule, if it is invalid."""
-    content = read_arrays(path, RULE)
-    try:
-        images = [typed_record(PixelDepths, image) for image in content["images"]]
-        return typed_record(LidarDepthRecord, {**content, "images": images})
-    except (KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, RULE, f"not a record of depths ({error})") from error
+    return read_typed_arrays(path, RULE, LidarDepthRecord, "depths")

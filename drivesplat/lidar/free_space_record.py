@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64
 
-from drivesplat.io.array_file import read_arrays, write_arrays
+from drivesplat.io.array_file import read_typed_arrays
 from drivesplat.io.storage import Provenance, unreadable
-from drivesplat.io.typed_record import typed_record
 
 RULE = "free_space"
 
@@ -31,18 +30,9 @@ class FreeSpace:
     provenance: Provenance = field(default_factory=dict)
 
 
-def write_free_space(path: str | Path, record: FreeSpace) -> None:
-    """Writes free_space.npz."""
-    write_arrays(path, vars(record))
-
-
 def read_free_space(path: str | Path) -> FreeSpace:
     """Reads free_space.npz. Raises ResultError, naming the file and its rule, if it is invalid."""
-    content = read_arrays(path, RULE)
-    try:
-        record = typed_record(FreeSpace, content)
-        if not record.voxel > 0 or (np.diff(record.keys) <= 0).any():
-            raise ValueError("its voxels are not in order")
-        return record
-    except (TypeError, ValueError) as error:
-        raise unreadable(path, RULE, f"not a record of free space ({error})") from error
+    record = read_typed_arrays(path, RULE, FreeSpace, "free space")
+    if not record.voxel > 0 or (np.diff(record.keys) <= 0).any():
+        raise unreadable(path, RULE, "not a record of free space (its voxels are not in order)")
+    return record

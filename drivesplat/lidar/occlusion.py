@@ -22,7 +22,7 @@ def patches(
     return 0.5 * spacing * intrinsics.diagonal()[:2] / depth[:, None]
 
 
-def unhidden(
+def unoccluded(
     rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, halves: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
     """Whether returns at `depth` (m,) metres and pixels (`rows`, `columns`) of an image of `shape` (h, w) are not

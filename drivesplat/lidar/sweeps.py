@@ -1,5 +1,6 @@
 """LiDAR sweeps in world coordinates, without returns of the ego vehicle or of boxes."""
 
+from collections.abc import Iterable
 from contextlib import suppress
 
 import numpy as np
@@ -10,36 +11,44 @@ from drivesplat.scene.rigid import apply
 from drivesplat.scene.scene import Scene, Sweep
 from drivesplat.scene.splits import Group, sweep_groups
 from drivesplat.scene.tracks import Box
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 
 
-def training_sweeps(scene: Scene, holdout: HoldoutSettings) -> list[Sweep]:
-    """The training sweeps of a scene, at and between key frames."""
-    return sweeps_of(scene, holdout, ("train",))
-
-
-def sweeps_of(scene: Scene, holdout: HoldoutSettings, groups: tuple[Group, ...]) -> list[Sweep]:
+def sweeps_of(scene: Scene, holdout: HoldoutSettings, groups: tuple[Group, ...] = ("train",)) -> list[Sweep]:
     """The sweeps of the given groups, at and between key frames."""
     owners = sweep_groups(scene, holdout)
     return [sweep for sweep, group in zip(scene.sweeps, owners, strict=True) if group in groups]
 
 
-def training_returns(scene: Scene, holdout: HoldoutSettings, own_car_radius: float) -> list[tuple[Sweep, np.ndarray]]:
-    """The training sweeps with their returns, as `returns_of` gives them."""
-    return returns_of(scene, holdout, own_car_radius, ("train",))
-
-
 def returns_of(
-    scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...]
+    scene: Scene, holdout: HoldoutSettings, own_car_radius: float, groups: tuple[Group, ...] = ("train",)
 ) -> list[tuple[Sweep, np.ndarray]]:
-    """The sweeps of the given groups, each with its returns (n, 3) in world coordinates, without those of the ego
-    vehicle. Sweeps with a missing or corrupt file are left out; the stage lidar_seed reports them."""
+    """The sweeps of the given groups, each with its `world_returns`. Sweeps with a missing or corrupt file are left
+    out; the stage lidar_seed reports them."""
     found = []
     for sweep in sweeps_of(scene, holdout, groups):
         with suppress(DatasetError):
-            points = without_ego_vehicle(read_returns(sweep).points, own_car_radius)
-            found.append((sweep, apply(sweep.sensor_to_world, points)))
+            found.append((sweep, world_returns(sweep, own_car_radius)))
     return found
+
+
+def nearest_returns(
+    sweeps: Iterable[Sweep], timestamp: int, interval: float, own_car_radius: float = 0.0
+) -> np.ndarray | None:
+    """The `world_returns` of the readable sweep nearest to `timestamp`; None if no sweep is within `interval`. Times
+    are in microseconds."""
+    for sweep in sorted(sweeps, key=lambda sweep: abs(sweep.timestamp - timestamp)):
+        if abs(sweep.timestamp - timestamp) >= interval:
+            break
+        with suppress(DatasetError):  # the stage lidar_seed reports unreadable files
+            return world_returns(sweep, own_car_radius)
+    return None
+
+
+def world_returns(sweep: Sweep, own_car_radius: float) -> np.ndarray:
+    """The returns (n, 3) of a sweep in world coordinates, without those of the ego vehicle, which are within
+    `own_car_radius` metres of the sensor. Raises DatasetError if its file is missing or corrupt."""
+    return apply(sweep.sensor_to_world, without_ego_vehicle(read_returns(sweep).points, own_car_radius))
 
 
 def without_ego_vehicle(points: np.ndarray, radius: float) -> np.ndarray:

@@ -8,6 +8,7 @@ ends in the voxel of its end point.
 import math
 from typing import no_type_check
 
+import cv2
 import numpy as np
 
 from drivesplat.kernels.cache import callee, kernel
@@ -61,48 +62,16 @@ def count_passing(counts, starts, ends):
             _count(counts, cell)
 
 
-@callee
-@no_type_check
-def _inside(counts, x, y, z):
-    """Whether rays passed all six face neighbours of a voxel: one side of a surface is reached by no ray."""
-    return (
-        counts[x - 1, y, z] > 0
-        and counts[x + 1, y, z] > 0
-        and counts[x, y - 1, z] > 0
-        and counts[x, y + 1, z] > 0
-        and counts[x, y, z - 1] > 0
-        and counts[x, y, z + 1] > 0
-    )
-
-
-@callee
-@no_type_check
-def _clear(counts, x, y, z):
-    """Whether a voxel and its 26 neighbours are all unoccupied."""
-    for i in range(x - 1, x + 2):
-        for j in range(y - 1, y + 2):
-            for k in range(z - 1, z + 2):
-                if counts[i, j, k] == OCCUPIED:
-                    return False
-    return True
-
-
-@kernel
-@no_type_check
-def empty_voxels(counts, min_rays):
-    """The voxels off the grid's border that at least `min_rays` rays passed, whose face neighbours rays passed, and
-    that have no occupied neighbour: ascending indices (k,) int64 into the flattened grid."""
-    nx, ny, nz = counts.shape
-    found = np.empty(1024, np.int64)
-    n = 0
-    for x in range(1, nx - 1):
-        for y in range(1, ny - 1):
-            for z in range(1, nz - 1):
-                if min_rays <= counts[x, y, z] < OCCUPIED and _inside(counts, x, y, z) and _clear(counts, x, y, z):
-                    if n == len(found):
-                        larger = np.empty(2 * n, np.int64)
-                        larger[:n] = found
-                        found = larger
-                    found[n] = (x * ny + y) * nz + z
-                    n += 1
-    return found[:n].copy()
+def empty_voxels(counts: np.ndarray, min_rays: int) -> np.ndarray:
+    """The voxels off the border of `counts` (x, y, z) that at least `min_rays` rays passed, whose six face neighbours
+    rays passed (one side of a surface is reached by no ray), and that have no occupied one among their 26 neighbours:
+    ascending indices (k,) int64 into the flattened grid."""
+    cross, square = (cv2.getStructuringElement(shape, (3, 3)) for shape in (cv2.MORPH_CROSS, cv2.MORPH_RECT))
+    found = [np.empty(0, dtype=np.int64)]
+    for x in range(1, len(counts) - 1):
+        before, here, after = counts[x - 1 : x + 2]
+        empty = (here >= min_rays) & (cv2.erode(here, cross) > 0) & (before > 0) & (after > 0)
+        empty &= cv2.dilate(np.maximum(here, np.maximum(before, after)), square) < OCCUPIED
+        empty[[0, -1]] = empty[:, [0, -1]] = False
+        found.append(np.flatnonzero(empty) + x * empty.size)
+    return np.concatenate(found)

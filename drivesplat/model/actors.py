@@ -6,7 +6,7 @@ of the direction in the object's frame: their spherical harmonics rotate with it
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -28,29 +28,19 @@ from drivesplat.scene.motion import Motion
 from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings
 
 
-@dataclass(frozen=True)
-class ActorPoses:
-    """Poses of a actors at one time: object to world as `quats` w, x, y, z and `translations` in metres; `present`;
-    `scales`: enlargement factors."""
-
-    quats: Float[Tensor, "a 4"]
-    translations: Float[Tensor, "a 3"]
-    present: Bool[Tensor, " a"]
-    scales: Float[Tensor, " a"]
-
-    def with_placements(self, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> "ActorPoses":
-        """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
-        quats, translations, scales = self.quats.clone(), self.translations.clone(), self.scales.clone()
-        present = torch.zeros_like(self.present)
-        for placement in placements:
-            i, pose = ids.index(placement.source), placement.object_to_world
-            present[i], scales[i] = self.present[i], placement.scale
-            if pose is not None:
-                present[i] = True
-                turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
-                quats[i] = torch.from_numpy(turned).to(quats)
-                translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
-        return ActorPoses(quats, translations, present, scales)
+def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:
+    """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
+    quats, translations, sizes = poses.quats.clone(), poses.translations.clone(), poses.sizes.clone()
+    presence = torch.zeros_like(poses.presence)
+    for placement in placements:
+        i, pose = ids.index(placement.source), placement.object_to_world
+        presence[i], sizes[i] = poses.presence[i], placement.scale
+        if pose is not None:
+            presence[i] = 1.0
+            turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+            quats[i] = torch.from_numpy(turned).to(quats)
+            translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
+    return ObjectPoses(quats, translations, sizes, presence)
 
 
 class Actors(Part):
@@ -118,16 +108,14 @@ class Actors(Part):
         state = TimeState(*time_state)
         return self.placed(state, self.poses(state))
 
-    def poses(self, state: TimeState) -> ActorPoses:
+    def poses(self, state: TimeState) -> ObjectPoses:
         """The annotated poses of the actors with their learned corrections."""
         weights = state.weights * self._annotated
         turns = about_vertical(weights @ self.shared["yaw"])
-        return ActorPoses(
-            (left_factor(state.quats) @ turns[..., None])[..., 0],
-            state.translations + weights @ self.shared["translation"],
-            state.present,
-            torch.ones_like(state.translations[:, 0]),
-        )
+        quats = (left_factor(state.quats) @ turns[..., None])[..., 0]
+        sizes = torch.ones_like(state.translations[:, 0])
+        translations = state.translations + weights @ self.shared["translation"]
+        return ObjectPoses(quats, translations, sizes, state.present.to(sizes.dtype))
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         state, known = self.time_state(time), [track.id for track in self.timeline.tracks]
@@ -136,22 +124,20 @@ class Actors(Part):
         for placement in (placement for placement in placements if placement.source in known):
             repeated = placement.source in {other.source for other in first}
             (copies if repeated else first).append(placement)
-        sets = [self.placed(state, poses.with_placements(known, first))]
+        sets = [self.placed(state, with_placements(poses, known, first))]
         for placement in copies:  # few: transforming all actors for each copy costs little
-            placed = self.placed(state, poses.with_placements(known, [placement]))
+            placed = self.placed(state, with_placements(poses, known, [placement]))
             sets.append(placed[self.params["owner"] == known.index(placement.source)])
         return concatenate(sets)
 
-    def placed(self, state: TimeState, poses: ActorPoses) -> Gaussians:
+    def placed(self, state: TimeState, poses: ObjectPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""
         p, owner, owns = self.params, self.params["owner"], self._owns
         local = LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
-        presence = poses.present.to(poses.scales.dtype)
-        objects = ObjectPoses(poses.quats, poses.translations, poses.scales, presence)
         # colors rotate by a few degrees: their gradient would add only noise to the track
         rotations = rotation_of_harmonics(rotation_matrix(poses.quats.detach()), p["shN"].shape[2] + 1)
         sh = colors_in_world(p["sh0"], p["shN"], state.series, rotations, owner, owns)
-        return Gaussians.of(*place(local, objects, owner, owns), sh)
+        return Gaussians.of(*place(local, poses, owner, owns), sh)
 
     @property
     def _owns(self) -> Float[Tensor, "n a"]:

@@ -72,12 +72,15 @@ def rebuild_model(
     state: Mapping[str, torch.Tensor], parts: list[PartDefinition], sky: SkyKind, settings: TrainSettings
 ) -> SplatModel:
     """The model whose `state_dict` is `state` and whose `definitions` are `parts`."""
-    makers = {"background": _restore_background, "actors": _restore_actors}
+    makers = {
+        "background": lambda params, definition: Background(params, settings.gaussians, definition.extent),
+        "actors": lambda params, definition: Actors(params, definition.tracks, settings.actors, settings.gaussians),
+    }
     made = []
     for i, definition in enumerate(parts):
         prefix = f"parts.{i}.params."
         params = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-        made.append(makers[definition.part](params, definition, settings))
+        made.append(makers[definition.part](params, definition))
     exposed = {
         key.removeprefix(EXPOSURE_PREFIX): gains for key, gains in state.items() if key.startswith(EXPOSURE_PREFIX)
     }
@@ -98,10 +101,6 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
     kept = random_subset(len(record.points), settings.cap_max)
     positions, colors = record.points[kept], record.points_rgb[kept] / 255.0
     return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes)
-
-
-def _restore_background(params: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
-    return Background(params, settings.gaussians, definition.extent)
 
 
 def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
@@ -143,10 +142,6 @@ def random_subset(count: int, limit: int) -> np.ndarray:
     if count <= limit:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, limit, replace=False))
-
-
-def _restore_actors(params: dict[str, torch.Tensor], definition: PartDefinition, settings: TrainSettings) -> Part:
-    return Actors(params, definition.tracks, settings.actors, settings.gaussians)
 
 
 def _exposures(first: Mapping[str, Any], settings: TrainSettings) -> Exposures | None:

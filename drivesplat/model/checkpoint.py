@@ -41,8 +41,7 @@ class TrainedCheckpoint:
 def write_checkpoint(path: str | Path, checkpoint: TrainedCheckpoint) -> None:
     """Writes checkpoint.npz, atomically. Raises ResultError naming `path` where the disk is full."""
     state = {name: value.numpy() for name, value in checkpoint.model.items()}
-    parts = [part.to_plain() for part in checkpoint.parts]
-    write_arrays(path, {**vars(checkpoint), "model": state, "job": checkpoint.job.model_dump_json(), "parts": parts})
+    write_arrays(path, {**vars(checkpoint), "model": state, "job": checkpoint.job.model_dump_json()})
 
 
 def read_checkpoint(path: str | Path) -> TrainedCheckpoint:
@@ -51,8 +50,7 @@ def read_checkpoint(path: str | Path) -> TrainedCheckpoint:
     try:
         state = {name: torch.from_numpy(value) for name, value in content["model"].items()}
         job = TrainJob.model_validate_json(content["job"])
-        parts = [PartDefinition.from_plain(part) for part in content["parts"]]
-        return typed_record(TrainedCheckpoint, {**content, "model": state, "job": job, "parts": parts})
+        return typed_record(TrainedCheckpoint, {**content, "model": state, "job": job})
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise unreadable(path, RULE, "not a checkpoint of a finished training") from error
 

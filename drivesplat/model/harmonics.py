@@ -21,9 +21,11 @@ def rotation_of_harmonics(rotations: Float[Tensor, "a 3 3"], coefficients: int) 
     """
     if coefficients <= 4:
         return _of_vectors(rotations, coefficients)
+    from drivesplat.kernels.gsplat_private import sh_basis  # late: stages report a missing gsplat
+
     directions, inverse, same_degree = _directions(coefficients, rotations.dtype, rotations.device)
     turned = directions @ rotations  # rows are R^T d
-    return inverse @ _basis(coefficients, turned) * same_degree
+    return inverse @ sh_basis(coefficients, turned) * same_degree
 
 
 def _of_vectors(rotations: Float[Tensor, "a 3 3"], coefficients: int) -> Float[Tensor, "a k k"]:
@@ -49,24 +51,19 @@ def rotated(sh: Float[Tensor, "n k 3"], object_to_world: Float[Tensor, "3 3"]) -
     return rotation_of_harmonics(object_to_world[None].to(sh), sh.shape[1])[0] @ sh
 
 
-def _basis(coefficients: int, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
-    """The first k functions along unit directions, in the order and with the signs of 3D Gaussian Splatting."""
-    from drivesplat.kernels.gsplat_private import sh_basis  # late: stages report a missing gsplat
-
-    return sh_basis(coefficients, directions)
-
-
 @cache
 def _directions(coefficients: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Directions (m, 3) spread over the sphere (a Fibonacci lattice), the pseudo-inverse (k, m) of their basis, and
     which coefficients (k, k) have the same degree."""
+    from drivesplat.kernels.gsplat_private import sh_basis
+
     count = 4 * coefficients
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1.0 - 2.0 * index / count
     angle = index * (torch.pi * (3.0 - 5.0**0.5))
     ring = torch.sqrt(1.0 - z**2)
     directions = torch.stack([ring * torch.cos(angle), ring * torch.sin(angle), z], dim=-1)
-    inverse = torch.linalg.pinv(_basis(coefficients, directions))
+    inverse = torch.linalg.pinv(sh_basis(coefficients, directions))
     degrees = torch.arange(coefficients).sqrt().long()
     same_degree = degrees[:, None] == degrees
     return directions.to(device, dtype), inverse.to(device, dtype), same_degree.to(device, dtype)

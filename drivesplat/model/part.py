@@ -3,17 +3,16 @@
 Each part owns its parameters, their learning rates and its densification. A method is a list of parts.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from drivesplat.io.typed_record import typed_record
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.timeline import ActorTrack
 from drivesplat.model.view import View
@@ -41,15 +40,6 @@ class PartDefinition:
     part: str
     extent: float
     tracks: tuple[ActorTrack, ...] = ()
-
-    def to_plain(self) -> dict[str, Any]:
-        """As plain data and arrays."""
-        return {**vars(self), "tracks": [track.to_plain() for track in self.tracks]}
-
-    @classmethod
-    def from_plain(cls, plain: dict[str, Any]) -> "PartDefinition":
-        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError where `plain` is none."""
-        return typed_record(cls, {**plain, "tracks": tuple(map(ActorTrack.from_plain, plain["tracks"]))})
 
 
 @dataclass(frozen=True)
@@ -145,6 +135,12 @@ class Part(nn.Module, ABC):
     def __len__(self) -> int:
         """The number of its Gaussians."""
         return self.row_count - self.preallocated
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree of the spherical harmonics of its colours: `params["shN"]` (n, ..., k - 1, 3) has k = (degree +
+        1)² coefficients with `sh0`."""
+        return math.isqrt(1 + self.params["shN"].shape[-2]) - 1
 
     @property
     def row_count(self) -> int:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.motion import Motion
 
 MAX_CACHED_TIMES = 8192
@@ -25,15 +24,6 @@ class ActorTrack:
     id: str
     size: Float[np.ndarray, "3"]
     motion: Motion
-
-    def to_plain(self) -> dict[str, Any]:
-        """As plain data and arrays."""
-        return {"id": self.id, "size": self.size, **self.motion.to_plain()}
-
-    @classmethod
-    def from_plain(cls, plain: dict[str, Any]) -> "ActorTrack":
-        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError where `plain` is none."""
-        return typed_record(cls, {**plain, "motion": Motion.from_plain(plain)})
 
 
 class TimeState(NamedTuple):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from drivesplat.scene.rigid import interpolate, inverse
+from drivesplat.scene.rigid import interpolate, inverse, rigid
 from drivesplat.scene.scene import Scene
 
 
@@ -52,14 +52,11 @@ class Corrections:
     def _interpolated(self, transforms: np.ndarray, timestamps: np.ndarray) -> np.ndarray:
         """`transforms` (n, 4, 4), one per image, interpolated at `timestamps` (m,): (m, 4, 4)."""
         within = np.clip(timestamps, self.timestamps[0], self.timestamps[-1])
-        poses = np.tile(np.eye(4), (len(within), 1, 1))
-        for axis in range(3):
-            poses[:, axis, 3] = np.interp(within, self.timestamps, transforms[:, axis, 3])
+        positions = [np.interp(within, self.timestamps, transforms[:, axis, 3]) for axis in range(3)]
         rotations = Rotation.from_matrix(transforms[:, :3, :3])
         if len(self.timestamps) > 1:
             rotations = Slerp(self.timestamps.astype(np.float64), rotations)(within.astype(np.float64))
-        poses[:, :3, :3] = rotations.as_matrix()
-        return poses
+        return rigid(rotations.as_matrix(), np.stack(positions, axis=-1))
 
 
 def apply_corrections(scene: Scene, corrections: Corrections, poses: str = "refined") -> Scene:

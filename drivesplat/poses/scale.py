@@ -10,8 +10,8 @@ from scipy.ndimage import median_filter
 from scipy.spatial import QhullError, cKDTree
 
 from drivesplat.lidar.coloring import visible
-from drivesplat.lidar.nearest_sweep import nearest_returns
-from drivesplat.lidar.occlusion import patches, unhidden
+from drivesplat.lidar.occlusion import patches, unoccluded
+from drivesplat.lidar.sweeps import nearest_returns
 from drivesplat.poses.mapping import ImagePoints, MappedImages
 from drivesplat.poses.rig import RigImages
 from drivesplat.scene.images import continuous_intrinsics, project
@@ -59,7 +59,7 @@ def _visible_returns(frame: Frame, points: np.ndarray, rays: LidarRays) -> tuple
     index, rows, columns, depth = visible(points, world_to_camera, k, shape)
     ranges = np.linalg.norm(points[index] - frame.camera_to_world[:3, 3], axis=1)
     windows = patches(ranges, depth, k, rays.ray_spacing)
-    front = unhidden(rows, columns, depth, windows, shape)
+    front = unoccluded(rows, columns, depth, windows, shape)
     pixels, _ = project(points[index[front]], world_to_camera, k)
     return pixels, depth[front], windows[front].clip(MIN_WINDOW)
 

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivesplat.io.array_file import read_arrays, write_arrays
-from drivesplat.io.storage import Provenance, unreadable
-from drivesplat.io.typed_record import typed_record
+from drivesplat.io.array_file import read_typed_arrays
+from drivesplat.io.storage import Provenance
 
 RULE = "refine_poses"
 MAX_MEAN_ERROR = 2.0
@@ -79,15 +78,6 @@ def no_points() -> TriangulatedPoints:
     return TriangulatedPoints(np.empty((0, 3)), none, none)
 
 
-def write_triangulated(path: str | Path, record: TriangulatedPoints) -> None:
-    """Writes triangulated.npz."""
-    write_arrays(path, vars(record))
-
-
 def read_triangulated(path: str | Path) -> TriangulatedPoints:
     """Reads triangulated.npz. Raises ResultError, naming the file and the rule that makes it, where it is not one."""
-    content = read_arrays(path, RULE)
-    try:
-        return typed_record(TriangulatedPoints, content)
-    except (TypeError, ValueError) as error:
-        raise unreadable(path, RULE, f"not a record of triangulated points ({error})") from error
+    return read_typed_arrays(path, RULE, TriangulatedPoints, "triangulated points")

@@ -6,7 +6,6 @@ Colours come from training images that show the actor. Held-out images and sweep
 """
 
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.coloring import in_image
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
-from drivesplat.lidar.sweeps import training_returns
+from drivesplat.lidar.sweeps import returns_of
 from drivesplat.scene.actor_record import RULE, ActorRecord, ActorRecords
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
@@ -33,18 +32,21 @@ UNSEEN = 127
 
 def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MASK) -> ActorRecords:
     """The actors of a scene, without provenance. Dynamic objects that no training image shows are left out."""
-    sweeps = training_returns(scene, job.holdout, job.own_car_radius)
+    sweeps = returns_of(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
-    for mover in sorted(dynamic_objects(scene), key=lambda mover: mover.track.id):
-        part = job.actors.part_of(mover.track.object_class)
+    for dynamic_object in sorted(dynamic_objects(scene), key=lambda item: item.track.id):
+        part = job.actors.part_of(dynamic_object.track.object_class)
         if STAGE_OF_PART.get(part) == RULE:
-            random = np.random.default_rng((job.random_seed, order[mover.track.id]))
-            seeds.append(Seed(mover, part, *gathered_points(scene, mover, sweeps, job.actors, random)))
-    for view in actor_views(scene, job, ego_mask):
+            random = np.random.default_rng((job.random_seed, order[dynamic_object.track.id]))
+            seeds.append(
+                Seed(dynamic_object, part, *gathered_points(scene, dynamic_object, sweeps, job.actors, random))
+            )
+    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
+    for view in prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames):
         for seed in seeds:
             seed.add_view(view)
-    unseen = [seed.mover.track.id for seed in seeds if not seed.seen]
+    unseen = [seed.dynamic_object.track.id for seed in seeds if not seed.seen]
     if unseen:
         log.info("%d dynamic tracks that no training image shows are left out: %s", len(unseen), ", ".join(unseen))
     actors = [seed.record() for seed in seeds if seed.seen]
@@ -55,7 +57,7 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
 
 def gathered_points(
     scene: Scene,
-    mover: DynamicObject,
+    dynamic_object: DynamicObject,
     sweeps: list[tuple[Sweep, np.ndarray]],
     settings: ActorSeedSettings,
     random: np.random.Generator,
@@ -64,12 +66,14 @@ def gathered_points(
 
     `sweeps` come with their returns (m, 3) in world coordinates.
     """
-    in_box = (mover.own(points, scene.seconds(sweep.timestamp), settings.box_margin) for sweep, points in sweeps)
+    in_box = (
+        dynamic_object.own(points, scene.seconds(sweep.timestamp), settings.box_margin) for sweep, points in sweeps
+    )
     lidar = np.concatenate([np.empty((0, 3)), *in_box])
     target = min(settings.random_points, settings.max_points) if len(lidar) < settings.min_points else 0
     if len(lidar) > settings.max_points:
         lidar = lidar[np.sort(random.choice(len(lidar), settings.max_points, replace=False))]
-    filling = random.uniform(-0.5, 0.5, (max(0, target - len(lidar)), 3)) * mover.track.size
+    filling = random.uniform(-0.5, 0.5, (max(0, target - len(lidar)), 3)) * dynamic_object.track.size
     return np.concatenate([lidar, filling]), len(lidar)
 
 
@@ -85,12 +89,6 @@ class ActorView:
     owners: np.ndarray
     tracks: dict[str, int]
     seen: set[str]
-
-
-def actor_views(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask) -> Iterator[ActorView]:
-    """The training images, prefetched one by one."""
-    frames = [scene.frames[i] for i in training_images(scene, job.holdout)]
-    return prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames)
 
 
 def actor_view(scene: Scene, frame: Frame, job: ActorSeedJob, ego_mask: EgoMask) -> ActorView:
@@ -113,8 +111,8 @@ class Seed:
     A point has the colour of its nearest camera among those whose image shows the actor at the point's pixel.
     """
 
-    def __init__(self, mover: DynamicObject, part: PartName, points: np.ndarray, lidar: int):
-        self.mover, self._part = mover, part
+    def __init__(self, dynamic_object: DynamicObject, part: PartName, points: np.ndarray, lidar: int):
+        self.dynamic_object, self._part = dynamic_object, part
         self.seen, self.pixels = False, 0
         self._points, self._lidar = points, lidar
         self._colors = np.zeros((len(points), 3), dtype=np.uint8)
@@ -122,8 +120,8 @@ class Seed:
 
     def add_view(self, view: ActorView) -> None:
         """Updates the colours of the points that this view sees from nearer than all earlier views."""
-        self.seen |= self.mover.track.id in view.seen
-        number, pose = view.tracks.get(self.mover.track.id), self.mover.pose(view.seconds)
+        self.seen |= self.dynamic_object.track.id in view.seen
+        number, pose = view.tracks.get(self.dynamic_object.track.id), self.dynamic_object.pose(view.seconds)
         if number is None or pose is None:
             return
         self.pixels += int((view.owners == number).sum())
@@ -137,13 +135,13 @@ class Seed:
 
     def record(self) -> ActorRecord:
         """The actor's record. Points that no image shows get the mean colour of the others, or UNSEEN."""
-        track, shown = self.mover.track, np.isfinite(self._distances)
+        track, shown = self.dynamic_object.track, np.isfinite(self._distances)
         mean = self._colors[shown].mean(axis=0).round() if shown.any() else UNSEEN
         return ActorRecord(
             id=track.id,
             category=track.category,
             size=track.size,
-            motion=self.mover.motion,
+            motion=self.dynamic_object.motion,
             points=self._points.astype(np.float32),
             points_rgb=np.where(shown[:, None], self._colors, mean).astype(np.uint8),
             lidar_points=self._lidar,

@@ -25,14 +25,13 @@ from scipy import ndimage
 from skimage.measure import approximate_polygon, find_contours
 
 from drivesplat.lidar.coloring import in_image
-from drivesplat.lidar.nearest_sweep import nearest_returns
-from drivesplat.lidar.sweeps import training_sweeps
+from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
 from drivesplat.scene.ego_mask import Outline, enclosed
 from drivesplat.scene.images import continuous_intrinsics, pixel_rays, read_image
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import training_images
-from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +97,7 @@ class ComparedImages:
         """From a scene's training images and training sweeps."""
         frames = (scene.frames[i] for i in training_images(scene, search.holdout))
         moving = spaced_frames([frame for frame in frames if frame.camera == camera])
-        sweeps = tuple(training_sweeps(scene, search.holdout))
+        sweeps = tuple(sweeps_of(scene, search.holdout))
         return cls(tuple(moving), sweeps, scene.key_frame_interval, search.own_car_radius)
 
     @property
@@ -153,19 +152,19 @@ def find_outlines(drive: ComparedImages) -> tuple[tuple[Outline, ...], str | Non
     hits = lidar_images(drive)
     if len(hits) < MIN_IMAGES:
         return (), f"{len(hits)} images have LiDAR; {MIN_IMAGES} are needed to tell the body from an even road"
-    unhit = touching_edge(below_horizon(drive) & (np.sum(hits, axis=0) < 2))
-    if not unhit.any():
+    unreached = touching_edge(below_horizon(drive) & (np.sum(hits, axis=0) < 2))
+    if not unreached.any():
         return (), "LiDAR has returns all along the edge of the images"
     varies, median = variation(drive.images)
     whole = float(np.median(varies))
     if whole < MIN_VARIATION:
         return (), f"half of the pixels vary by {whole:.0f} grey levels or less: too little to detect constant ones"
-    varies, _ = variation(equal_brightness(drive.images, unhit & _rim(unhit.shape, drive.pixels(RING))))
+    varies, _ = variation(equal_brightness(drive.images, unreached & _rim(unreached.shape, drive.pixels(RING))))
     constant = (
         (varies < MAX_BODY_VARIATION * whole) & (median > LEVELS[0]) & (median < LEVELS[1]) & below_horizon(drive)
     )
-    candidates = components(constant & dilated(unhit, drive.pixels(REACH)), drive)
-    bodies = [piece for piece in candidates if stands_out(piece, varies, drive)]
+    candidates = components(constant & dilated(unreached, drive.pixels(REACH)), drive)
+    bodies = [piece for piece in candidates if contrasts(piece, varies, drive)]
     if not bodies:
         return (), "no constant region can be the ego vehicle"
     mask = np.logical_or.reduce(bodies)
@@ -244,7 +243,7 @@ def _padded(mask: np.ndarray) -> np.ndarray:
     return cv2.copyMakeBorder(mask.astype(np.uint8), PAD, PAD, PAD, PAD, cv2.BORDER_REPLICATE)
 
 
-def stands_out(body: np.ndarray, varies: np.ndarray, drive: ComparedImages) -> bool:
+def contrasts(body: np.ndarray, varies: np.ndarray, drive: ComparedImages) -> bool:
     """Whether pixels of the body (h, w) bool vary much less than those outside it, in a ring around its border."""
     near, far = drive.pixels(1), drive.pixels(RING)
     inside = body & ~_eroded(body, far) & _eroded(body, near)

@@ -23,7 +23,7 @@ import numpy as np
 from drivesplat.errors import ConfigError
 from drivesplat.lidar.dynamic_objects import dynamic_objects
 from drivesplat.lidar.free_space_record import FreeSpace
-from drivesplat.lidar.sweeps import training_returns
+from drivesplat.lidar.sweeps import returns_of
 from drivesplat.lidar.traversal import OCCUPIED, count_passing, empty_voxels
 from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.scene.scene import Scene
@@ -48,11 +48,9 @@ class Rays:
     @classmethod
     def joined(cls, several: Sequence["Rays"]) -> "Rays":
         """Concatenates `several`."""
-        origins, ends = (np.concatenate([np.empty((0, 3)), *(getattr(r, name) for r in several)]) for name in _POINTS)
-        return cls(origins, ends, np.concatenate([np.empty(0, dtype=bool), *(r.static for r in several)]))
-
-
-_POINTS = ("origins", "ends")
+        none = cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, dtype=bool))
+        columns = zip(*((rays.origins, rays.ends, rays.static) for rays in (none, *several)), strict=True)
+        return cls(*map(np.concatenate, columns))
 
 
 def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: TriangulatedPoints | None = None) -> FreeSpace:
@@ -65,11 +63,11 @@ def free_space_record(scene: Scene, job: FreeSpaceJob, triangulated: Triangulate
 
 def lidar_rays(scene: Scene, job: FreeSpaceJob) -> Rays:
     """The rays of the training sweeps, from each sweep's sensor; returns of the ego vehicle are left out."""
-    movers, rays = dynamic_objects(scene), []
-    for sweep, points in training_returns(scene, job.holdout, job.own_car_radius):
+    objects, rays = dynamic_objects(scene), []
+    for sweep, points in returns_of(scene, job.holdout, job.own_car_radius):
         static = np.ones(len(points), dtype=bool)
-        for mover in movers:
-            static &= ~mover.near(points, scene.seconds(sweep.timestamp), job.box_margin)
+        for item in objects:
+            static &= ~item.near(points, scene.seconds(sweep.timestamp), job.box_margin)
         origins = np.broadcast_to(sweep.sensor_to_world[:3, 3], points.shape)
         rays.append(Rays(origins, points, static))
     return Rays.joined(rays)

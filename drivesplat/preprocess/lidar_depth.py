@@ -8,7 +8,7 @@ import logging
 
 import numpy as np
 
-from drivesplat.lidar.depth import clouds_of, depths_in, nearest_cloud, nearest_per_pixel
+from drivesplat.lidar.depth import depths_in, nearest_cloud, nearest_per_pixel, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import target_size
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 def lidar_depths(scene: Scene, job: LidarDepthJob, ego_mask: EgoMask = NO_EGO_MASK) -> list[PixelDepths]:
     """The LiDAR depths of each of the scene's frames, in their order, outside the ego vehicle's body; empty for frames
     outside the training split."""
-    clouds, images = clouds_of(scene, job, ("train",)), []
+    clouds, images = split_sweeps(scene, job, ("train",)), []
     for frame, group in zip(scene.frames, frame_groups(scene, job.holdout), strict=True):
         cloud = nearest_cloud(clouds, frame.timestamp, scene.key_frame_interval) if group == "train" else None
         body = ego_mask.pixels(frame.camera, target_size(frame, job.images))

@@ -7,7 +7,6 @@ sweeps contribute neither LiDAR positions nor colours.
 """
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +15,14 @@ from plyfile import PlyParseError
 from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud, read_positions
 from drivesplat.io.prefetch import prefetch
-from drivesplat.lidar.coloring import ColorView, color_by_visibility
-from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
+from drivesplat.lidar.coloring import ColorView, color_by_visibility, in_image
+from drivesplat.lidar.sweeps import outside_boxes, thin, world_returns
 from drivesplat.poses.triangulated import TriangulatedPoints
-from drivesplat.preprocess.far_points import far_points, uncovered
-from drivesplat.readers.sweeps import read_returns, sweep_fault
+from drivesplat.readers.sweeps import sweep_fault
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import continuous_intrinsics, read_image, target_size
 from drivesplat.scene.regions import fill, hulls_in
-from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.splits import sweep_groups, training_images
 from drivesplat.scene.tracks import boxes_of, moving_tracks
@@ -32,6 +30,9 @@ from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 
 log = logging.getLogger(__name__)
+
+COVERAGE_CELL = 8
+"""Edge length in pixels of the image cell that a seed point covers."""
 
 
 def seed_points(
@@ -59,7 +60,8 @@ def seed_points(
     }
     positions, times = (np.concatenate(columns) for columns in zip(*sources.values(), strict=True))
     source = np.repeat(np.arange(len(sources)), [len(points) for points, _ in sources.values()])
-    colors, seen = color_by_visibility(positions, times, color_views(scene, frames, job.images, ego_mask))
+    views = prefetch(lambda frame: color_view(scene, frame, job.images, ego_mask), frames)  # all exceed memory
+    colors, seen = color_by_visibility(positions, times, views)
     kept = np.flatnonzero(seen)
     if len(kept) > job.lidar_seed.max_points:
         kept = np.sort(random.choice(kept, job.lidar_seed.max_points, replace=False))
@@ -93,7 +95,7 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
     moving = moving_tracks(scene)
     for sweep, group in zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True):
         try:
-            points = read_returns(sweep).points
+            points = world_returns(sweep, settings.own_car_radius)
         except DatasetError:
             if settings.on_missing == "stop":
                 raise
@@ -102,7 +104,6 @@ def lidar_points(scene: Scene, job: SeedJob) -> tuple[np.ndarray, np.ndarray, in
             continue
         if group != "train":
             continue
-        points = apply(sweep.sensor_to_world, without_ego_vehicle(points, settings.own_car_radius))
         boxes = boxes_of(moving, sweep.timestamp, scene.key_frame_interval)
         points = points[outside_boxes(points, boxes, settings.box_margin)]
         positions.append(points)
@@ -131,13 +132,6 @@ def triangulated_points(scene: Scene, job: SeedJob, record: TriangulatedPoints) 
     times = np.array([frame.timestamp for frame in scene.frames], dtype=np.float64)
     chosen = record.seen_in(training)
     return record.points[chosen], record.mean_over_views(training, times)[chosen]
-
-
-def color_views(
-    scene: Scene, frames: list[Frame], images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK
-) -> Iterator[ColorView]:
-    """The frames as sources of colour, one by one: at 12 Hz all of them together exceed memory."""
-    return prefetch(lambda frame: color_view(scene, frame, images, ego_mask), frames)
 
 
 def color_view(scene: Scene, frame: Frame, images: ImageSettings, ego_mask: EgoMask = NO_EGO_MASK) -> ColorView:
@@ -178,3 +172,40 @@ def _far_points(
         positions.append(p)
         colors.append(c)
     return np.concatenate(positions), np.concatenate(colors)
+
+
+def uncovered(view: ColorView, points: np.ndarray) -> np.ndarray:
+    """Flat row-major indices (m,) of a view's usable pixels in cells of COVERAGE_CELL pixels into which none of the
+    world points (n, 3) projects."""
+    height, width = view.pixels.shape[:2]
+    cells = np.zeros((height // COVERAGE_CELL + 1, width // COVERAGE_CELL + 1), dtype=bool)
+    _, rows, columns, _ = in_image(points, view.world_to_camera, view.intrinsics, (height, width))
+    cells[rows // COVERAGE_CELL, columns // COVERAGE_CELL] = True
+    covered = cells.repeat(COVERAGE_CELL, axis=0).repeat(COVERAGE_CELL, axis=1)[:height, :width]
+    return np.flatnonzero(view.usable & ~covered)
+
+
+def far_points(
+    view: ColorView,
+    ground_z: float,
+    candidates: np.ndarray,
+    count: int,
+    depths: tuple[float, float],
+    random: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """At most `count` random points on the rays of pixels drawn from `candidates`, which `uncovered` returns.
+
+    Depth is log-uniform between `depths` (metres). A point below the ground plane at height `ground_z` is moved along
+    its ray onto the plane. Returns world positions (m, 3) and the colours (m, 3) uint8 of the pixels.
+    """
+    chosen = random.choice(candidates, size=min(count, len(candidates)), replace=False)
+    rows, columns = np.divmod(chosen, view.pixels.shape[1])
+    camera_to_world = np.linalg.inv(view.world_to_camera)
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
+    rays = pixels @ np.linalg.inv(view.intrinsics).T @ camera_to_world[:3, :3].T
+    center = camera_to_world[:3, 3]
+    depth = np.exp(random.uniform(*np.log(depths), size=len(rows)))
+    with np.errstate(divide="ignore"):
+        to_ground = np.where(rays[:, 2] < 0, (ground_z - center[2]) / rays[:, 2], np.inf)
+    depth = np.minimum(depth, np.where(to_ground > 0, to_ground, np.inf))
+    return center + depth[:, None] * rays, view.pixels[rows, columns]

@@ -11,14 +11,22 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
 import numpy as np
+from scipy import ndimage
 
 from drivesplat.errors import DatasetError
-from drivesplat.lidar.nearest_sweep import nearest_returns
-from drivesplat.lidar.sweeps import training_sweeps
-from drivesplat.preprocess.sky_mask import sky_mask
+from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
-from drivesplat.scene.images import continuous_intrinsics, read_image, read_mask, target_size, write_png
+from drivesplat.scene.images import (
+    continuous_intrinsics,
+    pixel_rays,
+    project,
+    read_image,
+    read_mask,
+    target_size,
+    write_png,
+)
 from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name
 from drivesplat.scene.regions import LABELS, label_image
 from drivesplat.scene.scene import Frame, Scene, Sweep
@@ -27,6 +35,16 @@ from drivesplat.settings.masks import MaskJob
 
 log = logging.getLogger(__name__)
 
+MIN_ELEVATION = np.sin(np.radians(1.0))
+"""Sine of the minimum elevation of sky, one degree above the horizon."""
+MIN_BRIGHTNESS = 0.35
+"""Minimum brightness of sky with a blue tint, in [0, 1]."""
+BRIGHT = 0.7
+"""Minimum brightness of sky without a blue tint (overcast)."""
+SMOOTH = 0.045
+"""Maximum brightness gradient of sky, per pixel at 640 pixels' width."""
+LIDAR_REACH = 12
+"""Distance from a LiDAR return within which no pixel is sky, in pixels at 640 pixels' width."""
 MIN_SKY = 0.005
 """Minimum share of sky over all images. Below it the heuristic, which looks for bright pixels, has found no sky."""
 NO_SKY = (
@@ -41,7 +59,7 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
 
     Raises DatasetError naming the file where a user's mask is missing or unreadable.
     """
-    groups, training = frame_groups(scene, job.holdout), training_sweeps(scene, job.holdout)
+    groups, training = frame_groups(scene, job.holdout), sweeps_of(scene, job.holdout)
 
     def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
         size = target_size(frame, job.images)
@@ -108,3 +126,41 @@ def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) ->
 
 def _users_mask(folder: str, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     return read_mask(Path(folder).expanduser() / frame.camera / f"{Path(frame.image_path).stem}.png", size)
+
+
+def sky_mask(
+    pixels: np.ndarray, intrinsics: np.ndarray, camera_to_world: np.ndarray, lidar: np.ndarray | None
+) -> np.ndarray:
+    """The sky (h, w) bool of an image (h, w, 3) uint8 RGB: pixels above the horizon, bright or blue, smooth, connected
+    to the top edge, without LiDAR returns.
+
+    `intrinsics` (3, 3) in the continuous convention; `lidar` (n, 3) world points of the nearest sweep, or None.
+    """
+    height, width = pixels.shape[:2]
+    scale = width / 640.0
+    smoothed = cv2.GaussianBlur(pixels, (0, 0), max(0.6, scale)).astype(np.float64) / 255.0
+    brightness = smoothed.mean(axis=2)
+    gradient = np.hypot(ndimage.sobel(brightness, axis=0), ndimage.sobel(brightness, axis=1)) / 8.0 * scale
+    blue = smoothed[..., 2] >= smoothed[..., 0]
+    candidate = (brightness > MIN_BRIGHTNESS) & (blue | (brightness > BRIGHT)) & (gradient < SMOOTH)
+    candidate &= pixel_rays((width, height), intrinsics, camera_to_world)[..., 2] > MIN_ELEVATION
+    if lidar is not None:
+        candidate &= ~_near_returns(
+            lidar, np.linalg.inv(camera_to_world), intrinsics, (height, width), max(1, round(LIDAR_REACH * scale))
+        )
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    candidate = cv2.morphologyEx(candidate.astype(np.uint8), cv2.MORPH_OPEN, cross, iterations=max(1, round(scale)))
+    labels, _ = ndimage.label(candidate)
+    at_top = np.unique(labels[: max(1, round(2 * scale))])
+    return np.isin(labels, at_top[at_top > 0])
+
+
+def _near_returns(
+    lidar: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray, shape: tuple[int, int], reach: int
+) -> np.ndarray:
+    hit = np.zeros(shape, dtype=np.uint8)
+    at, depth = project(lidar, world_to_camera, intrinsics)
+    inside = (depth > 0.5) & (at >= 0).all(axis=1) & (at[:, 0] < shape[1]) & (at[:, 1] < shape[0])
+    columns, rows = at[inside].astype(np.int64).T
+    hit[rows, columns] = 1
+    return cv2.dilate(hit, np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)).astype(bool)

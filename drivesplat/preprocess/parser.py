@@ -11,7 +11,7 @@ from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import ParserJob
 
 
 def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingRecord:

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
+from os.path import commonpath
 from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ResultError
-from drivesplat.io.storage import Provenance, canonical_json, sha256_file, sha256_text
+from drivesplat.io.storage import Provenance, canonical_json, leaves, sha256_file, sha256_text
 
 VERSIONS_OF = ("torch", "gsplat", "numpy", "nuscenes-devkit", "lpips", "pycolmap")
 
@@ -22,7 +23,7 @@ def provenance(
     merged = combine(upstream)
     merged["stages"][stage] = {"settings": settings, "code": code}
     merged["inputs"].update(inputs)
-    return sealed(merged["stages"], merged["inputs"])
+    return with_digests(merged["stages"], merged["inputs"])
 
 
 def combine(records: Iterable[Provenance]) -> Provenance:
@@ -39,16 +40,16 @@ def combine(records: Iterable[Provenance]) -> Provenance:
             )
         stages |= record["stages"]
         inputs |= record["inputs"]
-    return sealed(stages, inputs)
+    return with_digests(stages, inputs)
 
 
-def sealed(stages: dict[str, Any], inputs: dict[str, str]) -> Provenance:
+def with_digests(stages: dict[str, Any], inputs: dict[str, str]) -> Provenance:
     """The record with the digests that `metrics.json` specifies."""
     return {
         "settings_sha256": sha256_text(canonical_json({name: stage["settings"] for name, stage in stages.items()})),
         "code_sha256": sha256_text(canonical_json({name: stage["code"] for name, stage in stages.items()})),
         "inputs_sha256": sha256_text(canonical_json(inputs)),
-        "versions": {name: _version(name) for name in VERSIONS_OF},
+        "versions": {name: package_version(name) for name in VERSIONS_OF},
         "stages": stages,
         "inputs": inputs,
     }
@@ -62,7 +63,7 @@ def differences(expected: dict[str, Any], found: dict[str, Any], shared_only: bo
             if not shared_only:
                 lines.append(f"{stage}: {'not in this result' if stage in expected else 'no longer in the config'}")
             continue
-        a, b = (_flat(side[stage]["settings"]) for side in (expected, found))
+        a, b = (leaves(side[stage]["settings"]) for side in (expected, found))
         for key in sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key)):
             lines.append(f"{stage}: {key} is {b.get(key)!r} in the result, {a.get(key)!r} now")
         if expected[stage]["code"] != found[stage]["code"]:
@@ -71,17 +72,14 @@ def differences(expected: dict[str, Any], found: dict[str, Any], shared_only: bo
 
 
 def digests_of(files: Iterable[str | Path]) -> str:
-    """One digest for a set of files, by name and content."""
-    return sha256_text(canonical_json({Path(file).name: sha256_file(file) for file in files}))
+    """One digest for a set of files, by content and by path from the folder that holds all of them."""
+    paths = [Path(file).absolute() for file in files]
+    folder = commonpath([path.parent for path in paths]) if paths else ""
+    return sha256_text(canonical_json({path.relative_to(folder).as_posix(): sha256_file(path) for path in paths}))
 
 
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {prefix.rstrip("."): value}
-    return {key: item for name, child in value.items() for key, item in _flat(child, f"{prefix}{name}.").items()}
-
-
-def _version(package: str) -> str | None:
+def package_version(package: str) -> str | None:
+    """The version of an installed package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -1,6 +1,5 @@
 """Rasterization: 3D Gaussians in; image, alpha and depth out."""
 
-from drivesplat.rasterization.rasterization import rasterize
-from drivesplat.rasterization.rendering import Rendering
+from drivesplat.rasterization.rasterization import Rendering, rasterize
 
 __all__ = ["Rendering", "rasterize"]

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from drivesplat.errors import DatasetError
 from drivesplat.scene.images import continuous_intrinsics
+from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.render import TrajectorySettings
 
@@ -77,14 +78,10 @@ def smooth_poses(timestamps: np.ndarray, poses: np.ndarray, wanted: np.ndarray) 
     """
     # seconds since the first pose: polynomials in microseconds since 1970 lose all precision
     known, at = (timestamps - timestamps[0]) * 1e-6, (wanted - timestamps[0]) * 1e-6
-    smooth = np.tile(np.eye(4), (len(wanted), 1, 1))
     rotations = Rotation.from_matrix(poses[:, :3, :3])
     if len(poses) == 1:
-        smooth[:, :3, :3], smooth[:, :3, 3] = rotations.as_matrix(), poses[:, :3, 3]
-    else:
-        smooth[:, :3, :3] = RotationSpline(known, rotations)(at).as_matrix()
-        smooth[:, :3, 3] = CubicSpline(known, poses[:, :3, 3])(at)
-    return smooth
+        return np.tile(rigid(rotations.as_matrix(), poses[:, :3, 3]), (len(wanted), 1, 1))
+    return rigid(RotationSpline(known, rotations)(at).as_matrix(), CubicSpline(known, poses[:, :3, 3])(at))
 
 
 def displaced(camera_to_world: np.ndarray, ego_to_world: np.ndarray, offset: TrajectorySettings) -> np.ndarray:

@@ -9,14 +9,13 @@ from typing import Any
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.comparison import GROUP_PLACES
-from drivesplat.io import storage
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.provenance.record import differences
-from drivesplat.report.failures import why_missing
 from drivesplat.report.statistics import gap_closed, mean_over_scenes
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.report import ReportJob
+from drivesplat.workflow.job_logs import why_missing
 
 SCHEMA = 2
 REGIONS = ("static", "vehicle", "moving_vehicle")
@@ -64,11 +63,6 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
         "missing": missing,
         "protocols": protocols,
     }
-
-
-def write_csv(path: str | Path, report: dict[str, Any]) -> None:
-    """Writes the rows of a report as a table; null figures are empty cells."""
-    storage.write_csv(path, COLUMNS, ({column: row[column] for column in COLUMNS} for row in report["rows"]))
 
 
 COLUMNS = (

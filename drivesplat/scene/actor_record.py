@@ -5,14 +5,12 @@ The stage `actors` writes it (`drivesplat.preprocess.actor_seed`).
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from drivesplat.io.array_file import read_arrays, write_arrays
-from drivesplat.io.storage import Provenance, unreadable
-from drivesplat.io.typed_record import typed_record
+from drivesplat.io.array_file import read_typed_arrays
+from drivesplat.io.storage import Provenance
 from drivesplat.scene.motion import Motion
 
 RULE = "actors"
@@ -37,15 +35,6 @@ class ActorRecord:
     pixels: int
     part: str = "actors"
 
-    def to_plain(self) -> dict[str, Any]:
-        """The record as plain containers and arrays."""
-        return {**vars(self), "motion": self.motion.to_plain()}
-
-    @classmethod
-    def from_plain(cls, plain: dict[str, Any]) -> "ActorRecord":
-        """The inverse of `to_plain`. Raises AttributeError, KeyError, TypeError or ValueError if that fails."""
-        return typed_record(cls, {**plain, "motion": Motion.from_plain(plain["motion"])})
-
 
 @dataclass(frozen=True)
 class ActorRecords:
@@ -55,16 +44,6 @@ class ActorRecords:
     provenance: Provenance = field(default_factory=dict)
 
 
-def write_actors(path: str | Path, record: ActorRecords) -> None:
-    """Writes actors.npz."""
-    write_arrays(path, {**vars(record), "actors": [actor.to_plain() for actor in record.actors]})
-
-
 def read_actors(path: str | Path) -> ActorRecords:
     """Reads actors.npz. Raises ResultError that names the file and its rule if it is invalid."""
-    content = read_arrays(path, RULE)
-    try:
-        actors = [ActorRecord.from_plain(actor) for actor in content["actors"]]
-        return typed_record(ActorRecords, {**content, "actors": actors})
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise unreadable(path, RULE, f"not a record of actors ({error})") from error
+    return read_typed_arrays(path, RULE, ActorRecords, "actors")

@@ -6,14 +6,12 @@ the box centre; world metres.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from drivesplat.io.typed_record import typed_record
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import runs
 
@@ -40,17 +38,6 @@ class Motion:
         times = np.array([scene.seconds(timestamp) for timestamp in track.timestamps])
         reach = scene.key_frame_interval * 0.5e-6
         return cls(times, track.object_to_world, tuple(runs(track.sample_indices)), reach)
-
-    def to_plain(self) -> dict[str, Any]:
-        """The motion as plain containers and arrays, without `turns`."""
-        runs = [list(run) for run in self.runs]
-        return {"times": self.times, "object_to_world": self.object_to_world, "runs": runs, "reach": self.reach}
-
-    @classmethod
-    def from_plain(cls, plain: dict[str, Any]) -> "Motion":
-        """The inverse of `to_plain`. Raises KeyError, TypeError or ValueError if `plain` is invalid."""
-        runs = tuple((first, last) for first, last in plain["runs"])
-        return typed_record(cls, {**plain, "runs": runs})
 
     @property
     def span(self) -> tuple[float, float]:

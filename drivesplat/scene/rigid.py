@@ -5,21 +5,16 @@ from scipy.spatial.transform import Rotation
 
 
 def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """The 4x4 transform of a rotation matrix (3, 3) and a translation (3,)."""
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    transform[:3, 3] = translation
+    """The transforms (..., 4, 4) of rotation matrices (..., 3, 3), or a common one, and translations (..., 3)."""
+    transform = np.zeros((*np.shape(translation)[:-1], 4, 4))
+    transform[..., :3, :3], transform[..., :3, 3], transform[..., 3, 3] = rotation, translation, 1.0
     return transform
 
 
 def inverse(transform: np.ndarray) -> np.ndarray:
     """The inverse of rigid transforms (..., 4, 4)."""
     rotation_t = np.swapaxes(transform[..., :3, :3], -1, -2)
-    result = np.zeros_like(transform)
-    result[..., :3, :3] = rotation_t
-    result[..., :3, 3] = -(rotation_t @ transform[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
+    return rigid(rotation_t, -(rotation_t @ transform[..., :3, 3:])[..., 0])
 
 
 def apply(transform: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import Provenance, read_json, unreadable, write_json
+from drivesplat.io.typed_record import field_values, typed_record
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.sensors import Camera, Lidar
 
@@ -24,17 +26,17 @@ REFINED = "scene_refined.json"
 
 @dataclass(frozen=True)
 class Frame:
-    """One image. `camera` is a name in `Scene.cameras`; `intrinsics` (3, 3); `camera_to_world`, `ego_to_world` (4, 4)
-    at the image's own timestamp."""
+    """One image. `camera` is a name in `Scene.cameras`; `camera_to_world` and `ego_to_world` hold at the image's own
+    timestamp."""
 
     camera: str
     timestamp: int
     image_path: str
     width: int
     height: int
-    intrinsics: np.ndarray
-    camera_to_world: np.ndarray
-    ego_to_world: np.ndarray
+    intrinsics: Float64[np.ndarray, "3 3"]
+    camera_to_world: Float64[np.ndarray, "4 4"]
+    ego_to_world: Float64[np.ndarray, "4 4"]
     is_key_frame: bool
     sample_index: int
     token: str
@@ -42,12 +44,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One LiDAR revolution. `sensor_to_world` (4, 4) at the sweep's timestamp; `path` may be missing on disk. `lidar`
-    is a name in `Scene.lidars`; `reader` names the package of `drivesplat.readers` that reads it."""
+    """One LiDAR revolution. `sensor_to_world` holds at the sweep's timestamp; `path` may be missing on disk. `lidar` is
+    a name in `Scene.lidars`; `reader` names the package of `drivesplat.readers` that reads it."""
 
     path: str
     timestamp: int
-    sensor_to_world: np.ndarray
+    sensor_to_world: Float64[np.ndarray, "4 4"]
     is_key_frame: bool
     sample_index: int
     token: str
@@ -59,25 +61,25 @@ class Sweep:
 class Track:
     """One annotated object over time. `category` is the dataset's own name of its class.
 
-    `size` (3,) is length, width, height in metres. Per annotation: `timestamps` (n,), `sample_indices` (n,),
-    increasing; `object_to_world` (n, 4, 4); `visibility` (n,): 1 (0-40 %) to 4 (80-100 %), 0 if unknown.
+    `size` is length, width, height in metres. There are n annotations, at increasing `timestamps` and `sample_indices`;
+    `visibility` is 1 (0-40 %) to 4 (80-100 %), 0 if unknown.
     """
 
     id: str
     object_class: ObjectClass
     category: str
-    size: np.ndarray
-    timestamps: np.ndarray
-    sample_indices: np.ndarray
-    object_to_world: np.ndarray
-    visibility: np.ndarray
+    size: Float64[np.ndarray, "3"]
+    timestamps: Int64[np.ndarray, " n"]
+    sample_indices: Int64[np.ndarray, " n"]
+    object_to_world: Float64[np.ndarray, "n 4 4"]
+    visibility: Int64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
 class Scene:
     """A recorded drive.
 
-    `key_frame_timestamps` (n,): key frame i is `sample_index` i. `origin` (3,): global = world + origin. `poses` names
+    Key frame i of `key_frame_timestamps` is `sample_index` i. `origin`: global = world + origin. `poses` names
     where the poses come from (a reader, 'refined', 'images'); `key_frame_hz` is the nominal rate of key frames;
     `key_frame_range` the dataset's key frames [first, last + 1) that were read, None for all. `cameras` and `lidars`
     are the sensors that frames and sweeps name.
@@ -87,8 +89,8 @@ class Scene:
     dataset: str
     version: str
     description: str
-    origin: np.ndarray
-    key_frame_timestamps: np.ndarray
+    origin: Float64[np.ndarray, "3"]
+    key_frame_timestamps: Int64[np.ndarray, " n"]
     frames: tuple[Frame, ...]
     sweeps: tuple[Sweep, ...]
     tracks: tuple[Track, ...]
@@ -143,27 +145,9 @@ def place_of(recording: Frame | Sweep) -> str:
     return f"{where}key frame {recording.sample_index}, token {recording.token}"
 
 
-_ARRAYS = {
-    "intrinsics": np.float64,
-    "camera_to_world": np.float64,
-    "ego_to_world": np.float64,
-    "sensor_to_world": np.float64,
-    "object_to_world": np.float64,
-    "origin": np.float64,
-    "size": np.float64,
-    "timestamps": np.int64,
-    "sample_indices": np.int64,
-    "visibility": np.int64,
-    "key_frame_timestamps": np.int64,
-    "distortion": np.float64,
-    "beam_elevations": np.float64,
-}
-_RECORDS: dict[str, type] = {"frames": Frame, "sweeps": Sweep, "tracks": Track, "cameras": Camera, "lidars": Lidar}
-
-
 def write_scene(path: str | Path, scene: Scene) -> None:
     """Writes `scene.json`."""
-    write_json(path, {"schema": SCHEMA, **_to_plain(scene)})
+    write_json(path, {"schema": SCHEMA, **field_values(scene)}, _plain)
 
 
 def read_scene(path: str | Path) -> Scene:
@@ -181,32 +165,10 @@ def read_scene(path: str | Path) -> Scene:
     try:
         if content.pop("schema") != SCHEMA:
             raise ValueError("it has another schema")
-        return _from_plain(Scene, content)
+        return typed_record(Scene, content, json=True)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise unreadable(path, rule, f"not a scene record ({error})") from error
 
 
-def _to_plain(record: Any) -> dict[str, Any]:
-    plain = {}
-    for name, value in vars(record).items():
-        if isinstance(value, np.ndarray):
-            plain[name] = value.tolist()
-        elif name in _RECORDS:
-            plain[name] = [_to_plain(item) for item in value]
-        else:
-            plain[name] = value
-    return plain
-
-
-def _from_plain(kind: type, plain: dict[str, Any]) -> Any:
-    values = {}
-    for name, value in plain.items():
-        if name in _ARRAYS and value is not None:
-            values[name] = np.array(value, dtype=_ARRAYS[name])
-        elif name in _RECORDS:
-            values[name] = tuple(_from_plain(_RECORDS[name], item) for item in value)
-        elif name == "object_class":
-            values[name] = ObjectClass(value)
-        else:
-            values[name] = value
-    return kind(**values)
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else field_values(value)

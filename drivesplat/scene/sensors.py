@@ -4,30 +4,31 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float64
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera. `width`, `height` in pixels; `intrinsics` (3, 3), OpenCV (integer coordinates at pixel centres);
+    """A camera. `width`, `height` in pixels; `intrinsics`, OpenCV (integer coordinates at pixel centres);
     `distortion`: OpenCV's coefficients, all 0 for rectified images; `readout_s`: time in seconds from the first line
     of pixels to the last, read in `readout_direction`. None if unknown."""
 
     name: str
     width: int
     height: int
-    intrinsics: np.ndarray
-    distortion: np.ndarray | None = None
+    intrinsics: Float64[np.ndarray, "3 3"]
+    distortion: Float64[np.ndarray, " k"] | None = None
     readout_s: float | None = None
     readout_direction: Literal["down", "up", "left", "right"] | None = None
 
 
 @dataclass(frozen=True)
 class Lidar:
-    """A spinning LiDAR. `beam_elevations` (b,) in radians above the sensor's horizontal plane, in ring order;
+    """A spinning LiDAR. `beam_elevations` in radians above the sensor's horizontal plane, in ring order;
     `azimuth_steps` is the number of firings of a beam per revolution. None if unknown."""
 
     name: str
-    beam_elevations: np.ndarray | None = None
+    beam_elevations: Float64[np.ndarray, " b"] | None = None
     azimuth_steps: int | None = None
 
 

@@ -1,11 +1,12 @@
 """The split of images and LiDAR sweeps: key frames are held out as a whole, and recordings near them excluded."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
-from drivesplat.scene.scene import Scene
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.scene.scene import Frame, Scene, Sweep
+from drivesplat.settings.images import HoldoutSettings
 
 Group = Literal["train", "interpolation", "extrapolation", "excluded"]
 NEIGHBOURHOOD_HZ = 5.0
@@ -18,30 +19,6 @@ def held_out_key_frames(count: int, holdout: HoldoutSettings) -> dict[str, list[
     block = list(range(max(0, count - holdout.last_block), count))
     nth = range(holdout.offset, count, holdout.every_nth) if holdout.every_nth else range(0)
     return {"interpolation": [i for i in nth if i not in block], "extrapolation": block}
-
-
-def group_of_times(
-    scene: Scene, timestamps: np.ndarray, sample_indices: np.ndarray, is_key_frame: np.ndarray, holdout: HoldoutSettings
-) -> list[Group]:
-    """The group of each image or sweep: that of a held-out key frame; 'excluded' if nearer to one than the
-    neighbourhood; else 'train'.
-
-    The neighbourhood is half a key-frame interval below NEIGHBOURHOOD_HZ, else `holdout.neighbourhood_s`.
-    `timestamps` (n,) microseconds, `sample_indices` (n,), `is_key_frame` (n,).
-    """
-    held_out = held_out_key_frames(len(scene.key_frame_timestamps), holdout)
-    group_of_key_frame = {i: group for group, indices in held_out.items() for i in indices}
-    held_out_times = scene.key_frame_timestamps[sorted(group_of_key_frame)]
-    dense = scene.key_frame_hz >= NEIGHBOURHOOD_HZ
-    neighbourhood = holdout.neighbourhood_s * 1e6 if dense else scene.key_frame_interval / 2.0
-    groups: list[Group] = []
-    for time, index, key in zip(timestamps, sample_indices, is_key_frame, strict=True):
-        if key and int(index) in group_of_key_frame:
-            groups.append(group_of_key_frame[int(index)])
-        else:
-            near = np.any(np.abs(held_out_times - time) < neighbourhood)
-            groups.append("excluded" if near and (dense or not key) else "train")
-    return groups
 
 
 def frame_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
@@ -59,11 +36,23 @@ def sweep_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
     return _groups(scene, scene.sweeps, holdout)
 
 
-def _groups(scene: Scene, records: tuple, holdout: HoldoutSettings) -> list[Group]:
-    return group_of_times(
-        scene,
-        np.array([r.timestamp for r in records], dtype=np.int64),
-        np.array([r.sample_index for r in records], dtype=np.int64),
-        np.array([r.is_key_frame for r in records], dtype=bool),
-        holdout,
-    )
+def _groups(scene: Scene, records: Sequence[Frame | Sweep], holdout: HoldoutSettings) -> list[Group]:
+    """The group of each image or sweep: that of a held-out key frame; 'excluded' if nearer to one than the
+    neighbourhood; else 'train'.
+
+    The neighbourhood is half a key-frame interval below NEIGHBOURHOOD_HZ, else `holdout.neighbourhood_s`.
+    """
+    held_out = held_out_key_frames(len(scene.key_frame_timestamps), holdout)
+    group_of_key_frame = {i: group for group, indices in held_out.items() for i in indices}
+    held_out_times = scene.key_frame_timestamps[sorted(group_of_key_frame)]
+    dense = scene.key_frame_hz >= NEIGHBOURHOOD_HZ
+    neighbourhood = holdout.neighbourhood_s * 1e6 if dense else scene.key_frame_interval / 2.0
+
+    def group_of(record: Frame | Sweep) -> Group:
+        if record.is_key_frame and record.sample_index in group_of_key_frame:
+            return group_of_key_frame[record.sample_index]
+        if record.is_key_frame and not dense:
+            return "train"
+        return "excluded" if np.any(np.abs(held_out_times - record.timestamp) < neighbourhood) else "train"
+
+    return [group_of(record) for record in records]

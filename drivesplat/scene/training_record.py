@@ -1,6 +1,5 @@
 """The content of parser.pkl: the scene as training reads it."""
 
-import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from drivesplat.io.plain_pickle import read_plain_pickle, write_plain_pickle
 from drivesplat.io.storage import Provenance, unreadable
-from drivesplat.io.typed_record import typed_record
+from drivesplat.io.typed_record import field_values, typed_record
 
 RULE = "parser"
 
@@ -92,16 +91,13 @@ class TrainingRecord:
 
     def to_plain(self) -> dict[str, Any]:
         """The content of parser.pkl: plain containers and arrays."""
-        plain = {name: getattr(self, name) for name in _FIELDS}
-        return plain | {"scene": dataclasses.asdict(self.scene), "seed": dataclasses.asdict(self.seed)}
+        return {**field_values(self), "scene": field_values(self.scene), "seed": field_values(self.seed)}
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> "TrainingRecord":
         """The inverse of `to_plain`; further keys are ignored. Raises ValueError if `plain` is not a training
         record."""
-        infos = {"scene": SceneInfo, "seed": SeedInfo}
-        known = {name: typed_record(kind, plain[name]) for name, kind in infos.items() if name in plain}
-        record = typed_record(cls, {**plain, **known})
+        record = typed_record(cls, plain)
         count, indices = len(record.Ks), np.concatenate(list(record.splits.values()))
         if not len(record.image_paths) == len(record.image_names) == count:
             raise ValueError(f"it has {count} images, {len(record.image_paths)} paths")
@@ -112,9 +108,6 @@ class TrainingRecord:
             if index.dtype.kind not in "iu" or ((index < 0) | (index >= limit)).any():
                 raise ValueError(f"{name} has indices out of range")
         return record
-
-
-_FIELDS = tuple(f.name for f in dataclasses.fields(TrainingRecord))
 
 
 def write_training_record(path: str | Path, record: TrainingRecord) -> None:

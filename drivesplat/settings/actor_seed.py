@@ -5,8 +5,7 @@ from typing import Literal, get_args
 from pydantic import Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.train import PartName
 
 ObjectClassName = Literal[

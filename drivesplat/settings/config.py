@@ -22,8 +22,7 @@ from drivesplat.settings.evaluate import LpipsSettings
 from drivesplat.settings.export import ExportSettings
 from drivesplat.settings.extract import ExtractSettings
 from drivesplat.settings.free_space import FreeSpaceSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.inspection import GhostSettings, RemovalSettings, SubjectSettings
 from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings

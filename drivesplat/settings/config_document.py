@@ -45,26 +45,26 @@ def config_schema() -> str:
     return json.dumps(schema, indent=1) + "\n"
 
 
-def _mapping(record: BaseModel, indent: int, told: set[tuple[type, str]] | None = None) -> str:
-    """The record's fields. Comments already `told` for an earlier record of the same class are left out."""
-    told = set() if told is None else told
+def _mapping(record: BaseModel, indent: int, commented: set[tuple[type, str]] | None = None) -> str:
+    """The record's fields. Comments already in `commented` for an earlier record of the same class are left out."""
+    commented = set() if commented is None else commented
     lines = []
     for name, field in type(record).model_fields.items():
         pad, key = " " * indent, (type(record), name)
-        comment = "" if key in told else _comment(field, pad)
-        told.add(key)
-        value = _value(getattr(record, name), indent, told)
+        comment = "" if key in commented else _comment(field, pad)
+        commented.add(key)
+        value = _value(getattr(record, name), indent, commented)
         lines.append(("\n" if indent == 0 else "") + f"{comment}{pad}{name}:{value}")
     return "".join(lines)
 
 
-def _value(value: Any, indent: int, told: set[tuple[type, str]]) -> str:
+def _value(value: Any, indent: int, commented: set[tuple[type, str]]) -> str:
     if isinstance(value, BaseModel):
-        return "\n" + _mapping(value, indent + 2, told)
+        return "\n" + _mapping(value, indent + 2, commented)
     nested = isinstance(value, dict) and any(isinstance(item, (BaseModel, dict)) for item in value.values())
     if nested or (isinstance(value, dict) and len(_scalar(value)) > WIDTH):
         pad = " " * (indent + 2)
-        return "\n" + "".join(f"{pad}{key}:{_value(item, indent + 2, told)}" for key, item in value.items())
+        return "\n" + "".join(f"{pad}{key}:{_value(item, indent + 2, commented)}" for key, item in value.items())
     plain = list(value) if isinstance(value, tuple) else value
     return " " + _scalar(plain) + "\n"
 

@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 

@@ -13,7 +13,12 @@ class ExtractSettings(Settings):
 
 
 class SceneSource(Settings):
-    """All settings that determine one scene.json, except the dataroot."""
+    """All settings that determine one scene.json, except the dataroot.
+
+    A reader reads `scene` of `version`: the images of `cameras` and the LiDAR sweeps at key frames; with `sweeps` also
+    the images between them, with `lidar_sweeps` also the LiDAR sweeps between them. `frames` = (first, last + 1) keeps
+    these key frames, renumbered from 0, and the recordings between them. The stage applies `dataset` and `on_missing`.
+    """
 
     dataset: str
     reader: str

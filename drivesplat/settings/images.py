@@ -1,6 +1,6 @@
-"""Size of the images for training and evaluation."""
+"""Settings of the images: their size, the held-out key frames, and the rule `parser`."""
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from drivesplat.settings import Settings
 
@@ -9,3 +9,30 @@ class ImageSettings(Settings):
     width: int | None = Field(None, ge=16, le=10_000)
     """Width (pixels) to which images are resized for training and evaluation (INTER_AREA, aspect ratio kept). null =
     recorded size."""
+
+
+class HoldoutSettings(Settings):
+    every_nth: int = Field(8, ge=0)
+    """Hold out key frames i with i % every_nth == offset: group 'interpolation'. 0 = none."""
+    offset: int = Field(4, ge=0)
+    """See every_nth. Must be less than every_nth. 0 would hold out the first key frame, which has no predecessor."""
+    last_block: int = Field(4, ge=0)
+    """Number of key frames held out at the end of the drive: group 'extrapolation'. 0 = none."""
+    neighbourhood_s: float = Field(0.25, ge=0, le=5)
+    """Time in seconds around a held-out key frame in which nothing is trained on, for datasets with 5 key frames a
+    second or more. Below that rate it is half the interval between key frames."""
+
+    @model_validator(mode="after")
+    def _offset_within_period(self) -> "HoldoutSettings":
+        if self.every_nth and self.offset >= self.every_nth:
+            raise ValueError(
+                f"offset must be under every_nth ({self.every_nth}), or no key frame would ever be held out"
+            )
+        return self
+
+
+class ParserJob(Settings):
+    """All settings that determine the parser.pkl of one scene."""
+
+    holdout: HoldoutSettings
+    images: ImageSettings

@@ -5,8 +5,7 @@ from typing import Annotated
 from pydantic import Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 
 Degrees = Annotated[float, Field(ge=0, le=10)]
 

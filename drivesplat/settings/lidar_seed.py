@@ -6,8 +6,7 @@ from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.extract import OnMissing
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 
 
 class LidarSeedSettings(Settings):

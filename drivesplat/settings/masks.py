@@ -1,11 +1,13 @@
-"""Settings of the rule `masks`."""
+"""Settings of the rules `masks` and `own_car`, which finds the ego vehicle's body in images."""
+
+from typing import Literal
 
 from pydantic import Field
 
 from drivesplat.settings import Settings
-from drivesplat.settings.ego_mask import EgoMaskKind
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
+
+EgoMaskKind = Literal["none", "polygons", "auto", "auto_measured"]
 
 
 class MaskSettings(Settings):
@@ -31,3 +33,20 @@ class MaskJob(Settings):
     masks: MaskSettings
     holdout: HoldoutSettings
     images: ImageSettings
+
+
+class EgoMaskSearch(Settings):
+    """Search for the ego vehicle's body in the images of `cameras`."""
+
+    cameras: tuple[str, ...]
+    holdout: HoldoutSettings
+    own_car_radius: float
+    """Horizontal distance from the LiDAR (metres) within which returns belong to the ego vehicle."""
+
+
+class EgoMaskJob(Settings):
+    """All settings that determine the own_car.json of one scene."""
+
+    polygons: dict[str, tuple[tuple[float, float], ...]]
+    search: EgoMaskSearch | None
+    """None: polygons only."""

@@ -266,9 +266,12 @@ class TrainSettings(Settings):
     image_every: int = Field(5_000, ge=1)
     """Iterations between TensorBoard images."""
 
-    def without_moving_parts(self) -> "TrainSettings":
-        """These settings with those of moving parts at their defaults, for methods without moving parts."""
-        fields = (*STAGE_OF_PART, "entropy_weight", "dynamic_weight")
+    def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":
+        """These settings with those at their defaults that have no effect on a method of `parts`: those of other moving
+        parts and, without any, the loss weights of moving parts."""
+        fields = [part for part in STAGE_OF_PART if part not in parts]
+        if not set(STAGE_OF_PART) & set(parts):
+            fields += ["entropy_weight", "dynamic_weight"]
         return self.model_copy(update={name: type(self).model_fields[name].default for name in fields})
 
 

@@ -31,10 +31,9 @@ class GeometryPriors:
 NO_PRIORS = GeometryPriors()
 
 
-def geometry_priors(record: TrainingRecord, free_space: FreeSpace | None, settings: TrainSettings) -> GeometryPriors:
-    """The priors that `settings` want, on the CPU, from the training record and the record of free space (None: not
+def geometry_priors(record: TrainingRecord, space: FreeSpace | None, settings: TrainSettings) -> GeometryPriors:
+    """The priors that `settings` want, on the CPU, from the training record and the record of free `space` (None: not
     made)."""
-    space = free_space
     return GeometryPriors(
         SparseGrid.from_numpy(space.lower, space.voxel, space.shape, space.keys) if space else None,
         road_of(record, settings.road) if settings.road_weight else None,

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 @contextmanager
-def sole_trainer(folder: Path) -> Iterator[None]:
+def training_lock(folder: Path) -> Iterator[None]:
     """Keeps a second trainer out of `folder`; the kernel frees the lock when this process ends, however it ends.
 
     Raises TrainingError naming the process that holds it, ResultError where the folder cannot be written.
@@ -97,7 +97,8 @@ def restore(
 def resumable(path: Path, fingerprint: str) -> dict[str, Any] | None:
     """The resume state at `path` if this training wrote it.
 
-    None, with a message, where there is none or it is another's.
+    None where there is none; None, with a warning, where it is damaged or belongs to another training. The checksums of
+    the array file detect damage; a digest beside it would be out of date after a kill between the two writes.
     """
     if not path.exists():
         return None

@@ -55,19 +55,16 @@ class TrainingInputs:
         moving_wanted = self.actors and job.train.dynamic_weight
         with_ego = [i for i in images if self.record.camera_name(i) in self.cameras_with_ego]
         return Guides(
-            sky=_of_each(images, self._sky) if sky_wanted else {},
+            sky=_of_each(images, lambda i: read_sky_mask(*self._image(i))) if sky_wanted else {},
             moving=_of_each(images, self._moving) if moving_wanted else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
-            classes=_of_each(images, self._classes) if self.semantic_classes(job) else {},
-            ego_mask=_of_each(with_ego, self._ego_mask),
+            classes=_of_each(images, lambda i: read_classes(*self._image(i))) if self.semantic_classes(job) else {},
+            ego_mask=_of_each(with_ego, lambda i: read_labels(*self._image(i)) == LABELS["own_car"]),
         )
 
     def semantic_classes(self, job: TrainJob) -> int:
         """The number of semantic classes that `job` learns."""
         return self.classes if job.train.semantic_weight else 0
-
-    def _sky(self, index: int) -> np.ndarray:
-        return read_sky_mask(self.masks, *self._image(index))
 
     def exposed(self, job: TrainJob) -> tuple[str, ...]:
         """The cameras whose exposure `job` learns: all with training images but the reference camera."""
@@ -76,19 +73,14 @@ class TrainingInputs:
         seen = {self.record.camera_name(i) for i in self.record.train_images}
         return tuple(sorted(seen - {job.reference_camera}))
 
-    def _classes(self, index: int) -> np.ndarray:
-        return read_classes(self.masks, *self._image(index))
-
-    def _ego_mask(self, index: int) -> np.ndarray:
-        return read_labels(self.masks, *self._image(index)) == LABELS["own_car"]
-
     def _moving(self, index: int) -> np.ndarray:
-        labels = read_labels(self.masks, *self._image(index))
+        labels = read_labels(*self._image(index))
         return region_mask(labels, "moving_vehicle") | region_mask(labels, "moving_human")
 
-    def _image(self, index: int) -> tuple[str, int, tuple[int, int]]:
-        """Camera, timestamp and size of an image."""
-        return self.record.camera_name(index), int(self.record.timestamps[index]), self.record.image_size(index)
+    def _image(self, index: int) -> tuple[Path, str, int, tuple[int, int]]:
+        """What the masks of an image are read by."""
+        at = int(self.record.timestamps[index])
+        return self.masks, self.record.camera_name(index), at, self.record.image_size(index)
 
 
 def read_inputs(
@@ -152,7 +144,7 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
         _times_by_camera(views) if job.train.camera_poses.corrected else {},
     )
-    if not learns_from_sky_masks(job):
+    if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
         views = [dataclasses.replace(view, sky=None) for view in views]
     model = build_model(init, job.parts, job.sky, settings)
     return Prepared(model, views, settings, geometry_priors(inputs.record, inputs.free_space, settings))
@@ -169,7 +161,7 @@ def run_training(
     """Trains and writes both files, or raises and writes neither. The resume state is kept after a failure, and where
     the parent process was killed meanwhile: Snakemake did not see this training end and will run it again."""
     started_by = os.getppid()
-    with resume_state.sole_trainer(files.resume):
+    with resume_state.training_lock(files.resume):
         device = choose_device(device_settings)
         begun = prepare(inputs, job, device)
         fingerprint = sha256_text(
@@ -200,12 +192,6 @@ def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
     for view in views:
         times.setdefault(view.view.camera, set()).add(view.view.time)
     return {camera: sorted(at) for camera, at in sorted(times.items())}
-
-
-def learns_from_sky_masks(job: TrainJob) -> bool:
-    """Whether a loss term uses sky masks. Otherwise only the initial colour of the sky does, and the masks, a byte per
-    pixel, need not stay on the device."""
-    return job.sky == "mask" or job.train.sky_bce_weight > 0
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:

@@ -119,7 +119,7 @@ class Trainer:
         """The second half of an iteration: each part adds, removes and relocates its Gaussians."""
         info = {} if picture is None else picture.info
         for densifier, optimizers, rows in zip(self.densifiers, self.optimizers.parts, self.model.rows, strict=True):
-            densifier.after_step(self.step, optimizers, info, rows, self._coarse)
+            densifier.after_step(self.step, optimizers, info, rows, self.images.factor(self.step) > 1)
         self.step += 1
 
     def end(self) -> None:
@@ -127,16 +127,9 @@ class Trainer:
         for densifier, optimizers in zip(self.densifiers, self.optimizers.parts, strict=True):
             densifier.end(optimizers)
 
-    @property
-    def _coarse(self) -> bool:
-        """Whether this iteration's image is reduced."""
-        return self.images.factor(self.step) > 1
-
     def sh_degree(self) -> int:
         every = max(1, int(self.settings.sh_every * self.settings.iterations))
-        moving = any(part.moves for part in self.model.parts)
-        highest = max(self.settings.gaussians.sh_degree, self.settings.actors.sh_degree if moving else 0)
-        return min(self.step // every, highest)
+        return min(self.step // every, max(part.sh_degree for part in self.model.parts))
 
     def _gradient_norms(self) -> Terms:
         named = [(name, p.grad) for name, p in self.model.named_parameters() if p.grad is not None]

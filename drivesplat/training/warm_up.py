@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.lidar.occlusion import unhidden
+from drivesplat.lidar.occlusion import unoccluded
 from drivesplat.model.background import Background
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
@@ -47,7 +47,7 @@ def warm_up(folder: Path) -> None:
     folders = TrainingFolders(folder / "resume", folder / "tensorboard", "", "warm-up")
     train(model, [view], settings, 0, torch.device("cpu"), folders)
     pixel = np.zeros(1, dtype=np.int64)
-    unhidden(pixel, pixel, np.ones(1), np.ones((1, 2)), (height, width))
+    unoccluded(pixel, pixel, np.ones(1), np.ones((1, 2)), (height, width))
 
 
 def main(arguments: Sequence[str] = ()) -> int:

@@ -21,17 +21,17 @@ PATIENCE_S = 1.0
 """Seconds between two attempts to lock a GPU."""
 
 
-def visible_cards() -> int:
+def visible_gpus() -> int:
     """The number of GPUs of any vendor that this process may use; at least 1, so that GPU rules can run on a CPU."""
     return max(1, len(_visible()[1]))
 
 
-def any_card() -> bool:
+def any_gpu() -> bool:
     """Whether this process may use a GPU of any vendor."""
     return bool(_visible()[1])
 
 
-def hold_card(jobs_per_card: int) -> BinaryIO | None:
+def hold_gpu(jobs_per_card: int) -> BinaryIO | None:
     """Locks a GPU that fewer than `jobs_per_card` jobs of this user hold on this machine, and hides all others from
     this process. Must be called before any library looks for a GPU.
 
@@ -40,36 +40,36 @@ def hold_card(jobs_per_card: int) -> BinaryIO | None:
     taken. Raises DeviceError where no lock file can be written.
     """
     variable, names = _visible()
-    cards = dict(zip(names, _identities(names), strict=True))
-    if not cards or (len(cards) == 1 and variable in os.environ and next(iter(cards.values())).isdigit()):
+    gpus = dict(zip(names, _identities(names), strict=True))
+    if not gpus or (len(gpus) == 1 and variable in os.environ and next(iter(gpus.values())).isdigit()):
         return None
-    told = False
+    warned = False
     while True:
-        card, lock, holders = _free_card(cards, jobs_per_card)
+        gpu, lock, holders = _free_gpu(gpus, jobs_per_card)
         if lock is not None:
-            os.environ[variable] = card
-            log.info("runs on the GPU %s (%s)", card, cards[card])
+            os.environ[variable] = gpu
+            log.info("runs on the GPU %s (%s)", gpu, gpus[gpu])
             return lock
-        if not told:
+        if not warned:
             log.warning(
                 "waits for a GPU: jobs hold all there are (%d; processes %s); device.jobs_per_card lets more share one",
-                len(cards),
+                len(gpus),
                 ", ".join(holders),
             )
-            told = True
+            warned = True
         time.sleep(PATIENCE_S)
 
 
-def _free_card(cards: dict[str, str], jobs_per_card: int) -> tuple[str, BinaryIO | None, list[str]]:
+def _free_gpu(gpus: dict[str, str], jobs_per_card: int) -> tuple[str, BinaryIO | None, list[str]]:
     """The GPU with the fewest jobs and a lock on it; or no lock, and the processes that hold all locks. `cards` are
     identities by name."""
     holders = []
     for place in range(jobs_per_card):
-        for card, identity in cards.items():
+        for gpu, identity in gpus.items():
             path = _lock_folder() / f"{identity}.{place}"
             try:
                 path.parent.mkdir(mode=0o700, exist_ok=True)
-                return card, locked_file(path), []
+                return gpu, locked_file(path), []
             except LockHeldError as error:
                 holders.append(error.holder)
             except OSError as error:
@@ -92,17 +92,17 @@ def _visible() -> tuple[str, list[str]]:
     return variable, [str(number) for number in range(len(nvidia) or len(amd))]
 
 
-def _identities(cards: Sequence[str]) -> list[str]:
+def _identities(gpus: Sequence[str]) -> list[str]:
     """Names of GPUs that do not depend on which are visible (a scheduler may show every job its GPU as number 0): their
     UUIDs, or their numbers if nvidia-smi is not available."""
-    if all(not card.isdigit() for card in cards):
-        return list(cards)
+    if all(not gpu.isdigit() for gpu in gpus):
+        return list(gpus)
     command = ("nvidia-smi", "--query-gpu=index,uuid", "--format=csv,noheader")
     known: dict[str, str] = {}
     with suppress(OSError, subprocess.SubprocessError):
         lines = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.splitlines()
         known = dict(line.replace(" ", "").split(",", 1) for line in lines if "," in line)
-    return [known.get(card, card) for card in cards]
+    return [known.get(gpu, gpu) for gpu in gpus]
 
 
 def _lock_folder() -> Path:

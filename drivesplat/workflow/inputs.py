@@ -37,10 +37,10 @@ class Inputs:
         dataset = self.config.datasets[name]
         if dataset.world:
             return self.world_tables(name)
-        whole = index(dataset.reader) is None
-        return (
-            list(map(str, layout(dataset.reader).table_files(Path(self._root(name)), dataset.version))) if whole else []
-        )
+        if index(dataset.reader):
+            return []
+        files = layout(dataset.reader).table_files(Path(self._root(name)), dataset.version, wildcards.scene)
+        return [str(file) for file in files]
 
     def scene_tables(self, wildcards: Any) -> list[str]:
         """The file of a scene's own rows of a recorded dataset's tables, where its reader splits them into scenes.
@@ -70,12 +70,8 @@ class Inputs:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise unwritable_results(self.config, error) from error
-            files = [tables.scene_file(folder, scene) for scene in dataset.scenes]
-            before = [_modified(file) for file in files]
-            tables.index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder)
-            for file, modified in zip(files, before, strict=True):
-                if _modified(file) != modified:
-                    record_output(file, "extract", {}, {})
+            for file in tables.index_tables(Path(self._root(name)), dataset.version, dataset.scenes, folder):
+                record_output(file, "extract", {}, {})
             self._folders[name] = folder
         return self._folders[name]
 
@@ -134,8 +130,3 @@ class Inputs:
     def backbone_file(self, _: Any) -> list[str]:
         """The backbone itself if it is present: adding it reruns the measurements that lacked it."""
         return [BACKBONE] if Path(BACKBONE).is_file() else []
-
-
-def _modified(file: Path) -> int | None:
-    """A file's modification time in ns, None if it is absent."""
-    return file.stat().st_mtime_ns if file.is_file() else None

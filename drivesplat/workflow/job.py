@@ -23,7 +23,7 @@ from drivesplat.provenance.file_digests import (
 from drivesplat.provenance.record import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.workflow.gpus import hold_card
+from drivesplat.workflow.gpus import hold_gpu
 
 S = TypeVar("S", bound=Settings)
 
@@ -46,7 +46,7 @@ class Job:
         self._rule: str = snakemake.rule
         self._params = snakemake.params
         self._resources = snakemake.resources
-        self._card: BinaryIO | None = None
+        self._gpu: BinaryIO | None = None
         self._read: dict[str, str] = {}
         self._members = {str(path): member_states(path) for path in self.output}
         self._dataset: dict[str, dict[str, str]] = {}
@@ -70,8 +70,8 @@ class Job:
         """The device to run on; not part of the settings, since it changes no result. Reserves a GPU for the job until
         it ends, where there is one, and hides all others."""
         settings = DeviceSettings.model_validate_json(self._resources.device)
-        if settings.kind != "cpu" and self._card is None:  # a second lock would wait for the first
-            self._card = hold_card(settings.jobs_per_card)
+        if settings.kind != "cpu" and self._gpu is None:  # a second lock would wait for the first
+            self._gpu = hold_gpu(settings.jobs_per_card)
         return settings
 
     def provenance(self, *upstream: Provenance, inputs: dict[str, str] | None = None) -> Provenance:
@@ -81,12 +81,17 @@ class Job:
     def check_inputs(self, dataset: Iterable[str] = ()) -> None:
         """Compares the inputs with what their rules wrote, and the dataset's files of the kinds `dataset` ('images',
         'sweeps') with what `extract` read. Raises ResultError naming an altered file and the rule that rebuilds it."""
-        scene = getattr(self.wildcards, "scene", None)
+        results = self._scene_folder()
         for path in map(str, self.input):
-            self._read[path] = checked_digest(path, warn=scene in Path(path).parts)
+            self._read[path] = checked_digest(path, warn=results is not None and results in Path(path).parents)
         if dataset:
             record = self.input.scene if hasattr(self.input, "scene") else self.input.parser
             check_dataset(Path(record).parent, dataset)
+
+    def _scene_folder(self) -> Path | None:
+        """The folder of the scene's results, in which every file has a record; None for a rule without a scene."""
+        scene, parents = getattr(self.wildcards, "scene", None), Path(next(iter(self.output), "")).parents
+        return next((folder for folder in reversed(parents) if scene and folder.name == scene), None)
 
     def record_dataset(self, **files: Iterable[str | Path]) -> None:
         """Computes the digests of the dataset's `files` by kind, for the record beside the outputs."""

@@ -1,7 +1,9 @@
 """Reading the logs of jobs, which `drivesplat.workflow.job` writes."""
 
 import re
+from pathlib import Path
 
+NOT_MEASURED = "not measured"
 _FAILURE = re.compile(r"ERROR drivesplat\.workflow\.job: (\S+?)(?: \S+)?: (.*)")
 """The last line of a failed job's log: its stage, its scene if it has one, and the reason."""
 _BEGINS = re.compile(r"INFO drivesplat\.workflow\.job: .* begins$", re.MULTILINE)
@@ -24,3 +26,17 @@ def has_begun(text: str) -> bool:
 def is_cut_short(text: str) -> bool:
     """Whether a job's log has a beginning and no end: the job was killed, or is running."""
     return has_begun(text) and not _ENDS.search(text) and not failures(text)
+
+
+def why_missing(logs: Path, scene: str) -> str:
+    """Why a scene has no result: the message of the job that failed last (each log is that of the last attempt), else
+    the name of an interrupted job, else NOT_MEASURED."""
+    files = sorted((logs / scene).rglob("*.log"), key=lambda file: file.stat().st_mtime, reverse=True)
+    texts = {file: file.read_text(encoding="utf-8", errors="replace") for file in files}
+    for text in texts.values():
+        for stage, why in failures(text).items():
+            return f"{stage}: {why}"
+    for file, text in texts.items():
+        if is_cut_short(text):
+            return f"{file.relative_to(logs / scene).with_suffix('')} was interrupted, or is still running"
+    return NOT_MEASURED

@@ -17,7 +17,7 @@ from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
-from drivesplat.workflow.gpus import any_card
+from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
@@ -74,7 +74,7 @@ class Plan(Outputs):
             device = for_scene(self.config, scene).device.model_dump(mode="json")
             if self.config.datasets[name].world is not None and device["kind"] == "auto":
                 device["kind"] = "any"
-            on_gpu = device["kind"] != "cpu" and (device["kind"] != "any" or any_card())
+            on_gpu = device["kind"] != "cpu" and (device["kind"] != "any" or any_gpu())
             self._devices[name] = canonical_json(device), int(on_gpu)
         return self._devices[name]
 
@@ -165,6 +165,22 @@ class Plan(Outputs):
         if not scenes or any(scene is not None and scene not in self.config.scenes for scene in scenes):
             return self.report(targets).scenes
         return [scene for scene in scenes if scene is not None]
+
+    def scenes_and_methods(self, targets: list[str]) -> set[tuple[str, str]]:
+        """The pairs of scene and method that targets concern, and every such scene with an empty method: those of the
+        batch for a rule's name, a report or no target. Reads no result."""
+        pairs: set[tuple[str, str]] = set()
+        for target in targets or [""]:
+            scene, (_, *rest) = self._scene_of(target), self._inside_results(target)
+            if target == DOWNLOAD:
+                continue
+            if scene in self.config.scenes:
+                of_all = rest == ["metrics.json"]
+                methods = [method for method in self.config.methods if of_all or method in rest[:1]]
+                pairs |= {(scene, method) for method in ("", *methods)}
+            else:
+                pairs |= {(one, method) for one in self.config.batch_scenes for method in ("", *self.config.methods)}
+        return pairs
 
     def _scene_of(self, target: str) -> str | None:
         """The scene of a target: empty for a rule's name, None for a file outside the results of scenes."""

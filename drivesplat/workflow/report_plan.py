@@ -66,10 +66,10 @@ class ReportPlan:
     def settings(self, _: Any = None) -> str:
         """The settings of its job as canonical JSON."""
         config = self._plan.config
-        standing = (name for name, method in config.methods.items() if not method.moving_parts)
+        static_methods = (name for name, method in config.methods.items() if not method.moving_parts)
         job = ReportJob(
             expected={scene: self._plan.metrics_stages(scene) for scene in config.batch_scenes},
-            reference=next(standing, None),
+            reference=next(static_methods, None),
             random_seed=config.random_seed,
         )
         return canonical_json(job.model_dump(mode="json"))

@@ -17,16 +17,15 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
-from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import ExportJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
+from drivesplat.settings.images import ParserJob
 from drivesplat.settings.inspection import PanelJob, RemovalJob, SubjectSettings, TracksJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
-from drivesplat.settings.masks import MaskJob
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
@@ -130,8 +129,8 @@ def _scene_source(at: Place) -> dict[str, Any]:
 def _ego_mask(at: Place) -> dict[str, Any]:
     config, kind = at.config, at.config.masks.own_car
     polygons = config.masks.own_car_polygons if kind != "none" else {}
-    spared = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
-    cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *spared})
+    excluded = {"auto": {config.eval_camera}, "auto_measured": set()}.get(kind, set(config.cameras))
+    cameras = tuple(camera for camera in config.cameras if camera not in {*polygons, *excluded})
     search = EgoMaskSearch(cameras=cameras, holdout=config.holdout, **_lidar(at, "own_car_radius"))
     return {"polygons": polygons, "search": search if cameras else None}
 
@@ -153,7 +152,7 @@ def _lidar(at: Place, *names: str) -> dict[str, Any]:
 
 def _training(at: Place) -> dict[str, Any]:
     config, method = at.config, at.config.all_methods[at.method]
-    train = config.train if method.moving_parts else config.train.without_moving_parts()
+    train = config.train.for_parts(method.parts)
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
     return {"parts": method.parts, "train": train, "reference_camera": reference}
 

@@ -232,10 +232,10 @@ def called(tmp_path, monkeypatch):
 
     def call(words: list[str], done: tuple[str, ...] = ("plain", "street"), status: int = 0) -> tuple[int, list[str]]:
         recipe_file(tmp_path, recipes=TWO)
-        told: list[str] = []
+        passed: list[str] = []
 
         def start(run: SnakemakeRun, arguments: list[str], workflow: Path) -> Outcome:
-            told.extend(arguments)
+            passed.extend(arguments)
             for recipe in done:
                 for seed, content in enumerate(EVALS[recipe]):
                     write_evaluation(run, recipe, seed, content)
@@ -243,7 +243,7 @@ def called(tmp_path, monkeypatch):
 
         monkeypatch.setattr(SnakemakeRun, "start", start)
         monkeypatch.chdir(REPOSITORY)
-        return main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), *words]), told
+        return main([str(tmp_path / "recipes.yaml"), "--out", str(tmp_path / "out"), *words]), passed
 
     return call
 
@@ -304,9 +304,9 @@ def test_recipes_run_to_a_table_with_failures_and_only_failed_ones_run_again(tmp
     done = command(copy)
     assert done.returncode == 1, done.stdout
     record = copy.read("results/quality/recipes/quality.json")
-    whys = {item["recipe"]: item["why"] for item in record["failed"]}
-    assert set(whys) == {"elsewhere", "broken"} and "nowhere" in whys["elsewhere"], whys
-    assert whys["broken"].startswith("train: ") and "iteration" in whys["broken"]
+    reasons = {item["recipe"]: item["why"] for item in record["failed"]}
+    assert set(reasons) == {"elsewhere", "broken"} and "nowhere" in reasons["elsewhere"], reasons
+    assert reasons["broken"].startswith("train: ") and "iteration" in reasons["broken"]
     (row,) = record["tables"][0]["rows"]
     measured = copy.read("results/quality/recipes/plain/0001/vanilla-seed4/eval.json")["result"]
     assert (row["recipe"], row["train_iterations"], measured["random_seed"]) == ("vanilla", 3, 4)

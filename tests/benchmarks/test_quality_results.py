@@ -143,13 +143,13 @@ def test_an_invalid_evaluation_file_is_named(runs, content):
     assert result.figures is None and str(path) in result.reason and "'evaluate'" in result.reason
 
 
-def write_log(run, recipe: str, seed: int, began: str, finished: str, card: str | None, stage: str = "train") -> Path:
+def write_log(run, recipe: str, seed: int, began: str, finished: str, gpu: str | None, stage: str = "train") -> Path:
     """Writes the log of a job that held its GPU from `began` on, after waiting for it since nine o'clock."""
     path = run.log(recipe, seed, stage)
     path.parent.mkdir(parents=True, exist_ok=True)
-    took = f"2026-11-21 {began},000 INFO drivesplat.workflow.gpus: runs on the GPU 0 ({card})\n" if card else ""
+    took = f"2026-11-21 {began},000 INFO drivesplat.workflow.gpus: runs on the GPU 0 ({gpu})\n" if gpu else ""
     name = f"{recipe}-seed{seed}/{stage} 0061"
-    started = "09:00:00" if card else began
+    started = "09:00:00" if gpu else began
     path.write_text(
         f"2026-11-21 {started},000 INFO drivesplat.workflow.job: {name} begins\n{took}a line of a traceback\n"
         f"2026-11-21 {finished},000 INFO drivesplat.workflow.job: {name} ends\n"
@@ -204,8 +204,8 @@ def test_trainings_that_shared_a_gpu_are_recognised_from_their_logs(runs, others
     both, alone = runs
     write_evaluation(both, "a", 0, evaluation(20.0))
     write_log(both, "a", 0, "10:00:00", "10:10:00", "GPU-1")
-    for recipe, (began, finished, card, stage) in others.items():
-        write_log(alone if recipe == "c" else both, recipe, 0, began, finished, card, stage)
+    for recipe, (began, finished, gpu, stage) in others.items():
+        write_log(alone if recipe == "c" else both, recipe, 0, began, finished, gpu, stage)
     assert ended(runs)["a", 0].shared is shared
 
 

@@ -102,7 +102,7 @@ def test_errors_are_reported_in_one_line(tmp_path, content, words):
 
 def test_command_line_arguments_replace_the_files_values(tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(command, "measure", lambda *told: seen.append(told) or 0)
+    monkeypatch.setattr(command, "measure", lambda *args: seen.append(args) or 0)
     path = str(REPOSITORY / "benchmarks/speed/demo_1600.yaml")
     assert command.main([path, "--iterations", "5", "6", "--seeds", "9", "--", "--cores", "3"]) == 0
     assert command.main([path, "--out", "there"]) == 0
@@ -277,7 +277,7 @@ def measured(tmp_path_factory):
     (copy.folder / "tiny.yaml").write_text(yaml.safe_dump(TINY))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(copy.folder)
-        patch.setattr(command, "run_in_process", lambda function, *told: function(*told))
+        patch.setattr(command, "run_in_process", lambda function, *args: function(*args))
         status = command.main(["tiny.yaml", "--", "--cores", "2"])
     assert status == 0
     return copy
@@ -339,7 +339,7 @@ def test_seeds_are_trained_in_parallel_on_several_gpus(tmp_path, monkeypatch):
     file, tasks = planned(tmp_path, iterations=[30, 7], seeds=[4, 5])
     assert command.in_series(tasks, 1) == [tasks]
     assert [{task.seed for task in series} for series in command.in_series(tasks, 2)] == [{4}, {5}]
-    monkeypatch.setattr(command, "visible_cards", lambda: 2)
+    monkeypatch.setattr(command, "visible_gpus", lambda: 2)
     monkeypatch.setattr(SnakemakeRun, "start", lambda *_: Outcome(0))
     monkeypatch.setattr(command, "write", lambda record, _: record["runs"])
     monkeypatch.setattr(command, "speed", lambda _, measured, profiles: {"runs": list(measured)})

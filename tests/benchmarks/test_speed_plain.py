@@ -75,8 +75,8 @@ def test_a_shorter_schedule_scales_in_proportion():
 @pytest.mark.parametrize(("iterations", "start", "stop"), [(30_000, 500, 25_000), (15_000, 250, 12_500)])
 def test_densification_follows_the_example(iterations, start, stop):
     strategy = PlainRecipe(Schedule.of(iterations), cap_max=1234, seed=0).strategy()
-    told = (strategy.cap_max, strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every)
-    assert told == (1234, start, stop, 100)
+    actual = (strategy.cap_max, strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every)
+    assert actual == (1234, start, stop, 100)
     assert (strategy.noise_lr, strategy.min_opacity) == (5e5, 0.005)
 
 
@@ -199,10 +199,10 @@ def test_the_loss_equals_that_of_the_mcmc_example(record):
 
 def test_the_learning_rate_of_means_decays_and_the_noise_with_it(record, monkeypatch):
     """The final rate is 1% of the initial one. A step's noise uses the next step's rate, as in the example."""
-    told = []
+    actual = []
 
     def noted(self, params, optimizers, state, step, info, lr):
-        told.append((step, lr))
+        actual.append((step, lr))
 
     monkeypatch.setattr("benchmarks.speed.plain.MCMCStrategy.step_post_backward", noted)
     training = begun(record, PlainRecipe(Schedule.of(10), 60, 0))
@@ -210,8 +210,8 @@ def test_the_learning_rate_of_means_decays_and_the_noise_with_it(record, monkeyp
     for step in range(10):
         assert training.optimizers["means"].param_groups[0]["lr"] == pytest.approx(first * 0.01 ** (step / 10))
         training.learn(training.fit_one(data)[1])
-    assert [step for step, _ in told] == list(range(10))
-    assert [lr for _, lr in told] == pytest.approx([first * 0.01 ** (step / 10) for step in range(1, 11)])
+    assert [step for step, _ in actual] == list(range(10))
+    assert [lr for _, lr in actual] == pytest.approx([first * 0.01 ** (step / 10) for step in range(1, 11)])
     assert training.optimizers["scales"].param_groups[0]["lr"] == 5e-3
 
 

@@ -239,9 +239,9 @@ def test_a_faster_ego_vehicle_shortens_both_halves(scene, model, tmp_path):
     path = edited_camera_path(scene, "CAM_FRONT", 4, edit_of({"ego": {"speed": 1.5}}), "")
     assert len(made.reels["it"]) == made.record["frames"] == len(path) == 13 and slow.record["frames"] == 19
     np.testing.assert_allclose(made.record["camera_to_world"], path.camera_to_world)
-    ways = [np.array(record["camera_to_world"])[:, 0, 3] for record in (made.record, slow.record)]
-    np.testing.assert_allclose(ways[0] - ways[0][0], 4.0 * 1.5 * 0.25 * np.arange(13), atol=1e-3)
-    np.testing.assert_allclose(ways[1] - ways[1][0], 4.0 * 0.5 * 0.25 * np.arange(19), atol=1e-3)
+    forward = [np.array(record["camera_to_world"])[:, 0, 3] for record in (made.record, slow.record)]
+    np.testing.assert_allclose(forward[0] - forward[0][0], 4.0 * 1.5 * 0.25 * np.arange(13), atol=1e-3)
+    np.testing.assert_allclose(forward[1] - forward[1][0], 4.0 * 0.5 * 0.25 * np.arange(19), atol=1e-3)
     np.testing.assert_array_equal(made.halves[0], slow.halves[0][:13])
     frames = make(scene, model, tmp_path, {"ego": {"speed": 1.5}}, width=16, height=8, frames=True).pictures()
     np.testing.assert_array_equal(made.halves[1], frames)

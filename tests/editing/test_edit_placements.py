@@ -67,8 +67,8 @@ def edited_gaussians(
 
 def rows_of(model: SplatModel, *names: str) -> torch.Tensor:
     """Which rows of the model's Gaussians belong to these actors: (n,) bool."""
-    nobody = torch.zeros(len(model), dtype=torch.bool)
-    return torch.stack([nobody, *(model.of_track(name) for name in names)]).any(dim=0)
+    no_rows = torch.zeros(len(model), dtype=torch.bool)
+    return torch.stack([no_rows, *(model.of_track(name) for name in names)]).any(dim=0)
 
 
 STEPS = {

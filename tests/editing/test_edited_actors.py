@@ -59,7 +59,7 @@ def test_the_ego_vehicle_is_no_actor():
 
 
 @pytest.mark.parametrize(
-    ("steps", "said"),
+    ("steps", "expected"),
     [
         ([{"stop": {"track": "ff", "at": 3.0}}],
          f"step 1 (stop): no editable track has an id starting with 'ff'; editable tracks: {EDITABLE}"),
@@ -93,8 +93,8 @@ def test_the_ego_vehicle_is_no_actor():
          "step 1 (shift): the track ends before 'start' (7 s): it was recorded from 1.75 to 6.25 s"),
     ],
 )  # fmt: skip
-def test_invalid_steps_are_refused_with_their_number(steps, said):
-    assert refusal(*steps) == said
+def test_invalid_steps_are_refused_with_their_number(steps, expected):
+    assert refusal(*steps) == expected
 
 
 def test_a_duplicate_cannot_have_the_id_of_a_track_that_is_no_actor():

@@ -91,8 +91,8 @@ def test_overrides_of_a_variant_are_merged_over_those_of_the_method():
     without = {"noise": {"overrides": {"train": {"mcmc": {"noise_lr": 0.0}}}}, "sky": {"overrides": {"sky": "mask"}}}
     config = load({"methods": {"mine": mine}, "ablation": {"of": "mine", "seeds": [4], "without": without}})
     assert list(config.ablated) == ["mine-seed4", "mine-without-noise-seed4", "mine-without-sky-seed4"]
-    told = {name: training(config, name) for name in config.all_methods}
-    for name, settings in told.items():
+    actual = {name: training(config, name) for name in config.all_methods}
+    for name, settings in actual.items():
         assert (settings["train.iterations"], settings["train.depth_weight"]) == (7, 0.5), name
         assert settings["parts"] == ["background", "actors"]
         assert settings["random_seed"] == (9 if name == "mine" else 4)
@@ -103,8 +103,8 @@ def test_overrides_of_a_variant_are_merged_over_those_of_the_method():
 
 def test_a_variant_takes_precedence_over_dataset_settings():
     values = {"datasets": {"nuscenes": {"overrides": {"train": {"entropy_weight": 0.7, "iterations": 5}}}}}
-    told = training(load(values), "street-without-entropy-seed1")
-    assert (told["train.entropy_weight"], told["train.iterations"]) == (0.0, 5)
+    actual = training(load(values), "street-without-entropy-seed1")
+    assert (actual["train.entropy_weight"], actual["train.iterations"]) == (0.0, 5)
 
 
 def test_users_can_drop_variants_and_add_their_own():
@@ -260,7 +260,7 @@ def test_variants_can_be_filmed_and_those_with_actors_edited():
         made.refuse_unknown(["results/a1/street-without-actors-seed0/parts.mp4"])
 
 
-# --- what everything else is told ---
+# --- settings of all other stages ---
 
 
 def test_other_stages_do_not_depend_on_the_ablation():
@@ -272,8 +272,8 @@ def test_other_stages_do_not_depend_on_the_ablation():
         assert stage_settings(with_it.config, stage, "a1") == stage_settings(without.config, stage, "a1")
     for method in ("vanilla", "street"):
         for stage in METHOD_STAGES:
-            told = (stage_settings(made.config, stage, "a1", method) for made in (with_it, without))
-            assert next(told) == next(told)
+            actual = (stage_settings(made.config, stage, "a1", method) for made in (with_it, without))
+            assert next(actual) == next(actual)
     assert with_it.films(scenes=["a1", "demo"]) == without.films(scenes=["a1", "demo"])
     assert with_it.edits(scenes=["a1", "demo"]) == without.edits(scenes=["a1", "demo"]) != []
     assert {Path(edit).parts[2] for edit in with_it.edits(scenes=["demo"])} == {"street"}

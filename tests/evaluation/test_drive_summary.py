@@ -15,7 +15,7 @@ from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import LABELS
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import ParserJob
 
 
 def recording_of(scene: Scene, holdout=HELD_OUT) -> PreparedDrive:

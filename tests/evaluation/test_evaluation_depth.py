@@ -10,16 +10,15 @@ import torch
 from helpers.hand_made import looking_at, recording_of, round_gaussians
 from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, scene_at
 
-from drivesplat.evaluation.depth import DepthErrors
 from drivesplat.evaluation.evaluate import evaluate_groups, held_out_depths
-from drivesplat.evaluation.metrics import MIN_REGION_PIXELS
+from drivesplat.evaluation.metrics import MIN_REGION_PIXELS, DepthErrors
 from drivesplat.evaluation.synthetic import rendered, rendered_with_depth
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.splits import frame_groups
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 
 

@@ -33,8 +33,7 @@ from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box, box_at, boxes_at
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.inspection import RemovalSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 

@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.export.cameras_json import cameras_record
+from drivesplat.export.splat_asset import cameras_record
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.io.storage import write_json
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.images import project
 from drivesplat.scene.rigid import inverse
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 
 SEED = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
 

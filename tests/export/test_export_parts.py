@@ -8,9 +8,9 @@ import pytest
 import torch
 from helpers.hand_made import BLACK, recording_of, round_gaussians
 from helpers.hand_made_traffic import (
-    COURSES,
     FADING,
     GONE_AT_TIMES,
+    TRAJECTORIES,
     TURNING,
     Traffic,
     own_gaussians,
@@ -21,9 +21,8 @@ from helpers.hand_made_traffic import (
 from helpers.records import EMPTY_CHECKPOINT
 
 from drivesplat.export import splat_asset
-from drivesplat.export.parts_json import write_parts
 from drivesplat.export.sampled_motion import sample_motion
-from drivesplat.export.splat_asset import SplatFiles, export_splat
+from drivesplat.export.splat_asset import SplatFiles, export_splat, write_parts
 from drivesplat.export.splat_ply import note_of, read_splat_ply, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, trained_gaussians, trained_groups
 from drivesplat.export.unique_names import unique_names
@@ -98,7 +97,7 @@ def test_every_group_has_a_file_and_an_entry(folder, record, parts):
 
 
 def test_objects_are_in_their_own_frame_with_the_colours_of_the_middle_image(folder, parts):
-    for track_id in COURSES:
+    for track_id in TRAJECTORIES:
         found = read_splat_ply(folder / "parts" / parts[track_id]["file"])
         assert_same(found, own_gaussians(track_id, MIDDLE))
     background = read_splat_ply(folder / "parts/background.ply")
@@ -107,18 +106,18 @@ def test_objects_are_in_their_own_frame_with_the_colours_of_the_middle_image(fol
 
 
 def test_poses_are_those_of_the_closed_form_at_every_sample(parts):
-    for track_id, course in COURSES.items():
+    for track_id, trajectory in TRAJECTORIES.items():
         motion = parts[track_id]["motion"]
-        expected = np.stack([course.pose(seconds) for seconds in motion["seconds"]])
+        expected = np.stack([trajectory.pose(seconds) for seconds in motion["seconds"]])
         np.testing.assert_allclose(motion["object_to_world"], expected, rtol=0, atol=1e-9)
 
 
 def test_samples_are_dense_while_an_object_is_present_and_absent_otherwise(parts):
-    for track_id, course in COURSES.items():
+    for track_id, trajectory in TRAJECTORIES.items():
         motion = parts[track_id]["motion"]
         seconds = np.array(motion["seconds"])
         assert np.diff(seconds).min() > 0.0
-        expected = [[course.times[a] - 0.25, course.times[b] + 0.25] for a, b in course.runs]
+        expected = [[trajectory.times[a] - 0.25, trajectory.times[b] + 0.25] for a, b in trajectory.runs]
         np.testing.assert_allclose(motion["present"], expected, atol=1e-9)
         held = [seconds[(seconds >= low - 1e-6) & (seconds <= high + 1e-6)] for low, high in expected]
         assert sum(map(len, held)) == len(seconds)
@@ -129,11 +128,11 @@ def test_samples_are_dense_while_an_object_is_present_and_absent_otherwise(parts
 
 def test_every_image_and_every_annotation_has_a_sample(parts, scene):
     first = min(frame.timestamp for frame in scene.frames)
-    for track_id, course in COURSES.items():
+    for track_id, trajectory in TRAJECTORIES.items():
         motion = parts[track_id]["motion"]
-        images = {f.timestamp for f in scene.frames if course.is_there((f.timestamp - first) * 1e-6)}
+        images = {f.timestamp for f in scene.frames if trajectory.is_there((f.timestamp - first) * 1e-6)}
         assert len(images) > 5 and images <= set(motion["timestamps"])
-        assert np.abs(np.subtract.outer(course.times, motion["seconds"])).min(axis=1).max() < 1e-9
+        assert np.abs(np.subtract.outer(trajectory.times, motion["seconds"])).min(axis=1).max() < 1e-9
         elapsed = (np.array(motion["timestamps"]) - first) * 1e-6
         np.testing.assert_allclose(elapsed, motion["seconds"], rtol=0, atol=1e-9)
 
@@ -145,7 +144,7 @@ def test_the_groups_compose_the_drive_at_every_image(folder, parts, scene):
         seconds = (frame.timestamp - first) * 1e-6
         world = model.gaussians_at(seconds)
         start = len(STREET)
-        for track_id in COURSES:
+        for track_id in TRAJECTORIES:
             expected, start = world[slice(start, start + 12)], start + 12
             motion = parts[track_id]["motion"]
             if frame.timestamp not in motion["timestamps"]:
@@ -159,7 +158,7 @@ def test_the_groups_compose_the_drive_at_every_image(folder, parts, scene):
 
 def test_splat_ply_holds_all_groups_present_at_the_middle_image(folder):
     found = read_splat_ply(folder / "splat.ply")
-    present = placed(own_gaussians(TURNING, MIDDLE), COURSES[TURNING].pose(MIDDLE))
+    present = placed(own_gaussians(TURNING, MIDDLE), TRAJECTORIES[TURNING].pose(MIDDLE))
     assert len(found) == len(STREET) + len(present), "the absent vehicle is not there, invisible or not"
     np.testing.assert_allclose(found.means[:3], STREET)
     assert_same(found[slice(3, None)], present, atol=1e-5)

@@ -19,9 +19,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.parser import training_record
 from drivesplat.rasterization import rasterize
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}

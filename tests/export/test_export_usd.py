@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.export.trained_parts import SampledGroup
-from drivesplat.export.usd import splat_stage, usd_camera, write_usdz
-from drivesplat.export.usd_asset import export_usd, recorded_cameras
+from drivesplat.export.usd import export_usd, recorded_cameras, splat_stage, usd_camera, write_usdz
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.gaussians import Gaussians

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import (
-    COURSES,
     GONE_AT_TIMES,
+    TRAJECTORIES,
     TURNING,
     Traffic,
     own_gaussians,
@@ -16,11 +16,10 @@ from helpers.records import EMPTY_CHECKPOINT
 from pxr import Gf, Kind, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 from scipy.spatial.transform import Rotation
 
-from drivesplat.export import usd_asset
+from drivesplat.export import usd
 from drivesplat.export.sampled_motion import sample_motion
 from drivesplat.export.trained_parts import SampledGroup
-from drivesplat.export.usd import splat_stage, write_usdz
-from drivesplat.export.usd_asset import export_usd
+from drivesplat.export.usd import export_usd, splat_stage, write_usdz
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.settings.export import ExportJob
 
@@ -43,7 +42,7 @@ def scene(tiny_scene):
 def package(tmp_path_factory, scene):
     path = tmp_path_factory.mktemp("usd") / "scene.usdz"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(usd_asset, "trained_model", lambda _: street())
+        monkeypatch.setattr(usd, "trained_model", lambda _: street())
         export_usd(path, EMPTY_CHECKPOINT, scene, ExportJob(eval_camera="CAM_FRONT", gaussians=1000), PROVENANCE)
     return path
 
@@ -70,11 +69,11 @@ def seen(stage: Usd.Stage, path: str, code: Usd.TimeCode) -> bool:
 
 def present_seconds(track_id: str, count: int = 300) -> np.ndarray:
     """Times all over those at which an object is there."""
-    course, times = COURSES[track_id], np.random.default_rng(0).uniform(-0.3, 5.0, count)
-    return times[[course.is_there(seconds) for seconds in times]]
+    trajectory, times = TRAJECTORIES[track_id], np.random.default_rng(0).uniform(-0.3, 5.0, count)
+    return times[[trajectory.is_there(seconds) for seconds in times]]
 
 
-@pytest.mark.parametrize("track_id", COURSES)
+@pytest.mark.parametrize("track_id", TRAJECTORIES)
 def test_gaussians_of_an_object_are_where_the_model_has_them_at_any_time_code(stage, track_id):
     """To less than a millimetre, between samples too; in float64 and closed form."""
     own = own_gaussians(track_id, MIDDLE).means.double().numpy()
@@ -83,7 +82,7 @@ def test_gaussians_of_an_object_are_where_the_model_has_them_at_any_time_code(st
     seconds = present_seconds(track_id)
     assert len(seconds) > 100
     for now in seconds:
-        local_to_world, pose = matrix(stage, PATHS[track_id], now * 30.0), COURSES[track_id].pose(now)
+        local_to_world, pose = matrix(stage, PATHS[track_id], now * 30.0), TRAJECTORIES[track_id].pose(now)
         found = own @ local_to_world[:3, :3].T + local_to_world[:3, 3]
         expected = own @ pose[:3, :3].T + pose[:3, 3]
         assert np.linalg.norm(found - expected, axis=1).max() < 1e-3
@@ -92,24 +91,24 @@ def test_gaussians_of_an_object_are_where_the_model_has_them_at_any_time_code(st
 
 def test_a_point_that_openusd_transforms_itself_is_where_the_model_has_it(stage):
     """The rows and columns of the matrix are the right way round."""
-    code, course = Usd.TimeCode(30.0), COURSES[TURNING]
+    code, trajectory = Usd.TimeCode(30.0), TRAJECTORIES[TURNING]
     transform = UsdGeom.Xformable(stage.GetPrimAtPath(PATHS[TURNING])).ComputeLocalToWorldTransform(code)
-    expected = course.pose(1.0) @ [1.0, -2.0, 0.5, 1.0]
+    expected = trajectory.pose(1.0) @ [1.0, -2.0, 0.5, 1.0]
     np.testing.assert_allclose(transform.Transform(Gf.Vec3d(1.0, -2.0, 0.5)), expected[:3], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("track_id", COURSES)
+@pytest.mark.parametrize("track_id", TRAJECTORIES)
 def test_at_images_and_whole_time_codes_the_pose_is_exact(stage, scene, track_id):
-    course = COURSES[track_id]
+    trajectory = TRAJECTORIES[track_id]
     images = [scene.seconds(frame.timestamp) for frame in scene.frames]
     for seconds in [*images, *(np.arange(140) / 30.0)]:
-        if course.is_there(seconds):
+        if trajectory.is_there(seconds):
             # a sample is at a whole microsecond
             found = matrix(stage, PATHS[track_id], Usd.TimeCode(seconds * 30.0))
-            np.testing.assert_allclose(found, course.pose(seconds), rtol=0, atol=1e-5)
+            np.testing.assert_allclose(found, trajectory.pose(seconds), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("track_id", COURSES)
+@pytest.mark.parametrize("track_id", TRAJECTORIES)
 def test_the_transform_is_one_matrix_that_stays_rigid_between_samples(stage, track_id):
     operations = UsdGeom.Xformable(stage.GetPrimAtPath(PATHS[track_id])).GetOrderedXformOps()
     assert [operation.GetOpType() for operation in operations] == [UsdGeom.XformOp.TypeTransform]
@@ -118,12 +117,12 @@ def test_the_transform_is_one_matrix_that_stays_rigid_between_samples(stage, tra
         np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize("track_id", COURSES)
+@pytest.mark.parametrize("track_id", TRAJECTORIES)
 def test_an_object_is_visible_exactly_while_it_is_present(stage, track_id):
-    course = COURSES[track_id]
+    trajectory = TRAJECTORIES[track_id]
     for now in np.random.default_rng(1).uniform(-2.0, 7.0, 500):
-        assert seen(stage, PATHS[track_id], now * 30.0) == course.is_there(now), now
-    for first, last in ((course.times[a] - 0.25, course.times[b] + 0.25) for a, b in course.runs):
+        assert seen(stage, PATHS[track_id], now * 30.0) == trajectory.is_there(now), now
+    for first, last in ((trajectory.times[a] - 0.25, trajectory.times[b] + 0.25) for a, b in trajectory.runs):
         for edge, inwards in ((first, 1e-4), (last, -1e-4)):
             assert seen(stage, PATHS[track_id], (edge + inwards) * 30.0)
             assert not seen(stage, PATHS[track_id], (edge - inwards) * 30.0)
@@ -133,10 +132,10 @@ def test_without_a_time_it_is_the_middle_image(stage):
     """Objects that are absent then are hidden, and stand where they come in or went out, whichever is nearer."""
     default = Usd.TimeCode.Default()
     assert seen(stage, PATHS[TURNING], default) and not seen(stage, PATHS[GONE_AT_TIMES], default)
-    np.testing.assert_allclose(matrix(stage, PATHS[TURNING], default), COURSES[TURNING].pose(MIDDLE), atol=1e-9)
-    coming = COURSES[GONE_AT_TIMES].times[2] - 0.25  # at 2.285 s
+    np.testing.assert_allclose(matrix(stage, PATHS[TURNING], default), TRAJECTORIES[TURNING].pose(MIDDLE), atol=1e-9)
+    coming = TRAJECTORIES[GONE_AT_TIMES].times[2] - 0.25  # at 2.285 s
     np.testing.assert_allclose(
-        matrix(stage, PATHS[GONE_AT_TIMES], default), COURSES[GONE_AT_TIMES].pose(coming), atol=1e-5
+        matrix(stage, PATHS[GONE_AT_TIMES], default), TRAJECTORIES[GONE_AT_TIMES].pose(coming), atol=1e-5
     )
 
 
@@ -146,7 +145,7 @@ def test_the_background_is_static_and_always_visible(stage):
         assert seen(stage, "/World/background", code)
 
 
-@pytest.mark.parametrize("track_id", COURSES)
+@pytest.mark.parametrize("track_id", TRAJECTORIES)
 def test_orientations_and_colours_are_those_of_the_objects_frame(stage, track_id):
     own, splat = own_gaussians(track_id, MIDDLE), splat_of(stage, track_id)
     found = Rotation.from_quat([[*q.GetImaginary(), q.GetReal()] for q in splat.GetOrientationsAttr().Get()])
@@ -160,13 +159,13 @@ def test_orientations_and_colours_are_those_of_the_objects_frame(stage, track_id
 
 def test_the_extent_is_local_and_moves_with_the_object(stage):
     """The bounds of the world at a time hold the Gaussians where they are then."""
-    own, course = own_gaussians(TURNING, MIDDLE), COURSES[TURNING]
+    own, trajectory = own_gaussians(TURNING, MIDDLE), TRAJECTORIES[TURNING]
     low, high = np.array(splat_of(stage, TURNING).GetExtentAttr().Get())
     assert (low > -5.2).all() and (high < 5.2).all(), "two metres and three sigmas of a metre"
     for seconds in (0.5, 2.5):
         cache = UsdGeom.BBoxCache(Usd.TimeCode(seconds * 30.0), [UsdGeom.Tokens.default_])
         bounds = cache.ComputeWorldBound(stage.GetPrimAtPath(PATHS[TURNING])).ComputeAlignedRange()
-        pose = course.pose(seconds)
+        pose = trajectory.pose(seconds)
         places = own.means.double().numpy() @ pose[:3, :3].T + pose[:3, 3]
         assert (places > np.array(bounds.GetMin())).all() and (places < np.array(bounds.GetMax())).all()
         assert (np.array(bounds.GetMax()) - np.array(bounds.GetMin()) < 16.0).all()
@@ -200,7 +199,7 @@ def still(count: int) -> SampledGroup:
 
 
 def moving(count: int) -> SampledGroup:
-    motion = sample_motion(COURSES[TURNING].motion, np.array([]), 1.0)
+    motion = sample_motion(TRAJECTORIES[TURNING].motion, np.array([]), 1.0)
     return SampledGroup(some_gaussians(count, 0, count), motion)
 
 
@@ -241,7 +240,7 @@ def test_an_object_may_have_the_name_of_the_camera():
 
 def test_the_budget_is_shared_by_all_groups_and_an_empty_object_is_valid(tmp_path, scene, monkeypatch):
     """The two wide, opaque Gaussians of the background cover most."""
-    monkeypatch.setattr(usd_asset, "trained_model", lambda _: street())
+    monkeypatch.setattr(usd, "trained_model", lambda _: street())
     monkeypatch.setattr("helpers.hand_made_traffic.own_gaussians", lambda *_: some_gaussians(12, 1, 0)[slice(0, 1)])
     job = ExportJob(eval_camera="CAM_FRONT", gaussians=2)
     export_usd(tmp_path / "scene.usdz", EMPTY_CHECKPOINT, scene, job, PROVENANCE)

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.chromium import CHROMIUM, chromium
+from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made import round_gaussians
-from helpers.hand_made_traffic import COURSES, TURNING, Traffic, own_gaussians, placed
+from helpers.hand_made_traffic import TRAJECTORIES, TURNING, Traffic, own_gaussians, placed
 from helpers.records import EMPTY_CHECKPOINT
 from scipy.spatial.transform import Rotation
 from torch import nn
@@ -37,7 +37,6 @@ SHOWN_WITHOUT_WORDS = """new Promise((done) => {
   const look = () => document.documentElement.dataset.shown === "yes" ? done() : setTimeout(look, 20);
   look();
 }).then(() => document.querySelectorAll("p").forEach((p) => (p.hidden = true)))"""
-in_a_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium for viewer.html: apt-get install chromium")
 
 
 def splats(count: int = COUNT, sh_degree: int = 2) -> Gaussians:
@@ -142,7 +141,7 @@ def test_objects_present_at_the_middle_image_are_placed_there(tmp_path, tiny_sce
     job = ExportJob(eval_camera="CAM_FRONT", gaussians=1000)
     export_viewer(tmp_path / "viewer.html", EMPTY_CHECKPOINT, tiny_scene, job, "street", PROVENANCE)
     scene, arrays = decoded((tmp_path / "viewer.html").read_text(encoding="utf-8"))
-    there = placed(own_gaussians(TURNING, 2.25), COURSES[TURNING].pose(2.25))
+    there = placed(own_gaussians(TURNING, 2.25), TRAJECTORIES[TURNING].pose(2.25))
     assert (scene["count"], scene["coefficients"]) == (1 + len(there), 4)
     np.testing.assert_allclose(arrays["means"].reshape(-1, 3), [[1.0, 2.0, 3.0], *there.means.tolist()], atol=1e-5)
     np.testing.assert_allclose(arrays["sh0"].reshape(-1, 3)[1:], there.sh[:, 0], atol=1e-3)

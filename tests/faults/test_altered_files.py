@@ -57,8 +57,8 @@ def readers(copy: WorkflowCopy) -> dict[str, list[str]]:
             members = known[path]["members"] if path in known else {}
             for name in (path, *(str(Path(path).parent / member) for member in members)):
                 found.setdefault(name, set()).add(rule)
-        told = READS_DATASET.search(script(rule).read_text())
-        for kind in re.findall(r'"(\w+)"', told[1]) if told else ():
+        match = READS_DATASET.search(script(rule).read_text())
+        for kind in re.findall(r'"(\w+)"', match[1]) if match else ():
             for path in known["results/0001/scene.json"]["dataset"][kind]:
                 found.setdefault(path, set()).add(rule)
     return {path: sorted(rules) for path, rules in sorted(found.items()) if "v1.0-mini" not in path}
@@ -73,11 +73,11 @@ def refusal(copy: WorkflowCopy, rule: str, log: Path) -> str | None:
     name = {"scene": "scene", "scene_refined": "scene", "parser": "parser"}
     inputs = NamedFiles(**{name.get(Path(path).stem, Path(path).stem): path for path in read})
     wildcards = SimpleNamespace(scene="0001", method="street")
-    told = SimpleNamespace(
+    stage = SimpleNamespace(
         input=inputs, output=[], wildcards=wildcards, log=[str(log)], threads=1, rule=rule, params=None, resources=None
     )
     with pytest.raises(SystemExit):
-        runpy.run_path(str(script(rule)), {"snakemake": told})
+        runpy.run_path(str(script(rule)), {"snakemake": stage})
     line = log.read_text().splitlines()[-1]
     return line if re.search("not what the rule wrote|changed since the rule", line) else None
 
@@ -106,10 +106,14 @@ def test_each_of_100_flipped_bits_is_refused_with_file_and_rule(finished, tmp_pa
         content = bytearray(whole)
         content[random.integers(len(content))] ^= 1 << int(random.integers(8))
         path.write_bytes(content)
-        told = refusal(finished, rule, tmp_path / "it.log")
+        message = refusal(finished, rule, tmp_path / "it.log")
         path.write_bytes(whole)
-        if told is None or str(path) not in told or not re.search(r"rerun: the rule '\w+' re(builds|ads) it", told):
-            silent.append((str(path), rule, told))
+        if (
+            message is None
+            or str(path) not in message
+            or not re.search(r"rerun: the rule '\w+' re(builds|ads) it", message)
+        ):
+            silent.append((str(path), rule, message))
     assert not silent
 
 
@@ -154,8 +158,8 @@ def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, 
         damaged.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     target = "results/0001/street/checkpoint.npz"
     refused = copy.run(target)
-    name, delete, told = DELETE.search(refused.stdout).groups()
-    assert refused.returncode and told == rule and (copy.folder / name) == damaged
+    name, delete, named = DELETE.search(refused.stdout).groups()
+    assert refused.returncode and named == rule and (copy.folder / name) == damaged
     (copy.folder / (name if delete == "it" else delete)).unlink()
     done = copy.run(target)
     assert done.returncode == 0, done.stdout

@@ -107,7 +107,7 @@ def test_no_server_is_a_line(tmp_path):
     assert "Connection refused" in refused(site.job(tmp_path / "mini", size_bytes=10))
 
 
-def test_a_full_disk_is_said_before_anything_is_fetched(archive, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_before_anything_is_fetched(archive, tmp_path, monkeypatch):
     asked = []
 
     def usage(path: Path) -> Usage:
@@ -131,7 +131,9 @@ def test_what_has_come_already_needs_no_room_twice(archive, tmp_path, monkeypatc
         download(site.job(tmp_path / "mini"))
 
 
-def test_a_disk_that_others_have_filled_meanwhile_is_said_before_anything_is_unpacked(archive, tmp_path, monkeypatch):
+def test_a_disk_that_others_have_filled_meanwhile_is_reported_before_anything_is_unpacked(
+    archive, tmp_path, monkeypatch
+):
     free = [10**9, 1000]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**10, 0, free.pop(0)))
     with served(Site(archive)) as site:
@@ -316,7 +318,7 @@ def test_a_wrong_archive_that_a_user_put_there_is_named_and_left_alone(archive, 
     assert mine.read_bytes() == b"mine" and site.asked == []
 
 
-def told(done: subprocess.CompletedProcess) -> str:
+def only_complaint(done: subprocess.CompletedProcess) -> str:
     """The one line that a failed run says, checked to be one line and no traceback."""
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
     lines = complaints(done.stdout)
@@ -329,7 +331,7 @@ def told(done: subprocess.CompletedProcess) -> str:
 def test_through_the_workflow_it_is_refused_then_fetched_then_read(archive, tmp_path):
     copy = WorkflowCopy.make(tmp_path / "workflow", World(key_frames=3, sweeps_between=0), methods={"vanilla": {}})
     shutil.rmtree(copy.folder / "data")
-    line = told(copy.run("download_nuscenes_mini"))
+    line = only_complaint(copy.run("download_nuscenes_mini"))
     assert "accept_nuscenes_terms: true" in line and "nuscenes.org/terms-of-use" in line
     assert not (copy.folder / "results").exists()
     with served(Site(archive)) as site:

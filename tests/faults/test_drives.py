@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 GROUPS = ("interpolation", "extrapolation")
 
 
-def test_a_track_with_one_box_stands_where_it_was_seen_and_is_there_at_that_time_alone(tmp_path):
+def test_a_track_with_one_box_is_static_and_present_only_at_that_time(tmp_path):
     """A van ahead, annotated in key frame 2 alone, which is held out for interpolation."""
     van = Thing("vehicle.truck", (4.0, 4.0, 3.0), (9.0, 0.0, 1.5), seen=range(2, 3))
     made = run(write_world(tmp_path / "data", World(things=[van], key_frames=8, speed=1.0)), tmp_path)
@@ -40,7 +40,7 @@ def test_a_drive_whose_lidar_is_gone_is_measured_with_the_count_beside_it(tmp_pa
         assert all(method[group]["static"]["psnr"] > 0 and not method[group].get("depth") for group in GROUPS)
 
 
-def test_a_small_card_is_asked_for_what_its_preset_was_measured_to_take_and_something_more():
+def test_a_preset_for_a_small_gpu_requires_its_measured_memory_and_a_margin():
     """docs/measured.md has the peak of the preset; the CUDA context adds half a gigabyte to it."""
     preset = yaml.safe_load((REPOSITORY / "presets/8gb.yaml").read_text())
     (peak,) = re.findall(r"^\| `8gb` \|.*\| ([0-9.]+) GB \|", (REPOSITORY / "docs/measured.md").read_text(), re.M)

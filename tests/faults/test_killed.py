@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from helpers.killed_runs import VANILLA, told, training_process
+from helpers.killed_runs import VANILLA, only_complaint, training_process
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("killed")]
@@ -59,7 +59,7 @@ def test_a_training_that_outlives_a_killed_run_is_named_and_never_doubled(copy):
     running.wait()
     orphan = training_process(copy)
     assert orphan is not None, "the training goes on"
-    line = told(copy.run(TARGET))
+    line = only_complaint(copy.run(TARGET))
     assert f"process {orphan} is still training" in line and f"kill {orphan}" in line
     assert training_process(copy) == orphan
     os.kill(orphan, signal.SIGKILL)
@@ -71,7 +71,9 @@ def test_a_training_that_outlives_a_killed_run_is_named_and_never_doubled(copy):
 @pytest.mark.slow
 def test_an_interrupted_run_takes_its_training_along_and_the_next_one_goes_on(copy):
     running = at_work(copy)
-    assert "another run is working in results/" in told(copy.run("report")), "meanwhile there is no second one"
+    assert "another run is working in results/" in only_complaint(copy.run("report")), (
+        "meanwhile there is no second one"
+    )
     os.killpg(running.pid, signal.SIGINT)
     assert running.wait(PATIENCE) != 0
     until(lambda: training_process(copy) is None)

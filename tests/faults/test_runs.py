@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
-from helpers.killed_runs import VANILLA, told, training_process
+from helpers.killed_runs import VANILLA, only_complaint, training_process
 from helpers.tiny_world import World
 from helpers.workflow_copy import REPOSITORY, TINY_TRAINING, WorkflowCopy, complaints
 
@@ -51,32 +51,32 @@ def with_edits(copy: WorkflowCopy, text: str) -> WorkflowCopy:
 def test_a_mistyped_key_or_value_stops_before_any_job(copy, config, words):
     copy.config |= config
     copy.write_config()
-    line = told(copy.run())
+    line = only_complaint(copy.run())
     assert all(word in line for word in words), line
     assert not (copy.folder / "results").exists()
 
 
 def test_an_unknown_scene_stops_before_any_job_and_lists_those_there_are(copy):
-    line = told(copy.run("results/9999/metrics.json"))
+    line = only_complaint(copy.run("results/9999/metrics.json"))
     assert "9999" in line and "0001" in line
     assert not (copy.folder / "results").exists()
 
 
-def test_an_unquoted_scene_number_is_told_to_be_quoted(copy):
+def test_an_unquoted_scene_number_is_refused_with_advice_to_quote_it(copy):
     copy.write_config("datasets: {nuscenes: {dataroot: data, scenes: [0061]}}\n")
-    line = told(copy.run())
+    line = only_complaint(copy.run())
     assert "quotes" in line and '"0061"' in line
     assert not (copy.folder / "results").exists()
 
 
 def test_an_unknown_method_lists_those_there_are(copy):
-    line = told(copy.run("results/0001/vanila/train.json"))
+    line = only_complaint(copy.run("results/0001/vanila/train.json"))
     assert "vanila" in line and "vanilla" in line
 
 
 @pytest.mark.parametrize("target", ["nowhere.mp4", "nowhere.cameras.json"])
 def test_an_unknown_film_stops_before_any_job_and_lists_those_there_are(copy, target):
-    line = told(copy.run(f"results/0001/vanilla/{target}"))
+    line = only_complaint(copy.run(f"results/0001/vanilla/{target}"))
     assert f"'{target.split('.')[0]}'" in line and "original, lateral_2m" in line and "render.trajectories" in line
     assert not (copy.folder / "results/0001").exists()
 
@@ -96,7 +96,7 @@ EDITS = (
     ],
 )
 def test_an_edit_that_there_is_none_of_stops_before_any_job(copy, target, words):
-    line = told(with_edits(copy, EDITS).run(f"results/0001/{target}"))
+    line = only_complaint(with_edits(copy, EDITS).run(f"results/0001/{target}"))
     assert all(word in line for word in words), line
     assert not (copy.folder / "results/0001").exists()
 
@@ -115,7 +115,7 @@ def test_a_broken_edits_file_stops_before_any_job(copy, broken, target, words):
     with_edits(copy, broken or "")
     if broken is None:
         (copy.folder / "edits.yaml").unlink()
-    line = told(copy.run(*(f"results/0001/street/{name}" for name in target)))
+    line = only_complaint(copy.run(*(f"results/0001/street/{name}" for name in target)))
     assert all(word in line for word in ["edits.yaml", *words]), line
     assert not (copy.folder / "results/0001").exists()
 
@@ -128,17 +128,17 @@ def test_a_broken_edits_file_stops_before_any_job(copy, broken, target, words):
         ({"dataroot": "data", "version": "v1.0-trainval"}, ["v1.0-trainval", "data", "v1.0-mini", "version"]),
     ],
 )
-def test_a_missing_dataset_is_told_in_one_message(copy, dataset, words):
+def test_a_missing_dataset_is_reported_in_one_message(copy, dataset, words):
     (copy.folder / "empty").mkdir()
     copy.config["datasets"] = {"nuscenes": {"scenes": ["0001"], **dataset}}
     copy.write_config()
-    line = told(copy.run("results/0001/metrics.json"))
+    line = only_complaint(copy.run("results/0001/metrics.json"))
     assert all(word in line for word in words), line
 
 
 def test_missing_tables_are_named(copy):
     (copy.folder / "data/v1.0-mini/ego_pose.json").unlink()
-    assert "ego_pose.json" in told(copy.run("results/0001/scene.json"))
+    assert "ego_pose.json" in only_complaint(copy.run("results/0001/scene.json"))
 
 
 def edit_table(copy: WorkflowCopy, table: str, change) -> None:
@@ -161,7 +161,7 @@ def test_malformed_tables_are_rejected_with_the_token(copy, table, change, token
     edit_table(copy, table, change)
     copy.config["sweeps"] = True
     copy.write_config()
-    assert token in told(copy.run("results/0001/scene.json"))
+    assert token in only_complaint(copy.run("results/0001/scene.json"))
     assert not (copy.folder / "results/0001/scene.json").exists()
 
 
@@ -171,15 +171,15 @@ def test_malformed_tables_are_rejected_with_the_token(copy, table, change, token
 def test_a_bad_image_is_named_with_its_sample(copy, damage):
     path = copy.folder / "data/samples/CAM_FRONT/0001__0004.jpg"
     damage(path)
-    line = told(copy.run("results/0001/scene.json"))
+    line = only_complaint(copy.run("results/0001/scene.json"))
     assert "0001__0004.jpg" in line and "0001 CAM_FRONT 4" in line
     assert not (copy.folder / "results/0001/scene.json").exists()
 
 
 @pytest.mark.slow
-def test_missing_lidar_stops_and_names_it_or_is_counted_where_told_to_go_on(copy):
+def test_missing_lidar_stops_and_is_named_or_is_counted_with_on_missing_warn(copy):
     (copy.folder / "data/samples/LIDAR_TOP/0001__0002.pcd.bin").unlink()
-    line = told(copy.run("results/0001/parser.pkl"))
+    line = only_complaint(copy.run("results/0001/parser.pkl"))
     assert "0001__0002.pcd.bin" in line and "lidar_seed.on_missing: warn" in line
     copy.config["lidar_seed"] = {**copy.config["lidar_seed"], "on_missing": "warn"}
     copy.write_config()
@@ -192,7 +192,7 @@ def test_missing_lidar_stops_and_names_it_or_is_counted_where_told_to_go_on(copy
 def test_a_real_scene_never_falls_back_to_the_cpu_silently(copy):
     copy.config["device"] = "auto"
     copy.write_config()
-    line = told(copy.run("results/0001/vanilla/train.json"))
+    line = only_complaint(copy.run("results/0001/vanilla/train.json"))
     assert "no usable GPU" in line and "device: cpu" in line
     assert not (copy.folder / "results/0001/vanilla/checkpoint.npz").exists()
 
@@ -248,7 +248,7 @@ def test_an_ffmpeg_that_is_absent_or_dies_is_named_and_leaves_no_half_film(train
         program.write_text(ffmpeg)
         program.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
-    line = told(trained.run("results/0001/vanilla/original.mp4"))
+    line = only_complaint(trained.run("results/0001/vanilla/original.mp4"))
     assert all(word in line for word in ["results/0001/vanilla/original.mp4", "ffmpeg", *words]), line
     assert not list(trained.folder.glob("results/0001/vanilla/*original*"))
 
@@ -318,7 +318,7 @@ LARGEST_FILE = 2500
 def test_a_results_folder_that_cannot_be_made_is_named(trained, tmp_path):
     (tmp_path / "results").write_text("a file")
     folder = f"{tmp_path}/results/in"
-    line = told(trained.run(f"{folder}/0001/scene.json", flags=("--config", f"results_dir={folder}")))
+    line = only_complaint(trained.run(f"{folder}/0001/scene.json", flags=("--config", f"results_dir={folder}")))
     assert line.startswith(f"drivesplat: {folder}/: cannot be written (") and "results_dir" in line
 
 
@@ -329,7 +329,7 @@ def test_a_results_folder_on_a_read_only_disk_is_named(trained):
     under = ("unshare", "--map-root-user", "--mount", "sh", "-c", READ_ONLY, "sh")
     if shutil.which("unshare") is None or subprocess.run([*under, "true"], cwd=trained.folder).returncode:
         pytest.skip("only where users may mount what others do not see")
-    line = told(trained.run("results/0001/vanilla/scene.usdz", under=under))
+    line = only_complaint(trained.run("results/0001/vanilla/scene.usdz", under=under))
     assert line.startswith("drivesplat: results/: cannot be written (Read-only file system); fix its permissions")
 
 
@@ -347,11 +347,11 @@ Trainer.fit_one = fit_one
 
 
 def test_a_training_out_of_gpu_memory_says_what_lowers_the_need_and_is_not_tried_again(trained):
-    """The peak is the card's own in tests/test_gpu.py."""
+    """The peak is that of the GPU itself in tests/test_gpu.py."""
     changed = set_to(trained, methods={"large": {}})
     with changed, altered(trained, "train", lambda whole: OUT_OF_MEMORY + whole):
         done = trained.run("results/0001/large/train.json")
-    line = told(done)
+    line = only_complaint(done)
     assert re.search(r"out of GPU memory with \d[\d,]* Gaussians \(peak 0\.0 GB\): lower train\.cap_max", line), line
     assert len(re.findall(r"^(?:local)?rule train:$", done.stdout, re.M)) == done.stdout.count(f"{line}\n") == 1
     assert not list((trained.folder / "results/0001/large").glob("*.*"))
@@ -385,26 +385,26 @@ with job(snakemake) as current:
     current.device()
     began = time.time()
     time.sleep(0.7)
-    seen = {"card": os.environ["CUDA_VISIBLE_DEVICES"], "began": began, "ended": time.time()}
+    seen = {"gpu": os.environ["CUDA_VISIBLE_DEVICES"], "began": began, "ended": time.time()}
     Path(current.output.checkpoint).write_text("")
     Path(current.output.summary).write_text(json.dumps(seen))
 """
 
 
-@pytest.mark.parametrize("cards", [1, 4])
-def test_there_are_never_more_gpu_jobs_than_cards_and_each_sees_its_own(trained, cards):
-    """However many cores there are. None waits for a card, since none is started before one is free."""
-    names = [f"GPU-{os.getpid()}-{number}" for number in range(cards)]
-    methods = [f"on{cards}cards{number}" for number in range(cards + 2)]
+@pytest.mark.parametrize("gpus", [1, 4])
+def test_there_are_never_more_gpu_jobs_than_gpus_and_each_sees_its_own(trained, gpus):
+    """However many cores there are. None waits for a GPU, since none is started before one is free."""
+    names = [f"GPU-{os.getpid()}-{number}" for number in range(gpus)]
+    methods = [f"on{gpus}gpus{number}" for number in range(gpus + 2)]
     targets = [f"results/0001/{method}/train.json" for method in methods]
     changed = set_to(trained, methods={method: {} for method in methods}, device="any")
     with changed, altered(trained, "train", lambda _: TRAINING_THAT_SLEEPS):
-        done = trained.run(*targets, cores=100, cards=",".join(names))
+        done = trained.run(*targets, cores=100, gpus=",".join(names))
     assert done.returncode == 0 and "waits for a GPU" not in done.stdout, done.stdout
     jobs = [trained.read(target) for target in targets]
-    assert {job["card"] for job in jobs} == set(names)
+    assert {job["gpu"] for job in jobs} == set(names)
     for name in names:
-        spans = sorted((job["began"], job["ended"]) for job in jobs if job["card"] == name)
+        spans = sorted((job["began"], job["ended"]) for job in jobs if job["gpu"] == name)
         assert all(ended <= began for (_, ended), (began, _) in itertools.pairwise(spans))
 
 
@@ -413,7 +413,7 @@ def test_a_second_run_in_one_folder_is_refused(copy):
     results.mkdir()
     with open(results / ".lock", "w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        line = told(copy.run("results/0001/scene.json"))
+        line = only_complaint(copy.run("results/0001/scene.json"))
     assert "another run" in line
     assert copy.run("results/0001/scene.json").returncode == 0
 

@@ -24,7 +24,7 @@ class Batch:
     copy: WorkflowCopy
     image: Path
     whole: bytes
-    said: str = ""
+    output: str = ""
 
     def scenes(self, *names: str) -> None:
         self.copy.config["datasets"]["nuscenes"]["scenes"] = list(names)
@@ -43,7 +43,7 @@ def batch(tmp_path_factory) -> Batch:
     image.write_bytes(made.whole[: len(made.whole) // 3])
     done = copy.run(*FIGURES, flags=("--keep-going",))
     assert done.returncode != 0
-    made.said = done.stdout
+    made.output = done.stdout
     return made
 
 
@@ -65,7 +65,7 @@ def test_one_scene_that_fails_stops_no_other_and_stands_in_a_partial_report(batc
     assert missing["scene"] == "0002" and missing["why"].startswith("extract: ") and batch.image.name in missing["why"]
     page = (batch.copy.folder / "results/gap_report.html").read_text()
     assert "Partial: 1 of 2 configured scenes" in page and batch.image.name in page and "data:image/jpeg" in page
-    assert "0002: extract: " in batch.said and "results/gap_report.html" in batch.said
+    assert "0002: extract: " in batch.output and "results/gap_report.html" in batch.output
     costs = (batch.copy.folder / "results/costs.csv").read_text()
     assert "0001,vanilla,train," in costs and "0002," not in costs and "<h2>Costs</h2>" in page
 

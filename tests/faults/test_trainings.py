@@ -111,7 +111,7 @@ def train_and_kill_the_parent(folder: str) -> None:
     run_training(inputs_in(Path(folder)), RESUMABLE, CPU, files_in(Path(folder) / "it"), PROVENANCE, "train")
 
 
-def test_a_training_that_nobody_saw_end_goes_on_from_its_last_checkpoint_when_it_is_made_again(tmp_path, caplog):
+def test_a_training_whose_end_snakemake_missed_resumes_from_its_last_checkpoint(tmp_path, caplog):
     process, files = in_subprocess(train_and_kill_the_parent, str(tmp_path)), files_in(tmp_path / "it")
     _, errors = process.communicate(timeout=60)  # as long as any of both is there
     assert process.returncode == -signal.SIGKILL and files.summary.is_file(), errors
@@ -168,7 +168,7 @@ def test_a_training_on_a_full_disk_names_what_it_could_not_write(tmp_path, quiet
     assert all(name == "lock" or name.startswith("events.") for name in left)
 
 
-def test_what_ends_a_training_goes_before_what_the_disk_says_then(tmp_path, quiet_threads):
+def test_the_cause_of_a_failed_training_takes_precedence_over_a_full_disk(tmp_path, quiet_threads):
     monitor = Monitor(tmp_path, 10, 0, "x")
     with FullDisk(0), pytest.raises(EndedError), monitor:
         monitor.scalars(1, {"loss/total": 1.0, "gaussians": 5.0}, 1)
@@ -192,22 +192,22 @@ def ended_by(tmp_path: Path, error: Exception | None, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
-def test_a_disk_that_takes_no_more_is_no_bug(tmp_path, capsys, number):
-    said, logged = ended_by(tmp_path, OSError(number, os.strerror(number), "frames/000001.png"), capsys)
+def test_a_full_disk_is_not_reported_as_a_bug(tmp_path, capsys, number):
+    printed, logged = ended_by(tmp_path, OSError(number, os.strerror(number), "frames/000001.png"), capsys)
     expected = (
         f"film 0001: frames/000001.png: cannot be written ({os.strerror(number)}); free space or fix its permissions"
     )
-    assert said == f"drivesplat: {expected}\n"
+    assert printed == f"drivesplat: {expected}\n"
     assert logged.splitlines()[-1].endswith(f"ERROR drivesplat.workflow.job: {expected}") and "Traceback" not in logged
 
 
 def test_any_other_error_is_one_with_its_traceback_in_the_log(tmp_path, capsys):
-    said, logged = ended_by(tmp_path, FileNotFoundError(errno.ENOENT, "No such file", "x"), capsys)
-    assert said.count("\n") == 1 and "(a bug; the traceback is in" in said and "x.log)" in said
-    assert "Traceback" in logged and logged.splitlines()[-1].endswith(said.strip().removeprefix("drivesplat: "))
+    printed, logged = ended_by(tmp_path, FileNotFoundError(errno.ENOENT, "No such file", "x"), capsys)
+    assert printed.count("\n") == 1 and "(a bug; the traceback is in" in printed and "x.log)" in printed
+    assert "Traceback" in logged and logged.splitlines()[-1].endswith(printed.strip().removeprefix("drivesplat: "))
 
 
-def test_a_disk_without_room_for_the_log_is_said_once(tmp_path, capsys):
+def test_a_disk_too_full_for_the_log_is_reported_once(tmp_path, capsys):
     with FullDisk(0):
-        said, logged = ended_by(tmp_path, ResultError("x.mp4: cannot be written (No space left on device)"), capsys)
-    assert said == "drivesplat: film 0001: x.mp4: cannot be written (No space left on device)\n" and logged == ""
+        printed, logged = ended_by(tmp_path, ResultError("x.mp4: cannot be written (No space left on device)"), capsys)
+    assert printed == "drivesplat: film 0001: x.mp4: cannot be written (No space left on device)\n" and logged == ""

@@ -13,14 +13,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NO_CHROMIUM = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
 _FLAGS = (
     "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--remote-debugging-pipe", "about:blank",
 )  # fmt: skip
+
+
+def in_a_browser(test: Any) -> Any:
+    """Marks a test that needs Chromium: `make test-viewers` runs it."""
+    return pytest.mark.viewers(NO_CHROMIUM(test))
 
 
 class Tab:

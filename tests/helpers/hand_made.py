@@ -22,9 +22,7 @@ from drivesplat.scene.motion import Motion
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.train import ActorSettings, GaussianSettings
 
 BLACK = (0.0, 0.0, 0.0)

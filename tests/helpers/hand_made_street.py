@@ -38,14 +38,14 @@ class Driver:
     """An object that was annotated at the key frames `seen`, in order, where `way` says: object to world (4, 4) at a
     second. `size` is length, width, height in metres."""
 
-    way: Callable[[float], np.ndarray]
+    pose_at: Callable[[float], np.ndarray]
     size: tuple[float, float, float]
     seen: tuple[int, ...]
     category: str = "vehicle.car"
 
     @property
     def motion(self) -> Motion:
-        return Motion(KEY[[*self.seen]], np.stack([self.way(t) for t in KEY[[*self.seen]]]), self.runs, 0.25)
+        return Motion(KEY[[*self.seen]], np.stack([self.pose_at(t) for t in KEY[[*self.seen]]]), self.runs, 0.25)
 
     @property
     def runs(self) -> tuple[tuple[int, int], ...]:
@@ -61,8 +61,8 @@ def straight(seconds: float) -> np.ndarray:
 def bend(seconds: float) -> np.ndarray:
     """Towards the camera, round a left turn of 20 m."""
     turned, began = 2.8 + 0.2 * seconds, 2.8
-    way = 20.0 * np.array([np.sin(turned) - np.sin(began), np.cos(began) - np.cos(turned), 0.0])
-    return rigid(about_z(turned), np.array([48.0, 4.0, 0.9]) + way)
+    displacement = 20.0 * np.array([np.sin(turned) - np.sin(began), np.cos(began) - np.cos(turned), 0.0])
+    return rigid(about_z(turned), np.array([48.0, 4.0, 0.9]) + displacement)
 
 
 def aside(seconds: float) -> np.ndarray:

@@ -21,7 +21,7 @@ FADING = 0.03
 
 
 @dataclass(frozen=True)
-class Course:
+class Trajectory:
     """Steadily ahead from `start` at `velocity` (m/s), turning at `rate` (rad/s), tilted a little; annotated at `times`
     seconds in `runs`."""
 
@@ -49,9 +49,9 @@ def key_times(first: int, last: int) -> tuple[float, ...]:
     return tuple(0.035 + 0.5 * k for k in range(first, last + 1))
 
 
-COURSES = {
-    TURNING: Course((10.0, 2.0, 0.8), (4.0, -1.0, 0.0), 0.8, key_times(0, 5), ((0, 5),)),
-    GONE_AT_TIMES: Course(
+TRAJECTORIES = {
+    TURNING: Trajectory((10.0, 2.0, 0.8), (4.0, -1.0, 0.0), 0.8, key_times(0, 5), ((0, 5),)),
+    GONE_AT_TIMES: Trajectory(
         (-5.0, -3.0, 1.0), (9.0, 3.0, 0.1), -0.5, key_times(1, 2) + key_times(5, 8), ((0, 1), (2, 5))
     ),
 }
@@ -69,7 +69,7 @@ def some_gaussians(count: int, sh_degree: int, seed: int) -> Gaussians:
 
 def own_gaussians(track_id: str, time: float) -> Gaussians:
     """A vehicle's in its own frame, in the colours of a time."""
-    own = some_gaussians(12, 1, seed=list(COURSES).index(track_id))
+    own = some_gaussians(12, 1, seed=list(TRAJECTORIES).index(track_id))
     return replace(own, sh0=own.sh0 + FADING * time)
 
 
@@ -96,19 +96,20 @@ class Traffic(Part):
 
     def __init__(self) -> None:
         super().__init__()
-        everyone = concatenate([own_gaussians(track_id, 0.0) for track_id in COURSES])
-        self.params = nn.ParameterDict({"means": everyone.means})
+        all_gaussians = concatenate([own_gaussians(track_id, 0.0) for track_id in TRAJECTORIES])
+        self.params = nn.ParameterDict({"means": all_gaussians.means})
 
     def at(self, time: float) -> Gaussians:
         shown = []
-        for track_id, course in COURSES.items():
-            gaussians = placed(own_gaussians(track_id, time), course.pose(time))
-            shown.append(replace(gaussians, opacities=gaussians.opacities * course.is_there(time)))
+        for track_id, trajectory in TRAJECTORIES.items():
+            gaussians = placed(own_gaussians(track_id, time), trajectory.pose(time))
+            shown.append(replace(gaussians, opacities=gaussians.opacities * trajectory.is_there(time)))
         return concatenate(shown)
 
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         return {
-            track_id: RigidGroup(own_gaussians(track_id, time), course.motion) for track_id, course in COURSES.items()
+            track_id: RigidGroup(own_gaussians(track_id, time), trajectory.motion)
+            for track_id, trajectory in TRAJECTORIES.items()
         }
 
     def learning_rates(self) -> dict[str, float]:

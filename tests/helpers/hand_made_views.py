@@ -74,7 +74,7 @@ class Drive:
 def drive_of(
     key_frames: int = 12,
     cameras: Sequence[str] = FRONT,
-    way=ego_at,
+    ego_path=ego_at,
     error=error_at,
     size: tuple[int, int] = SIZE,
     **fields,
@@ -84,7 +84,7 @@ def drive_of(
     for index in range(key_frames):
         for camera in cameras:
             timestamp = index * KEY_FRAME_US + DELAYS_US[camera] + 100_000
-            pose = way(timestamp * 1e-6)
+            pose = ego_path(timestamp * 1e-6)
             given = recorded(pose, error(timestamp * 1e-6))
             frames.append(_frame(camera, timestamp, given, index, size))
             truth.append(pose)

@@ -6,7 +6,7 @@ from pathlib import Path
 from helpers.workflow_copy import WorkflowCopy, complaints
 
 
-def told(done: subprocess.CompletedProcess) -> str:
+def only_complaint(done: subprocess.CompletedProcess) -> str:
     """The one line that a failed run says, checked to be one line and no traceback."""
     assert done.returncode != 0, done.stdout
     assert "Traceback" not in done.stdout, done.stdout

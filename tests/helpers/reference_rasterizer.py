@@ -9,7 +9,7 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
-from drivesplat.rasterization.rendering import Rendering, assembled
+from drivesplat.rasterization.rasterization import Rendering, assembled
 
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1.0 / 255.0

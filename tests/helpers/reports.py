@@ -65,8 +65,8 @@ NO_LOGS = Path("no such folder")
 
 
 def expecting(*scenes: str, methods=("vanilla",)) -> ReportJob:
-    return told({scene: stages(methods) for scene in scenes})
+    return report_job({scene: stages(methods) for scene in scenes})
 
 
-def told(expected: dict[str, Any], reference: str | None = "vanilla") -> ReportJob:
+def report_job(expected: dict[str, Any], reference: str | None = "vanilla") -> ReportJob:
     return ReportJob(expected=expected, reference=reference, random_seed=0)

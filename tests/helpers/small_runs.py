@@ -23,10 +23,10 @@ from drivesplat.settings.config import Config, load
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.images import ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import MaskJob
-from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import TrainJob
 from drivesplat.training.run import TrainingFiles, TrainingInputs, run_training
 from drivesplat.workflow.stages import stage_settings

@@ -95,10 +95,10 @@ class WorkflowCopy:
         (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))
 
     def command(self, *arguments: str) -> list[str]:
-        return [sys.executable, "-m", "snakemake", *self._told(*arguments)]
+        return [sys.executable, "-m", "snakemake", *self._arguments(*arguments)]
 
-    def _told(self, *arguments: str) -> list[str]:
-        """What Snakemake is told."""
+    def _arguments(self, *arguments: str) -> list[str]:
+        """Snakemake's arguments."""
         return ["--configfile", "mine.yaml", *arguments]
 
     def run(
@@ -106,16 +106,16 @@ class WorkflowCopy:
         *targets: str,
         cores: int = 2,
         flags: tuple[str, ...] = (),
-        cards: str = "",
+        gpus: str = "",
         under: tuple[str, ...] = (),
         timeout: float = 600,
     ) -> subprocess.CompletedProcess:
         """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `cards`, by the program
         `under` where one is given; the result holds its output (both streams) as `stdout`."""
         arguments = ("--cores", str(cores), *flags, "--", *targets)
-        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": cards}
+        environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": gpus}
         if not under:
-            return run_snakemake(self._told(*arguments), self.folder, environment, timeout)
+            return run_snakemake(self._arguments(*arguments), self.folder, environment, timeout)
         return subprocess.run(
             [*under, *self.command(*arguments)],
             cwd=self.folder,

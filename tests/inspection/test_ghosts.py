@@ -44,8 +44,8 @@ def track_of(poses: list[np.ndarray], seconds=None, indices=None, size=SIZE) -> 
 
 def straight(speed: float, count: int = 7, heading: float = 0.0, **changes) -> Track:
     """From the origin on along `heading`, `speed` metres a second."""
-    way = np.array([np.cos(heading), np.sin(heading)]) * speed
-    return track_of([pose(*(0.5 * i * way), angle=heading) for i in range(count)], **changes)
+    step_m = np.array([np.cos(heading), np.sin(heading)]) * speed
+    return track_of([pose(*(0.5 * i * step_m), angle=heading) for i in range(count)], **changes)
 
 
 def around(place: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -71,8 +71,8 @@ def test_a_straight_path_sweeps_a_long_box(speed, heading):
     beyond = np.maximum(-0.25 * speed - 2.0 - along[:, 0], along[:, 0] - 3.25 * speed - 2.0)
     beside = np.maximum(np.abs(along[:, 1]) - 1.0, np.abs(along[:, 2]) - 0.8)
     assert not found[(beyond > 1e-6) | (beside > 1e-6)].any()
-    surely = (beyond < -SLACK) & (beside < -1e-6)
-    assert surely.sum() > 1000 and found[surely].all()
+    certain = (beyond < -SLACK) & (beside < -1e-6)
+    assert certain.sum() > 1000 and found[certain].all()
 
 
 @pytest.mark.parametrize("speed", [3.0, 12.0, 30.0])
@@ -103,16 +103,16 @@ def test_a_turning_box_sweeps_nothing_beside_its_path(turn):
     """Random points against boxes every 10 ms, posed by the protocol's interpolation."""
     it = track_of([pose(8.0 * np.cos(turn * i), 8.0 * np.sin(turn * i), 0.0, turn * i) for i in range(6)])
     points = np.random.default_rng(1).uniform([-14, -14, -2], [14, 14, 2], (20_000, 3))
-    surely = np.zeros(len(points), dtype=bool)
-    perhaps = surely.copy()
+    certain = np.zeros(len(points), dtype=bool)
+    possible = certain.copy()
     for time in range(START - 250_000, START + 2_750_001, 10_000):
         place = box_at(it, time, INTERVAL).object_to_world
         in_box = np.abs((points - place[:3, 3]) @ place[:3, :3]) - SIZE / 2
-        perhaps |= (in_box < 0.05).all(axis=1)
-        surely |= (in_box < -0.25).all(axis=1)
+        possible |= (in_box < 0.05).all(axis=1)
+        certain |= (in_box < -0.25).all(axis=1)
     found = in_swept_volume(it, INTERVAL, points)
-    assert surely.sum() > 300 and found[surely].all()
-    assert not found[~perhaps].any() and not found.all()
+    assert certain.sum() > 300 and found[certain].all()
+    assert not found[~possible].any() and not found.all()
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.2, 0.5])
@@ -203,7 +203,7 @@ def test_boxes_along_a_path_are_ordered_and_close(speed):
     assert 14 <= len(boxes) < 3.5 * max(speed / 0.25, 4.0) + 2
 
 
-def sight_of(scene: Scene, *parts: Part, index: int = 0) -> RenderedView:
+def render_image(scene: Scene, *parts: Part, index: int = 0) -> RenderedView:
     model = SplatModel(parts, None).requires_grad_(False)
     return RenderedView(TrainedDrive(model, recording_of(scene), torch.device("cpu")), index)
 
@@ -234,24 +234,24 @@ PLACES = np.array(
 GHOSTS = np.array([True, True, False, False, False, False, False, False, True])
 
 
-def ghosts_at(sight: RenderedView, clearance: float = 0.2) -> torch.Tensor:
-    scene = sight.drive.recording.scene
-    box = box_at(scene.tracks[0], sight.frame.timestamp, scene.key_frame_interval)
-    return ghosts_of(sight, box, GhostSettings(clearance=clearance))
+def ghosts_at(rendered: RenderedView, clearance: float = 0.2) -> torch.Tensor:
+    scene = rendered.drive.recording.scene
+    box = box_at(scene.tracks[0], rendered.frame.timestamp, scene.key_frame_interval)
+    return ghosts_of(rendered, box, GhostSettings(clearance=clearance))
 
 
 def test_ghosts_lie_on_the_path_but_not_in_the_present_box(tiny_scene):
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER))
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER))
     np.testing.assert_array_equal(found, GHOSTS)
 
 
 def test_ghosts_depend_on_the_time(tiny_scene):
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:4]), index=1))
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES[:4]), index=1))
     np.testing.assert_array_equal(found, [True, True, True, False])
 
 
 def test_without_clearance_the_road_counts_as_ghosts(tiny_scene):
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER), clearance=0.0)
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), round_gaussians(PLACES), index=LATER), clearance=0.0)
     np.testing.assert_array_equal(np.flatnonzero(found & ~torch.from_numpy(GHOSTS)), [4])
 
 
@@ -259,7 +259,7 @@ def test_without_clearance_the_road_counts_as_ghosts(tiny_scene):
 def test_gaussians_of_dynamic_parts_are_no_ghosts(tiny_scene, whose):
     """Two parts of the same Gaussians: those that go where their object goes are no ghosts wherever they lie."""
     parts = round_gaussians(PLACES), Own(round_gaussians(PLACES), whose)
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), *parts, index=LATER))
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), *parts, index=LATER))
     np.testing.assert_array_equal(found, [*GHOSTS, *np.zeros_like(GHOSTS)])
 
 
@@ -267,14 +267,14 @@ def test_gaussians_of_the_object_in_a_static_part_can_be_ghosts(tiny_scene, monk
     """That it is known does not make it go: the part has to move."""
     monkeypatch.setattr(Own, "moves", False)
     parts = Own(round_gaussians(PLACES), "it"), round_gaussians(PLACES)
-    found = ghosts_at(sight_of(drive_ahead(tiny_scene), *parts, index=LATER))
+    found = ghosts_at(render_image(drive_ahead(tiny_scene), *parts, index=LATER))
     np.testing.assert_array_equal(found, [*GHOSTS, *GHOSTS])
 
 
 def test_figures_of_ghosts(tiny_scene):
     opacities = [0.1, 0.4, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9, 0.7]
-    sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES, opacities=opacities), index=LATER)
-    figures = ghost_figures(sight.gaussians, ghosts_at(sight))
+    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(PLACES, opacities=opacities), index=LATER)
+    figures = ghost_figures(rendered.gaussians, ghosts_at(rendered))
     assert figures["gaussians"] == 3
     assert figures["opacity_sum"] == pytest.approx(1.2, abs=1e-6)
     assert figures["opacity_mean"] == pytest.approx(0.4, abs=1e-6)
@@ -282,13 +282,13 @@ def test_figures_of_ghosts(tiny_scene):
 
 
 def test_the_median_of_two_is_their_mean(tiny_scene):
-    sight = sight_of(drive_ahead(tiny_scene), round_gaussians(PLACES[:2], opacities=[0.2, 0.6]), index=LATER)
-    assert ghost_figures(sight.gaussians, ghosts_at(sight))["opacity_median"] == pytest.approx(0.4, abs=1e-6)
+    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(PLACES[:2], opacities=[0.2, 0.6]), index=LATER)
+    assert ghost_figures(rendered.gaussians, ghosts_at(rendered))["opacity_median"] == pytest.approx(0.4, abs=1e-6)
 
 
 @pytest.mark.parametrize("places", [PLACES[4:6], PLACES[:0]])
 def test_without_ghosts_the_means_are_null(tiny_scene, places):
     """Nothing on the way, or no Gaussian at all."""
-    sight = sight_of(drive_ahead(tiny_scene), round_gaussians(places), index=LATER)
-    figures = json.loads(json.dumps(ghost_figures(sight.gaussians, ghosts_at(sight)), allow_nan=False))
+    rendered = render_image(drive_ahead(tiny_scene), round_gaussians(places), index=LATER)
+    figures = json.loads(json.dumps(ghost_figures(rendered.gaussians, ghosts_at(rendered)), allow_nan=False))
     assert figures == {"gaussians": 0, "opacity_sum": 0.0, "opacity_mean": None, "opacity_median": None}

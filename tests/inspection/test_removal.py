@@ -190,7 +190,7 @@ def test_pixels_of_the_ego_mask_are_neither_inside_nor_outside(tiny_scene, tmp_p
     labels[OWN_CAR_FROM:] = LABELS["own_car"]
     scene, part = one_car(tiny_scene, speed=6.0), round_gaussians([*PLACES, BEFORE_THE_BOX], 0.2)
     masks = write_labels(tmp_path, scene, labels)
-    (whole, unhidden), (pair, record) = (
+    (whole, unmasked), (pair, record) = (
         remove_actor(drive_of(scene, part, masks=given), job_of()) for given in (None, masks)
     )
     np.testing.assert_array_equal(whole.outside, ~whole.inside)
@@ -200,13 +200,13 @@ def test_pixels_of_the_ego_mask_are_neither_inside_nor_outside(tiny_scene, tmp_p
         all_rows = getattr(whole, name)
         assert (all_rows & hidden).any() and (all_rows & ~hidden).any()
         np.testing.assert_array_equal(getattr(pair, name), all_rows & ~hidden)
-    assert record["box"]["pixels"] == (whole.inside & ~hidden).sum() < unhidden["box"]["pixels"]
+    assert record["box"]["pixels"] == (whole.inside & ~hidden).sum() < unmasked["box"]["pixels"]
     assert record["outside"]["pixels"] == (whole.outside & ~hidden).sum()
     assert record["subject"]["pixels"] == (whole.inside & ~hidden).sum()
     error = ((pair.with_car - pair.without_car)[whole.outside & ~hidden] ** 2).mean()
     assert record["outside"]["psnr"] == pytest.approx(-10 * np.log10(error))
-    assert [found["ghosts"]["gaussians"] for found in (record, unhidden)] == [1, 1]
-    assert unhidden["ghosts"]["reach_outside_box"] and unhidden["ghosts"]["covered_share_outside"] > 0.0
+    assert [found["ghosts"]["gaussians"] for found in (record, unmasked)] == [1, 1]
+    assert unmasked["ghosts"]["reach_outside_box"] and unmasked["ghosts"]["covered_share_outside"] > 0.0
     assert not record["ghosts"]["reach_outside_box"] and record["ghosts"]["covered_share_outside"] == 0.0
 
 

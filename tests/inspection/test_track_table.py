@@ -96,9 +96,9 @@ def test_the_table_reads_back(recording, tmp_path):
 def test_only_moving_objects_are_labelled(recording):
     rows = rows_of(recording)
     found = set(texts(drawn(recording)))
-    movers = [row.id for row in rows if row.moves and row.pixels >= 100]
-    assert len(movers) == len(found) == 2
-    assert all(any(name.startswith(label) for name in movers) for label in found)
+    dynamic_tracks = [row.id for row in rows if row.moves and row.pixels >= 100]
+    assert len(dynamic_tracks) == len(found) == 2
+    assert all(any(name.startswith(label) for name in dynamic_tracks) for label in found)
 
 
 @pytest.mark.parametrize(

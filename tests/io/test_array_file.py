@@ -104,7 +104,7 @@ def test_every_flipped_bit_of_an_array_is_refused(tmp_path):
         content = bytearray(whole)
         content[start + bit // 8] ^= 1 << bit % 8
         path.write_bytes(content)
-        with pytest.raises(ResultError, match=r"values\.npy is damaged"):
+        with pytest.raises(ResultError, match=r"Bad CRC-32 for file 'values\.npy'"):
             read_arrays(path, "actors")
 
 
@@ -127,8 +127,8 @@ def archive(path: Path, compression: int = zipfile.ZIP_STORED, **members: bytes)
 def npy(array: np.ndarray, **header: Any) -> bytes:
     """An array in numpy's format; `header` replaces its header."""
     file = io.BytesIO()
-    told = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape, **header}
-    np.lib.format.write_array_header_1_0(file, told)
+    fields = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape, **header}
+    np.lib.format.write_array_header_1_0(file, fields)
     return file.getvalue() + array.tobytes()
 
 
@@ -168,5 +168,5 @@ def test_a_forged_archive_is_refused(tmp_path, members):
 def test_a_compressed_archive_is_refused_without_decompression(tmp_path):
     """A few compressed bytes could expand to gigabytes."""
     archive(tmp_path / "a.npz", zipfile.ZIP_DEFLATED, content=REFERS, a=npy(np.zeros(100_000)))
-    with pytest.raises(ResultError, match=r"larger than the file|is compressed"):
+    with pytest.raises(ResultError, match="larger than the file"):
         read_arrays(tmp_path / "a.npz", "actors")

@@ -356,7 +356,7 @@ for kernel in (color_difference._similarity, color_difference._gradient):
 
 
 def test_every_kernel_compiles():
-    """Which needs no card: it is what the interpreter does not try."""
+    """Needs no GPU: it is what the interpreter does not try."""
     environment = {**os.environ, "TRITON_INTERPRET": "0"}
     done = subprocess.run([sys.executable, "-c", COMPILED], cwd=REPOSITORY, env=environment, capture_output=True)
     assert done.returncode == 0, done.stderr.decode()

@@ -15,7 +15,7 @@ from helpers.tiny_world import CAMERA_AT, Thing, World
 
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.io.array_file import write_arrays
-from drivesplat.lidar.free_space_record import FreeSpace, read_free_space, write_free_space
+from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
 from drivesplat.lidar.traversal import OCCUPIED, count_passing
 from drivesplat.poses.triangulated import TriangulatedPoints
 from drivesplat.preprocess.free_space import Rays, camera_rays, free_space_record, lidar_rays, proven_empty, proving
@@ -260,8 +260,8 @@ def test_space_that_a_vehicle_has_left_is_empty(tmp_path):
     """The centre of a car's first position, which the sensor sees empty two seconds later."""
     scene = drive(tmp_path, GOING)
     assert empty_at(free_space_record(scene, job(NOTHING_HELD_OUT)), [[8.0, 0.0, 1.2], [7.4, 0.3, 1.0]]).all()
-    nobody = dataclasses.replace(scene, tracks=())
-    assert not empty_at(free_space_record(nobody, job(NOTHING_HELD_OUT)), [[7.1, 0.0, 1.2]]).any()
+    without_tracks = dataclasses.replace(scene, tracks=())
+    assert not empty_at(free_space_record(without_tracks, job(NOTHING_HELD_OUT)), [[7.1, 0.0, 1.2]]).any()
 
 
 def test_rays_start_at_the_sensor_of_their_sweep_and_exclude_the_ego_vehicle(tiny_scene):
@@ -319,7 +319,7 @@ def test_held_out_sweeps_prove_nothing(tiny_root, tmp_path):
 
 def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
     record = dataclasses.replace(free_space_record(tiny_scene, job()), provenance={"stages": {}})
-    write_free_space(tmp_path / "free_space.npz", record)
+    write_arrays(tmp_path / "free_space.npz", record)
     again = read_free_space(tmp_path / "free_space.npz")
     assert (again.voxel, again.provenance) == (record.voxel, record.provenance)
     for name in ("lower", "shape", "keys"):

@@ -13,10 +13,11 @@ from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
 from drivesplat.errors import ResultError
+from drivesplat.io.array_file import write_arrays
 from drivesplat.lidar.depth import split_sweep
-from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth, write_lidar_depth
+from drivesplat.lidar.depth_record import LidarDepthRecord, PixelDepths, read_lidar_depth
 from drivesplat.lidar.dynamic_objects import DynamicObject, dynamic_objects
-from drivesplat.lidar.occlusion import patches, unhidden
+from drivesplat.lidar.occlusion import patches, unoccluded
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_depth import lidar_depths
 from drivesplat.readers.truth import read_truth
@@ -89,15 +90,15 @@ def test_depths_match_the_surfaces_visible_at_the_images_own_time(tmp_path, thin
     assert np.concatenate(fitting).mean() > 0.96
 
 
-@pytest.mark.parametrize("mover", [CROSSING, SPEEDING], ids=["crossing", "speeding"])
-def test_depths_of_a_moving_object_match_its_position_in_the_image(tmp_path, mover):
+@pytest.mark.parametrize("dynamic_object", [CROSSING, SPEEDING], ids=["crossing", "speeding"])
+def test_depths_of_a_moving_object_match_its_position_in_the_image(tmp_path, dynamic_object):
     """Depths at its pixels are correct to a centimetre, except for returns from the road, also while it accelerates:
     linear interpolation between annotations would err by 9 cm. The first and last second are left out, since a natural
     spline has no acceleration at its ends."""
-    world, scene = World(things=[mover]), drive(tmp_path, mover)
+    world, scene = World(things=[dynamic_object]), drive(tmp_path, dynamic_object)
     images = lidar_depths(scene, job(NOTHING_HELD_OUT))
     fitting = [
-        fits(world, frame, image, within=0.01)[of(image, shows(world, frame, mover))]
+        fits(world, frame, image, within=0.01)[of(image, shows(world, frame, dynamic_object))]
         for frame, image in list(zip(scene.frames, images, strict=True))[4:-4]
     ]
     assert min(map(len, fitting)) > 30 and np.concatenate(fitting).mean() > 0.99
@@ -155,7 +156,7 @@ def test_a_return_occludes_farther_returns_in_its_window(row, column, depth, see
     metre."""
     rows, columns, depths = np.array([50, row]), np.array([60, column]), np.array([10.0, depth])
     halves = np.array([[7.2, 4.8], [0.0, 0.0]])
-    assert unhidden(rows, columns, depths, halves, (100, 100))[1] == seen
+    assert unoccluded(rows, columns, depths, halves, (100, 100))[1] == seen
 
 
 def test_windows_grow_as_depth_decreases():
@@ -274,8 +275,8 @@ def test_pixels_of_the_ego_vehicles_body_have_no_depth(tiny_scene):
 
 
 def moving_car(tiny_scene: Scene) -> DynamicObject:
-    (mover,) = [mover for mover in dynamic_objects(tiny_scene) if mover.track.category == "vehicle.car"]
-    return mover
+    (car,) = [item for item in dynamic_objects(tiny_scene) if item.track.category == "vehicle.car"]
+    return car
 
 
 def test_returns_under_a_moving_box_are_neither_dynamic_nor_static(tiny_scene):
@@ -291,20 +292,20 @@ def test_returns_under_a_moving_box_are_neither_dynamic_nor_static(tiny_scene):
 
 
 def test_moving_people_are_dynamic_and_parked_vehicles_are_static(tiny_scene):
-    assert {mover.track.category for mover in dynamic_objects(tiny_scene)} == {"vehicle.car", "human.pedestrian.adult"}
+    assert {item.track.category for item in dynamic_objects(tiny_scene)} == {"vehicle.car", "human.pedestrian.adult"}
 
 
 def test_a_drive_without_lidar_has_a_record_without_depths(root, tmp_path):
     shutil.rmtree(root / "samples" / "LIDAR_TOP")
     scene = scene_at(root)
-    write_lidar_depth(tmp_path / "lidar_depth.npz", LidarDepthRecord(lidar_depths(scene, job())))
+    write_arrays(tmp_path / "lidar_depth.npz", LidarDepthRecord(lidar_depths(scene, job())))
     images = read_lidar_depth(tmp_path / "lidar_depth.npz").images
     assert len(images) == len(scene.frames) and not any(len(image.depth) for image in images)
 
 
 def test_the_record_survives_a_round_trip(tiny_scene, tmp_path):
     record = LidarDepthRecord(lidar_depths(tiny_scene, job()), {"stages": {}})
-    write_lidar_depth(tmp_path / "lidar_depth.npz", record)
+    write_arrays(tmp_path / "lidar_depth.npz", record)
     assert pickle.dumps(read_lidar_depth(tmp_path / "lidar_depth.npz")) == pickle.dumps(record)
     assert pickle.dumps(lidar_depths(tiny_scene, job())) == pickle.dumps(record.images)
 
@@ -336,11 +337,11 @@ def test_depths_of_the_demo_world_agree_with_its_ground_truth(demo_root):
     scene = demo_scene(demo_root)
     truth = read_truth(demo_root / "truth/truth.json")
     records = truth.recorded("CAM_FRONT").by_image()
-    moving = {mover.track.id for mover in dynamic_objects(scene)}
+    moving = {item.track.id for item in dynamic_objects(scene)}
     numbers = [int(number) for number, track in truth.instances.items() if track in moving]
     errors, allowed, own = [], [], []
-    told = job(NOTHING_HELD_OUT, margin=0.2, spacing=LidarDepthSettings().ray_spacing)
-    for frame, image in zip(scene.frames, lidar_depths(scene, told), strict=True):
+    lidar_job = job(NOTHING_HELD_OUT, margin=0.2, spacing=LidarDepthSettings().ray_spacing)
+    for frame, image in zip(scene.frames, lidar_depths(scene, lidar_job), strict=True):
         record = records[frame.token]
         depth, things = (
             np.asarray(Image.open(demo_root / "truth" / name)) for name in (record.depth, record.instances)
@@ -362,9 +363,9 @@ def test_returns_rotate_with_their_box(tiny_scene):
     turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
     poses = np.stack([rigid(turn, np.array([12.0, 1.0 * i, 0.8])) for i, turn in enumerate(turns)])
     turning = dataclasses.replace(car, object_to_world=poses)
-    (mover,) = dynamic_objects(dataclasses.replace(tiny_scene, tracks=(turning,)))
+    (dynamic_object,) = dynamic_objects(dataclasses.replace(tiny_scene, tracks=(turning,)))
     nose = poses[0, :3, 3] + [1.9, 0.0, 0.0]
-    ((_, own),) = split_sweep(tiny_scene.sweeps[0], nose[None], 0.035, [mover], 0.1).dynamic
+    ((_, own),) = split_sweep(tiny_scene.sweeps[0], nose[None], 0.035, [dynamic_object], 0.1).dynamic
     np.testing.assert_allclose(own, [[1.9, 0.0, 0.0]], atol=1e-6)
-    later = mover.pose(1.035)
+    later = dynamic_object.pose(1.035)
     np.testing.assert_allclose(later[:3, :3] @ own[0] + later[:3, 3], [12.0, 2.0 + 1.9, 0.8], atol=1e-6)

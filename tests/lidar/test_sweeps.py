@@ -29,13 +29,11 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import load
-from drivesplat.settings.ego_mask import EgoMaskJob
 from drivesplat.settings.free_space import FreeSpaceJob
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings, ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
-from drivesplat.settings.masks import MaskJob
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.masks import EgoMaskJob, MaskJob
 
 HALF_AN_INTERVAL = 250_000
 WORLD = World(key_frames=8, sweeps_between=5, lidar_between=4)

@@ -62,14 +62,14 @@ def test_without_a_gpu_nothing_falls_back_to_the_cpu_silently(no_gpu, kind):
 
 
 @pytest.mark.parametrize(
-    ("cuda", "hip", "said"),
+    ("cuda", "hip", "expected"),
     [(None, None, "built without GPU support"), ("13.0", None, "finds no GPU"), (None, "6.4", "finds no GPU")],
 )
-def test_without_a_gpu_the_message_names_torch_or_the_driver_as_the_cause(no_gpu, monkeypatch, cuda, hip, said):
+def test_without_a_gpu_the_message_names_torch_or_the_driver_as_the_cause(no_gpu, monkeypatch, cuda, hip, expected):
     monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setattr(torch.version, "hip", hip)
     message = refusal()
-    assert said in message and torch.__version__ in message
+    assert expected in message and torch.__version__ in message
 
 
 def test_device_cpu_selects_the_cpu(no_gpu):

@@ -110,7 +110,7 @@ def test_the_variable_takes_precedence_over_the_gpus(variable, gpus, archs):
 
 
 @pytest.mark.parametrize(
-    ("archs", "cuda", "said"),
+    ("archs", "cuda", "expected"),
     [
         (["8.6", "12.0+PTX"], "13.0", None),
         (["7.0"], "12.6", None),
@@ -121,9 +121,9 @@ def test_the_variable_takes_precedence_over_the_gpus(variable, gpus, archs):
         ([], "13.0", "GSPLAT_ARCHS"),
     ],
 )
-def test_invalid_archs_are_refused_before_compiling(archs, cuda, said):
+def test_invalid_archs_are_refused_before_compiling(archs, cuda, expected):
     problem = diagnose.arch_problem(archs, cuda)
-    assert problem is None if said is None else said in problem
+    assert problem is None if expected is None else expected in problem
 
 
 def run_command(monkeypatch, platform, gpus=(), archs=None, done=False, arguments=()):
@@ -147,18 +147,18 @@ def test_without_a_gpu_nothing_is_compiled_and_a_line_says_so(monkeypatch, capsy
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize(("platform", "said"), [((None, None), "CPU alone"), ((None, "6.4"), "docs/amd.md")])
-def test_builds_of_torch_without_cuda_need_no_compiling(monkeypatch, capsys, platform, said):
+@pytest.mark.parametrize(("platform", "expected"), [((None, None), "CPU alone"), ((None, "6.4"), "docs/amd.md")])
+def test_builds_of_torch_without_cuda_need_no_compiling(monkeypatch, capsys, platform, expected):
     assert run_command(monkeypatch, platform, archs="8.6") == (0, [])
-    assert said in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 def test_named_archs_are_compiled_without_a_gpu_with_an_estimate(monkeypatch, capsys):
     monkeypatch.setenv("MAX_JOBS", "2")
     status, built = run_command(monkeypatch, ("13.0", None), archs="7.5;8.9")
-    said = capsys.readouterr().err
+    printed = capsys.readouterr().err
     assert status == 0 and built[0][:3] == (TOOLKIT, ["7.5", "8.9"], 2)
-    assert f"about {building.expected_minutes(2, 2)} min" in said and "build.log" in said
+    assert f"about {building.expected_minutes(2, 2)} min" in printed and "build.log" in printed
 
 
 def test_compiled_archs_are_not_compiled_again(monkeypatch, capsys):
@@ -293,10 +293,10 @@ def shell(script: str) -> list[str]:
 
 
 def test_progress_is_reported_with_the_remaining_time(package, tmp_path):
-    said = []
+    printed = []
     steps = shell("echo '[1/2] nvcc one'; sleep 0.3; echo '[2/2] nvcc two'; sleep 0.3")
-    building.run_with_progress(steps, os.environ, tmp_path / "log", said.append)
-    assert [line.split()[0] for line in said] == ["1/2", "2/2"] and "min to go" in said[0]
+    building.run_with_progress(steps, os.environ, tmp_path / "log", printed.append)
+    assert [line.split()[0] for line in printed] == ["1/2", "2/2"] and "min to go" in printed[0]
 
 
 def test_an_interruption_ends_the_compilers(package, tmp_path, monkeypatch):
@@ -315,7 +315,7 @@ def test_an_interruption_ends_the_compilers(package, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("log", "said"),
+    ("log", "expected"),
     [
         ("c++: fatal error: Killed signal terminated program cc1plus", "MAX_JOBS=1"),
         ("nvcc error : 'cicc' died due to signal 9 (Kill signal)", "MAX_JOBS=1"),
@@ -330,13 +330,13 @@ def test_an_interruption_ends_the_compilers(package, tmp_path, monkeypatch):
         ("something nobody has seen", "docs/installation.md"),
     ],
 )
-def test_a_failed_build_names_its_cause_and_the_log(package, tmp_path, log, said):
+def test_a_failed_build_names_its_cause_and_the_log(package, tmp_path, log, expected):
     lines = []
     with pytest.raises(DeviceError) as error:
         building.run_with_progress(
             ["bash", "-c", f'echo {"x" * 5000}; echo "$0"; exit 1', log], os.environ, tmp_path / "log", lines.append
         )
-    assert said in str(error.value) and str(tmp_path / "log") in str(error.value)
+    assert expected in str(error.value) and str(tmp_path / "log") in str(error.value)
     assert log in "\n".join(lines) and max(map(len, "\n".join(lines).splitlines())) < 400
 
 

@@ -30,7 +30,7 @@ case "$*" in
 esac
 """
 NVIDIA_SMI = """#!/usr/bin/env bash
-echo "$FAKE_CARDS"
+echo "$FAKE_GPUS"
 """
 
 
@@ -55,9 +55,9 @@ class Machine:
         file.write_text(content)
         file.chmod(0o755)
 
-    def cards(self, *lines: str) -> dict[str, str]:
+    def gpus(self, *lines: str) -> dict[str, str]:
         self.program("nvidia-smi", NVIDIA_SMI)
-        return {"FAKE_CARDS": "\n".join(lines)}
+        return {"FAKE_GPUS": "\n".join(lines)}
 
     def run(self, *arguments: str, script: str = "setup", **environment: str) -> subprocess.CompletedProcess:
         known = {
@@ -106,7 +106,7 @@ def test_a_good_venv_is_left_alone(machine):
     assert second.returncode == 0 and machine.done() == [] and second.stderr == ""
 
 
-def test_a_machine_on_which_nothing_can_be_trained_is_told_at_once(machine):
+def test_a_machine_that_cannot_train_is_reported_at_once(machine):
     result = machine.run(FAKE_WARM_UP_FAILS="1")
     assert result.returncode == 0, "who has a GPU may do without"
     assert "a first training on the processors fails" in result.stderr and "make doctor" in result.stderr
@@ -151,14 +151,14 @@ def test_pip_that_fails_points_to_proxies(machine):
     assert done.returncode == 1 and "docs/installation.md" in done.stderr and "proxy" in done.stderr
 
 
-def test_python_without_venv_is_told_from_no_python(machine):
+def test_python_without_venv_is_distinguished_from_no_python(machine):
     done = machine.run(FAKE_NO_VENV="1")
     assert done.returncode == 1 and "sudo apt-get install python3.11-venv" in done.stderr
     assert not (machine.checkout / ".venv").exists()
 
 
 @pytest.mark.parametrize(
-    ("release", "said"),
+    ("release", "expected"),
     [
         ('ID=ubuntu\nVERSION_ID="24.04"\n', "apt-get install python3.12 python3.12-venv python3.12-dev"),
         ('ID=ubuntu\nVERSION_ID="22.04"\n', "apt-get install python3.11 python3.11-venv python3.11-dev"),
@@ -167,12 +167,12 @@ def test_python_without_venv_is_told_from_no_python(machine):
         ("", "conda create"),
     ],
 )
-def test_no_suitable_python_names_the_packages_of_the_distribution(machine, tmp_path, release, said):
+def test_no_suitable_python_names_the_packages_of_the_distribution(machine, tmp_path, release, expected):
     (tmp_path / "os-release").write_text(release)
     machine.program("python3", PYTHON)
     (machine.bin / "python3.11").unlink()
     done = machine.run(FAKE_VERSION="3.13", OS_RELEASE=str(tmp_path / "os-release"))
-    assert done.returncode == 1 and said in done.stderr and "python3 is 3.13" in done.stderr
+    assert done.returncode == 1 and expected in done.stderr and "python3 is 3.13" in done.stderr
 
 
 def test_a_python_of_ones_own_is_taken(machine, tmp_path):
@@ -205,36 +205,36 @@ def test_a_small_folder_for_downloads_is_named(machine):
     assert done.returncode == 1 and "TMPDIR=" in done.stderr
 
 
-def test_a_card_that_the_default_build_suits_is_not_mentioned(machine):
-    done = machine.run(**machine.cards(ADA))
+def test_a_gpu_that_the_default_build_suits_is_not_mentioned(machine):
+    done = machine.run(**machine.gpus(ADA))
     assert done.returncode == 0 and "TORCH_CUDA" not in done.stderr
 
 
 @pytest.mark.parametrize(
-    ("card", "said"),
+    ("gpu", "expected"),
     [
         (TURING_OLD_DRIVER, ["driver 550.120", "580", "TORCH_CUDA=cu126 make setup"]),
         (VOLTA, ["Volta", "7.0", "TORCH_CUDA=cu126 make setup"]),
         (PASCAL, ["Pascal", "too old for gsplat", "TORCH_CUDA=cpu make setup"]),
     ],
 )
-def test_an_unsuitable_card_or_driver_stops_before_gigabytes_are_fetched(machine, card, said):
-    cards = machine.cards(card)
-    done = machine.run(**cards)
+def test_an_unsuitable_gpu_or_driver_stops_before_gigabytes_are_fetched(machine, gpu, expected):
+    gpus = machine.gpus(gpu)
+    done = machine.run(**gpus)
     assert done.returncode == 1 and machine.done() == []
-    assert all(part in done.stderr for part in said), done.stderr
+    assert all(part in done.stderr for part in expected), done.stderr
 
 
 def test_the_build_asked_for_comes_from_pytorchs_index_and_is_remembered(machine):
-    cards = machine.cards(VOLTA)
-    assert machine.run(TORCH_CUDA="cu126", **cards).returncode == 0
+    gpus = machine.gpus(VOLTA)
+    assert machine.run(TORCH_CUDA="cu126", **gpus).returncode == 0
     lines = machine.done()
     assert (
         "pip install --quiet torch==2.11.0 torchvision==0.26.0 --index-url https://download.pytorch.org/whl/cu126"
         in lines
     )
     assert machine.stamp.read_text().split()[1:] == ["cu126"]
-    assert machine.run(**cards).returncode == 0
+    assert machine.run(**gpus).returncode == 0
     assert not [line for line in machine.done() if line.startswith("pip")], "make test keeps the build"
 
 
@@ -268,7 +268,7 @@ def test_an_index_that_gives_another_torch_is_noticed(machine):
 
 
 def test_an_unsuitable_build_is_made_where_it_was_asked_for(machine):
-    done = machine.run(TORCH_CUDA="cu130", **machine.cards(VOLTA))
+    done = machine.run(TORCH_CUDA="cu130", **machine.gpus(VOLTA))
     assert done.returncode == 0 and "going on" in done.stderr
 
 
@@ -277,12 +277,12 @@ def test_an_unknown_build_is_refused_with_those_there_are(machine):
     assert done.returncode == 1 and "cu130, cu128, cu126, cpu" in done.stderr and machine.done() == []
 
 
-def test_gsplat_is_seen_to_on_every_call_where_there_is_a_card_or_archs_are_named(machine):
+def test_gsplat_is_checked_on_every_call_with_a_gpu_or_named_archs(machine):
     machine.run()
     machine.done()
     assert machine.run(GSPLAT_ARCHS="8.6").returncode == 0
     assert machine.done() == ["gsplat_build --if-needed"]
-    assert machine.run(**machine.cards(ADA)).returncode == 0
+    assert machine.run(**machine.gpus(ADA)).returncode == 0
     assert machine.done() == ["gsplat_build --if-needed"]
 
 
@@ -295,7 +295,7 @@ def test_gsplat_that_does_not_compile_fails_the_setup_but_not_the_packages(machi
 def test_the_doctor_without_venv_says_what_stands_in_the_way(machine):
     done = machine.run(script="doctor")
     assert done.returncode == 1 and "make setup" in done.stdout and "nothing stands in the way" in done.stderr
-    done = machine.run(script="doctor", FAKE_NO_VENV="1", **machine.cards(PASCAL))
+    done = machine.run(script="doctor", FAKE_NO_VENV="1", **machine.gpus(PASCAL))
     assert done.returncode == 1 and "python3.11-venv" in done.stderr
     assert not (machine.checkout / ".venv").exists()
 

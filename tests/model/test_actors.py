@@ -8,8 +8,9 @@ import torch
 from helpers.hand_made import about_z, actors_of, looking_at, motion_through, track_of
 from scipy.spatial.transform import Rotation
 
+from drivesplat.kernels.placement import ObjectPoses
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
-from drivesplat.model.actors import ActorPoses, Actors, track_penalties
+from drivesplat.model.actors import Actors, track_penalties
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.timeline import ActorTrack
@@ -124,10 +125,8 @@ def test_actors_can_be_placed_anywhere_and_enlarged():
     actors = actors_of(van(), car())
     turns = Rotation.random(2, random_state=3)
     places, scales = np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 1.0]]), np.array([1.5, 0.5])
-    poses = ActorPoses(
-        *(torch.from_numpy(x).float() for x in (turns.as_quat(scalar_first=True), places)),
-        torch.tensor([True, True]),
-        torch.from_numpy(scales).float(),
+    poses = ObjectPoses(
+        *(torch.from_numpy(x).float() for x in (turns.as_quat(scalar_first=True), places, scales)), torch.ones(2)
     )
     gaussians, p = actors.placed(actors.time_state(9.0), poses), doubled(actors)
     for i, rotation in enumerate(turns.as_matrix()):

@@ -232,10 +232,10 @@ def test_a_training_corrects_its_cameras_where_the_settings_say_so(tmp_path, cor
     files = TrainingFiles(tmp_path / "it/checkpoint.npz", tmp_path / "it/train.json")
     run_training(inputs, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
     model = trained_model(read_checkpoint(files.checkpoint))
-    told = json.loads(files.summary.read_text())["of_cameras"]
+    saved = json.loads(files.summary.read_text())["of_cameras"]
     if not corrected:
-        assert model.camera_poses is None and told == {}
+        assert model.camera_poses is None and saved == {}
         return
     figures = {f"camera_poses/{name}": value for name, value in model.camera_poses.figures().items()}
-    assert told == pytest.approx(figures) and told["camera_poses/CAM_FRONT/shift_m"] > 1e-4
+    assert saved == pytest.approx(figures) and saved["camera_poses/CAM_FRONT/shift_m"] > 1e-4
     assert len(model.camera_poses.params["CAM_FRONT"]) == 5, "one correction for every training image"

@@ -35,10 +35,8 @@ from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.preprocess.parser import training_record
 from drivesplat.settings.config import load
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
-from drivesplat.settings.parser import ParserJob
 from drivesplat.settings.train import ExposureSettings, TrainJob, TrainSettings
 from drivesplat.training.exposure_init import initial_gains, log_gains
 from drivesplat.training.losses import loss_terms
@@ -247,9 +245,9 @@ def test_a_training_starts_from_the_estimated_gains_and_saves_them(rig, tmp_path
     files = TrainingFiles(tmp_path / "it/checkpoint.npz", tmp_path / "it/train.json")
     run_training(rig, job, DeviceSettings(kind="cpu"), files, PROVENANCE, "train")
     model = trained_model(read_checkpoint(files.checkpoint))
-    told = json.loads(files.summary.read_text())["of_cameras"]
+    saved = json.loads(files.summary.read_text())["of_cameras"]
     figures = {f"exposure/{name}": value for name, value in model.exposure.figures().items()}
-    assert told == pytest.approx(figures) and told["exposure/CAM_BACK/gain_red"] > 1.1
+    assert saved == pytest.approx(figures) and saved["exposure/CAM_BACK/gain_red"] > 1.1
     assert model.exposure.first["CAM_BACK"][0] == pytest.approx(1.4 ** (1 / 2.2), rel=0.03)
     assert not model.exposure.first["CAM_BACK"].requires_grad
 

@@ -220,8 +220,8 @@ def test_concatenation_keeps_the_colours_of_lower_degrees(degrees):
     for part, rows in zip(parts, (slice(0, 3), slice(3, 7)), strict=True):
         alone = part.at(0.0).sh
         assert torch.equal(joined.sh[rows, : alone.shape[1]], alone) and not joined.sh[rows, alone.shape[1] :].any()
-    lookers = [looking_at([0.0, 0.0, 4.0], [0.0, 0.0, 4.0] + 9.0 * d) for d in directions[:3]]
-    for view in lookers:
+    cameras = [looking_at([0.0, 0.0, 4.0], [0.0, 0.0, 4.0] + 9.0 * d) for d in directions[:3]]
+    for view in cameras:
         alone = SplatModel([parts[1]], None).render(view).image
         model = SplatModel(parts, None)
         seen = model.render(view, gaussians=model.gaussians_at(0.0)[3:]).image

@@ -7,6 +7,7 @@ from helpers.hand_made import about_z, motion_through, track_of
 from scipy.spatial.transform import Rotation
 
 from drivesplat.io.array_file import read_arrays, write_arrays
+from drivesplat.io.typed_record import typed_record
 from drivesplat.model import timeline as timeline_module
 from drivesplat.model.timeline import ActorTrack, Timeline
 
@@ -90,8 +91,8 @@ def test_two_annotations_have_no_neighbours():
 
 
 def test_a_track_survives_a_checkpoint(tmp_path):
-    write_arrays(tmp_path / "a.npz", a_car().to_plain())
-    again = ActorTrack.from_plain(read_arrays(tmp_path / "a.npz", "train"))
+    write_arrays(tmp_path / "a.npz", {"tracks": [a_car()]})
+    again = typed_record(ActorTrack, read_arrays(tmp_path / "a.npz", "train")["tracks"][0])
     assert (again.id, again.motion.runs, again.motion.reach) == ("car", ((0, 2), (3, 6)), 0.25)
     np.testing.assert_array_equal(again.size, a_car().size)
     at = np.linspace(-0.5, 4.5, 33)

@@ -105,7 +105,7 @@ def test_six_cameras_are_one_rig(tmp_path):
 
 def test_points_come_to_lie_where_they_are_and_errors_fall_to_the_features_noise(front, tmp_path):
     """The median of an error with deviation s in x and y is 1.18 s; points follow their features a little."""
-    case = case_of(tmp_path, drive_of(10, way=flat, error=lambda _: np.eye(4)), noise=0.3)
+    case = case_of(tmp_path, drive_of(10, ego_path=flat, error=lambda _: np.eye(4)), noise=0.3)
     reconstruction = triangulate(case.start, case.database, job_of(), 1)
     seen = observations_of(reconstruction)
     truth = street_points(400)

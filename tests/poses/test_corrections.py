@@ -14,9 +14,7 @@ from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep, Track, read_scene, write_scene
 from drivesplat.scene.splits import frame_groups
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 
 TIMES = np.array([100_000, 600_000, 1_100_000])
 GIVEN = np.stack([ego_at(time * 1e-6) for time in TIMES])

@@ -90,10 +90,10 @@ def test_rays_hit_a_box_where_points_along_them_lie_in_it(origin):
     origin, reach, rng = np.array(origin), np.array([2.0, 1.0, 0.8]), np.random.default_rng(0)
     towards = np.concatenate([rng.normal(size=(60, 3)), rng.uniform(-1.5, 1.5, (60, 3)) * reach - origin, np.eye(3),
                               -np.eye(3)])  # fmt: skip
-    told = np.array([margin(origin, ray, reach) for ray in towards])
+    unambiguous = np.array([margin(origin, ray, reach) for ray in towards])
     expected = np.array([brute(origin, ray, reach) for ray in towards])
-    assert told.sum() > 90 and expected.any()
-    np.testing.assert_array_equal(rays_hit_box(origin, towards, reach)[told], expected[told])
+    assert unambiguous.sum() > 90 and expected.any()
+    np.testing.assert_array_equal(rays_hit_box(origin, towards, reach)[unambiguous], expected[unambiguous])
 
 
 def test_boxes_behind_the_camera_are_not_hit():
@@ -112,7 +112,7 @@ def static_of(
     track: Track | None, job: RefinePosesJob, camera: str = "CAM_FRONT", ego_mask: EgoMask = NO_EGO_MASK
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (n, 2) spread over the image of the first key frame, and which of them are static."""
-    drive = drive_of(1, (camera,), way=lambda _: np.eye(4), error=lambda _: np.eye(4))
+    drive = drive_of(1, (camera,), ego_path=lambda _: np.eye(4), error=lambda _: np.eye(4))
     scene = dataclasses.replace(drive.scene, tracks=() if track is None else (track,))
     pixels = np.stack(np.meshgrid(np.arange(5.0, SIZE[0], 10.0), np.arange(5.0, SIZE[1], 10.0)), axis=-1).reshape(-1, 2)
     return pixels, static_pixels(scene, scene.frames[0], pixels, ego_mask, margin_of(job))
@@ -124,7 +124,7 @@ def margin_of(job: RefinePosesJob) -> float:
 
 def box_pixels(track: Track, margin: float) -> np.ndarray:
     """The least and the greatest pixel (2, 2) of its nearest face, which hides the rest from straight behind."""
-    drive = drive_of(1, way=lambda _: np.eye(4), error=lambda _: np.eye(4))
+    drive = drive_of(1, ego_path=lambda _: np.eye(4), error=lambda _: np.eye(4))
     frame, reach = drive.scene.frames[0], track.size / 2 + margin
     center = np.array([12.0 + 3.0 * frame.timestamp * 1e-6, 0.0, 0.8])
     face = center + np.array([[-1, y, z] for y in (-1, 1) for z in (-1, 1)]) * reach
@@ -189,7 +189,7 @@ def dotted(tmp_path_factory):
     dots = sum(np.exp(-((x - px) ** 2 + (y - py) ** 2) / (2 * r**2)) for (px, py), r in zip(places, radii, strict=True))
     grey = (40 + 180 * np.minimum(dots, 1.0)).astype(np.uint8)
     Image.fromarray(np.repeat(grey[..., None], 3, axis=2)).save(folder / "dots.png")
-    drive = drive_of(1, way=lambda _: np.eye(4), error=lambda _: np.eye(4), size=size)
+    drive = drive_of(1, ego_path=lambda _: np.eye(4), error=lambda _: np.eye(4), size=size)
     frame = dataclasses.replace(drive.scene.frames[0], image_path=str(folder / "dots.png"))
     return dataclasses.replace(drive.scene, frames=(frame,), tracks=(car(3.0),)), places
 

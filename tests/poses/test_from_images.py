@@ -38,17 +38,19 @@ def curve(seconds: float) -> np.ndarray:
     return rigid(Rotation.from_euler("z", heading).as_matrix(), place)
 
 
-def nowhere(way):
+def nowhere(ego_path):
     """The error that makes every recorded pose the identity."""
-    return lambda seconds: inverse(way(seconds))
+    return lambda seconds: inverse(ego_path(seconds))
 
 
-def points_along(way, count: int = 700, seconds: float = 12.0) -> np.ndarray:
+def points_along(ego_path, count: int = 700, seconds: float = 12.0) -> np.ndarray:
     """Points (n, 3) on both sides of a way, and before its end."""
     rng = np.random.default_rng(0)
     side = np.where(rng.uniform(size=count) < 0.5, -1.0, 1.0) * rng.uniform(5.0, 18.0, count)
     beside = np.stack([np.zeros(count), side, rng.uniform(0.0, 8.0, count)], axis=1)
-    return np.stack([apply(way(t), p[None])[0] for t, p in zip(rng.uniform(-1.0, seconds, count), beside, strict=True)])
+    return np.stack(
+        [apply(ego_path(t), p[None])[0] for t, p in zip(rng.uniform(-1.0, seconds, count), beside, strict=True)]
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,14 +70,14 @@ def job_of(lidar: bool = True, **settings) -> RefinePosesJob:
 
 
 def case_of(
-    folder: Path, way=curve, error=None, key_frames: int = 10, points=None, shows=None, noise=0.0, stretch=None,
+    folder: Path, ego_path=curve, error=None, key_frames: int = 10, points=None, shows=None, noise=0.0, stretch=None,
     cameras=FRONT,
 ) -> Case:  # fmt: skip
     """A drive of cameras and LiDAR, by default with no recorded poses. `shows`: which of the points image i may show.
     `stretch`: a factor on what LiDAR measures, by key frame."""
-    drive = drive_of(key_frames, cameras, way, error or nowhere(way))
-    points = points_along(way) if points is None else points
-    scene = dataclasses.replace(drive.scene, sweeps=sweeps_of(folder, drive.scene, way, error, points, stretch))
+    drive = drive_of(key_frames, cameras, ego_path, error or nowhere(ego_path))
+    points = points_along(ego_path) if points is None else points
+    scene = dataclasses.replace(drive.scene, sweeps=sweeps_of(folder, drive.scene, ego_path, error, points, stretch))
     drive = Drive(scene, drive.truth)
     images = RigImages.of(scene, range(len(scene.frames)))
     seen = views(drive, images, points, noise)
@@ -86,15 +88,15 @@ def case_of(
     return Case(drive, images, folder / "features.db", start)
 
 
-def sweeps_of(folder: Path, scene: Scene, way, error, points, stretch) -> tuple[Sweep, ...]:
+def sweeps_of(folder: Path, scene: Scene, ego_path, error, points, stretch) -> tuple[Sweep, ...]:
     """A sweep a key frame that meets all points, its pose as recorded."""
     sweeps = []
     for i, time in enumerate(scene.key_frame_timestamps):
-        pose, path = way(time * 1e-6), folder / f"{i}.pcd.bin"
+        pose, path = ego_path(time * 1e-6), folder / f"{i}.pcd.bin"
         returns = np.zeros((len(points), 5), dtype=np.float32)
         returns[:, :3] = apply(inverse(pose @ LIDAR), points) * (stretch(i) if stretch else 1.0)
         returns.tofile(path)
-        recorded = pose @ (error or nowhere(way))(time * 1e-6)
+        recorded = pose @ (error or nowhere(ego_path))(time * 1e-6)
         sweeps.append(Sweep(str(path), int(time), recorded @ LIDAR, True, i, str(i), "LIDAR_TOP", "nuscenes"))
     return tuple(sweeps)
 
@@ -181,11 +183,11 @@ def test_estimated_poses_are_aligned_to_recorded_poses_that_move(tmp_path):
     assert place < 0.3 and turn < 1.0 and made.record["placement"]["aligned_to"] == "recorded poses"
     best = align_poses(truth, poses_of(made), PriorSettings())
     assert apart(truth, best)[0] < 0.05 and apart(truth, best)[1] < 0.1
-    told = [made.record[key]["median"] for key in ("shift_m", "turn_deg")]
+    reported = [made.record[key]["median"] for key in ("shift_m", "turn_deg")]
     recorded = np.stack([frame.ego_to_world for frame in case.drive.scene.frames])
     change = inverse(recorded) @ poses_of(made)
     angles = np.degrees(Rotation.from_matrix(change[:, :3, :3]).magnitude())
-    assert told == pytest.approx([np.median(np.linalg.norm(change[:, :3, 3], axis=1)), np.median(angles)], rel=1e-3)
+    assert reported == pytest.approx([np.median(np.linalg.norm(change[:, :3, 3], axis=1)), np.median(angles)], rel=1e-3)
 
 
 def test_without_lidar_recorded_positions_give_the_scale(tmp_path):
@@ -210,9 +212,9 @@ def turns_on_the_spot(seconds: float) -> np.ndarray:
     return camera @ rigid(Rotation.from_euler("z", 0.1 * seconds).as_matrix(), np.zeros(3)) @ inverse(camera)
 
 
-@pytest.mark.parametrize("way", [stands, turns_on_the_spot])
-def test_a_vehicle_without_translation_is_refused(tmp_path, way):
-    case = case_of(tmp_path, way, noise=0.3, points=points_along(curve, 400, 5.0))
+@pytest.mark.parametrize("ego_path", [stands, turns_on_the_spot])
+def test_a_vehicle_without_translation_is_refused(tmp_path, ego_path):
+    case = case_of(tmp_path, ego_path, noise=0.3, points=points_along(curve, 400, 5.0))
     with pytest.raises(DatasetError, match=r"scene made: .*far enough apart, as where the vehicle.*start: recorded"):
         case.made()
 

@@ -130,7 +130,7 @@ def test_limits_keep_the_given_poses_with_a_warning(tmp_path, caplog, limits, wo
 
 def test_a_fraction_of_images_may_lack_points(tmp_path):
     """The last images look where there are no points any more."""
-    drive = drive_of(14, way=lambda s: ego_at(2 * s), error=error_at)
+    drive = drive_of(14, ego_path=lambda s: ego_at(2 * s), error=error_at)
     few = {"min_points": 20}
     held = refined_of(tmp_path, drive, rounds=1, limits={**few, "min_images": 0.5}).record
     fraction = np.mean([item["points"] >= 20 for item in held["corrections"]])
@@ -142,7 +142,7 @@ def test_a_fraction_of_images_may_lack_points(tmp_path):
 
 def test_a_refinement_that_only_fits_feature_noise_is_rejected(tmp_path):
     """Exact poses with weak priors, and noisy features: withheld points show it."""
-    drive = drive_of(10, way=flat, error=exact)
+    drive = drive_of(10, ego_path=flat, error=exact)
     refined = refined_of(tmp_path, drive, 150, 2.0, feature_noise=0.05, robust_pixels=5.0, withheld=0.3)
     assert "the error of withheld points is" in refined.record["kept_because"]
     assert refined.record["trial"]["after_px"] > refined.record["trial"]["before_px"] > 0

@@ -19,7 +19,6 @@ from drivesplat.poses.triangulated import (
     no_points,
     read_triangulated,
     triangulated_points,
-    write_triangulated,
 )
 from drivesplat.preprocess import lidar_seed
 from drivesplat.preprocess.lidar_seed import seed_points
@@ -147,7 +146,7 @@ def test_a_broken_file_is_named_with_its_rule(tmp_path, content):
 
 def test_what_is_written_is_read(tmp_path):
     record = record_of(wall(1.0, 2.0), [[0, 1], [1, 2]])
-    write_triangulated(tmp_path / "triangulated.npz", record)
+    write_arrays(tmp_path / "triangulated.npz", record)
     again = read_triangulated(tmp_path / "triangulated.npz")
     assert all(np.array_equal(value, vars(record)[name]) for name, value in vars(again).items())
 

@@ -25,9 +25,11 @@ from PIL import Image
 from pydantic import ValidationError
 
 from drivesplat.errors import ResultError
+from drivesplat.io.array_file import write_arrays
+from drivesplat.io.typed_record import field_values
 from drivesplat.preprocess.actor_seed import actors_record
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors, write_actors
+from drivesplat.scene.actor_record import ActorRecord, ActorRecords, read_actors
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.object_class import ObjectClass
@@ -74,7 +76,7 @@ def assert_same(a: ActorRecords, b: ActorRecords) -> None:
 
 
 def fields_of(actor: ActorRecord) -> list[tuple[str, Any]]:
-    return sorted(({**actor.to_plain(), "motion": None} | actor.motion.to_plain()).items())
+    return sorted(({**vars(actor), "motion": None} | field_values(actor.motion)).items())
 
 
 @pytest.fixture
@@ -438,11 +440,11 @@ def test_the_record_holds_the_tracks_own_motion_in_the_models_seconds(tmp_path):
 
 def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, tmp_path):
     record = dataclasses.replace(actors_record(tiny_scene, job()), provenance={"stages": {}})
-    write_actors(tmp_path / "actors.npz", record)
+    write_arrays(tmp_path / "actors.npz", record)
     read = read_actors(tmp_path / "actors.npz")
     assert_same(read, record)
     (actor,) = read.actors
-    fields = {**vars(actor), **actor.motion.to_plain()}
+    fields = {**vars(actor), **field_values(actor.motion)}
     kinds = {name: (value.dtype, value.ndim) for name, value in fields.items() if isinstance(value, np.ndarray)}
     assert kinds == {
         "size": (np.float64, 1), "times": (np.float64, 1), "object_to_world": (np.float64, 3),
@@ -451,7 +453,7 @@ def test_the_record_is_plain_data_and_survives_a_round_trip(tiny_scene, tmp_path
 
 
 def test_a_static_drive_has_an_empty_record_of_actors(tmp_path):
-    write_actors(tmp_path / "actors.npz", actors_record(drive(tmp_path, PARKED), job()))
+    write_arrays(tmp_path / "actors.npz", actors_record(drive(tmp_path, PARKED), job()))
     assert read_actors(tmp_path / "actors.npz").actors == []
 
 

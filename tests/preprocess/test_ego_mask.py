@@ -15,19 +15,19 @@ from drivesplat.preprocess import ego_mask as search_module
 from drivesplat.preprocess.ego_mask import (
     ComparedImages,
     camera_outlines,
+    contrasts,
     ego_mask_record,
     find_outlines,
     outlines_of,
-    stands_out,
 )
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.ego_mask import EgoMask, enclosed, read_ego_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups
 from drivesplat.settings.config import load
-from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch
 from drivesplat.workflow.stages import stage_settings
 
 CAMERAS = ("CAM_BACK", "CAM_BACK_RIGHT", "CAM_FRONT")
@@ -69,7 +69,7 @@ def body_in(scene: Scene, camera: str = "CAM_BACK", search: EgoMaskSearch = LOOK
     return enclosed(outlines, SIZE)
 
 
-def why_not(scene: Scene, camera: str = "CAM_BACK") -> str:
+def reason_without_body(scene: Scene, camera: str = "CAM_BACK") -> str:
     outlines, source, why = camera_outlines(scene, camera, JOB)
     assert (outlines, source) == ((), None)
     return why
@@ -128,31 +128,33 @@ def test_held_out_images_and_sweeps_contribute_nothing(seen, tmp_path):
 
 
 def test_a_stationary_car_is_refused(tmp_path):
-    assert why_not(rig_drive(tmp_path, ["CAM_BACK"], own_car=True, ego="stands")).startswith("the car hardly moves")
+    assert reason_without_body(rig_drive(tmp_path, ["CAM_BACK"], own_car=True, ego="stands")).startswith(
+        "the car hardly moves"
+    )
 
 
 def test_few_images_are_refused(seen):
     few = dataclasses.replace(seen, frames=tuple(frame for frame in seen.frames if frame.sample_index < 9))
-    assert "9 images" in why_not(few)
+    assert "9 images" in reason_without_body(few)
 
 
 def test_images_at_a_standstill_are_left_out(seen):
     """Thirty more images taken at a standstill, in which every pixel is constant."""
-    waited = [frame for frame in seen.frames if frame.camera == "CAM_BACK" and frame.sample_index == 5]
-    more = [dataclasses.replace(waited[0], timestamp=waited[0].timestamp + i) for i in range(1, 31)]
+    at_standstill = [frame for frame in seen.frames if frame.camera == "CAM_BACK" and frame.sample_index == 5]
+    more = [dataclasses.replace(at_standstill[0], timestamp=at_standstill[0].timestamp + i) for i in range(1, 31)]
     scene = dataclasses.replace(seen, frames=(*seen.frames, *more))
     assert len(ComparedImages.of(scene, "CAM_BACK", LOOKING).frames) == KEY_FRAMES
     np.testing.assert_array_equal(body_in(scene), body_in(seen))
 
 
 def test_without_lidar_no_body_is_found(seen):
-    assert why_not(dataclasses.replace(seen, sweeps=())).startswith("0 images have LiDAR")
+    assert reason_without_body(dataclasses.replace(seen, sweeps=())).startswith("0 images have LiDAR")
 
 
 def test_an_even_road_with_lidar_returns_is_not_a_body(unseen, tmp_path):
     """The road near the camera becomes one grey, up to a line that stays where it is."""
     even = painted(unseen, tmp_path, lambda pixels, _: np.where(np.arange(90)[:, None, None] > 75, 90.0, pixels))
-    assert why_not(even) == "LiDAR has returns all along the edge of the images"
+    assert reason_without_body(even) == "LiDAR has returns all along the edge of the images"
 
 
 def without_returns_below(scene: Scene, folder: Path) -> Scene:
@@ -179,7 +181,7 @@ def test_black_and_overexposed_areas_are_not_a_body(unseen, tmp_path, level):
 
 def test_dark_images_are_refused(seen, tmp_path):
     dark = painted(seen, tmp_path, lambda pixels, _: 0.05 * pixels)
-    assert "too little to detect" in why_not(dark)
+    assert "too little to detect" in reason_without_body(dark)
 
 
 def test_a_body_is_cut_at_the_horizon(unseen, tmp_path):
@@ -199,7 +201,7 @@ def _empty(sweep, folder: Path):
 def test_a_constant_area_that_is_too_large_is_not_a_body(unseen, tmp_path):
     missed = dataclasses.replace(unseen, sweeps=tuple(_empty(sweep, tmp_path) for sweep in unseen.sweeps))
     even = painted(missed, tmp_path, lambda p, _: np.where(np.arange(90)[:, None, None] > 60, 120.0, p))
-    assert "more than a body fills" in why_not(even)
+    assert "more than a body fills" in reason_without_body(even)
 
 
 def test_a_gradual_increase_of_variation_is_not_a_border(unseen):
@@ -207,8 +209,8 @@ def test_a_gradual_increase_of_variation_is_not_a_border(unseen):
     drive = ComparedImages.of(unseen, "CAM_BACK", LOOKING)
     rows = np.arange(90.0)[:, None].repeat(160, axis=1)
     lower = rows >= 70
-    assert stands_out(lower, np.where(lower, 4.0, 20.0), drive)
-    assert not stands_out(lower, 4.0 + 0.5 * (89.0 - rows), drive)
+    assert contrasts(lower, np.where(lower, 4.0, 20.0), drive)
+    assert not contrasts(lower, 4.0 + 0.5 * (89.0 - rows), drive)
 
 
 # ---- what is told

@@ -17,8 +17,7 @@ from drivesplat.io.point_cloud import PointCloud
 from drivesplat.lidar.coloring import ColorView, color_by_visibility
 from drivesplat.lidar.sweeps import outside_boxes, thin, without_ego_vehicle
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.far_points import far_points, uncovered
-from drivesplat.preprocess.lidar_seed import color_view, lidar_points, seed_points
+from drivesplat.preprocess.lidar_seed import color_view, far_points, lidar_points, seed_points, uncovered
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import project
@@ -28,8 +27,7 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.scene.tracks import Box, box_at, moving_tracks
 from drivesplat.settings.extract import SceneSource
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.lidar_seed import SeedJob
 
 HELD_OUT = {"every_nth": 4, "offset": 2, "last_block": 2}
@@ -89,8 +87,8 @@ def test_lidar_points_are_exactly_the_static_returns_of_training_sweeps(tiny_sce
             continue
         everything = returns_at(seconds)
         kept = np.hypot(*(everything - World().ego_at(seconds) - [0.9, 0.0, 0.0])[:, :2].T) > 2.5
-        for mover in ("vehicle.car", "human.pedestrian.adult"):
-            in_box = within(everything, mover, seconds, 0.2)
+        for dynamic_class in ("vehicle.car", "human.pedestrian.adult"):
+            in_box = within(everything, dynamic_class, seconds, 0.2)
             assert in_box.any() or seconds > 2.0, "the case must hold returns from the moving object"
             kept &= ~in_box
         assert within(everything[kept], "vehicle.truck", seconds, 0.05).any()

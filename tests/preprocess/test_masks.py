@@ -12,8 +12,7 @@ from PIL import Image
 
 from drivesplat.errors import DatasetError, ResultError
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.masks import NO_SKY, make_masks
-from drivesplat.preprocess.sky_mask import sky_mask
+from drivesplat.preprocess.masks import NO_SKY, make_masks, sky_mask
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.ego_mask import EgoMask
 from drivesplat.scene.images import project, read_image

@@ -12,9 +12,7 @@ from drivesplat.io.point_cloud import PointCloud
 from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.splits import frame_groups
 from drivesplat.scene.training_record import read_training_record, write_training_record
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 
 HOLDOUT = HoldoutSettings(every_nth=4, offset=2, last_block=2)
 

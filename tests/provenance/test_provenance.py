@@ -161,3 +161,14 @@ def test_digests_of_files_depend_on_names_and_contents_but_not_on_order_or_folde
     assert digests_of(two) != before
     one[0].rename(tmp_path / "one" / "c.json")
     assert digests_of([tmp_path / "one" / "c.json", one[1]]) != before
+
+
+@pytest.mark.parametrize("changed", ["left", "right"])
+def test_digests_of_files_depend_on_each_of_several_files_of_one_name(tmp_path, changed):
+    files = [tmp_path / folder / "poses.json" for folder in ("left", "right")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text("recorded")
+    before = digests_of(files)
+    (tmp_path / changed / "poses.json").write_text("other")
+    assert digests_of(files) != before

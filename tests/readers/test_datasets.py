@@ -18,8 +18,10 @@ ALLOWED = set(get_args(DatasetSettings.model_fields["reader"].annotation))
 def test_every_allowed_reader_has_a_package_with_all_modules_and_every_package_is_allowed():
     packages = {path.parent.name for path in Path(drivesplat.readers.__file__).parent.glob("*/__init__.py")}
     assert packages == ALLOWED
-    for pattern in (LAYOUT, READER, SWEEP_FILE):
+    for pattern in (LAYOUT, READER):
         assert set(expanded(pattern)) == {pattern.replace("*", name) for name in ALLOWED}
+    assert set(expanded(SWEEP_FILE)) <= {SWEEP_FILE.replace("*", name) for name in ALLOWED}
+    assert SWEEP_FILE.replace("*", "nuscenes") in expanded(SWEEP_FILE)
 
 
 @pytest.mark.parametrize("name", sorted(ALLOWED))
@@ -33,7 +35,7 @@ def test_the_tables_of_nuscenes_are_split_into_scenes_and_other_tables_are_read_
 
 
 @pytest.mark.parametrize("module", [layout, reader])
-def test_a_reader_that_is_missing_is_told_in_one_sentence(module):
+def test_a_missing_reader_is_reported_in_one_sentence(module):
     with pytest.raises(
         DatasetError, match=r"^no module drivesplat\.readers\.toy\.\w+ reads datasets of reader: toy; add"
     ):

@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import time
@@ -18,7 +19,6 @@ from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.nuscenes.download import console, nuscenes_mini
 from drivesplat.readers.nuscenes.download import fetch as fetching
-from drivesplat.readers.nuscenes.download.console import ByteProgress
 from drivesplat.readers.nuscenes.download.destination import download_job, is_present
 from drivesplat.readers.nuscenes.download.fetch import fetch
 from drivesplat.readers.nuscenes.download.nuscenes_mini import download, work_folder
@@ -286,13 +286,20 @@ def test_a_run_killed_while_unpacking_unpacks_again_without_fetching(site, world
     assert site.asked == [] and files(tmp_path / "mini") == files(world)
 
 
-def test_progress_is_announced_at_intervals(monkeypatch, capsys):
+def test_progress_counts_what_earlier_calls_received(monkeypatch, capsys):
     monkeypatch.setattr(console, "INTERVAL_S", 0.0)
-    ByteProgress("download", 4_000_000_000, 1_000_000_000).add(1_000_000_000)
-    assert "download: 50 % of 4.00 GB, " in capsys.readouterr().err
-    told = ByteProgress("download", 4_000_000_000, 1_000_000_000)
-    told.add(1_000_000_000)
-    assert told.line(100.0) == "download: 50 % of 4.00 GB, 10.0 MB/s, 3 min left"
+    with console.byte_progress("download", 4_000_000_000, 1_000_000_000) as progress:
+        progress.update(1_000_000_000)
+    lines = capsys.readouterr().err.replace("\r", "\n")
+    assert re.search(r"^download: +50%.*\b2\.00G/4\.00G .*B/s\]", lines, re.MULTILINE)
+
+
+def test_progress_is_shown_at_intervals(capsys):
+    with console.byte_progress("download", 1000) as progress:
+        for _ in range(1000):
+            progress.update(1)
+        shown = capsys.readouterr().err.count("download:")
+    assert shown == 1 and "100%" in capsys.readouterr().err
 
 
 def test_the_first_recorded_dataset_of_the_mini_split_is_the_destination():

@@ -276,11 +276,11 @@ def test_the_parent_of_a_folder_of_another_name_is_not_used(root):
 def test_an_incomplete_dataset_is_refused_with_the_missing_tables(root, table):
     (root / "v1.0-mini" / f"{table}.json").unlink()
     with pytest.raises(DatasetError, match=rf"{table}\.json.*nuscenes\.org"):
-        table_files(root, "v1.0-mini")
+        table_files(root, "v1.0-mini", "0001")
 
 
 def test_the_table_files_are_all_tables_of_the_version(root):
-    assert {file.stem for file in table_files(root, "v1.0-mini")} == set(TABLES)
+    assert {file.stem for file in table_files(root, "v1.0-mini", "0001")} == set(TABLES)
     assert {file.stem for file in (root / "v1.0-mini").iterdir()} == set(TABLES)
 
 

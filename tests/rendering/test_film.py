@@ -245,7 +245,7 @@ def test_a_file_that_is_not_ffmpeg_is_reported(folder, tmp_path, monkeypatch, co
 
 
 @pytest.mark.parametrize(
-    ("script", "told"),
+    ("script", "fragment"),
     [
         ("echo 'Unknown encoder libx264' >&2; exit 8", "exit status 8: Unknown encoder libx264"),
         ("cat >/dev/null; printf 'one\\n\\ntwo\\nthree\\nfour\\n' >&2; exit 1", "exit status 1: two; three; four"),
@@ -256,21 +256,23 @@ def test_a_file_that_is_not_ffmpeg_is_reported(folder, tmp_path, monkeypatch, co
     ],
     ids=["at once", "at the end", "midway with success", "killed", "closes its input", "wordy"],
 )  # fmt: skip
-def test_a_crash_of_ffmpeg_is_reported_with_its_last_output(folder, started, fake_ffmpeg, monkeypatch, script, told):
+def test_a_crash_of_ffmpeg_is_reported_with_its_last_output(
+    folder, started, fake_ffmpeg, monkeypatch, script, fragment
+):
     monkeypatch.setattr(video, "PATIENCE", 1.0)
     fake_ffmpeg(script)
     message = failure(folder, noise(40))
-    assert "ffmpeg" in message and told in message and len(message) < 1200
+    assert "ffmpeg" in message and fragment in message and len(message) < 1200
     assert_nothing_left(folder, started)
 
 
 @pytest.mark.parametrize(
-    ("script", "told"), [("exec sleep 60", "took no more"), ("cat >/dev/null; exec sleep 60 </dev/null", "an end")]
+    ("script", "fragment"), [("exec sleep 60", "took no more"), ("cat >/dev/null; exec sleep 60 </dev/null", "an end")]
 )
-def test_a_hanging_ffmpeg_times_out(folder, started, fake_ffmpeg, monkeypatch, script, told):
+def test_a_hanging_ffmpeg_times_out(folder, started, fake_ffmpeg, monkeypatch, script, fragment):
     monkeypatch.setattr(video, "PATIENCE", 0.5)
     fake_ffmpeg(script)
-    assert told in failure(folder, noise(40))
+    assert fragment in failure(folder, noise(40))
     assert_nothing_left(folder, started)
 
 

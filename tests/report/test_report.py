@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, stages, told
+from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, report_job, stages
 
-from drivesplat.report.console import console_table
-from drivesplat.report.gaps import gap_report, summary_sentences, write_csv
+from drivesplat.io.storage import write_csv
+from drivesplat.report.files import console_table
+from drivesplat.report.gaps import COLUMNS, gap_report, summary_sentences
 
 VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
 VANILLA_B = method(group(26.0, None, 22.0, lpips=0.1), group(23.0), gaussians=3000, seconds=80.0)
@@ -173,7 +174,7 @@ def test_a_scene_that_kept_its_poses_is_comparable_with_refined_ones(write, orde
     results = {"0061": ("refined", made), "0103": ("nuscenes", made)}
     paths = [write(metrics(scene, {"vanilla": VANILLA_A}, stages, poses=poses))
              for scene, (poses, stages) in list(results.items())[::order]]  # fmt: skip
-    report = gap_report(paths, told({"0061": made, "0103": made}), NO_LOGS)
+    report = gap_report(paths, report_job({"0061": made, "0103": made}), NO_LOGS)
     assert {row["scene"] for row in report["rows"]} == {"0061", "0103"} and report["left_out"] == []
 
 
@@ -183,7 +184,7 @@ def test_a_scene_with_poses_from_images_is_not_comparable(write):
         write(metrics(scene, {"vanilla": VANILLA_A}, made, poses=poses))
         for scene, poses in (("0061", "refined"), ("0103", "images"))
     ]
-    report = gap_report(paths, told({"0061": made, "0103": made}), NO_LOGS)
+    report = gap_report(paths, report_job({"0061": made, "0103": made}), NO_LOGS)
     assert "poses" in left_out(report, "0103")
 
 
@@ -191,7 +192,7 @@ def test_a_scene_without_refinement_is_not_comparable(write):
     made = {**stages(), "refine_poses": {"settings": {"rounds": 3}, "code": "r"}}
     paths = [write(metrics("0061", {"vanilla": VANILLA_A}, made, poses="refined")),
              write(metrics("0103", {"vanilla": VANILLA_A}))]  # fmt: skip
-    report = gap_report(paths, told({"0061": made, "0103": stages()}), NO_LOGS)
+    report = gap_report(paths, report_job({"0061": made, "0103": stages()}), NO_LOGS)
     (left_out,) = report["left_out"]
     assert left_out["scene"] == "0103" and "poses" in left_out["why"]
 
@@ -243,7 +244,7 @@ def test_configured_scenes_without_a_result_are_listed(write):
 def test_a_report_without_results_is_written(tmp_path):
     report = gap_report([], expecting("0061"), NO_LOGS)
     assert report["rows"] == report["means"] == [] and [item["scene"] for item in report["missing"]] == ["0061"]
-    write_csv(tmp_path / "gap_report.csv", report)
+    write_csv(tmp_path / "gap_report.csv", COLUMNS, report["rows"])
     assert len((tmp_path / "gap_report.csv").read_text().splitlines()) == 1
     assert "0061" in console_table(report)
 
@@ -265,7 +266,7 @@ def test_a_report_is_json_without_nan(report):
 
 def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
     before = copy.deepcopy(report)
-    write_csv(tmp_path / "gap_report.csv", report)
+    write_csv(tmp_path / "gap_report.csv", COLUMNS, report["rows"])
     with open(Path(tmp_path / "gap_report.csv"), newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     figures = ("static", "vehicle", "moving_vehicle", "gap_db", "lpips")
@@ -349,7 +350,7 @@ def test_a_reference_without_a_gap_has_no_closed_fraction(write):
 
 def test_without_a_reference_there_is_no_closed_fraction(write):
     path = write(metrics("0061", {"vanilla": VANILLA_A}))
-    assert gap_report([path], told({"0061": stages()}, reference=None), NO_LOGS)["gap_closed"] == []
+    assert gap_report([path], report_job({"0061": stages()}, reference=None), NO_LOGS)["gap_closed"] == []
 
 
 # ---- why a scene is missing

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.chromium import CHROMIUM, chromium
+from helpers.chromium import chromium, in_a_browser
 from helpers.reports import NO_LOGS, expecting, group, method, metrics, stages
 from PIL import Image
 
@@ -149,7 +149,7 @@ def test_the_plot_has_a_dot_for_every_scene_with_moving_vehicles(results):
     assert [len(of_method) for of_method in dots] == [3, 3]
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+@in_a_browser
 def test_in_a_browser_sorting_and_sliders_work_without_requests(results, tmp_path):
     file = tmp_path / "gap_report.html"
     file.write_text(page_of(results), encoding="utf-8")

@@ -52,10 +52,10 @@ def test_without_a_class_for_cars_no_pixel_belongs_to_a_car(tiny_scene):
         for track in tiny_scene.tracks
     )
     frame = tiny_scene.frames[6]
-    told, untold = (
+    with_cars, without_cars = (
         label_image(scene, frame, (frame.width, frame.height))
         for scene in (tiny_scene, dataclasses.replace(tiny_scene, tracks=tuple(tracks)))
     )
-    assert region_mask(told, "car").sum() > 100 and not region_mask(untold, "car").any()
+    assert region_mask(with_cars, "car").sum() > 100 and not region_mask(without_cars, "car").any()
     for region in ("vehicle", "moving_vehicle", "parked_vehicle", "static"):
-        np.testing.assert_array_equal(region_mask(told, region), region_mask(untold, region))
+        np.testing.assert_array_equal(region_mask(with_cars, region), region_mask(without_cars, region))

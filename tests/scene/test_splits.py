@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import frame_groups, held_out_key_frames, sweep_groups
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 
 INTERVAL = 500_000
 

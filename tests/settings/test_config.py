@@ -138,7 +138,7 @@ def refusal(values: dict[str, Any]) -> str:
         ("methods", {"logs": {}}, ["method", "logs"]),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line_with_key_value_and_what_is_allowed(defaults, path, value, words):
+def test_an_invalid_value_is_reported_in_one_line_with_key_value_and_range(defaults, path, value, words):
     """Over the whole of config.yaml, as Snakemake reads it: the message names the culprit and not the rest."""
     message = refusal(merged(defaults, at(path, value)))
     assert "\n" not in message
@@ -156,7 +156,7 @@ def test_several_faults_are_all_named():
     ("text", "suggestion"),
     [("[0061]", '"0061"'), ("[103]", '"0103"'), ("[0103]", '"0103"'), ('["0061", 1100]', '"1100"')],
 )
-def test_scene_numbers_without_quotes_are_told_to_be_quoted(text, suggestion):
+def test_scene_numbers_without_quotes_are_refused_with_advice_to_quote_them(text, suggestion):
     """Bare YAML reads 0061 as octal, 49."""
     message = refusal({"datasets": {"nuscenes": {"scenes": yaml.safe_load(text)}}})
     assert "datasets.nuscenes.scenes" in message and "quotes" in message
@@ -239,7 +239,9 @@ def test_mappings_are_merged_key_by_key_and_the_rest_is_replaced():
     assert base == {"a": {"b": 1, "c": {"d": 2}}, "e": [1, 2], "f": {"g": 1}}
 
 
-def told(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> dict[str, Any]:
+def stage_record(
+    values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla"
+) -> dict[str, Any]:
     return json.loads(spelled(values, stage, scene, method))
 
 
@@ -260,23 +262,23 @@ def test_overrides_of_a_dataset_reach_the_stages_of_its_scenes_only():
         "train": {"iterations": 99},
     }
     for stage in ("lidar_seed", "parser", "masks"):
-        assert told(values, stage, "a")["images"] == {"width": 320}
-        assert told(values, stage, "b")["images"] == {"width": 640}
-    train = told(values, "train", "a")["train"]
+        assert stage_record(values, stage, "a")["images"] == {"width": 320}
+        assert stage_record(values, stage, "b")["images"] == {"width": 640}
+    train = stage_record(values, "train", "a")["train"]
     assert (train["mcmc"]["noise_lr"], train["iterations"]) == (7.0, 99)
     assert train["mcmc"]["refine_every"] == Config().train.mcmc.refine_every
-    assert told(values, "train", "b")["train"]["mcmc"]["noise_lr"] == Config().train.mcmc.noise_lr
-    assert told(values, "extract", "a")["cameras"] == ["CAM_FRONT", "X"]
-    assert told(values, "evaluate", "b")["cameras"] == ["CAM_FRONT"]
-    assert told(values, "extract", "a")["dataset"] == "small"
+    assert stage_record(values, "train", "b")["train"]["mcmc"]["noise_lr"] == Config().train.mcmc.noise_lr
+    assert stage_record(values, "extract", "a")["cameras"] == ["CAM_FRONT", "X"]
+    assert stage_record(values, "evaluate", "b")["cameras"] == ["CAM_FRONT"]
+    assert stage_record(values, "extract", "a")["dataset"] == "small"
 
 
 def test_overrides_of_a_method_reach_its_own_stages_only():
     values = {"methods": {"vanilla": {}, "no_sky": {"overrides": {"sky": "none", "train": {"iterations": 5}}}}}
-    assert told(values, "train", method="no_sky")["sky"] == "none"
-    assert told(values, "train", method="no_sky")["train"]["iterations"] == 5
+    assert stage_record(values, "train", method="no_sky")["sky"] == "none"
+    assert stage_record(values, "train", method="no_sky")["train"]["iterations"] == 5
     for stage in STAGES:
-        assert told(values, stage, method="vanilla") == told({}, stage)
+        assert stage_record(values, stage, method="vanilla") == stage_record({}, stage)
 
 
 def test_a_methods_override_goes_over_the_datasets():
@@ -284,7 +286,7 @@ def test_a_methods_override_goes_over_the_datasets():
         "datasets": {"nuscenes": {"overrides": {"sky": "mask", "train": {"iterations": 5, "lr_sky": 0.5}}}},
         "methods": {"mine": {"overrides": {"train": {"iterations": 6}}}},
     }
-    settings = told(values, "train", method="mine")
+    settings = stage_record(values, "train", method="mine")
     assert (settings["sky"], settings["train"]["iterations"], settings["train"]["lr_sky"]) == ("mask", 6, 0.5)
 
 
@@ -319,7 +321,7 @@ def reversed_keys(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_neither_the_order_of_keys_nor_a_default_written_out_changes_what_a_stage_is_told(defaults, stage):
+def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stage(defaults, stage):
     plain = spelled({}, stage)
     for values in (defaults, reversed_keys(defaults), {"train": {"iterations": defaults["train"]["iterations"]}}):
         assert spelled(values, stage) == plain
@@ -394,13 +396,13 @@ def test_a_setting_reaches_the_stages_that_read_it_and_no_others(defaults, chang
     assert {stage for stage in STAGES if spelled(before, stage) != spelled(after, stage)} == set(readers.split())
 
 
-def test_of_a_synthetic_world_the_evaluation_is_told_what_a_removal_takes(defaults):
+def test_for_a_synthetic_world_the_evaluation_gets_the_settings_of_removal(defaults):
     """Only there is a street without the car to hold it to."""
     before, after = load(defaults), load(merged(defaults, at("removal.margin", 0.5)))
     changed = {stage for stage in STAGES if spelled(before, stage, "demo") != spelled(after, stage, "demo")}
     assert changed == {"evaluate", "remove_actor"}
-    assert told(after, "evaluate", "demo")["removal"]["margin"] == 0.5
-    assert told(after, "evaluate", "0061")["removal"] is None
+    assert stage_record(after, "evaluate", "demo")["removal"]["margin"] == 0.5
+    assert stage_record(after, "evaluate", "0061")["removal"] is None
 
 
 def test_a_film_that_a_scene_does_not_have_is_refused_with_those_it_has():

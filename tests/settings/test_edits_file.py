@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from drivesplat.demo.tables import token
 from helpers import REPOSITORY
 
 from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.tables import token
 from drivesplat.editing.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
@@ -87,7 +87,7 @@ def test_reading_edits_imports_nothing_heavy():
     assert not {"torch", "scipy", "matplotlib", "nuscenes"} & set(done.stdout.split())
 
 
-def test_a_missing_file_is_said_to_be_missing(tmp_path):
+def test_a_missing_file_is_reported_as_missing(tmp_path):
     with pytest.raises(
         ConfigError, match=r"nowhere\.yaml: the edits file cannot be read \(No such file or directory\)"
     ):
@@ -98,7 +98,7 @@ def test_a_missing_file_is_said_to_be_missing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("edits: [", "edits.yaml: not YAML: while parsing a flow node"),
         ("steps: {}", "edits.yaml: an edits file holds the one key 'edits', under it a list of steps per name"),
@@ -113,8 +113,8 @@ def test_a_missing_file_is_said_to_be_missing(tmp_path):
         ("edits: {a: {remove: {track: x}}}", "edits.yaml: edit 'a' is {'remove': {'track': 'x'}}; it is a"),
     ],
 )  # fmt: skip
-def test_a_file_of_another_form_is_refused(tmp_path, text, said):
-    assert refusal(text, tmp_path).startswith(said)
+def test_a_file_of_another_form_is_refused(tmp_path, text, expected):
+    assert refusal(text, tmp_path).startswith(expected)
 
 
 KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, rescale, ego"
@@ -123,13 +123,13 @@ NAME = "cannot name a file: use letters, digits, '_', '-' and '.'"
 
 def refused_step(step: str, folder: Path) -> str:
     """What is said of the second step of an edit, without where."""
-    said = refusal(f"edits:\n  a:\n  - stop: {{track: y, at: 1}}\n  - {step}\n", folder)
-    assert said.startswith("edits.yaml: edit 'a', step 2")
-    return said.removeprefix("edits.yaml: edit 'a', step 2")
+    message = refusal(f"edits:\n  a:\n  - stop: {{track: y, at: 1}}\n  - {step}\n", folder)
+    assert message.startswith("edits.yaml: edit 'a', step 2")
+    return message.removeprefix("edits.yaml: edit 'a', step 2")
 
 
 @pytest.mark.parametrize(
-    ("step", "said"),
+    ("step", "expected"),
     [
         ("remove", f" is 'remove'; a step has one key, one of {KINDS}"),
         ("{remove: 1, ego: 2}", f" is {{'remove': 1, 'ego': 2}}; a step has one key, one of {KINDS}"),
@@ -138,12 +138,12 @@ def refused_step(step: str, folder: Path) -> str:
         ("ego:", " (ego) is None; it is a mapping: ego: {lateral: 2.0}"),
     ],
 )
-def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, said):
-    assert refused_step(step, tmp_path) == said
+def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, expected):
+    assert refused_step(step, tmp_path) == expected
 
 
 @pytest.mark.parametrize(
-    ("kind", "fields", "said"),
+    ("kind", "fields", "expected"),
     [
         ("remove", "", "'track' is missing; there are: track"),
         ("remove", "track: 75", "'track' is 75: an id is text: put it in quotes as it stands in tracks.csv"),
@@ -174,13 +174,13 @@ def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, said):
         ("ego", "speed: -1", "'speed' is -1: input should be greater than or equal to 0"),
     ],
 )  # fmt: skip
-def test_a_step_with_other_fields_is_refused_by_its_number_and_kind(tmp_path, kind, fields, said):
-    assert refused_step(f"{kind}: {{{fields}}}", tmp_path) == f" ({kind}): {said}"
+def test_a_step_with_other_fields_is_refused_by_its_number_and_kind(tmp_path, kind, fields, expected):
+    assert refused_step(f"{kind}: {{{fields}}}", tmp_path) == f" ({kind}): {expected}"
 
 
-def test_a_decimal_comma_is_told_apart_from_a_point(tmp_path):
-    said = refused_step("shift: {track: x, lateral: 3,5}", tmp_path)
-    assert said == " (shift): 5 stands where a key should; a decimal has a point: 3.5, not 3,5"
+def test_a_decimal_comma_is_distinguished_from_a_point(tmp_path):
+    message = refused_step("shift: {track: x, lateral: 3,5}", tmp_path)
+    assert message == " (shift): 5 stands where a key should; a decimal has a point: 3.5, not 3,5"
 
 
 def test_yaml_merges_stay_possible(tmp_path):

@@ -14,7 +14,7 @@ from drivesplat.training.coarse_to_fine import TrainingImages, reduced
 from drivesplat.training.views import LidarDepth, TrainingView, view_index
 
 WIDTH, HEIGHT = 14, 9
-LEAST_HEIGHT = CoarseToFineSettings().least_height
+MIN_HEIGHT = CoarseToFineSettings().least_height
 
 
 def a_view(width: int = WIDTH, height: int = HEIGHT) -> TrainingView:
@@ -90,8 +90,8 @@ def images_of(height: int, count: int = 3, **changes: float) -> TrainingImages:
     return TrainingImages([a_view(16, height) for _ in range(count)], settings, seed=7)
 
 
-def test_images_are_whole_where_it_is_said():
-    images = images_of(4 * LEAST_HEIGHT)
+def test_images_are_not_reduced_by_default():
+    images = images_of(4 * MIN_HEIGHT)
     assert {images.factor(step) for step in range(100)} == {1}
     assert images.at(5) is images.views[view_index(3, 5, 7)] is images.views[images.number(5)]
 
@@ -99,11 +99,11 @@ def test_images_are_whole_where_it_is_said():
 @pytest.mark.parametrize(
     ("height", "changes", "expected"),
     [
-        (4 * LEAST_HEIGHT, {"quarter_until": 0.2, "half_until": 0.5}, [4] * 20 + [2] * 30 + [1] * 50),
-        (4 * LEAST_HEIGHT, {"half_until": 0.3}, [2] * 30 + [1] * 70),
-        (4 * LEAST_HEIGHT, {"quarter_until": 0.3}, [4] * 30 + [1] * 70),
-        (4 * LEAST_HEIGHT - 1, {"quarter_until": 0.2, "half_until": 0.5}, [2] * 50 + [1] * 50),
-        (2 * LEAST_HEIGHT - 1, {"quarter_until": 0.2, "half_until": 0.5}, [1] * 100),
+        (4 * MIN_HEIGHT, {"quarter_until": 0.2, "half_until": 0.5}, [4] * 20 + [2] * 30 + [1] * 50),
+        (4 * MIN_HEIGHT, {"half_until": 0.3}, [2] * 30 + [1] * 70),
+        (4 * MIN_HEIGHT, {"quarter_until": 0.3}, [4] * 30 + [1] * 70),
+        (4 * MIN_HEIGHT - 1, {"quarter_until": 0.2, "half_until": 0.5}, [2] * 50 + [1] * 50),
+        (2 * MIN_HEIGHT - 1, {"quarter_until": 0.2, "half_until": 0.5}, [1] * 100),
     ],
 )
 def test_images_are_reduced_as_long_as_the_settings_say_and_never_to_few_rows(height, changes, expected):
@@ -113,7 +113,7 @@ def test_images_are_reduced_as_long_as_the_settings_say_and_never_to_few_rows(he
 
 
 def test_reduced_images_come_in_the_order_of_whole_ones_and_once_each_is_made(monkeypatch):
-    images = images_of(2 * LEAST_HEIGHT, half_until=0.5)
+    images = images_of(2 * MIN_HEIGHT, half_until=0.5)
     for i, view in enumerate(images.views):
         view.pixels.fill_(10 * i)
     seen = [images.at(step) for step in range(100)]

@@ -35,12 +35,9 @@ from drivesplat.preprocess.parser import training_record
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.training_record import write_training_record
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.ego_mask import EgoMaskJob, EgoMaskSearch
-from drivesplat.settings.holdout import HoldoutSettings
-from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
-from drivesplat.settings.masks import MaskJob, MaskSettings
-from drivesplat.settings.parser import ParserJob
+from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob, MaskSettings
 from drivesplat.settings.train import TrainJob
 from drivesplat.training import run
 from drivesplat.training.run import TrainingInputs, read_inputs, run_training

@@ -60,7 +60,7 @@ def test_the_road_is_the_plane_that_the_car_stood_on(lie):
 
 
 @pytest.mark.parametrize("lie", ROADS, ids=str)
-def test_it_is_as_wide_as_told_and_counts_less_the_farther_out(lie):
+def test_the_road_has_the_configured_width_and_weighs_less_farther_out(lie):
     random, poses = np.random.default_rng(1), straight(**lie)
     along, aside = random.uniform(0, 20, 4000), random.uniform(-2.0, 2.0, 4000)
     road = driven_road(poses, WIDE)
@@ -202,7 +202,7 @@ def known() -> GeometryPriors:
     return GeometryPriors(road=driven_road(straight(), WIDE))
 
 
-def test_terms_are_weighted_and_about_what_stands_still_alone():
+def test_terms_are_weighted_and_apply_to_static_parts_only():
     model = a_street()
     picture = model.render(looking_at([5.0, 0.0, 0.0], [-2.0, 0.0, 1.5]))
     terms = geometry_terms(picture, model, known(), TrainSettings(flatness_weight=0.3, road_weight=0.2))
@@ -237,6 +237,6 @@ def test_flatness_makes_the_shortest_axis_shorter_and_no_other():
     assert (part.params["scales"].grad > 0).tolist() == [[False, True, False], [False, False, True]]
 
 
-def test_what_is_known_goes_where_it_is_asked():
+def test_priors_move_to_the_requested_device():
     moved = dataclasses.replace(known(), free=None).to(torch.device("meta"))
     assert moved.free is None and {t.device.type for t in (moved.road.normals, moved.road.cells.keys)} == {"meta"}

@@ -9,8 +9,7 @@ import torch
 from helpers.hand_made import actors_of, looking_at, motion_through, track_of
 from skimage.metrics import structural_similarity
 
-from drivesplat.kernels.color_difference import masked_l1
-from drivesplat.kernels.ssim import ssim, ssim_in_torch
+from drivesplat.kernels.color_difference import masked_l1, ssim, ssim_in_torch
 from drivesplat.model.background import Background
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import Picture, SplatModel
@@ -123,7 +122,7 @@ def test_colour_terms_are_weighted_l1_and_ssim():
     assert float(terms["ssim"]) == pytest.approx(0.3 * (1.0 - similarity), abs=1e-4)
 
 
-def test_regularisers_are_weighted_means_over_all_gaussians():
+def test_regularizers_are_weighted_means_over_all_gaussians():
     picture, view = a_case(model := a_model())
     terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=0.03, scale_reg=0.07))
     gaussians = model.parts[0].at(0.0)
@@ -131,7 +130,7 @@ def test_regularisers_are_weighted_means_over_all_gaussians():
     torch.testing.assert_close(terms["scale_reg"], 0.07 * gaussians.scales.mean())
 
 
-def test_regularisers_of_several_parts_weigh_every_gaussian_alike():
+def test_regularizers_of_several_parts_weigh_every_gaussian_alike():
     parts = [a_model(gaussians=n).parts[0] for n in (3, 9)]
     picture, view = a_case(model := SplatModel(parts, None))
     terms = loss_terms(picture, view, model, TrainSettings(opacity_reg=1.0))
@@ -195,7 +194,7 @@ def test_sky_term_is_finite_where_alpha_is_full(alpha):
 
 
 @pytest.mark.parametrize(("term", "parameter"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
-def test_a_regulariser_makes_its_parameter_smaller_and_no_other(term, parameter):
+def test_a_regularizer_makes_its_parameter_smaller_and_no_other(term, parameter):
     picture, view = a_case(model := a_model())
     loss_terms(picture, view, model, TrainSettings())[term].backward()
     params = model.parts[0].params
@@ -272,7 +271,7 @@ def test_entropy_is_that_of_a_coin():
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0])
-def test_entropy_is_least_and_finite_where_it_is_sure(alpha):
+def test_entropy_is_zero_with_a_finite_gradient_for_certain_pixels(alpha):
     sure = torch.full((2, 2), alpha, requires_grad=True)
     loss = entropy(sure)
     loss.backward()
@@ -329,16 +328,20 @@ def test_gaussians_learn_the_classes_of_their_pixels():
     view = View(torch.tensor([[12.0, 0, 10], [0, 12, 7], [0, 0, 1]]), torch.eye(4), WIDTH, HEIGHT, 0.0)
     classes = torch.full((HEIGHT, WIDTH), 1, dtype=torch.uint8)
     classes[:, WIDTH // 2 :] = 2
-    told = dataclasses.replace(a_view((random_image(1) * 255).to(torch.uint8), None), view=view, classes=classes)
+    labelled_view = dataclasses.replace(
+        a_view((random_image(1) * 255).to(torch.uint8), None), view=view, classes=classes
+    )
     for weight in (0.5, 1.5):
         picture = model.render(view)
-        terms = loss_terms(picture, told, model, TrainSettings(semantic_weight=weight))
+        terms = loss_terms(picture, labelled_view, model, TrainSettings(semantic_weight=weight))
         assert float(terms["semantic"].detach()) == pytest.approx(weight * math.log(3.0)), "nothing is known as yet"
     terms["semantic"].backward()
     pulls = -part.params["classes"].grad
     assert pulls.argmax(dim=1).tolist() == [1, 2] and (pulls[:, 0] < 0).all()
-    assert "semantic" not in loss_terms(picture, dataclasses.replace(told, classes=None), model, TrainSettings())
-    assert "semantic" not in loss_terms(picture, told, a_model(), TrainSettings())
+    assert "semantic" not in loss_terms(
+        picture, dataclasses.replace(labelled_view, classes=None), model, TrainSettings()
+    )
+    assert "semantic" not in loss_terms(picture, labelled_view, a_model(), TrainSettings())
 
 
 def street() -> tuple[SplatModel, Picture, TrainingView]:
@@ -397,7 +400,7 @@ def test_terms_are_what_they_are_called():
         torch.testing.assert_close(terms[name], value)
 
 
-def test_a_model_that_stands_still_has_no_terms_of_what_moves():
+def test_a_static_model_has_no_terms_of_dynamic_parts():
     _, _, view = street()
     model = SplatModel([a_model().parts[0]], None)
     picture = model.render(view.view)
@@ -417,7 +420,7 @@ def test_what_is_absent_is_not_regularised(term):
     assert (gradient[there] > 0).all() and not gradient[~there].any()
 
 
-def test_only_what_moves_is_made_sure_of():
+def test_entropy_has_gradients_for_actors_only():
     model, picture, view = street()
     loss_terms(picture, view, model, TrainSettings())["entropy"].backward()
     still, actors = (part.params for part in model.parts)

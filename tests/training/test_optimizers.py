@@ -88,4 +88,4 @@ def test_steps_at_device_rates_equal_those_of_adam(kernels, monkeypatch):
             )
         ends.append({name: value.cpu() for name, value in model.state_dict().items()})
     for name, value in ends[1].items():
-        torch.testing.assert_close(ends[0][name], value, atol=1e-5, rtol=1e-4, msg=lambda said, name=name: name + said)
+        torch.testing.assert_close(ends[0][name], value, atol=1e-5, rtol=1e-4, msg=lambda text, name=name: name + text)

@@ -54,10 +54,12 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import (
+    STAGE_OF_PART,
     ActorSettings,
     DefaultSettings,
     FloaterSettings,
     GaussianSettings,
+    McmcSettings,
     TrainJob,
 )
 from drivesplat.training import resume_state
@@ -91,7 +93,7 @@ def print_whether_torchs_compiler_is_read(folder: str) -> None:
 
 def hold_the_lock(folder: str) -> None:
     """For a subprocess: a trainer that works until it is killed."""
-    with resume_state.sole_trainer(Path(folder)):
+    with resume_state.training_lock(Path(folder)):
         print("held", flush=True)
         signal.pause()
 
@@ -202,7 +204,7 @@ def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
     assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
 
 
-def test_a_training_is_held_to_flatness_and_the_road():
+def test_a_training_applies_the_flatness_and_road_losses():
     """The terms are among those of an iteration, and pull on the background."""
     settings = settings_of(flatness_weight=0.2, road_weight=0.3)
     poses = np.tile(np.eye(4), (2, 1, 1))
@@ -217,13 +219,21 @@ def test_a_training_is_held_to_flatness_and_the_road():
     assert plain.fit_one()[0].keys() == terms.keys() - {"flatness", "road"}
 
 
-def test_what_stands_still_knows_no_settings_of_what_moves():
+def test_static_methods_have_no_settings_of_dynamic_parts():
     """So that a change of these leaves trainings without moving parts as they are."""
+    still, all_parts = ("background",), ("background", "actors")
     changed = {"iterations": 70, "depth_weight": 0.2, "sky_bce_weight": 0.3, "opacity_reg": 0.5}
     moving = {"actors": ActorSettings(fourier=2), "entropy_weight": 0.7, "dynamic_weight": 0.9}
     settings = settings_of(**changed, **moving)
-    assert settings.without_moving_parts() == settings_of(**changed)
-    assert {name for name, value in settings if getattr(settings.without_moving_parts(), name) != value} == set(moving)
+    assert settings.for_parts(still) == settings_of(**changed) and settings.for_parts(all_parts) == settings
+    assert {name for name, value in settings if getattr(settings.for_parts(still), name) != value} == set(moving)
+
+
+def test_a_moving_part_knows_no_settings_of_other_moving_parts(monkeypatch):
+    monkeypatch.setitem(STAGE_OF_PART, "mcmc", "actors")
+    settings = settings_of(actors=ActorSettings(fourier=2), mcmc=McmcSettings(growth=0.1), dynamic_weight=0.9)
+    kept = settings.for_parts(("background", "actors"))
+    assert kept == settings.model_copy(update={"mcmc": McmcSettings()})
 
 
 @pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (50, 0.1), (100, 0.01)])
@@ -245,6 +255,15 @@ def test_spherical_harmonics_gain_a_degree_at_a_time(step, degree):
     assert trainer.sh_degree() == degree
 
 
+@pytest.mark.parametrize(("still", "moving"), [(0, 2), (2, 1)])
+def test_the_degree_of_spherical_harmonics_grows_to_the_highest_of_any_part(still, moving):
+    settings = settings_of(gaussians=GaussianSettings(sh_degree=still), actors=ActorSettings(sh_degree=moving))
+    trainer = Trainer.begin(untrained_street(settings), recorded_views(), settings, 0, CPU)
+    assert [part.sh_degree for part in trainer.model.parts] == [still, moving]
+    trainer.step = settings.iterations
+    assert trainer.sh_degree() == max(still, moving)
+
+
 # ---- the images
 
 
@@ -256,7 +275,7 @@ def test_every_epoch_sees_every_view_once_in_an_order_of_its_own(count):
     assert epochs == [[view_index(count, epoch * count + i, seed=5) for i in range(count)] for epoch in range(8)]
 
 
-def test_the_order_of_views_hangs_on_the_seed():
+def test_the_order_of_views_depends_on_the_seed():
     assert [view_index(20, i, seed=1) for i in range(20)] != [view_index(20, i, seed=2) for i in range(20)]
 
 
@@ -450,7 +469,7 @@ FOREIGN = [
 
 
 @pytest.mark.parametrize("kind", FOREIGN)
-def test_a_spoilt_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(kind, tmp_path, caplog):
+def test_a_damaged_resume_state_is_ignored_with_a_message_and_nothing_of_it_runs(kind, tmp_path, caplog):
     path = tmp_path / "state.npz"
     spoil(path, kind)
     with caplog.at_level(logging.WARNING):
@@ -471,7 +490,7 @@ def test_a_foreign_checkpoint_is_refused_by_name_and_nothing_of_it_runs(kind, tm
     assert not (tmp_path / "executed").exists()
 
 
-def test_without_a_resume_state_nothing_is_said(tmp_path, caplog):
+def test_without_a_resume_state_nothing_is_logged(tmp_path, caplog):
     assert resume_state.resumable(tmp_path / "state.npz", "any") is None
     assert caplog.text == ""
 
@@ -492,7 +511,7 @@ def test_a_crash_while_a_checkpoint_is_written_keeps_the_earlier_one(tmp_path, m
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_is_told_with_the_files_name_and_keeps_the_earlier_checkpoint(tmp_path):
+def test_a_full_disk_is_reported_with_the_file_name_and_keeps_the_earlier_checkpoint(tmp_path):
     """A limit on the size of files stands for the full disk."""
     path = tmp_path / "state.npz"
     checkpoint_file.save(path, {"step": 1})
@@ -515,20 +534,20 @@ def test_a_second_trainer_is_refused_naming_the_first_and_a_killed_one_frees_the
     finally:
         holder.kill()
         holder.communicate()
-    with resume_state.sole_trainer(tmp_path / "resume"):
+    with resume_state.training_lock(tmp_path / "resume"):
         assert_refused(tmp_path / "resume", os.getpid())
 
 
 def assert_refused(folder: Path, process: int) -> None:
     refusal = rf"process {process} is still training in .*{folder.name}"
-    with pytest.raises(TrainingError, match=refusal), resume_state.sole_trainer(folder):
+    with pytest.raises(TrainingError, match=refusal), resume_state.training_lock(folder):
         pass
 
 
 def test_a_trainer_that_fails_frees_the_folder(tmp_path):
-    with pytest.raises(EndedError), resume_state.sole_trainer(tmp_path):
+    with pytest.raises(EndedError), resume_state.training_lock(tmp_path):
         raise EndedError
-    with resume_state.sole_trainer(tmp_path):
+    with resume_state.training_lock(tmp_path):
         pass
 
 
@@ -555,7 +574,7 @@ def test_a_loss_that_is_no_number_stops_the_training_and_keeps_the_last_checkpoi
 
 @pytest.mark.parametrize("log_every", [1, 50])
 @pytest.mark.parametrize("strategy", ["mcmc", "default"])
-def test_it_is_a_training_error_however_rarely_it_is_looked_for(tmp_path, strategy, log_every):
+def test_a_loss_that_is_not_finite_is_a_training_error_however_rarely_it_is_checked(tmp_path, strategy, log_every):
     """Densification comes between the loss that is no number and the check."""
     settings = settings_of(
         strategy,
@@ -654,7 +673,7 @@ def test_tensorboard_holds_every_loss_and_pictures(tmp_path):
     assert {(event.width, event.height) for event in board.Images("recorded_and_rendered")} == {(2 * WIDTH, HEIGHT)}
 
 
-def test_tensorboard_of_a_resumed_training_tells_every_iteration_once(tmp_path):
+def test_tensorboard_of_a_resumed_training_has_every_iteration_once(tmp_path):
     with pytest.raises(EndedError):
         trained(tmp_path, settings_of(), EndingViews(recorded_views(), ENDED_AT))
     trained(tmp_path, settings_of())
@@ -728,9 +747,9 @@ def test_a_finished_training_of_actors_can_be_rendered_from_its_checkpoint_alone
 def test_only_what_a_training_asks_for_is_read(tmp_path, parts, changes, known):
     """Masks are read by the training images; of people that move, too, is known that they do."""
     guides = inputs_in(tmp_path, actors=True).guides(job_of(parts, **changes))
-    told = {name: getattr(guides, name) for name in ("sky", "moving", "lidar")}
-    assert {name for name, images in told.items() if images} == known
-    assert all(list(images) == [0, 1, 3, 4] for images in told.values() if images)
+    by_kind = {name: getattr(guides, name) for name in ("sky", "moving", "lidar")}
+    assert {name for name, images in by_kind.items() if images} == known
+    assert all(list(images) == [0, 1, 3, 4] for images in by_kind.values() if images)
     if "moving" in known:
         assert guides.moving[3][HEIGHT // 2 :].all() and not guides.moving[3][: HEIGHT // 2].any()
     if "sky" in known:

@@ -99,8 +99,8 @@ def test_a_scene_is_found_under_90_minutes_or_not(tmp_path, minutes, under):
     page = report_page(report, {}, [short, long])
     assert f"<td>{minutes}.0</td>" in page and f"<td>{'yes' if under else 'no'}</td>" in page
     assert "<td>yes, so far</td>" in page and "Costs" not in report_page(report, {})
-    said = costs_in_words(costs_record(tmp_path, ["vanilla", "street"]))
-    assert f"0103: {minutes}.0 min, {'under' if under else 'not under'} 90" in said and "so far, under 90" in said
+    printed = costs_in_words(costs_record(tmp_path, ["vanilla", "street"]))
+    assert f"0103: {minutes}.0 min, {'under' if under else 'not under'} 90" in printed and "so far, under 90" in printed
 
 
 def test_a_resumed_training_counts_whole(tmp_path):
@@ -133,11 +133,11 @@ def test_what_is_missing_or_garbled_is_named_and_left_out(tmp_path):
     assert json.loads((tmp_path / "costs.json").read_text()) == record and record["unreadable"] == complaints
 
 
-def test_costs_that_cannot_be_told_or_written_end_no_run(tmp_path, capsys):
+def test_costs_that_cannot_be_estimated_or_written_end_no_run(tmp_path, capsys):
     (tmp_path / "costs.csv").mkdir()
     config = yaml.safe_load((REPOSITORY / "config.yaml").read_text()) | {"results_dir": str(tmp_path)}
     of_run = RunCosts(Plan(config, str(REPOSITORY)), None, [COSTS])
     of_run.begin()
     of_run.end()
-    said = capsys.readouterr().err
-    assert "the run cannot be estimated" in said and "costs are not written" in said
+    printed = capsys.readouterr().err
+    assert "the run cannot be estimated" in printed and "costs are not written" in printed

@@ -53,13 +53,13 @@ def test_a_training_goes_with_its_iterations():
     assert more == (None, set()), "a method without parts that move tells nothing of one with them"
 
 
-def test_a_synthetic_world_tells_the_cost_of_no_other():
+def test_a_synthetic_world_gives_no_estimate_for_others():
     measured = expectations(Cost(JobId("demo_world", film="demo"), 50.0, ""))
     assert measured.of(JobId("demo_world", film="demo")) == (50.0, {JobId("demo_world", film="demo")})
     assert measured.of(JobId("demo_world", film="large")) == (None, set())
 
 
-def test_scenes_and_methods_share_cores_and_cards():
+def test_scenes_and_methods_share_cores_and_gpus():
     work = [
         PlannedJob(JobId("train", scene, m), 8, True, seconds=100.0) for scene in "abcd" for m in ("vanilla", "street")
     ]
@@ -113,7 +113,7 @@ def test_disk_is_what_the_same_jobs_left_for_other_scenes(tmp_path):
 
 
 @pytest.mark.parametrize(("gpu", "on_gpu"), [(1, True), (0, False), (None, False)])
-def test_on_processors_no_job_waits_for_a_card(gpu, on_gpu):
+def test_on_processors_no_job_waits_for_a_gpu(gpu, on_gpu):
     resources = {} if gpu is None else {"gpu": gpu}
     job = SimpleNamespace(threads=2, resources=resources, output=["a.mp4"])
     assert planned_job(JobId("film", "demo"), job) == PlannedJob(JobId("film", "demo"), 2, on_gpu, ("a.mp4",))

@@ -24,7 +24,7 @@ MASKS, TRAIN, FILM = (
 COSTS = [Cost(MASKS, 100.0, ""), Cost(TRAIN, 800.0, "", iterations=15000), Cost(FILM, 100.0, "")]
 BEGINS = "2026-11-22 00:00:00,000 INFO drivesplat.workflow.job: street/train 0103 begins\n"
 ENDS = "2026-11-22 00:00:20,000 INFO drivesplat.workflow.job: street/train 0103 ends\n"
-TOLD = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
+LOGGED = "2026-11-22 00:00:10,000 INFO drivesplat.training.monitor: {}\n"
 
 
 def progress(
@@ -35,28 +35,28 @@ def progress(
     return RunProgress(planned, logs, lambda: Expectations(CONFIG, costs), lambda: finished, Machine(1, 1), began)
 
 
-def test_trainings_weigh_what_they_take(tmp_path):
+def test_trainings_weigh_in_proportion_to_their_seconds(tmp_path):
     assert progress(tmp_path, set()).line(0.0) == "0 % of the work, 0 of 3 jobs, about 17 min left"
     assert progress(tmp_path, {MASKS}).line(0.0) == "10 % of the work, 1 of 3 jobs, about 15 min left"
     assert progress(tmp_path, {MASKS, TRAIN}).line(0.0) == "90 % of the work, 2 of 3 jobs, about 2 min left"
 
 
-def test_a_training_at_work_tells_how_far_it_is(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("10 %, 9.0 it/s, 999 s left"))
+def test_a_running_training_reports_its_progress(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("10 %, 9.0 it/s, 999 s left"))
     with open(tmp_path / "train.log", "a") as log:
-        log.write(TOLD.format("50 %, 18.8 it/s, 400 s left"))
+        log.write(LOGGED.format("50 %, 18.8 it/s, 400 s left"))
     line = progress(tmp_path, {MASKS}).line(0.0)
     assert line == "50 % of the work, 1 of 3 jobs, about 8 min left; at work: 0103 street train (50 %)"
 
 
 def test_a_training_slower_than_expected_takes_as_long_as_it_says(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("50 %, 1.0 it/s, 4000 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("50 %, 1.0 it/s, 4000 s left"))
     assert progress(tmp_path, {MASKS}).line(0.0).startswith("50 % of the work, 1 of 3 jobs, about 68 min left")
 
 
 def test_a_training_faster_than_expected_is_no_further_than_it_says(tmp_path):
     """4 % of 200 s, and the masks' 100, of 400."""
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("4 %, 99.0 it/s, 192 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("4 %, 99.0 it/s, 192 s left"))
     assert progress(tmp_path, {MASKS}).line(0.0).startswith("27 % of the work, 1 of 3 jobs, about 5 min left")
 
 
@@ -72,24 +72,24 @@ def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
     """A running training says how long it still takes."""
     alone = progress(tmp_path, {MASKS}, costs=COSTS[:1])
     assert alone.line(0.0) == "1 of 3 jobs, about 0 s and 2 jobs not measured yet left"
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("50 %, 18.8 it/s, 400 s left"))
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("50 %, 18.8 it/s, 400 s left"))
     line = alone.line(0.0)
     assert line == "1 of 3 jobs, about 7 min and 1 jobs not measured yet left; at work: 0103 street train (50 %)"
 
 
 def test_a_job_that_has_ended_is_done_before_it_is_counted(tmp_path):
     """Snakemake looks for outputs, and at other jobs, before it counts one."""
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("99 %, 18.8 it/s, 8 s left") + ENDS)
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("99 %, 18.8 it/s, 8 s left") + ENDS)
     assert progress(tmp_path, {MASKS}).line(0.0) == "90 % of the work, 1 of 3 jobs, about 2 min left"
 
 
-def test_a_log_without_a_beginning_tells_nothing(tmp_path):
+def test_a_log_without_a_beginning_gives_no_times(tmp_path):
     (tmp_path / "train.log").write_text("")
     assert progress(tmp_path, {MASKS}).line(0.0).startswith("10 % of the work, 1 of 3 jobs, about 15 min left")
 
 
-def test_logs_of_earlier_runs_are_nobody_at_work(tmp_path):
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format("50 %, 18.8 it/s, 400 s left"))
+def test_logs_of_earlier_runs_are_not_running_jobs(tmp_path):
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("50 %, 18.8 it/s, 400 s left"))
     assert "at work" not in progress(tmp_path, {MASKS}, began=time.time() + 60).line(0.0)
 
 
@@ -103,7 +103,7 @@ def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):
     monkeypatch.undo()
     watched.close()
     assert [record.message for record in caplog.records] == ["34 %, 20.0 it/s, 33 s left", "46 %, 10.0 it/s, 54 s left"]
-    (tmp_path / "train.log").write_text(BEGINS + TOLD.format(caplog.records[-1].message))
+    (tmp_path / "train.log").write_text(BEGINS + LOGGED.format(caplog.records[-1].message))
     assert "(46 %)" in progress(tmp_path, {MASKS}).line(0.0)
 
 
@@ -111,12 +111,12 @@ def test_a_training_logs_what_progress_reads(tmp_path, monkeypatch, caplog):
 def test_a_watch_prints_and_outlives_what_goes_wrong(tmp_path, capsys, fails):
     finished = set() if not fails else None
     ended = watch(progress(tmp_path, finished), every_s=0.01)
-    deadline, said = time.monotonic() + 10, ""
-    while said.count("\n") < 2 and time.monotonic() < deadline:
+    deadline, printed = time.monotonic() + 10, ""
+    while printed.count("\n") < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
-        said += capsys.readouterr().err
+        printed += capsys.readouterr().err
     ended.set()
     assert (
-        said.count("drivesplat: ") >= 2
-        and ("the progress of the run is unknown" if fails else "0 % of the work") in said
+        printed.count("drivesplat: ") >= 2
+        and ("the progress of the run is unknown" if fails else "0 % of the work") in printed
     )

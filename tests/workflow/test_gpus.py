@@ -1,4 +1,4 @@
-"""How many cards there are, and which job has which: one job a card, and each sees its own alone."""
+"""The number of visible GPUs, and the GPU of each job: one job per GPU, and each job sees only its own."""
 
 import os
 import signal
@@ -14,31 +14,31 @@ from helpers import REPOSITORY
 
 from drivesplat.workflow.job import Job
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.workflow.gpus import visible_cards
+from drivesplat.workflow.gpus import visible_gpus
 
-CARD_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
+VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 
 
 @pytest.fixture
-def four_cards(monkeypatch):
-    """A machine with four NVIDIA cards, nothing hidden."""
-    for variable in CARD_VARIABLES:
+def four_gpus(monkeypatch):
+    """A machine with four NVIDIA GPUs, all visible."""
+    for variable in VARIABLES:
         monkeypatch.delenv(variable, raising=False)
     devices = [Path(f"/dev/nvidia{i}") for i in range(4)] + [Path("/dev/nvidiactl"), Path("/dev/nvidia-uvm")]
-    with_cards = {Path("/dev"): devices, Path("/sys/class/kfd/kfd/topology/nodes"): []}
+    with_gpus = {Path("/dev"): devices, Path("/sys/class/kfd/kfd/topology/nodes"): []}
     real = Path.glob
     monkeypatch.setattr(
-        Path, "glob", lambda self, *a, **k: iter(with_cards[self]) if self in with_cards else real(self, *a, **k)
+        Path, "glob", lambda self, *a, **k: iter(with_gpus[self]) if self in with_gpus else real(self, *a, **k)
     )
 
 
-def test_all_cards_count_where_none_is_hidden(four_cards):
-    assert visible_cards() == 4
+def test_all_gpus_count_where_none_is_hidden(four_gpus):
+    assert visible_gpus() == 4
 
 
-@pytest.mark.parametrize("variable", CARD_VARIABLES)
+@pytest.mark.parametrize("variable", VARIABLES)
 @pytest.mark.parametrize(
-    ("value", "cards"),
+    ("value", "gpus"),
     [
         ("0", 1),
         ("2,3", 2),
@@ -49,22 +49,22 @@ def test_all_cards_count_where_none_is_hidden(four_cards):
         (" 0 , 1 ", 2),
     ],
 )
-def test_hidden_cards_do_not_count_and_there_is_always_one(four_cards, monkeypatch, variable, value, cards):
+def test_hidden_gpus_do_not_count_and_there_is_always_one(four_gpus, monkeypatch, variable, value, gpus):
     monkeypatch.setenv(variable, value)
-    assert visible_cards() == cards
+    assert visible_gpus() == gpus
 
 
-def test_an_empty_list_hides_all_nvidia_cards(four_cards, monkeypatch):
+def test_an_empty_list_hides_all_nvidia_gpus(four_gpus, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert visible_cards() == 1
+    assert visible_gpus() == 1
 
 
-def test_a_machine_without_cards_schedules_one_gpu_job_at_a_time(four_cards, monkeypatch):
+def test_a_machine_without_gpus_schedules_one_gpu_job_at_a_time(four_gpus, monkeypatch):
     monkeypatch.setattr(Path, "glob", lambda *_: iter(()))
-    assert visible_cards() == 1
+    assert visible_gpus() == 1
 
 
-def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path):
+def test_amd_gpus_count_and_processors_do_not(four_gpus, monkeypatch, tmp_path):
     for node, gpu_id in enumerate(("0", "0", "51234", "8121")):
         (tmp_path / str(node)).mkdir()
         (tmp_path / str(node) / "gpu_id").write_text(f"{gpu_id}\n")
@@ -73,44 +73,44 @@ def test_amd_cards_count_and_processors_do_not(four_cards, monkeypatch, tmp_path
         Path("/sys/class/kfd/kfd/topology/nodes"): [tmp_path / str(node) / "gpu_id" for node in range(4)],
     }
     monkeypatch.setattr(Path, "glob", lambda self, *_: iter(found[self]))
-    assert visible_cards() == 2
+    assert visible_gpus() == 2
 
 
-def test_counting_cards_does_not_import_torch():
+def test_counting_gpus_does_not_import_torch():
     """Planning takes about a second; torch takes longer."""
-    counting = "from drivesplat.workflow.gpus import visible_cards; visible_cards()"
+    counting = "from drivesplat.workflow.gpus import visible_gpus; visible_gpus()"
     script = f"import sys; {counting}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, check=True)
 
 
 HOLD = """
 import logging, os, sys, time
-from drivesplat.workflow.gpus import hold_card
+from drivesplat.workflow.gpus import hold_gpu
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
-lock = hold_card(int(sys.argv[1]))
+lock = hold_gpu(int(sys.argv[1]))
 print("holds", os.environ.get("CUDA_VISIBLE_DEVICES"), flush=True)
 time.sleep(float(sys.argv[2]))
 """
 
 
 class Machine:
-    """One with cards, a folder for locks, and an nvidia-smi that knows the cards that a job may use by `uuids`."""
+    """A machine with GPUs, a folder for locks, and an nvidia-smi that lists `uuids` as the GPUs of a job."""
 
     def __init__(self, folder: Path, uuids: list[str] | None = None):
         self.folder = folder
         for name in ("bin", "tmp"):
             (folder / name).mkdir()
-        self.know(uuids)
+        self.set_uuids(uuids)
         self.jobs: list[subprocess.Popen] = []
 
-    def know(self, uuids: list[str] | None) -> None:
+    def set_uuids(self, uuids: list[str] | None) -> None:
         program = self.folder / "bin/nvidia-smi"
         lines = "".join(f"echo '{index}, {uuid}'\n" for index, uuid in enumerate(uuids or []))
         program.write_text(f"#!/bin/sh\n{lines}" if uuids else "#!/bin/sh\nexit 9\n")
         program.chmod(0o755)
 
     def start(self, visible: str | None, jobs_per_card: int = 1, seconds: float = 60) -> subprocess.Popen:
-        """A job that holds a card, as long as it is told to."""
+        """A job that holds a GPU for `seconds`."""
         path = f"{self.folder / 'bin'}:{os.environ['PATH']}"
         environment = {k: v for k, v in os.environ.items() if not k.endswith("_VISIBLE_DEVICES")}
         environment |= {"PATH": path, "TMPDIR": str(self.folder / "tmp"), "PYTHONPATH": str(REPOSITORY)}
@@ -123,15 +123,15 @@ class Machine:
         self.jobs.append(job)
         return job
 
-    def card_of(self, job: subprocess.Popen) -> str:
-        """What a job sees, once it holds it."""
+    def gpu_of(self, job: subprocess.Popen) -> str:
+        """The GPU that a job sees once it holds it."""
         for line in job.stdout:
             if line.startswith("holds "):
                 return line.split()[1]
         raise AssertionError(job.wait())
 
-    def cards(self, visible: str | None, jobs: int, jobs_per_card: int = 1) -> list[str]:
-        return [self.card_of(job) for job in [self.start(visible, jobs_per_card) for _ in range(jobs)]]
+    def gpus_of(self, visible: str | None, jobs: int, jobs_per_card: int = 1) -> list[str]:
+        return [self.gpu_of(job) for job in [self.start(visible, jobs_per_card) for _ in range(jobs)]]
 
 
 @pytest.fixture
@@ -145,55 +145,55 @@ def machine(tmp_path):
 
 
 @pytest.mark.parametrize("visible", ["0,1,2,3", "GPU-a,GPU-b,GPU-c,GPU-d", "1,3"])
-def test_jobs_started_at_once_see_a_card_each(machine, visible):
-    cards = visible.split(",")
-    assert sorted(machine.cards(visible, len(cards))) == cards
+def test_jobs_started_at_the_same_time_see_a_gpu_each(machine, visible):
+    gpus = visible.split(",")
+    assert sorted(machine.gpus_of(visible, len(gpus))) == gpus
 
 
-def test_one_more_job_waits_says_so_and_gets_the_card_of_one_that_is_killed(machine):
+def test_one_more_job_waits_with_a_warning_and_gets_the_gpu_of_a_killed_one(machine):
     holders = [machine.start("0,1") for _ in range(2)]
-    cards = [machine.card_of(job) for job in holders]
+    gpus = [machine.gpu_of(job) for job in holders]
     late = machine.start("0,1")
     line = late.stdout.readline()
     assert line.startswith("waits for a GPU") and all(str(job.pid) in line for job in holders), line
     assert "device.jobs_per_card" in line
     holders[1].send_signal(signal.SIGKILL)
-    assert machine.card_of(late) == cards[1]
+    assert machine.gpu_of(late) == gpus[1]
 
 
-def test_on_one_card_one_job_at_a_time(machine):
-    machine.know(["GPU-a"])
+def test_on_one_gpu_one_job_at_a_time(machine):
+    machine.set_uuids(["GPU-a"])
     first, began = machine.start("0", seconds=1.5), time.monotonic()
-    assert machine.card_of(first) == "0"
-    assert machine.card_of(machine.start("0")) == "0"
+    assert machine.gpu_of(first) == "0"
+    assert machine.gpu_of(machine.start("0")) == "0"
     assert time.monotonic() - began > 1.5
 
 
-def test_more_jobs_share_the_cards_evenly_where_they_may(machine):
-    assert sorted(machine.cards("0,1", 4, jobs_per_card=2)) == ["0", "0", "1", "1"]
+def test_more_jobs_share_the_gpus_evenly_where_they_may(machine):
+    assert sorted(machine.gpus_of("0,1", 4, jobs_per_card=2)) == ["0", "0", "1", "1"]
 
 
-def test_a_card_is_one_and_the_same_by_number_and_by_name(machine):
-    assert machine.cards("GPU-b", 1) == ["GPU-b"]
-    assert machine.cards("0,1", 1) == ["0"]
+def test_a_gpu_is_the_same_by_number_and_by_name(machine):
+    assert machine.gpus_of("GPU-b", 1) == ["GPU-b"]
+    assert machine.gpus_of("0,1", 1) == ["0"]
     assert machine.start("1").stdout.readline().startswith("waits")
 
 
-def test_cards_of_a_scheduler_that_shows_every_job_its_own_as_number_0_are_not_taken_for_one(machine):
-    machine.know(["GPU-c"])
-    first = machine.cards("0", 1)
-    machine.know(["GPU-d"])
-    assert first == machine.cards("0", 1) == ["0"]
+def test_gpus_that_a_scheduler_shows_each_as_number_0_are_distinguished(machine):
+    machine.set_uuids(["GPU-c"])
+    first = machine.gpus_of("0", 1)
+    machine.set_uuids(["GPU-d"])
+    assert first == machine.gpus_of("0", 1) == ["0"]
 
 
-def test_a_single_card_of_a_scheduler_is_used_as_given_where_nobody_tells_which_it_is(machine):
-    machine.know(None)
-    assert machine.cards("0", 2) == ["0", "0"]
-    assert sorted(machine.cards("0,1", 2)) == ["0", "1"]
+def test_a_single_gpu_of_unknown_identity_from_a_scheduler_is_used_as_given(machine):
+    machine.set_uuids(None)
+    assert machine.gpus_of("0", 2) == ["0", "0"]
+    assert sorted(machine.gpus_of("0,1", 2)) == ["0", "1"]
 
 
 @pytest.mark.parametrize("visible", ["", "-1"])
-def test_without_cards_nothing_is_held_and_nothing_changed(machine, visible):
+def test_without_gpus_nothing_is_held_and_nothing_changed(machine, visible):
     assert machine.start(visible).stdout.readline() == f"holds {visible}\n"
 
 
@@ -204,15 +204,15 @@ def test_locks_that_cannot_be_written_are_named(machine):
 
 
 @pytest.mark.parametrize("kind", ["auto", "any", "cuda"])
-def test_a_rules_job_holds_a_card_from_when_it_asks_where_to_run(tmp_path, monkeypatch, kind):
+def test_a_rules_job_holds_a_gpu_from_the_choice_of_its_device(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(time, "sleep", lambda _: pytest.fail("it waits for itself"))
     jobs = [rules_job(kind) for _ in range(2)]
-    for job, card in zip(jobs, ("GPU-x", "GPU-y"), strict=True):
+    for job, gpu in zip(jobs, ("GPU-x", "GPU-y"), strict=True):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "GPU-x,GPU-y")
-        for _ in ("once", "asked again"):
+        for _ in ("once", "again"):
             assert job.device().kind == kind
-            assert os.environ["CUDA_VISIBLE_DEVICES"] == card
+            assert os.environ["CUDA_VISIBLE_DEVICES"] == gpu
 
 
 def test_a_rules_job_on_the_cpu_holds_none(tmp_path, monkeypatch):

@@ -3,9 +3,12 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from helpers import REPOSITORY
+
+from drivesplat.workflow.job import Job
 
 AS_A_SCRIPT = """
 snakemake = None
@@ -21,7 +24,7 @@ with job(told):
 """
 
 
-def said(code: str, folder: Path) -> str:
+def output_of(code: str, folder: Path) -> str:
     """What Python prints that runs `code` in a folder."""
     environment = {"PYTHONPATH": str(REPOSITORY), "PATH": "/usr/bin:/bin"}
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
@@ -31,12 +34,12 @@ def said(code: str, folder: Path) -> str:
 
 @pytest.mark.parametrize(("code", "collects"), [(AS_A_SCRIPT, "False"), (AS_A_LIBRARY, "True")])
 def test_garbage_is_collected_while_all_is_imported_but_by_a_rules_script(code, collects, tmp_path):
-    assert said(code + "print(gc.isenabled())", tmp_path) == collects
+    assert output_of(code + "print(gc.isenabled())", tmp_path) == collects
 
 
 @pytest.mark.parametrize("code", [AS_A_SCRIPT, AS_A_LIBRARY])
 def test_a_job_collects_its_own_garbage_and_looks_through_no_import(code, tmp_path):
-    assert said(code + IN_A_JOB, tmp_path) == "True True"
+    assert output_of(code + IN_A_JOB, tmp_path) == "True True"
 
 
 def test_every_script_imports_the_job_before_the_rest_of_the_library():
@@ -48,3 +51,19 @@ def test_every_script_imports_the_job_before_the_rest_of_the_library():
         assert heavy[0] == "drivesplat.workflow.job", (
             f"{script.name}: garbage is looked for while {heavy[0]} is imported"
         )
+
+
+@pytest.mark.parametrize("wildcards", [{"scene": "t1"}, {"scene": "t1", "method": "t1"}, {}], ids=str)
+def test_only_results_of_the_scene_are_expected_to_have_a_digest(tmp_path, caplog, wildcards):
+    """A dataset may have a folder of the scene's name, too."""
+    result, own = tmp_path / "results/t1/scene.json", tmp_path / "data/t1/poses.json"
+    for file in (result, own):
+        file.parent.mkdir(parents=True)
+        file.write_text("{}")
+    output = result.parent.joinpath(wildcards.get("method", "."), "own_car.json")
+    told = SimpleNamespace(
+        wildcards=SimpleNamespace(**wildcards), log=[], threads=1, rule="it", params={}, resources={}
+    )
+    told.input, told.output = [str(own), str(result)], [str(output)]
+    Job(told).check_inputs()
+    assert [record.args[0] for record in caplog.records] == ([result] if wildcards else [])

@@ -11,6 +11,7 @@ from helpers import REPOSITORY
 from drivesplat.errors import ConfigError
 from drivesplat.settings.config import load
 from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
+from drivesplat.workflow import inputs
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, TRAINING_INPUTS, refines_poses, stage_settings
 
@@ -30,6 +31,20 @@ def taken(made: Plan, scene: str, method: str) -> list[str]:
     return [file for stage in TRAINING_INPUTS for file in made.training_input(stage)(at)]
 
 
+def test_a_dataset_without_scene_tables_names_the_files_of_each_scene(monkeypatch):
+    """A scene that is added to it reruns no other."""
+    files = SimpleNamespace(
+        find_root=lambda dataroot, _: Path(dataroot),
+        table_files=lambda root, version, scene: [root / version / scene / "poses.json"],
+    )
+    monkeypatch.setattr(inputs, "layout", lambda _: files)
+    monkeypatch.setattr(inputs, "index", lambda _: None)
+    made = Plan({"datasets": {"a": {"dataroot": "there", "version": "v1", "scenes": ["a1", "a2"]}}}, str(REPOSITORY))
+    for scene in ("a1", "a2"):
+        at = SimpleNamespace(scene=scene)
+        assert made.tables(at) == [f"there/v1/{scene}/poses.json"] and made.scene_tables(at) == []
+
+
 def test_actors_are_an_input_of_methods_with_that_part_alone():
     made = plan(methods={"vanilla": {}, "mine": {"parts": ACTORS}})
     assert taken(made, "a1", "mine") == ["elsewhere/a1/actors.npz"]
@@ -37,7 +52,7 @@ def test_actors_are_an_input_of_methods_with_that_part_alone():
     assert taken(made, "a1", "vanilla") == []
 
 
-def test_depth_is_an_input_where_a_training_is_held_to_it():
+def test_depth_is_an_input_of_trainings_supervised_with_it():
     made = plan(methods={"vanilla": {}, "held": {"overrides": HELD}})
     assert taken(made, "a1", "held") == ["elsewhere/a1/lidar_depth.npz"]
     assert taken(made, "a1", "vanilla") == []
@@ -137,38 +152,38 @@ def test_a_report_expects_the_refinement_of_scenes_whose_poses_are_refined():
     assert expected["b1"]["refine_poses"]["settings"]["refine_poses"]["enabled"] is True
 
 
-def test_the_refinement_is_told_what_decides_it_and_no_more():
-    job = told("refine_poses", random_seed=3, refine_poses={"rounds": 5})
+def test_the_refinement_gets_only_the_settings_that_determine_it():
+    job = stage_record("refine_poses", random_seed=3, refine_poses={"rounds": 5})
     assert job.keys() == {"refine_poses", "random_seed", "lidar"} and job["lidar"] is None
     assert (job["refine_poses"]["rounds"], job["random_seed"]) == (5, 3)
     lidar = {"lidar_depth": {"ray_spacing": [0.2, 0.4]}, "lidar_seed": {"own_car_radius": 3.0}}
-    alone = told("refine_poses", refine_poses={"start": "images"}, **lidar)
+    alone = stage_record("refine_poses", refine_poses={"start": "images"}, **lidar)
     assert alone["lidar"] == {"ray_spacing": [0.2, 0.4], "own_car_radius": 3.0}
 
 
-def told(stage: str, **values: Any) -> dict[str, Any]:
+def stage_record(stage: str, **values: Any) -> dict[str, Any]:
     return json.loads(stage_settings(load(values), stage, "0061"))
 
 
-def test_each_is_told_what_decides_it():
+def test_each_stage_gets_the_settings_that_determine_it():
     values = {
         "actors": {"humans": True}, "holdout": {"last_block": 2}, "images": {"width": 320}, "random_seed": 7,
         "lidar_seed": {"own_car_radius": 3.0, "box_margin": 0.3},
     }  # fmt: skip
     values |= {"free_space": {"voxel": 0.4}, "lidar_depth": {"ray_spacing": [0.2, 0.4]}}
-    actors, depth, free = (told(stage, **values) for stage in ("actors", "lidar_depth", "free_space"))
+    actors, depth, free = (stage_record(stage, **values) for stage in ("actors", "lidar_depth", "free_space"))
     for record in (actors, depth):
         assert (record["holdout"]["last_block"], record["images"]["width"], record["own_car_radius"]) == (2, 320, 3.0)
     assert (actors["actors"]["humans"], actors["random_seed"]) == (True, 7)
     assert depth["box_margin"] == 0.3 and "actors" not in depth and "random_seed" not in depth
-    assert depth["ray_spacing"] == [0.2, 0.4] and told("evaluate", **values)["lidar"] == depth
+    assert depth["ray_spacing"] == [0.2, 0.4] and stage_record("evaluate", **values)["lidar"] == depth
     assert (free["free_space"]["voxel"], free["holdout"]["last_block"]) == (0.4, 2)
     assert (free["own_car_radius"], free["box_margin"]) == (3.0, 0.3) and "images" not in free
 
 
 def test_a_dataset_may_set_its_actors_for_itself():
     overrides = {"datasets": {"nuscenes": {"overrides": {"actors": {"min_points": 9}}}}}
-    assert told("actors", **overrides)["actors"]["min_points"] == 9
+    assert stage_record("actors", **overrides)["actors"]["min_points"] == 9
 
 
 def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
@@ -212,7 +227,7 @@ def test_a_report_asked_for_alone_is_of_what_is_there(tmp_path):
     assert {Path(link).name for link in made.report([]).links()} >= {"original.mp4", "parts.mp4", "viewer.html"}
 
 
-def test_the_reference_is_the_first_method_that_stands_still():
+def test_the_reference_is_the_first_static_method():
     def reference(methods):
         return json.loads(plan(methods=methods).report([]).settings())["reference"]
 
@@ -235,3 +250,26 @@ def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_
         made.report(others).refuse_empty()
     (tmp_path / "a1/metrics.json").touch()
     made.report(["report"]).refuse_empty()
+
+
+# ---- targets
+
+
+EVERY_METHOD = ("", "street", "vanilla")
+
+
+@pytest.mark.parametrize(
+    ("targets", "scenes", "methods"),
+    [
+        ([], ("a1", "a2", "b1"), EVERY_METHOD),
+        (["films"], ("a1", "a2", "b1"), EVERY_METHOD),
+        (["elsewhere/gap_report.html"], ("a1", "a2", "b1"), EVERY_METHOD),
+        (["elsewhere/a2/metrics.json"], ("a2",), EVERY_METHOD),
+        (["elsewhere/a2/street/original.mp4"], ("a2",), ("", "street")),
+        (["elsewhere/a1/seed.ply", "elsewhere/b1/masks/masks.json"], ("a1", "b1"), ("",)),
+        (["download_nuscenes_mini"], (), EVERY_METHOD),
+    ],
+)
+def test_targets_concern_these_scenes_and_methods(targets, scenes, methods):
+    expected = {(scene, method) for scene in scenes for method in methods}
+    assert plan().scenes_and_methods(targets) == expected

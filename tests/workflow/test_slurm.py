@@ -22,7 +22,7 @@ def test_the_profile_for_slurm_reruns_what_the_default_one_does():
     default, slurm = (yaml.safe_load((PROFILES / name / "config.yaml").read_text()) for name in ("default", "slurm"))
     own = {"__use_yte__", "__definitions__", "resources"}
     assert {key: slurm.get(key) for key in default.keys() - own} == {k: v for k, v in default.items() if k not in own}
-    assert slurm["executor"] == "slurm" and "resources" not in slurm, "how many cards there are is SLURM's to know"
+    assert slurm["executor"] == "slurm" and "resources" not in slurm, "SLURM knows the number of GPUs"
 
 
 @pytest.mark.slurm

@@ -62,7 +62,7 @@ def test_what_the_drives_were_like_stands_beside_their_figures(drives):
         assert night[group]["flat_psnr"] > still[group]["flat_psnr"] + 8.0
 
 
-def test_in_words_they_are_read_with_a_grain_of_salt(drives):
+def test_the_summary_warns_about_standing_dark_and_static_drives(drives):
     stands, still, night = ("\n".join(sentences(drives[name].metrics, "metrics.json")) for name in WORLDS)
     assert stands.count("were taken 0.00 m from training frames") == 2 and "dark" not in stands
     assert night.count("are dark (mean luminance 0.1") == 2 and "memorised" not in night
@@ -77,7 +77,7 @@ def test_a_standing_car_has_a_scale_and_seeds(drives):
 
 
 @pytest.mark.parametrize(("film", "left"), [("original", 0.0), ("lateral_2m", 2.0)])
-def test_a_film_of_a_standing_car_is_taken_by_a_camera_that_stands(drives, film, left):
+def test_a_film_of_a_stationary_car_is_taken_by_a_stationary_camera(drives, film, left):
     made = drives["stands"]
     job, scene = made.job("film", FilmJob, "street", film), made.drives["street"].recording.scene
     path = film_path(scene, job.camera, job.fps, job.trajectory)
@@ -86,7 +86,7 @@ def test_a_film_of_a_standing_car_is_taken_by_a_camera_that_stands(drives, film,
     np.testing.assert_allclose(path.camera_to_world[:, :3, 3], expected, atol=1e-6)
 
 
-def test_a_standing_cars_movers_are_seen_and_removed(drives):
+def test_a_standing_cars_moving_vehicle_is_shown_and_removed(drives):
     made = drives["stands"]
     for method, by in zip(METHODS, ("box", "actor"), strict=True):
         _, panel = ghost_panel(made.drives[method], made.job("ghost_panel", PanelJob, method))
@@ -107,10 +107,10 @@ def test_where_nothing_moves_figures_say_so_and_nothing_can_be_edited(drives, me
         editable_actors(drive.model, drive.recording.scene, "scene 0001, edit 'gone'")
 
 
-@pytest.mark.parametrize(("name", "told"), [("night", False), ("still", True)])
-def test_by_night_no_loss_takes_the_dark_sky_for_a_wall(drives, name, told):
+@pytest.mark.parametrize(("name", "logged"), [("night", False), ("still", True)])
+def test_by_night_no_loss_takes_the_dark_sky_for_a_wall(drives, name, logged):
     """The heuristic finds no sky there; a cross entropy that was told so would near alpha to 1 all over."""
     made = drives[name]
     board = EventAccumulator(str(made.folder / "street" / "tensorboard"))
     board.Reload()
-    assert ("loss/sky_bce" in board.Tags()["scalars"]) == told and "loss/depth" in board.Tags()["scalars"]
+    assert ("loss/sky_bce" in board.Tags()["scalars"]) == logged and "loss/depth" in board.Tags()["scalars"]

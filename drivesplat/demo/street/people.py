@@ -12,7 +12,7 @@ from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import StreetPath
 from drivesplat.demo.street.road import Road
 from drivesplat.scene.splits import held_out_key_frames
-from drivesplat.settings.holdout import HoldoutSettings
+from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.world import WorldSettings
 
 CYCLING_SPEED = 4.2

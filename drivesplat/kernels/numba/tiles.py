@@ -20,7 +20,6 @@ from drivesplat.kernels.numba.layout import (
     MEAN_X,
     MEAN_Y,
     MIN_ALPHA,
-    OPACITY,
     RADIUS_X,
     RADIUS_Y,
     REACH,
@@ -41,8 +40,8 @@ CHUNKS = 16
 class Splats:
     """The m Gaussians in view of one camera, front to back.
 
-    `order` (m,) are their numbers in the scene; `shapes` (m, 9), by the columns of `layout`, and `values` (m,
-    channels) are drawn.
+    `order` (m,) are their numbers in the scene; `shapes` (m, 9), with the columns that `layout` numbers, and `values`
+    (m, channels) are drawn.
     """
 
     order: np.ndarray
@@ -85,12 +84,9 @@ def front_to_back(
     keys = depths[visible]
     keys = keys.view(np.uint32 if keys.dtype == np.float32 else np.uint64)  # of positive numbers, in the same order
     order = _sorted_by(visible, keys)
-    shapes = np.empty((len(order), 9), means2d.dtype)
-    gathered = np.empty((len(order), values.shape[1]), means2d.dtype)
-    parallel_for(
-        _gather, len(order), 8192, order, means2d, conics, opacities, radii, values, shapes, gathered,
-    )  # fmt: skip
-    return Splats(order, shapes, gathered)
+    reach = 2.0 * np.log(opacities[order].astype(np.float64) / MIN_ALPHA) + 1e-3
+    by_column = (means2d[order], conics[order], opacities[order, None], reach[:, None], radii[order])
+    return Splats(order, np.concatenate(by_column, axis=1, dtype=means2d.dtype, casting="same_kind"), values[order])
 
 
 def tile_lists(splats: Splats, columns: int, rows: int) -> Iterator[TileLists]:
@@ -165,20 +161,6 @@ def _sorted_by(items, keys):
         items, other_items = other_items, items
         keys, other_keys = other_keys, keys
     return items
-
-
-@kernel
-@no_type_check
-def _gather(start, stop, order, means2d, conics, opacities, radii, values, shapes, gathered):
-    for r in range(start, stop):
-        g = order[r]
-        shapes[r, MEAN_X], shapes[r, MEAN_Y] = means2d[g, 0], means2d[g, 1]
-        shapes[r, CONIC_XX], shapes[r, CONIC_XY], shapes[r, CONIC_YY] = conics[g, 0], conics[g, 1], conics[g, 2]
-        shapes[r, OPACITY] = opacities[g]
-        shapes[r, REACH] = 2.0 * math.log(float(opacities[g]) / MIN_ALPHA) + 1e-3
-        shapes[r, RADIUS_X], shapes[r, RADIUS_Y] = radii[g, 0], radii[g, 1]
-        for k in range(values.shape[1]):
-            gathered[r, k] = values[g, k]
 
 
 @callee

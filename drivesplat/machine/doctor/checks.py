@@ -103,8 +103,8 @@ def _no_gpu(facts: Facts) -> Finding:
     consequence = "the CPU demo runs; real scenes are refused unless you write device: cpu (very slow)"
     torch = facts.torch
     if facts.gpu_problem:
-        cure = "(re)install NVIDIA's driver (Ubuntu: sudo ubuntu-drivers install), then reboot"
-        return note("GPU", f"{facts.gpu_problem}: {cure}; until then {consequence}")
+        remedy = "(re)install NVIDIA's driver (Ubuntu: sudo ubuntu-drivers install), then reboot"
+        return note("GPU", f"{facts.gpu_problem}: {remedy}; until then {consequence}")
     if facts.gpus and torch is not None and (torch.cuda or torch.hip) and _unfit_build(facts) is None:
         return fix("GPU", "torch finds no GPU: is CUDA_VISIBLE_DEVICES set, or was the driver updated (reboot)?")
     if facts.gpus:

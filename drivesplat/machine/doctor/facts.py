@@ -17,8 +17,9 @@ from drivesplat.kernels import triton_support
 from drivesplat.machine.compute_capability import Capability
 from drivesplat.machine.doctor.torch_builds import Gpu, read_gpus
 from drivesplat.machine.gsplat_build.diagnose import missing_prerequisite
-from drivesplat.machine.gsplat_build.installed import build_record, compiled_extension, package_folder, package_version
+from drivesplat.machine.gsplat_build.installed import build_record, compiled_extension, package_folder
 from drivesplat.machine.gsplat_build.toolkit import Toolkit, installed_toolkits
+from drivesplat.provenance.record import package_version
 from drivesplat.readers.datasets import layout
 from drivesplat.settings.config import Config, load, merged
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
@@ -175,7 +176,8 @@ def _datasets(config: Config) -> tuple[Dataset, ...]:
         files = layout(dataset.reader)
         try:
             root = files.find_root(dataset.dataroot, dataset.version)
-            files.table_files(root, dataset.version)
+            for scene in dataset.scenes:
+                files.table_files(root, dataset.version, scene)
             found.append(Dataset(name, str(root), generated=generated))
         except DriveSplatError as error:
             found.append(Dataset(name, problem=str(error), generated=generated))

@@ -1,6 +1,5 @@
 """Compiling gsplat's kernels with progress reports, and installing them where gsplat's loader looks first."""
 
-import argparse
 import os
 import re
 import shutil
@@ -83,7 +82,8 @@ def compile_and_install(toolkit: Toolkit, archs: Sequence[str], jobs: int, repor
     folder = build_folder()
     with _exclusive(folder):
         (folder / "lock").unlink(missing_ok=True)  # torch would wait forever for the lock of an interrupted build
-        command = [sys.executable, "-m", "drivesplat.machine.gsplat_build.compile", str(folder)]
+        script = f"import sys; from {__name__} import compile_in; compile_in(sys.argv[1])"
+        command = [sys.executable, "-c", script, str(folder)]
         run_with_progress(command, compile_environment(toolkit, archs, jobs), log_file(), report)
         installed = install(folder / "csrc.so", package, archs)
     check_loads(os.environ)
@@ -183,9 +183,3 @@ def compile_in(folder: str) -> None:
         build_directory=folder,
         verbose=True,
     )
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser("python -m drivesplat.machine.gsplat_build.compile", description=__doc__)
-    parser.add_argument("folder", help="where to compile gsplat's kernels")
-    compile_in(parser.parse_args().folder)

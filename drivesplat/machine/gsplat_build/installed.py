@@ -3,10 +3,11 @@
 import json
 import re
 from importlib.machinery import EXTENSION_SUFFIXES
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+from drivesplat.provenance.record import package_version
 
 RECORD = "csrc.build.json"
 
@@ -47,14 +48,6 @@ def build_record() -> dict[str, Any]:
 def versions() -> dict[str, str | None]:
     """The installed versions to which compiled kernels belong."""
     return {name: package_version(name) for name in ("torch", "gsplat")}
-
-
-def package_version(name: str) -> str | None:
-    """The version of an installed package; None if it is not installed."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def torch_platform() -> tuple[str | None, str | None]:

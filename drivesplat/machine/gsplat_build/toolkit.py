@@ -15,7 +15,7 @@ from drivesplat.errors import DeviceError
 FROM_PYPI_SINCE = 13
 """NVIDIA's packages on PyPI contain nvcc from CUDA 13 on; those for CUDA 12 contain only ptxas."""
 EXTRAS = "nvcc,crt,nvvm,cccl,cudart"
-OTHER_WAYS = (
+ALTERNATIVES = (
     "install NVIDIA's CUDA toolkit {version} (https://developer.nvidia.com/cuda-toolkit-archive, or `conda create -p "
     "~/cuda-{version} -c conda-forge cuda-nvcc={version} cuda-cudart-dev={version} cuda-cccl={version} "
     "libcublas-dev libcusparse-dev libcusolver-dev cuda-version={version}`), then CUDA_HOME=/where/it/is make setup"
@@ -53,7 +53,7 @@ def provide_toolkit(torch_cuda: str) -> Toolkit:
             return toolkit
     raise DeviceError(
         f"no CUDA compiler for torch's CUDA {torch_cuda}: {reason}, and none is installed; "
-        + OTHER_WAYS.format(version=torch_cuda)
+        + ALTERNATIVES.format(version=torch_cuda)
     )
 
 

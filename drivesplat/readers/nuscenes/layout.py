@@ -46,8 +46,13 @@ def find_root(dataroot: str, version: str) -> Path:
     raise DatasetError(f"nuScenes {version} not found: looked for {version}/scene.json in {given}; {found}")
 
 
-def table_files(root: Path, version: str) -> list[Path]:
-    """The files from which `read` reads a scene. Raises DatasetError naming the tables that are missing."""
+def table_files(root: Path, version: str, scene: str) -> list[Path]:
+    """The files from which `read` reads a scene: for every scene all tables. Raises DatasetError as `all_tables`."""
+    return all_tables(root, version)
+
+
+def all_tables(root: Path, version: str) -> list[Path]:
+    """The files of all tables. Raises DatasetError naming the tables that are missing."""
     files = [root / version / f"{name}.json" for name in TABLES]
     absent = [file.name for file in files if not file.is_file()]
     if absent:

@@ -178,23 +178,24 @@ def _records(tables: Any, samples: list[dict], channel: str, sweeps: bool) -> It
         data = following
 
 
-def _place(tables: Any, data: dict, scene: Scene) -> tuple[np.ndarray, np.ndarray, dict]:
-    """Ego and sensor poses in world coordinates, and the calibration record."""
-    sensor = _get(tables, "calibrated_sensor", data["calibrated_sensor_token"])
-    ego_to_world = _ego_pose(tables, data)
-    ego_to_world[:3, 3] -= scene.origin
-    sensor_to_ego = checked_pose(sensor["translation"], sensor["rotation"], f"calibrated_sensor {sensor['token']}")
-    return ego_to_world, ego_to_world @ sensor_to_ego, sensor
-
-
-def _index(data: dict, index_of_sample: dict[str, int], scene: Scene) -> int:
-    return index_of_sample[data["sample_token"]] if data["is_key_frame"] else scene.nearest_key_frame(data["timestamp"])
+def _recordings(
+    tables: Any, samples: list[dict], channel: str, sweeps: bool, scene: Scene
+) -> Iterator[tuple[dict, int, np.ndarray, np.ndarray, dict]]:
+    """The records of a channel, each with its key frame, its ego and sensor poses in world coordinates, and its
+    calibration."""
+    index_of_sample = {sample["token"]: i for i, sample in enumerate(samples)}
+    for data in _records(tables, samples, channel, sweeps):
+        at, of_sample = data["timestamp"], data["sample_token"]
+        index = index_of_sample[of_sample] if data["is_key_frame"] else scene.nearest_key_frame(at)
+        sensor = _get(tables, "calibrated_sensor", data["calibrated_sensor_token"])
+        ego_to_world = _ego_pose(tables, data)
+        ego_to_world[:3, 3] -= scene.origin
+        sensor_to_ego = checked_pose(sensor["translation"], sensor["rotation"], f"calibrated_sensor {sensor['token']}")
+        yield data, index, ego_to_world, ego_to_world @ sensor_to_ego, sensor
 
 
 def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: bool, scene: Scene) -> Iterator[Frame]:
-    index_of_sample = {sample["token"]: i for i, sample in enumerate(samples)}
-    for data in _records(tables, samples, camera, sweeps):
-        ego_to_world, camera_to_world, sensor = _place(tables, data, scene)
+    for data, index, ego_to_world, camera_to_world, sensor in _recordings(tables, samples, camera, sweeps, scene):
         width, height = checked_size(data["width"], data["height"], f"sample_data {data['token']}")
         yield Frame(
             camera=camera,
@@ -206,7 +207,7 @@ def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: b
             camera_to_world=camera_to_world,
             ego_to_world=ego_to_world,
             is_key_frame=data["is_key_frame"],
-            sample_index=_index(data, index_of_sample, scene),
+            sample_index=index,
             token=data["token"],
         )
 
@@ -214,20 +215,9 @@ def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: b
 def _sweeps(tables: Any, root: Path, samples: list[dict], sweeps: bool, scene: Scene) -> Iterator[Sweep]:
     if not any(LIDAR in sample["data"] for sample in samples):
         return
-    index_of_sample = {sample["token"]: i for i, sample in enumerate(samples)}
-    for data in _records(tables, samples, LIDAR, sweeps):
-        _, sensor_to_world, _ = _place(tables, data, scene)
-        index = _index(data, index_of_sample, scene)
-        yield Sweep(
-            str(root / data["filename"]),
-            data["timestamp"],
-            sensor_to_world,
-            data["is_key_frame"],
-            index,
-            data["token"],
-            LIDAR,
-            "nuscenes",
-        )
+    for data, index, _, sensor_to_world, _ in _recordings(tables, samples, LIDAR, sweeps, scene):
+        path, time, is_key_frame = str(root / data["filename"]), data["timestamp"], data["is_key_frame"]
+        yield Sweep(path, time, sensor_to_world, is_key_frame, index, data["token"], LIDAR, READER)
 
 
 def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Track]:

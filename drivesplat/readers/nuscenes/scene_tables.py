@@ -17,7 +17,7 @@ from typing import Any
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import atomic_path, unwritable, write_json
-from drivesplat.readers.nuscenes.layout import TABLES, table_files
+from drivesplat.readers.nuscenes.layout import TABLES, all_tables
 
 SCHEMA = 1
 INDEX = ".index.json"
@@ -46,13 +46,13 @@ _SHARED = ("attribute", "category", "sensor", "visibility")
 """Small tables that are copied for all scenes."""
 
 
-def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) -> None:
-    """Updates the files of `scenes` in `folder` from the tables in `root`/`version`.
+def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) -> list[Path]:
+    """Updates the files of `scenes` in `folder` from the tables in `root`/`version`; returns those that it wrote.
 
     Returns at once if no table has changed its size or modification time. The file of a scene that is not in the tables
     names the scenes that are. Raises DatasetError if a table is damaged, ResultError if `folder` cannot be written.
     """
-    files = [(file.name, file.stat()) for file in table_files(root, version)]
+    files = [(file.name, file.stat()) for file in all_tables(root, version)]
     made_from = {
         "schema": SCHEMA,
         "scenes": list(scenes),
@@ -60,12 +60,13 @@ def index_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) 
         "tables": {name: [stat.st_size, stat.st_mtime_ns] for name, stat in files},
     }
     if all(scene_file(folder, scene).is_file() for scene in scenes) and _made_from(folder) == made_from:
-        return
+        return []
     size = sum(stat.st_size for _, stat in files)
     if size > LARGE:
         print(f"drivesplat: reading the tables of nuScenes {version} once ({size / 1e9:.1f} GB)", file=sys.stderr)
-    write_scene_tables(root, version, scenes, folder)
+    written = write_scene_tables(root, version, scenes, folder)
     write_json(folder / INDEX, made_from)
+    return written
 
 
 def scene_file(folder: Path, scene: str) -> Path:
@@ -79,8 +80,8 @@ def _made_from(folder: Path) -> Any:
     return None
 
 
-def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) -> None:
-    """Writes the files of `scenes` in `folder` whose content has changed.
+def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: Path) -> list[Path]:
+    """Writes the files of `scenes` in `folder` whose content has changed, and returns them.
 
     Raises DatasetError if a table is damaged, ResultError if `folder` cannot be written.
     """
@@ -91,15 +92,17 @@ def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: 
         raise unwritable(folder, error) from error
     with work as made:
         try:
-            with _SceneRows(Path(made)) as found:
-                _collect(root / version, scenes, found)
+            _append(_rows_of_scenes(root / version, scenes), Path(made))
         except (AttributeError, KeyError, TypeError, ValueError, OSError) as error:
             raise damaged(root, version, error) from error
+        changed = []
         for scene in scenes:
             new, file = scene_file(Path(made), scene), scene_file(folder, scene)
             if not file.is_file() or file.read_bytes() != new.read_bytes():
+                changed.append(file)
                 with atomic_path(file) as temporary:
                     new.replace(temporary)
+        return changed
 
 
 def damaged(root: Path, version: str, error: Exception) -> DatasetError:
@@ -122,76 +125,68 @@ def read_scene_tables(path: Path) -> dict[str, list[dict[str, Any]]]:
     return tables
 
 
-class _SceneRows:
-    """Writes the rows of several scenes to their files through a buffer."""
+Found = tuple[Iterable[str], str, str]
+"""The scenes of a row, its table, and the row as text."""
 
-    def __init__(self, folder: Path):
-        self._folder = folder
-        self._lines: dict[str, list[str]] = defaultdict(list)
-        self._size = 0
 
-    def __enter__(self) -> "_SceneRows":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._append()
-
-    def add(self, scenes: Iterable[str], table: str, row: str) -> None:
-        """Adds a row, as text, of a table to the given scenes."""
+def _append(found: Iterable[Found], folder: Path) -> None:
+    """Appends rows to the files of their scenes, many at a time."""
+    lines: dict[Path, list[str]] = defaultdict(list)
+    size = 0
+    for scenes, table, row in found:
         for scene in scenes:
-            self._lines[scene].append(f'{{"{table}": {row}}}\n')
-            self._size += len(row)
-        if self._size > _BUFFER:
-            self._append()
-
-    def _append(self) -> None:
-        for scene, lines in self._lines.items():
-            path = scene_file(self._folder, scene)
-            try:
-                with open(path, "a", encoding="utf-8") as file:
-                    file.writelines(lines)
-            except OSError as error:
-                raise unwritable(path, error) from error
-        self._lines.clear()
-        self._size = 0
+            lines[scene_file(folder, scene)].append(f'{{"{table}": {row}}}\n')
+            size += len(row)
+        if size > _BUFFER:
+            _flush(lines)
+            size = 0
+    _flush(lines)
 
 
-def _collect(tables: Path, scenes: Sequence[str], found: _SceneRows) -> None:
-    """Collects the rows of `scenes` in a folder of tables."""
-    owners = _collect_scenes(tables, scenes, found)
+def _flush(lines: dict[Path, list[str]]) -> None:
+    for path, added in lines.items():
+        try:
+            with open(path, "a", encoding="utf-8") as file:
+                file.writelines(added)
+        except OSError as error:
+            raise unwritable(path, error) from error
+    lines.clear()
+
+
+def _rows_of_scenes(tables: Path, scenes: Sequence[str]) -> Iterator[Found]:
+    """The rows of `scenes` in a folder of tables."""
+    owners: dict[str, dict[str, tuple[str, ...]]] = defaultdict(dict)
+    yield from _scene_rows(tables, scenes, owners)
     no_scenes: tuple[str, ...] = ()
     for table, column, owner, references in _REFERENCES:
         owned_by, referred = owners[owner], [(owners[other], token) for other, token in references.items()]
         for text, row in rows(tables / f"{table}.json"):
             row_scenes = owned_by.get(row[column], no_scenes)
             if row_scenes:
-                found.add(row_scenes, table, text)
+                yield row_scenes, table, text
             for others, token in referred if row_scenes else ():
                 known = others.setdefault(row[token], row_scenes)
                 if known != row_scenes:
                     others[row[token]] = tuple(dict.fromkeys((*known, *row_scenes)))
     for table in _SHARED:
         for text, _ in rows(tables / f"{table}.json"):
-            found.add(scenes, table, text)
+            yield scenes, table, text
     for _, row in rows(tables / "map.json"):
         for log in row["log_tokens"]:
-            found.add(owners["log"].get(log, no_scenes), "map", json.dumps({**row, "log_tokens": [log]}))
+            yield owners["log"].get(log, no_scenes), "map", json.dumps({**row, "log_tokens": [log]})
 
 
-def _collect_scenes(tables: Path, scenes: Sequence[str], found: _SceneRows) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Collects the rows of the table of scenes; returns per table the scenes to which each token belongs."""
-    owners: dict[str, dict[str, tuple[str, ...]]] = defaultdict(dict)
+def _scene_rows(tables: Path, scenes: Sequence[str], owners: dict[str, dict[str, tuple[str, ...]]]) -> Iterator[Found]:
+    """The rows of the table of scenes; adds to `owners`, per table, the scenes to which each token belongs."""
     known = {row["name"]: (text, row) for text, row in rows(tables / "scene.json")}
     for scene in scenes:
         if f"scene-{scene}" not in known:
-            for name in known:
-                found.add([scene], "scene", json.dumps({"name": name}))
+            yield from (([scene], "scene", json.dumps({"name": name})) for name in known)
             continue
         text, row = known[f"scene-{scene}"]
-        found.add([scene], "scene", text)
+        yield [scene], "scene", text
         for table, token in (("scene", row["token"]), ("log", row["log_token"])):
             owners[table][token] = (*owners[table].get(token, ()), scene)
-    return owners
 
 
 def rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -147,7 +147,7 @@ def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine:
     for one, (seconds, _) in zip(planned, expected, strict=True):
         stages[one.job.stage].append(seconds)
     known = {stage: [value for value in values if value is not None] for stage, values in stages.items()}
-    dearest = sorted(stages, key=lambda stage: -sum(known[stage]))
+    longest_first = sorted(stages, key=lambda stage: -sum(known[stage]))
     disk = [expectations.disk_bytes(one, results) for one in planned]
     jobs = [replace(one, seconds=seconds) for one, (seconds, _) in zip(planned, expected, strict=True)]
     return Estimate(
@@ -155,7 +155,7 @@ def estimate(planned: Sequence[PlannedJob], expectations: Expectations, machine:
         seconds=wall_seconds(jobs, machine),
         known=sum(map(len, known.values())),
         measured=len(set().union(*(measured for _, measured in expected))),
-        by_stage={s: (len(stages[s]), statistics.fmean(known[s]) if known[s] else None) for s in dearest},
+        by_stage={s: (len(stages[s]), statistics.fmean(known[s]) if known[s] else None) for s in longest_first},
         machine=machine,
         disk=sum((size or 0.0 for size in disk), 0.0),
         unknown_disk=disk.count(None),

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -124,12 +123,3 @@ def _summary(path: Path) -> tuple[dict[str, Any], bool]:
         "device": str(content["device"]),
     }
     return fields, bool(content["resumed_at"])
-
-
-def by_scene(costs: Iterable[Cost]) -> Iterator[tuple[str, list[Cost]]]:
-    """The costs of each scene, in order; those of no scene are left out."""
-    scenes: dict[str, list[Cost]] = {}
-    for cost in costs:
-        if cost.job.scene:
-            scenes.setdefault(cost.job.scene, []).append(cost)
-    yield from scenes.items()

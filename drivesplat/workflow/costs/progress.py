@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from drivesplat.workflow.costs.estimate import NOT_MEASURED, Expectations, Machine, PlannedJob, spelled, wall_seconds
@@ -15,36 +15,32 @@ from drivesplat.workflow.job_logs import has_begun, is_cut_short
 EVERY_S = 30.0
 MAX_NAMED = 4
 """Running jobs that are named at most."""
-TAIL_BYTES = 4096
 _PROGRESS = re.compile(r"([\d.]+) %, [\d.]+ it/s, (\d+) s left")
 """The progress that a training logs (`drivesplat.training.monitor`)."""
 
 
+@dataclass
 class RunProgress:
-    """The progress of a run of `planned` jobs, whose `logs` tell which are running and how far trainings are.
+    """The progress of a run of `planned` jobs, whose `logs` tell which are running and how far trainings are; `began`
+    is the time of its begin.
 
     Expected seconds are updated with every line, since jobs that finish in this run are measured, too.
     """
 
-    def __init__(
-        self,
-        planned: Sequence[PlannedJob],
-        logs: Mapping[JobId, Path],
-        expectations: Callable[[], Expectations],
-        finished: Callable[[], set[JobId]],
-        machine: Machine,
-        began: float,
-    ):
-        self._planned, self._logs, self._machine, self._began = planned, logs, machine, began
-        self._expectations, self._finished = expectations, finished
-        self._since: dict[JobId, float] = {}
+    planned: Sequence[PlannedJob]
+    logs: Mapping[JobId, Path]
+    expectations: Callable[[], Expectations]
+    finished: Callable[[], set[JobId]]
+    machine: Machine
+    began: float
+    _since: dict[JobId, float] = field(default_factory=dict)
 
     def line(self, now: float) -> str:
         """'37 % of the work, 12 of 40 jobs, about 9 min left; at work: 0103 street train (43 %)'; without a share of
         the work while the costs of some jobs are unknown."""
-        expectations, finished = self._expectations(), self._finished()
+        expectations, finished = self.expectations(), self.finished()
         done, unknown, left, at_work = 0.0, 0, [], []
-        for one in self._planned:
+        for one in self.planned:
             seconds, _ = expectations.of(one.job)
             working = False if one.job in finished else self._is_at_work(one.job)
             remaining = seconds if working is None else 0.0
@@ -60,18 +56,18 @@ class RunProgress:
             left.append(replace(one, seconds=remaining))
         whole = done + sum(one.seconds for one in left)
         share = "" if unknown else f"{100.0 * done / whole if whole else 100.0:.0f} % of the work, "
-        time_left = spelled(wall_seconds(left, self._machine))
+        time_left = spelled(wall_seconds(left, self.machine))
         more = f" and {len(at_work) - MAX_NAMED} more" if len(at_work) > MAX_NAMED else ""
         named = f"; at work: {', '.join(at_work[:MAX_NAMED])}{more}" if at_work else ""
         missing = f" and {unknown} jobs {NOT_MEASURED}" if unknown else ""
-        return f"{share}{len(finished)} of {len(self._planned)} jobs, about {time_left}{missing} left{named}"
+        return f"{share}{len(finished)} of {len(self.planned)} jobs, about {time_left}{missing} left{named}"
 
     def _is_at_work(self, job: JobId) -> bool | None:
         """Whether a job is running, by its log of this run, since Snakemake counts a finished job seconds later; None
         before it begins."""
-        log = self._logs.get(job)
+        log = self.logs.get(job)
         try:
-            text = log.read_text("utf-8") if log and log.stat().st_mtime >= self._began else ""
+            text = log.read_text("utf-8") if log and log.stat().st_mtime >= self.began else ""
         except (OSError, UnicodeDecodeError):
             return None
         return is_cut_short(text) if has_begun(text) else None
@@ -79,17 +75,10 @@ class RunProgress:
     def _of_running(self, job: JobId, expected: float | None, now: float) -> tuple[float | None, float | None]:
         """The percentage of a running job where its log tells it, and the seconds it still needs where known."""
         elapsed = now - self._since.setdefault(job, now)
-        told = _PROGRESS.findall(_tail(self._logs[job])) if job.stage == TRAIN else []
-        if told:
-            return float(told[-1][0]), float(told[-1][1])
+        logged = _PROGRESS.findall(self.logs[job].read_text("utf-8")) if job.stage == TRAIN else []
+        if logged:
+            return float(logged[-1][0]), float(logged[-1][1])
         return None, None if expected is None else max(0.0, expected - elapsed)
-
-
-def _tail(path: Path) -> str:
-    with open(path, "rb") as file:
-        file.seek(0, 2)
-        file.seek(max(0, file.tell() - TAIL_BYTES))
-        return file.read().decode(errors="replace")
 
 
 def watch(progress: RunProgress, every_s: float = EVERY_S) -> threading.Event:

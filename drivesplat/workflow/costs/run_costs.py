@@ -1,4 +1,5 @@
-"""The costs of a run, for Snakemake's hooks: an estimate at its start, its progress, and costs.csv at its end."""
+"""What Snakemake's main process prints of a run: settings without effect at planning, an estimate at its start, its
+progress, and costs.csv at its end."""
 
 import os
 import sys
@@ -9,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import DriveSplatError
-from drivesplat.settings.overridden import without_effect
 from drivesplat.workflow.costs.estimate import (
     Estimate,
     Expectations,
@@ -22,6 +22,7 @@ from drivesplat.workflow.costs.estimate import (
 from drivesplat.workflow.costs.measured import BENCHMARKS, JobId, read_costs
 from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
+from drivesplat.workflow.overridden import without_effect
 from drivesplat.workflow.plan import Plan
 
 COSTS, ESTIMATE = "costs", "estimate"
@@ -37,15 +38,21 @@ class RunCosts:
         self._jobs: dict[JobId, Any] = {}
         self._ended: threading.Event | None = None
 
-    def tell_estimate(self) -> bool:
-        """Prints the settings without effect and, if ESTIMATE is a target, the estimate in full. Returns whether it
-        is."""
+    def report_settings_without_effect(self) -> None:
+        """Prints each setting that an override replaces for the scenes and methods of the targets. Called at planning,
+        so that `snakemake -n` and a run with nothing to do print them, too."""
+        wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
+        if wanted or COSTS not in self._targets:
+            for sentence in without_effect(self._plan.config, self._plan.scenes_and_methods(wanted)):
+                _say(sentence)
+
+    def print_estimate(self) -> bool:
+        """Prints the estimate in full if ESTIMATE is a target. Returns whether it is."""
+        if ESTIMATE not in self._targets:
+            return False
         self._jobs = self._needed()
-        for sentence in without_effect(self._plan.config, {(job.scene, job.method) for job in self._jobs}):
-            _say(sentence)
-        if ESTIMATE in self._targets:
-            print(in_full(self.estimate()), flush=True)
-        return ESTIMATE in self._targets
+        print(in_full(self.estimate()), flush=True)
+        return True
 
     def begin(self) -> None:
         """Prints the estimate in a line and, from then on, the progress. A failure is printed and the run goes on."""

@@ -1,16 +1,18 @@
 """costs.csv and costs.json: a row per job that has run, and the total of each scene."""
 
 from collections.abc import Collection, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from drivesplat.io.storage import write_csv, write_json
-from drivesplat.workflow.costs.measured import TRAIN, Cost, by_scene, read_costs
+from drivesplat.workflow.costs.measured import TRAIN, Cost, read_costs
 
 FILES = ("costs.csv", "costs.json")
 LIMIT_SECONDS = 90 * 60.0
 """Target for the time of a scene; reported, not enforced."""
 ABLATION = "ablation"
+PEAKS = ("max_rss_mb", "gpu_memory_gb")
 COLUMNS = (
     "scene", "method", "stage", "film", "seconds", "seconds_from", "max_rss_mb", "cpu_seconds", "mean_load",
     "gpu_memory_gb", "device", "scene_under_90_minutes",
@@ -18,36 +20,31 @@ COLUMNS = (
 
 
 def scene_totals(costs: Sequence[Cost], methods: Collection[str]) -> list[dict[str, Any]]:
-    """The summed costs of each scene's jobs, and whether they are under 90 minutes. Counts the scene's stages and
-    `methods`, without ablation variants; `complete`: whether all `methods` have been trained."""
+    """The summed costs of each scene's jobs, which follow each other in `costs`, and whether they are under 90 minutes.
+    Counts the scene's stages and `methods`, without ablation variants; `complete`: whether all `methods` have been
+    trained."""
     totals = []
-    for scene, own in by_scene(costs):
+    for scene, own in groupby(costs, key=lambda c: c.job.scene):
         counted = [c for c in own if c.job.method in methods or (not c.job.method and c.job.stage != ABLATION)]
-        if not counted:
+        if not scene or not counted:
             continue
         seconds = sum(c.seconds for c in counted)
-        by_part = dict.fromkeys(("scene", *methods), 0.0)
-        for c in counted:
-            by_part[c.job.method or "scene"] += c.seconds
-        memory = {name: [v for c in counted if (v := getattr(c, name)) is not None] for name in _PEAKS}
-        trained = {c.job.method for c in counted if c.job.stage == TRAIN}
+        trainings = [c for c in counted if c.job.stage == TRAIN]
+        memory = {name: [v for c in counted if (v := getattr(c, name)) is not None] for name in PEAKS}
         totals.append(
             {
                 "scene": scene,
                 "jobs": len(counted),
                 "seconds": seconds,
-                "training_seconds": sum((c.seconds for c in counted if c.job.stage == TRAIN), 0.0),
-                "seconds_by_method": {part: value for part, value in by_part.items() if part != "scene"},
-                "scene_seconds": by_part["scene"],
+                "training_seconds": sum((c.seconds for c in trainings), 0.0),
+                "seconds_by_method": {m: sum((c.seconds for c in counted if c.job.method == m), 0.0) for m in methods},
+                "scene_seconds": sum((c.seconds for c in counted if not c.job.method), 0.0),
                 **{name: max(values, default=None) for name, values in memory.items()},
                 "under_90_minutes": seconds < LIMIT_SECONDS,
-                "complete": trained == set(methods),
+                "complete": {c.job.method for c in trainings} == set(methods),
             }
         )
     return totals
-
-
-_PEAKS = ("max_rss_mb", "gpu_memory_gb")
 
 
 def costs_record(results: Path, methods: Collection[str]) -> dict[str, Any]:
@@ -55,14 +52,8 @@ def costs_record(results: Path, methods: Collection[str]) -> dict[str, Any]:
     costs, complaints = read_costs(results)
     scenes = scene_totals(costs, methods)
     under = {total["scene"]: total["under_90_minutes"] for total in scenes}
-    rows = [
-        {
-            **{name: getattr(cost.job, name) for name in ("scene", "method", "stage", "film")},
-            **{name: getattr(cost, name) for name in COLUMNS[4:-1]},
-            "scene_under_90_minutes": under.get(cost.job.scene),
-        }
-        for cost in costs
-    ]
+    known = [{**vars(cost.job), **vars(cost), COLUMNS[-1]: under.get(cost.job.scene)} for cost in costs]
+    rows = [{name: row[name] for name in COLUMNS} for row in known]
     return {"rows": rows, "scenes": scenes, "unreadable": complaints}
 
 
@@ -72,14 +63,11 @@ def write_costs(results: Path, methods: Collection[str]) -> dict[str, Any]:
     Raises ResultError where they cannot be written.
     """
     record = costs_record(results, methods)
-    csv_rows = [{**row, "scene_under_90_minutes": _spelled(row["scene_under_90_minutes"])} for row in record["rows"]]
+    spelled = {None: None, True: "true", False: "false"}
+    csv_rows = [{**row, COLUMNS[-1]: spelled[row[COLUMNS[-1]]]} for row in record["rows"]]
     write_csv(results / FILES[0], COLUMNS, csv_rows)
     write_json(results / FILES[1], record)
     return record
-
-
-def _spelled(value: bool | None) -> str | None:
-    return None if value is None else str(value).lower()
 
 
 def finding(total: dict[str, Any]) -> str:

@@ -53,7 +53,7 @@ def dataroot(job: DownloadJob) -> Path:
 def is_present(job: DownloadJob) -> bool:
     """Whether all tables of the dataset are present."""
     try:
-        layout.table_files(layout.find_root(job.dataroot, job.version), job.version)
+        layout.all_tables(layout.find_root(job.dataroot, job.version), job.version)
     except DatasetError:
         return False
     return True

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import sha256_file, write_json
-from drivesplat.readers.nuscenes.download.console import ByteProgress, announce
+from drivesplat.readers.nuscenes.download.console import announce, byte_progress
 from drivesplat.settings.download import NuscenesMiniSettings
 
 CHUNK = 1 << 20
@@ -143,8 +143,9 @@ def _range_of(response: http.client.HTTPResponse, start: int, validator: str | N
 
 def _receive(source: NuscenesMiniSettings, response: http.client.HTTPResponse, part: Path, start: int) -> int:
     """Writes the response to `part` from `start` on, up to a byte more than expected; returns the size of `part`."""
-    progress, end = ByteProgress("download", source.size_bytes, start), source.size_bytes + 1
-    with open(part, "r+b" if start else "wb") as file:
+    end = source.size_bytes + 1
+    progress = byte_progress("download", source.size_bytes, start)
+    with open(part, "r+b" if start else "wb") as file, progress:
         if not start:
             write_json(_record_of(part), {source.url: _validator(response.headers)})
         file.seek(start)
@@ -152,7 +153,7 @@ def _receive(source: NuscenesMiniSettings, response: http.client.HTTPResponse, p
             file.write(chunk)
             file.flush()
             start += len(chunk)
-            progress.add(len(chunk))
+            progress.update(len(chunk))
         os.fsync(file.fileno())
     return start
 

@@ -9,9 +9,11 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
+from tqdm import tqdm
+
 from drivesplat.errors import DatasetError
 from drivesplat.io.free_disk import disk_of, free_bytes
-from drivesplat.readers.nuscenes.download.console import ByteProgress, announce
+from drivesplat.readers.nuscenes.download.console import announce, byte_progress
 from drivesplat.settings.download import NuscenesMiniSettings
 
 MAX_READ = 1 << 20
@@ -48,8 +50,9 @@ def unpack(archive: Path, folder: Path, limits: NuscenesMiniSettings, required: 
         raise BadArchiveError(f"{archive.name} is damaged ({error})") from error
     require_space(folder, size, "unpacking nuScenes mini")
     folder.mkdir(parents=True)
-    with _Stream(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as tar:
-        tar.extractall(folder, members=_counted(tar, ByteProgress("unpacking", max(size, 1))), filter="data")
+    progress = byte_progress("unpacking", size)
+    with _Stream(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as tar, progress:
+        tar.extractall(folder, members=_counted(tar, progress), filter="data")
 
 
 def require_space(folder: Path, needed: int, what: str) -> None:
@@ -62,10 +65,10 @@ def require_space(folder: Path, needed: int, what: str) -> None:
         )
 
 
-def _counted(tar: tarfile.TarFile, progress: ByteProgress) -> Iterator[tarfile.TarInfo]:
+def _counted(tar: tarfile.TarFile, progress: tqdm) -> Iterator[tarfile.TarInfo]:
     for member in tar:
         yield member
-        progress.add(member.size)
+        progress.update(member.size)
 
 
 def _inspect(archive: Path, limits: NuscenesMiniSettings, required: list[str]) -> int:

@@ -6,7 +6,8 @@ import pytest
 import torch
 from helpers.trainings import folders_of, recorded_views, settings_of, untrained
 
-from drivesplat.training.clock import ITERATION, OTHER, UNTIMED, Clock, StageClock
+from benchmarks.speed.stage_clock import OTHER, StageClock
+from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -17,7 +18,7 @@ CPU = torch.device("cpu")
 def time_passes(monkeypatch):
     """Lets the time of clocks pass by so many seconds."""
     now = [100.0]
-    monkeypatch.setattr("drivesplat.training.clock.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("benchmarks.speed.stage_clock.time.perf_counter", lambda: now[0])
 
     def by(seconds: float) -> None:
         now[0] += seconds
@@ -55,7 +56,7 @@ def test_a_stage_that_comes_twice_counts_twice(time_passes):
 
 
 @pytest.mark.parametrize("iterations", [0, 2])
-def test_where_no_iteration_is_left_after_the_warm_up_nothing_is_said(iterations):
+def test_without_an_iteration_after_the_warm_up_nothing_is_logged(iterations):
     clock = StageClock(CPU, warm_up=2)
     for _ in range(iterations):
         with clock.stage(ITERATION):

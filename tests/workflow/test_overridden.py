@@ -1,0 +1,77 @@
+"""A setting that was given and holds nowhere is told, with the place that sets another one."""
+
+import pytest
+import yaml
+from helpers import REPOSITORY
+from helpers.workflow_copy import WorkflowCopy
+
+from drivesplat.settings.config import load, merged
+from drivesplat.workflow.overridden import without_effect
+
+DEFAULTS = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
+DEMO, REAL = [("demo", ""), ("demo", "vanilla"), ("demo", "street")], [("0061", "vanilla"), ("0061", "street")]
+
+
+def sentences(places, **config) -> list[str]:
+    return without_effect(load(merged(DEFAULTS, config)), places)
+
+
+def test_defaults_are_not_reported():
+    assert sentences([*DEMO, *REAL]) == []
+
+
+def test_a_setting_that_a_dataset_overrides_is_reported_once_with_its_place():
+    assert sentences(DEMO, train={"iterations": 3000}) == [
+        "train.iterations: 3000 does not hold for dataset demo, where datasets.demo.overrides.train.iterations is 1000"
+    ]
+    assert sentences(REAL, train={"iterations": 3000}) == [], "no scene of the demo takes part"
+
+
+def test_a_setting_that_a_method_overrides_is_reported_for_that_method():
+    (sentence,) = sentences([*DEMO, *REAL], train={"depth_weight": 0.5})
+    assert sentence.startswith("train.depth_weight: 0.5 does not hold for method street, where methods.street.")
+    assert sentence.endswith("is 0.01")
+    assert sentences([("0061", "vanilla")], train={"depth_weight": 0.5}) == []
+
+
+@pytest.mark.parametrize("dataset", [{"iterations": 3000}, {"iterations": 3000, "cap_max": 500_000}])
+def test_a_setting_given_where_it_applies_is_not_reported(dataset):
+    overrides = {"datasets": {"demo": {"overrides": {"train": dataset}}}}
+    assert sentences(DEMO, train={"iterations": 3000}, **overrides) == []
+
+
+def test_a_setting_overridden_by_dataset_and_method_is_reported_for_both():
+    overrides = {"methods": {"vanilla": {"overrides": {"train": {"iterations": 500}}}}}
+    found = sentences(DEMO, train={"iterations": 3000}, **overrides)
+    assert [line.rsplit(" ", 1)[1] for line in found] == ["1000", "500"], "the demo's, and that method's"
+
+
+def test_variants_of_an_ablation_differ_on_purpose():
+    config = load(merged(DEFAULTS, {"sky": "none"}))
+    variants = [("0061", name) for name in config.ablated]
+    assert variants and without_effect(config, variants) == []
+
+
+def test_scenes_that_are_not_configured_and_jobs_of_no_scene_are_passed_over():
+    assert sentences([("", ""), ("9999", "street")], train={"iterations": 3000}) == []
+
+
+@pytest.mark.workflow
+def test_a_run_reports_it_before_its_estimate(tmp_path):
+    copy = WorkflowCopy.make(tmp_path / "workflow", methods={"vanilla": {"overrides": {"train": {"iterations": 7}}}})
+    asked = copy.run("estimate")
+    lines = [line for line in asked.stdout.splitlines() if line.startswith("drivesplat: ")]
+    assert lines[0].startswith("drivesplat: train.iterations: 60 does not hold for method vanilla"), asked.stdout
+    assert " jobs, time not measured yet, " in lines[1]
+
+
+@pytest.mark.workflow
+def test_it_is_reported_once_by_a_dry_run_by_a_run_and_when_nothing_is_to_be_done(tmp_path):
+    """The job of the run reads the Snakefile again, in a process of its own, and does not repeat it."""
+    data = {"dataroot": "data", "scenes": ["0001"], "overrides": {"train": {"iterations": 7}}}
+    copy, expected = WorkflowCopy.make(tmp_path / "workflow", datasets={"nuscenes": data}), "Nothing to be done"
+    runs = [copy.run("results/0001/scene.json", flags=flags) for flags in (("-n",), (), (), ("-n",))]
+    assert [expected in run.stdout for run in runs] == [False, False, True, True], [run.stdout for run in runs]
+    for run in runs:
+        (sentence,) = (line for line in run.stdout.splitlines() if "does not hold for" in line)
+        assert sentence.startswith("drivesplat: train.iterations: 60 does not hold for dataset nuscenes, where ")
