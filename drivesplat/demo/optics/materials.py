@@ -1,25 +1,33 @@
 """Procedural textures, compiled: colour, mirror reflectance and emission of a surface as functions of position.
 
-Textures are filtered by the size of a pixel on the surface (`footprint`, metres): details below it fade to their mean
-and do not flicker.
+Textures are filtered by the size of a pixel on the surface (`footprint`, metres): details below it fade to their mean,
+do not flicker, and are not computed.
 """
 
 import math
-from typing import no_type_check
+from collections.abc import Callable
+from typing import Any, no_type_check
 
 import numpy as np
 
-from drivesplat.demo.shapes.mesh import Material
-from drivesplat.demo.street.layout import CROSSING, CURB, LANE, ROAD, SIDEWALK, WINDOW
+from drivesplat.demo.shapes.mesh import BARK, Material
 from drivesplat.kernels.cache import kernel
 
-compiled = kernel(fastmath=True)
+LANE, ROAD, CURB, SIDEWALK = 3.5, 5.9, 6.15, 9.5
+"""Distances of outer edges from the centre line (metres)."""
+CROSSING = (46.0, 49.0)
+WINDOW = (3.2, 3.0)
+"""Width and height (metres) of the cells of a facade, one window each."""
 
-PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES, METAL_, SIGN_ = (int(m) for m in Material)
+PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES, METAL, SIGN = (int(m) for m in Material)
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A kernel; its arguments are numbers without annotations."""
+    return kernel(no_type_check(function), fastmath=True)
 
 
 @compiled
-@no_type_check
 def hash_noise(x, y, z):
     """A pseudo-random number in [0, 1) for integer coordinates."""
     h = np.uint32(np.int64(x) * 73856093 ^ np.int64(y) * 19349663 ^ np.int64(z) * 83492791)
@@ -28,40 +36,61 @@ def hash_noise(x, y, z):
 
 
 @compiled
-@no_type_check
-def value_noise(x, y, z):
-    """Value noise in [0, 1) with a wavelength of one unit."""
-    ix, iy, iz = math.floor(x), math.floor(y), math.floor(z)
-    fx, fy, fz = x - ix, y - iy, z - iz
-    fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
-    value = 0.0
-    for dz in range(2):
-        wz = fz if dz else 1 - fz
-        for dy in range(2):
-            wy = fy if dy else 1 - fy
-            row = hash_noise(ix, iy + dy, iz + dz) * (1 - fx) + hash_noise(ix + 1, iy + dy, iz + dz) * fx
-            value += wz * wy * row
-    return value
+def plane_noise(x, y, seed):
+    """Value noise in [0, 1) with a wavelength of one unit on a plane, one per integer `seed`."""
+    ix, iy = math.floor(x), math.floor(y)
+    fx, fy = x - ix, y - iy
+    fx, fy = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy)
+    low = hash_noise(ix, iy, seed) * (1 - fx) + hash_noise(ix + 1, iy, seed) * fx
+    high = hash_noise(ix, iy + 1, seed) * (1 - fx) + hash_noise(ix + 1, iy + 1, seed) * fx
+    return low * (1 - fy) + high * fy
 
 
 @compiled
-@no_type_check
+def value_noise(x, y, z):
+    """Value noise in [0, 1) with a wavelength of one unit."""
+    iz = math.floor(z)
+    fz = (z - iz) ** 2 * (3 - 2 * (z - iz))
+    return plane_noise(x, y, iz) * (1 - fz) + plane_noise(x, y, iz + 1) * fz
+
+
+@compiled
+def visible(wavelength, footprint):
+    """Contrast in [0, 1] that remains of a detail of this size: none below a wavelength of one footprint."""
+    return min(1.0, max(0.0, wavelength / (2.0 * footprint + 1e-6) - 0.5))
+
+
+@compiled
 def fractal(x, y, z, wavelength, footprint):
     """Three octaves of noise around 0 (about +-0.5); those finer than the footprint fade out."""
     total, amplitude = 0.0, 0.5
     for octave in range(3):
-        visible = min(1.0, max(0.0, wavelength / (2.0 * footprint + 1e-6) - 0.5))
-        if visible > 0.0:
-            shift = 17.3 * octave
-            at = value_noise(x / wavelength + shift, y / wavelength + shift, z / wavelength - shift)
-            total += visible * amplitude * (2 * at - 1)
+        contrast = visible(wavelength, footprint)
+        if contrast == 0.0:
+            break
+        shift = 17.3 * octave
+        at = value_noise(x / wavelength + shift, y / wavelength + shift, z / wavelength - shift)
+        total += contrast * amplitude * (2 * at - 1)
         amplitude *= 0.5
         wavelength *= 0.37
     return total
 
 
 @compiled
-@no_type_check
+def grain(x, y, wavelength, footprint):
+    """One octave of noise around 0 (+-1) on a plane."""
+    contrast = visible(wavelength, footprint)
+    return contrast * (2 * plane_noise(x / wavelength, y / wavelength, 40) - 1) if contrast > 0.0 else 0.0
+
+
+@compiled
+def plane_fractal(x, y, wavelength, footprint):
+    """`fractal` on a plane, at half the cost."""
+    coarse, middle = grain(x, y, wavelength, footprint), grain(x + 9.1, y, 0.37 * wavelength, footprint)
+    return 0.5 * coarse + 0.25 * middle + 0.125 * grain(x, y + 9.1, 0.137 * wavelength, footprint)
+
+
+@compiled
 def coverage(value, low, high, footprint):
     """Fraction of a pixel at `value` that lies between `low` and `high`."""
     width = footprint + 1e-4
@@ -69,88 +98,202 @@ def coverage(value, low, high, footprint):
 
 
 @compiled
-@no_type_check
+def stripes(value, period, width, footprint):
+    """Fraction of a pixel at `value` that lies in stripes from k * `period` to k * `period` + `width`."""
+    half, share = 0.5 * (footprint + 1e-4) / period, width / period
+    low, high = value / period - half, value / period + half
+    first, last = math.floor(low), math.floor(high)
+    covered = ((last - first) * share + min(high - last, share) - min(low - first, share)) / (2 * half)
+    return min(1.0, max(0.0, covered))
+
+
+@compiled
+def tiles(x, y, width, height, joint, footprint):
+    """Tiles in running bond: the fraction of a pixel in joints, and a tone around 0 (+-0.5) for each tile."""
+    row = math.floor(y / height)
+    x += 0.5 * width * (row % 2)
+    gaps = 1 - (1 - stripes(x, width, joint, footprint)) * (1 - stripes(y, height, joint, footprint))
+    contrast = visible(1.5 * height, footprint)
+    return gaps, contrast * (hash_noise(math.floor(x / width), row, 7) - 0.5) if contrast > 0.0 else 0.0
+
+
+@compiled
+def glyphs(x, y, height, seed, footprint):
+    """Fraction of a pixel covered by symmetric letters, within a line from y = 0 to y = `height`."""
+    letter = math.floor(x / (0.75 * height))
+    i, j = math.floor(4 * (x / (0.75 * height) - letter)), math.floor(5 * y / height)
+    drawn = i < 3 and hash_noise(letter, seed, 1) > 0.15 and hash_noise(letter, i % 2 + 4 * j, seed) < 0.55
+    return 0.34 + visible(0.25 * height, footprint) * ((1.0 if drawn else 0.0) - 0.34)
+
+
+@compiled
 def ground(x, y, footprint):
     """Linear reflectance of road, markings, curb, sidewalk and grass."""
     a = abs(y)
     if a > SIDEWALK:
-        tone = 1.0 + 0.7 * fractal(x, y, 0.0, 3.0, footprint)
-        return 0.11 * tone, 0.17 * tone, 0.05 * tone
+        tone = 1 + 0.7 * plane_fractal(x, y, 3.0, footprint) + 0.5 * grain(x, y, 0.15, footprint)
+        tone += 0.6 * grain(x, 0.5 * y, 0.025, footprint)
+        return 0.11 * max(0.1, tone), 0.17 * max(0.15, tone), 0.05 * max(0.1, tone)
     if a > CURB:
-        row, column = math.floor(x / 0.9), math.floor(y / 0.9)
-        joint = max(coverage(x - 0.9 * row, -0.02, 0.02, footprint), coverage(y - 0.9 * column, -0.02, 0.02, footprint))
-        fade = min(1.0, 0.5 / (footprint + 1e-6))
-        tone = 0.3 * (1 + fade * 0.25 * (hash_noise(row, column, 7) - 0.5) + 0.2 * fractal(x, y, 1.0, 1.5, footprint))
-        tone *= 1 - 0.6 * joint
+        size, joint = (0.12, 0.012) if a < CURB + 0.48 else (0.45, 0.01)
+        gaps, slab = tiles(x, y, size, size, joint, footprint)
+        tone = 0.3 * (1 + 0.3 * slab + 0.2 * plane_fractal(x, y, 1.5, footprint))
+        tone *= (1 - 0.6 * gaps) * (1 + 0.12 * grain(x, y, 0.02, footprint))
         return tone, 0.97 * tone, 0.92 * tone
     if a > ROAD:
-        tone = 0.36 * (1 + 0.2 * fractal(x, y, 2.0, 1.0, footprint))
+        tone = 0.36 * (1 + 0.2 * plane_fractal(x, y, 1.0, footprint)) * (1 + 0.25 * grain(x, y, 0.015, footprint))
+        tone *= 1 - 0.6 * stripes(x, 1.0, 0.012, footprint)
         return tone, tone, 0.98 * tone
-    tone = 0.085 * (1 + 0.5 * fractal(x, y, 3.0, 3.0, footprint) + 0.5 * fractal(x, y, 4.0, 0.5, footprint))
-    cell = math.floor(x / 11.0)
-    if hash_noise(cell, 0, 11) < 0.5:  # a repaired patch
-        at = 11.0 * cell + 6.0 * hash_noise(cell, 1, 11)
-        side = 5.0 * hash_noise(cell, 2, 11) - 3.5
-        patch = coverage(x, at, at + 2.5, footprint) * coverage(y, side, side + 1.7, footprint)
-        tone *= 1 - 0.4 * patch
+    tone = 0.085 * asphalt(x, y, footprint) * iron(x, y, footprint)
     white = coverage(a, LANE - 0.08, LANE + 0.08, footprint)
-    dash = x - 6.0 * math.floor(x / 6.0)
-    white = max(white, coverage(a, -0.08, 0.08, footprint) * coverage(dash, 0.0, 3.0, footprint))
+    if a < 0.08 + footprint:
+        white = max(white, coverage(a, -0.08, 0.08, footprint) * stripes(x, 6.0, 3.0, footprint))
     if CROSSING[0] - 1 < x < CROSSING[1] + 1:
-        stripe = y - math.floor(y)
-        white = max(white, coverage(x, CROSSING[0], CROSSING[1], footprint) * coverage(stripe, 0.0, 0.5, footprint))
-    worn = white * (0.85 + 0.25 * fractal(x, y, 5.0, 0.6, footprint))
-    tone = tone * (1 - worn) + 0.6 * worn
+        white = max(white, coverage(x, CROSSING[0], CROSSING[1], footprint) * stripes(y, 1.0, 0.5, footprint))
+    if white > 0.0:
+        white *= 0.75 + 0.25 * plane_fractal(x, y, 0.6, footprint) + 0.1 * grain(x, y, 0.012, footprint)
+        white *= 1 - 0.5 * max(0.0, 1.5 * grain(x, y, 0.07, footprint) - 0.6)
+    tone = tone * (1 - white) + 0.6 * white
     return tone, tone, 1.03 * tone
 
 
 @compiled
-@no_type_check
-def facade(r, g, b, along, z, footprint):
-    """A wall with windows: reflectance r, g, b, mirror reflectance, emission at night."""
-    column, floor = math.floor(along / WINDOW[0]), math.floor(z / WINDOW[1])
-    u, v = along / WINDOW[0] - column, z / WINDOW[1] - floor
-    shop = floor == 0
-    low, high, sill, top = (0.08, 0.92, 0.12, 0.85) if shop else (0.25, 0.75, 0.3, 0.82)
-    fu, fv = footprint / WINDOW[0], footprint / WINDOW[1]
-    frame = coverage(u, low - 0.05, high + 0.05, fu) * coverage(v, sill - 0.05, top + 0.05, fv)
-    pane = coverage(u, low, high, fu) * coverage(v, sill, top, fv)
-    pane *= 1 - 0.8 * coverage(u, 0.49, 0.51, fu)
-    wall = 1 + 0.3 * fractal(along, z, 9.0, 2.0, footprint) + 0.15 * fractal(along, 4 * z, 8.0, 0.4, footprint)
-    trim = frame - pane * frame
-    inside = 0.03 + 0.1 * hash_noise(column, floor, 5)
-    r = r * wall * (1 - frame) + 0.55 * trim + inside * pane
-    g = g * wall * (1 - frame) + 0.54 * trim + inside * pane
-    b = b * wall * (1 - frame) + 0.5 * trim + 1.2 * inside * pane
-    lit = 0.5 * pane if shop or hash_noise(column, floor, 6) < 0.3 else 0.0
-    return r, g, b, pane, lit
+def asphalt(x, y, footprint):
+    """Tone of asphalt around 1: stains, repaired patches, seams of tar, cracks, stones."""
+    tone = 1 + 0.5 * plane_fractal(x, y, 3.0, footprint) + 0.5 * plane_fractal(x, y, 0.5, footprint)
+    cell = math.floor(x / 11.0)
+    at, side, seam = x - 11.0 * cell - 6.0 * hash_noise(cell, 1, 11), y - 5.0 * hash_noise(cell, 2, 11) + 3.5, 0.0
+    if hash_noise(cell, 0, 11) < 0.5:  # a repaired patch and the tar along its edges
+        outer = coverage(at, 0.0, 2.5, footprint) * coverage(side, 0.0, 1.7, footprint)
+        inner = coverage(at, 0.05, 2.45, footprint) * coverage(side, 0.05, 1.65, footprint)
+        tone *= 1 - 0.4 * inner
+        seam = outer - inner
+    if footprint < 0.2:
+        seam = max(seam, coverage(abs(y - 0.5) + 0.08 * plane_noise(0.7 * x, 0.0, 12), 1.34, 1.4, footprint))
+        if footprint < 0.05 and seam == 0.0:
+            field = plane_noise(0.45 * x, 0.6 * y, 20) + 0.1 * plane_noise(5 * x, 5 * y, 21) - 0.55
+            tone *= 1 - 0.75 * visible(0.05, footprint) * coverage(field, -0.003, 0.003, 0.7 * footprint + 0.002)
+        tone *= 1 + 0.55 * grain(x, y, 0.014, footprint) + 0.2 * grain(y, x, 0.05, footprint)
+    return max(0.1, tone) * (1 - 0.65 * seam)
 
 
 @compiled
-@no_type_check
+def iron(x, y, footprint):
+    """Tone around 1 of the cover of a manhole; 1 on bare asphalt."""
+    cell = math.floor(x / 13.0)
+    u, v = x - 13.0 * cell - 2.0 - 9.0 * hash_noise(cell, 3, 11), y - 2.2 + 4.4 * hash_noise(cell, 4, 11)
+    if footprint > 0.3 or max(abs(u), abs(v)) > 0.4 + footprint:
+        return 1.0
+    radius, ribs = math.hypot(u, v), stripes(u + v, 0.08, 0.04, footprint) * stripes(u - v, 0.08, 0.06, footprint)
+    lid, rim = coverage(radius, -1.0, 0.29, footprint), coverage(radius, 0.31, 0.36, footprint)
+    return 1 + lid * (0.9 * ribs - 0.3) + 0.35 * rim - 0.8 * coverage(radius, 0.29, 0.31, footprint)
+
+
+@compiled
+def masonry(style, along, z, footprint):
+    """Bricks (style 0), plaster (1) or slabs (2): tone around 1, fraction of joints and their reflectance."""
+    tone = 1 + 0.3 * plane_fractal(along, z, 2.0, footprint)
+    if style == 1:
+        tone += 0.12 * plane_fractal(along, 0.1 * z, 0.3, footprint) + 0.1 * grain(along, z, 0.02, footprint)
+        return tone, coverage(z % WINDOW[1], 2.75, 2.95, footprint), 0.5  # a cornice on every floor
+    width, height, joint, mortar = (0.25, 0.075, 0.011, 0.36) if style == 0 else (1.6, 0.75, 0.02, 0.06)
+    gaps, tile = tiles(along, z, width, height, joint, footprint)
+    return tone + (0.6 if style == 0 else 0.15) * tile + 0.08 * grain(along, z, 0.02, footprint), gaps, mortar
+
+
+@compiled
+def interior(u, v, column, floor, footprint):
+    """Reflectance r, g, b behind a pane at u, v metres in its cell: goods in shops, curtains and blinds above."""
+    if footprint > 0.3:
+        return (0.115, 0.106, 0.106) if floor == 0 else (0.213, 0.213, 0.224)
+    if floor > 0:
+        blind = coverage(v, 2.5 - 1.2 * hash_noise(column, floor, 15), 3.0, footprint)
+        side = coverage(abs(u - 1.6), 0.75 - 0.5 * hash_noise(column, floor, 16), 1.6, footprint)
+        light = max(blind * stripes(v, 0.05, 0.042, footprint), side * stripes(u, 0.09, 0.075, footprint))
+        tone = 0.03 + 0.1 * hash_noise(column, floor, 5) + 0.3 * light
+        return tone, tone, 1.05 * tone
+    shelf = 0.0 if v < 1.5 else 1.5
+    place = math.floor(u / 0.31) + 11 * column
+    size = 0.3 + 0.75 * hash_noise(place, int(shelf), 31)
+    item = coverage(v - shelf, 0.4 if v < 1.5 else 0.0, size, footprint)
+    item *= coverage(abs(u % 0.31 - 0.155), -1.0, 0.11 if v - shelf < 0.7 * size else 0.05, footprint)
+    back, shade = (1 - item) * (0.07 + 0.1 * coverage(v, 1.44, 1.5, footprint)), 0.1 * item
+    red, green, blue = hash_noise(place, 1, 32), hash_noise(place, 2, 32), hash_noise(place, 3, 32)
+    return back + shade * (1 + 4 * red**2), back + shade * (1 + 3 * green**2), back + shade * (1 + 3 * blue**2)
+
+
+@compiled
+def facade(r, g, b, along, z, footprint):
+    """A wall with windows, shops on the ground floor: reflectance r, g, b, mirror reflectance, emission at night."""
+    column, floor = math.floor(along / WINDOW[0]), math.floor(z / WINDOW[1])
+    u, v, shop = along - WINDOW[0] * column, z - WINDOW[1] * floor, floor == 0
+    style = math.floor(3 * hash_noise(1000 * r, 1000 * g, 1000 * b))
+    tone, gaps, mortar = masonry(style, along, z, footprint)
+    brick = tone * (1 - gaps)
+    r, g, b = r * brick + mortar * gaps, g * brick + mortar * gaps, b * brick + mortar * gaps
+    edge, sill, top = (0.25, 0.4, 2.4) if shop else (0.8 + 0.15 * style, 0.9, 2.3 + 0.1 * style)
+    width, bars = WINDOW[0] - 2 * edge, 0.0
+    frame = stripes(along - edge + 0.07, WINDOW[0], width + 0.14, footprint)
+    frame *= coverage(v, sill - 0.07, top + 0.07, footprint)
+    pane = stripes(along - edge, WINDOW[0], width, footprint) * coverage(v, sill, top, footprint)
+    pane *= 1 - coverage(u, 1.57, 1.63, footprint)
+    if shop:  # a sign above
+        board = coverage(v, 2.5, 2.92, footprint) * coverage(u, 0.15, WINDOW[0] - 0.15, footprint)
+        ink = 0.6 * coverage(v, 2.6, 2.82, footprint) * glyphs(u, v - 2.6, 0.22, column, footprint)
+        r += board * (0.5 * hash_noise(column, 1, 9) ** 2 + ink - r)
+        g += board * (0.5 * hash_noise(column, 2, 9) ** 2 + ink - g)
+        b += board * (0.5 * hash_noise(column, 3, 9) ** 2 + ink - b)
+    elif footprint < 0.3 and hash_noise(column, style, 8) < 0.3:  # the railing of a balcony
+        bars = coverage(u, edge - 0.2, WINDOW[0] - edge + 0.2, footprint) * coverage(v, 0.05, 1.0, footprint)
+        bars *= visible(0.3, footprint) * max(stripes(along, 0.11, 0.022, footprint), coverage(v, 0.94, 1.0, footprint))
+    red, green, blue = interior(u, v, column, floor, footprint) if pane > 0.0 else (0.0, 0.0, 0.0)
+    trim, left = 0.55 * (frame - pane), 1 - bars
+    lit = 1.0 if shop else 0.3 + visible(2.0, footprint) * (0.7 if hash_noise(column, floor, 6) < 0.3 else -0.3)
+    r = left * (r * (1 - frame) + trim + red * pane)
+    g = left * (g * (1 - frame) + trim + green * pane)
+    b = left * (b * (1 - frame) + 0.9 * trim + blue * pane)
+    return r, g, b, left * pane, 0.5 * left * pane * lit
+
+
+@compiled
+def lettering(r, g, b, along, z, footprint):
+    """A panel with lines of letters about z = 0 and a picture above and below: as `facade`."""
+    line, dark = math.floor((z + 0.15) / 0.3), 0.7 if r + g + b < 0.9 else 0.04
+    picture = min(1.0, max(0.0, 0.5 + 1.5 * grain(along, z, 0.5, footprint)))
+    ink = stripes(z + 0.07, 0.3, 0.14, footprint) * glyphs(along, z - 0.3 * line + 0.07, 0.14, line + 50, footprint)
+    ink = picture + coverage(z, -0.45, 0.45, footprint) * (ink - picture)
+    return r + ink * (dark - r), g + ink * (dark - g), b + ink * (dark - b), 0.0, 0.0
+
+
+@compiled
 def surface(material, r, g, b, x, y, z, nx, ny, nz, footprint):
     """Reflectance r, g, b, mirror reflectance and emission at night of a point with normal n in the object's frame."""
     if material == ROAD_:
         r, g, b = ground(x, y, footprint)
         return r, g, b, 0.0, 0.0
+    along = y if abs(nx) > abs(ny) else x
     if material == FACADE:
-        return facade(r, g, b, y if abs(nx) > abs(ny) else x, z, footprint)
-    if material == STRIPES and 0.25 < z < 0.42:
-        return 0.75, 0.75, 0.75, 0.0, 0.0
-    tone, mirror, emission = 1.0, 0.0, 0.0
+        return facade(r, g, b, along, z, footprint)
+    if material == SIGN:
+        return lettering(r, g, b, along, z, footprint)
+    tone, mirror, emission = 1.0, 1.0 if material in (PAINT, GLASS) else 0.0, 0.0
     if material == LEAVES:
-        tone = max(0.15, 1.0 + 1.1 * fractal(x, y, z, 0.9, footprint))
-    elif material == PAINT:
-        mirror = 1.0
-        if abs(ny) > 0.6:  # the seams of doors
-            for at in (-0.95, 0.0, 0.85):
-                tone = min(tone, 1 - 0.7 * coverage(x, at - 0.012, at + 0.012, footprint))
-    elif material == GLASS:
-        mirror = 1.0
+        cell = hash_noise(math.floor((x + z) / 0.06), math.floor((y - z) / 0.06), math.floor((x - y) / 0.06))
+        tone = max(0.15, 1 + 1.1 * fractal(x, y, z, 0.9, footprint) + visible(0.07, footprint) * (cell - 0.5))
+    elif material == PAINT and abs(ny) > 0.6:  # the seams of doors
+        for at in (-0.95, 0.0, 0.85):
+            tone = min(tone, 1 - 0.7 * coverage(x, at - 0.006, at + 0.006, footprint))
     elif material == LAMP:
         mirror, emission = 0.3, 1.5
+    elif material == METAL:
+        mirror, tone = 0.5, 1 + 0.15 * grain(along, 9 * z, 0.2, footprint)
     elif material == CLOTH:
-        tone = 1.0 + 0.5 * fractal(x, y, z, 0.25, footprint)
-    else:
-        tone = 1.0 + 0.2 * fractal(x, y, z, 0.7, footprint)
+        tone = 1 + 0.5 * fractal(x, y, z, 0.25, footprint)
+    elif material == STRIPES:
+        white = coverage(z, 0.25, 0.42, footprint)
+        r, g, b = r + white * (0.75 - r), g + white * (0.75 - g), b + white * (0.75 - b)
+    elif material == PLAIN:
+        tone = 1 + 0.2 * fractal(x, y, z, 0.7, footprint)
+        if abs(r - BARK[0]) + abs(b - BARK[2]) < 1e-4:
+            tone += 0.8 * grain(along, 0.15 * z + 0.2 * x, 0.03, footprint)
     return r * tone, g * tone, b * tone, mirror, emission
