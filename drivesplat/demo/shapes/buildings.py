@@ -71,7 +71,7 @@ def balcony(width: float) -> ColoredMesh:
     ]
     bars = [
         box((x - 0.008, depth - 0.04, 0.0), (x + 0.008, depth - 0.024, 0.97), Material.METAL, IRON)
-        for x in np.arange(-half + 0.03, half, 0.12)
+        for x in np.arange(-half + 0.03, half, 0.14)
     ]
     sides = [
         box((x - 0.008, y - 0.008, 0.0), (x + 0.008, y + 0.008, 0.97), Material.METAL, IRON)
@@ -119,6 +119,7 @@ def _front(columns: int, floors: int, cell: np.ndarray, random: np.random.Genera
                  Material.PLAIN, STONE)]  # fmt: skip
     entrance = int(random.integers(columns))
     sill = box((-0.85, -0.02, 0.72), (0.85, 0.12, 0.8), Material.PLAIN, STONE)
+    platform = balcony(0.8 * cell[0])
     with_balconies = random.uniform() < 0.5
     for column in range(columns):
         center, color = (column + 0.5) * cell[0], AWNINGS[random.integers(len(AWNINGS))]
@@ -132,7 +133,7 @@ def _front(columns: int, floors: int, cell: np.ndarray, random: np.random.Genera
                          Material.PLAIN, STONE))  # fmt: skip
         for floor in range(1, floors):
             if with_balconies and (column + floor) % 2 == 0:
-                parts.append(balcony(0.8 * cell[0]).moved((center, 0.0, floor * cell[2] + 0.05)))
+                parts.append(platform.moved((center, 0.0, floor * cell[2] + 0.05)))
             else:
                 parts.append(sill.moved((center, 0.0, floor * cell[2])))
     pipe = columns * cell[0] - 0.25
