@@ -1,12 +1,11 @@
 """A spinning LiDAR: the time of each ray, reflectivity, dropped rays, mixed returns at edges."""
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 
 from drivesplat.demo.optics.lighting import facing_normal, texture_point
-from drivesplat.demo.optics.materials import GLASS, LEAVES, METAL_, PAINT, ROAD_, SIGN_, compiled, surface
+from drivesplat.demo.optics.materials import GLASS, LEAVES, METAL, PAINT, ROAD_, SIGN, compiled, surface
 from drivesplat.demo.optics.raycast import NO_HIT, RayHits, Rays, StreetSnapshot
 from drivesplat.settings.world import WorldLidarSettings
 
@@ -148,7 +147,6 @@ def _reflected(snapshot: StreetSnapshot, rays: Rays, hits: RayHits, wet: float) 
 
 
 @compiled
-@no_type_check
 def _reflect(directions, face, normal, weights, texture, texture_normal, material, color, wet, out):
     """Fills `out` (n,) with the reflected fraction; see `shade` in lighting.py for the arguments."""
     for i in range(len(directions)):
@@ -165,7 +163,6 @@ def _reflect(directions, face, normal, weights, texture, texture_normal, materia
 
 
 @compiled
-@no_type_check
 def infrared(material, visible, mirror, facing, wet):
     """Reflectivity at 905 nm of a surface whose mean reflectance to visible light is `visible`.
 
@@ -175,11 +172,11 @@ def infrared(material, visible, mirror, facing, wet):
     """
     if material == LEAVES:
         return min(0.6, 4.0 * visible)
-    if material == SIGN_:
+    if material == SIGN:
         return 1.5
     if material == GLASS:
         return 0.02 + 0.6 * facing**40
-    if material in (PAINT, METAL_):
+    if material in (PAINT, METAL):
         return 0.05 + 0.6 * visible + 0.3 * facing**20
     if material == ROAD_:
         return visible * (1.0 - 0.85 * wet * (1.0 - facing**4))

@@ -1,7 +1,7 @@
 """Shading, compiled: sun, shadows and sky by day; street lamps, headlights and lit windows by night."""
 
 import math
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,7 +54,6 @@ def lamplight(lamps: np.ndarray, ego_to_street: np.ndarray) -> Light:
 
 
 @compiled
-@no_type_check
 def sky_color(dx, dy, dz, light):
     """Radiance r, g, b of the sky in a direction."""
     up = max(dz, 0.0)
@@ -75,7 +74,6 @@ def sky_color(dx, dy, dz, light):
 
 
 @compiled
-@no_type_check
 def lamp_irradiance(px, py, pz, nx, ny, nz, light):
     """Irradiance r, g, b of street lamps, which shine down, and headlights at a point p with normal n."""
     r = g = b = 0.0
@@ -101,7 +99,6 @@ def lamp_irradiance(px, py, pz, nx, ny, nz, light):
 
 
 @compiled
-@no_type_check
 def shade(
     directions, origins, moment, distance, face, normal, weights, lit, texture, texture_normal, material, color,
     pixel_angle, light, out,
@@ -151,7 +148,6 @@ def shade(
 
 
 @compiled
-@no_type_check
 def texture_point(corners, weights):
     """The point x, y, z of a face with `corners` (3, 3) at barycentric `weights` (2,) of the second and the third."""
     u, v = weights[0], weights[1]
@@ -163,7 +159,6 @@ def texture_point(corners, weights):
 
 
 @compiled
-@no_type_check
 def facing_normal(normal, direction):
     """The unit normal x, y, z on the viewer's side, and its cosine to the ray, at least 0.04."""
     length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2) + 1e-30
@@ -175,7 +170,6 @@ def facing_normal(normal, direction):
 
 
 @compiled
-@no_type_check
 def dot(v, x, y, z):
     """Scalar product of the first three elements of `v` with x, y, z."""
     return v[0] * x + v[1] * y + v[2] * z

@@ -10,14 +10,9 @@ from typing import Any, no_type_check
 
 import numpy as np
 
+from drivesplat.demo.layout import CROSSING, CURB, LANE, ROAD, SIDEWALK, WINDOW
 from drivesplat.demo.shapes.mesh import BARK, Material
 from drivesplat.kernels.cache import kernel
-
-LANE, ROAD, CURB, SIDEWALK = 3.5, 5.9, 6.15, 9.5
-"""Distances of outer edges from the centre line (metres)."""
-CROSSING = (46.0, 49.0)
-WINDOW = (3.2, 3.0)
-"""Width and height (metres) of the cells of a facade, one window each."""
 
 PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES, METAL, SIGN = (int(m) for m in Material)
 

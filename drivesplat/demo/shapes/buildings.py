@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivesplat.demo.optics.materials import WINDOW
+from drivesplat.demo.layout import WINDOW
 from drivesplat.demo.shapes.mesh import (
     METAL,
     Color,

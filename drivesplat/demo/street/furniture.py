@@ -1,15 +1,26 @@
-"""Trees, lamps, signs and bins beside the road."""
+"""Trees, lamps, signs and other furniture of the sidewalks."""
+
+from collections.abc import Callable
 
 import numpy as np
 
-from drivesplat.demo.shapes import scenery
+from drivesplat.demo.layout import FURNITURE, TREES
+from drivesplat.demo.shapes import plants, scenery
 from drivesplat.demo.shapes.mesh import ColoredMesh
 from drivesplat.demo.street.buildings import ALONG
-from drivesplat.demo.street.layout import FURNITURE, TREES
 from drivesplat.demo.street.road import Road
 
+LAMP_HEIGHT, LAMP_ARM = 6.5, 1.5
+"""Metres."""
 SIGNS = ((28.0, (0.6, 0.04, 0.03)), (44.5, (0.04, 0.1, 0.5)), (90.0, (0.6, 0.04, 0.03)))
 """Place along the road in metres and colour of each sign."""
+TREE_SPACING = 17.0
+SHELTER = 104.0
+"""Place along the road of the bus shelter, on the right."""
+KERBSIDE: tuple[Callable[[], ColoredMesh], ...] = (
+    scenery.litter_bin, scenery.hydrant, scenery.mailbox, scenery.bollard, scenery.street_name_sign,
+)  # fmt: skip
+"""Small things beside the curb."""
 
 
 def lamp_places() -> np.ndarray:
@@ -18,21 +29,41 @@ def lamp_places() -> np.ndarray:
 
 
 def trees(road: Road, random: np.random.Generator) -> list[ColoredMesh]:
-    """A row of trees on each sidewalk."""
+    """A row of trees on each sidewalk, some of which overhang the road; between them benches, planters and advertising
+    columns."""
     found = []
     for side in (-1, 1):
-        for s in np.arange(ALONG[0] + 6 * side, 190.0, 17.0):
+        for s in np.arange(ALONG[0] + 6 * side, 190.0, TREE_SPACING):
             place = s + random.uniform(-2, 2), side * random.uniform(*TREES)
-            found.append(road.place(scenery.tree(random.uniform(5.0, 8.0), random), *place))
+            overhang = -side * random.uniform(1.5, 2.5) if random.uniform() < 0.4 else 0.0
+            tree = plants.tree(random.uniform(5.0, 8.0), random, overhang)
+            if side > 0 or abs(place[0] - SHELTER) > 4.0:
+                found.append(road.place(tree, *place))
+            between = s + TREE_SPACING / 2
+            if side > 0 or abs(between - SHELTER) > 4.0:
+                found.append(road.place(_between_trees(side, random), between, side * 8.9))
     return found
 
 
+def _between_trees(side: int, random: np.random.Generator) -> ColoredMesh:
+    kind = random.integers(4)
+    if kind == 0:
+        return scenery.advertising_column(random)
+    if kind == 1:
+        return plants.planter(random)
+    return scenery.bench().moved((0.0, 0.0, 0.0), 0.0 if side < 0 else np.pi)
+
+
 def furniture(road: Road, lamps: np.ndarray, random: np.random.Generator) -> list[ColoredMesh]:
-    """Street lamps at the places `lamps` (m, 2), signs and bins."""
-    found = [road.place(scenery.street_lamp(6.5, -np.sign(t) * 1.5), s, t) for s, t in lamps]
+    """Street lamps at the places `lamps` (m, 2) with wires between some of them, signs, a bus shelter, and small things
+    beside the curb, clear of the pedestrians' path."""
+    found = [road.place(scenery.street_lamp(LAMP_HEIGHT, -np.sign(t) * LAMP_ARM), s, t) for s, t in lamps]
     found += [road.place(scenery.sign(color), s + random.uniform(-3, 3), -FURNITURE) for s, color in SIGNS]
-    found += [
-        road.place(scenery.litter_bin(), s, side * FURNITURE)
-        for s, side in ((17.0, 1), (52.0, -1), (81.0, 1), (110.0, -1))
-    ]
+    tops = road.points(np.column_stack([lamps, np.full(len(lamps), LAMP_HEIGHT - 0.2)]))
+    found += [scenery.overhead_wire(tops[i], tops[i + 1]) for i in range(1, len(tops) - 1, 3)]
+    found.append(road.place(scenery.bus_shelter(random), SHELTER, -9.0))
+    for i, s in enumerate(np.arange(-20.0, 140.0, 11.0)):
+        side = (-1) ** i
+        if np.abs(lamps[:, 0] - s).min() > 1.0:
+            found.append(road.place(KERBSIDE[i % len(KERBSIDE)](), s, side * FURNITURE))
     return found

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from drivesplat.demo.layout import CURB, ROAD, SIDEWALK
 from drivesplat.demo.shapes.mesh import ColoredMesh, Material, SurfaceClass
-from drivesplat.demo.street.layout import CURB, ROAD, SIDEWALK
 from drivesplat.demo.street.road import Road
 
 NEAR = (-120.0, 300.0)

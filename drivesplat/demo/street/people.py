@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivesplat.demo.layout import CYCLE_LANE, ROADSIDE, SIDEWALK_PATH, WALL_SIDE
 from drivesplat.demo.shapes.animals import Dog
 from drivesplat.demo.shapes.cyclist import Cyclist
 from drivesplat.demo.shapes.people import Person
-from drivesplat.demo.street.layout import CYCLE_LANE, ROADSIDE, SIDEWALK_PATH, WALL_SIDE
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import StreetPath
 from drivesplat.demo.street.road import Road

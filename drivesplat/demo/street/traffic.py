@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from drivesplat.demo.layout import CROSSING, PARKING
 from drivesplat.demo.shapes.body import RigidBody
 from drivesplat.demo.shapes.vehicles import vehicle
-from drivesplat.demo.street.layout import CROSSING, PARKING
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.demo.street.paths import LANE_CENTER, StreetPath
 from drivesplat.demo.street.road import Road
