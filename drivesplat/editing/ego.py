@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from drivesplat.editing.ego_path import edited_poses, recorded_time
-from drivesplat.editing.lateral_offset import PosesAt
+from drivesplat.edited_motion.ego_path import edited_poses, recorded_time
+from drivesplat.edited_motion.lateral_offset import PosesAt
 from drivesplat.errors import ConfigError
 from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames, smooth_poses
 from drivesplat.scene.rigid import inverse

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model

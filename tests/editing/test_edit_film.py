@@ -26,7 +26,7 @@ from helpers.hand_made_street import (
 from helpers.hand_made_traffic import placed
 from PIL import Image
 
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import EditFiles, Still, actor_placements, collisions, editable_actors, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError

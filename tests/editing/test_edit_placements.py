@@ -19,7 +19,7 @@ from helpers.hand_made_street import (
 )
 from helpers.hand_made_traffic import placed
 
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import actor_placements, editable_actors
 from drivesplat.model.gaussians import Gaussians

@@ -11,7 +11,7 @@ from drivesplat.demo.tables import token
 from helpers import REPOSITORY
 
 from drivesplat.demo.recorder import Recorder
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.scene.motion import Motion

@@ -338,7 +338,7 @@ def test_changed_tables_rerun_the_scenes_whose_rows_they_change(finished):
         ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
         ("drivesplat/io/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
         ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
-        ("drivesplat/editing/lateral_offset.py", "FULL_HEADING_SPEED = 1.0", "FULL_HEADING_SPEED = 0.5", {"edit": 2}),
+        ("drivesplat/edited_motion/lateral_offset.py", "HEADING_SPEED = 1.0", "HEADING_SPEED = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report/gaps.py", "SCHEMA = 2", "SCHEMA = 3", {"gap_report": 1}),
         ("drivesplat/report/page/page.js", "Sliders", "The sliders", {"gap_report": 1}),

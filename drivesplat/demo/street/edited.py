@@ -13,9 +13,9 @@ from drivesplat.demo.street.objects import EGO_PARTS, StreetObject
 from drivesplat.demo.street.paths import GivenPath
 from drivesplat.demo.street.street import Street, street_with
 from drivesplat.demo.tokens import instance_token
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
-from drivesplat.editing.ego_path import edited_poses
-from drivesplat.editing.lateral_offset import PosesAt
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.ego_path import edited_poses
+from drivesplat.edited_motion.lateral_offset import PosesAt
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.edit import Edit
 

@@ -17,7 +17,7 @@ EGO_REACH = (-0.7, 3.5)
 PARKED_SPACING = 7.2
 CREEP = 1.1
 """Mean speed of a queue in m/s."""
-QUEUE_AHEAD = (("truck", 6.0), ("car", 5.0), ("van", 5.5), ("car", 6.0))
+QUEUE_AHEAD = (("truck", 3.6), ("car", 5.0), ("van", 5.5), ("car", 6.0))
 """Kind of each vehicle ahead of the ego vehicle in a queue, and the gap in metres before it."""
 QUEUE_ONCOMING = ("car", "truck", "car", "van", "car", "car", "truck", "car")
 ONCOMING_GAP = 2.2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from drivesplat.editing.extrapolation import EndState, end_state, extrapolate
+from drivesplat.edited_motion.extrapolation import EndState, end_state, extrapolate
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import inverse
 
@@ -32,8 +32,8 @@ class ObjectTrajectory:
     """The trajectory of a motion.
 
     Distance is horizontal, in metres from the first annotation; it never decreases and is constant while the object
-    stands. Past its ends the trajectory is extrapolated straight on (`drivesplat.editing.extrapolation`); a gap of the
-    track is bridged smoothly.
+    stands. Past its ends the trajectory is extrapolated straight on (`drivesplat.edited_motion.extrapolation`); a gap of
+    the track is bridged smoothly.
     """
 
     motion: Motion

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from drivesplat.editing.transition import Transition
+from drivesplat.edited_motion.transition import Transition
 from drivesplat.scene.motion import Motion
 
 FITTED_STEPS = 4

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivesplat.editing.lateral_offset import PosesAt, offset_poses
-from drivesplat.editing.transition import Transition
+from drivesplat.edited_motion.lateral_offset import PosesAt, offset_poses
+from drivesplat.edited_motion.transition import Transition
 from drivesplat.settings.edit import Ego
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.edit import Edit

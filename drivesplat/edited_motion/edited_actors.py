@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drivesplat.editing.actor_path import ActorPath, recorded_path
-from drivesplat.editing.placed_path import placed_motion
-from drivesplat.editing.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
+from drivesplat.edited_motion.actor_path import ActorPath, recorded_path
+from drivesplat.edited_motion.placed_path import placed_motion
+from drivesplat.edited_motion.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.tracks import short_ids

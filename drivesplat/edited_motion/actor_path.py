@@ -1,6 +1,6 @@
 """The path of an actor in an edited drive: its trajectory, its position along it over time, and its offsets from it.
 
-`times` (n,) are seconds of the film. `edited_actors` creates paths, `drivesplat.editing.steps` changes them.
+`times` (n,) are seconds of the film. `edited_actors` creates paths, `drivesplat.edited_motion.steps` changes them.
 """
 
 from collections.abc import Callable
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivesplat.editing.lateral_offset import offset_poses, rotate_yaw
-from drivesplat.editing.object_trajectory import ObjectTrajectory
+from drivesplat.edited_motion.lateral_offset import offset_poses, rotate_yaw
+from drivesplat.edited_motion.object_trajectory import ObjectTrajectory
 from drivesplat.scene.motion import Motion
 
 

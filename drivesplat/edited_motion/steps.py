@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from drivesplat.editing.actor_path import ActorPath, PathOffsets, PathPosition
-from drivesplat.editing.transition import Transition
+from drivesplat.edited_motion.actor_path import ActorPath, PathOffsets, PathPosition
+from drivesplat.edited_motion.transition import Transition
 from drivesplat.settings.edit import Duplicate, Reverse, Shift, Speed, Stop
 
 INTEGRATION_STEP = 0.005
