@@ -32,8 +32,8 @@ class ObjectTrajectory:
     """The trajectory of a motion.
 
     Distance is horizontal, in metres from the first annotation; it never decreases and is constant while the object
-    stands. Past its ends the trajectory is extrapolated straight on (`drivesplat.edited_motion.extrapolation`); a gap of
-    the track is bridged smoothly.
+    stands. Past its ends the trajectory is extrapolated straight on (`extrapolation`); a gap of the track is bridged
+    smoothly.
     """
 
     motion: Motion
