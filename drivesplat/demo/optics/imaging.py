@@ -1,7 +1,7 @@
 """Camera images of the street: radiance, depth, and the object and class that each pixel shows."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,10 @@ MAX_RAYS = 400_000
 """Rays cast at once, which bounds memory."""
 SHADOW_OFFSET = 2e-3
 """Distance (metres) from a surface to the start of its shadow ray; larger far away, where float32 is coarse."""
+DEPTH_STEP = 0.05
+"""Relative change of depth between pixels from which a surface counts as ending."""
+FILTER = 0.7
+"""Width of the filter of textures in pixels."""
 EXPOSURE = 0.62
 R2_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 """Steps of the R2 sequence (Roberts 2018), which spreads any number of points evenly over a square."""
@@ -30,31 +34,25 @@ class DemoCamera:
     height: int
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
-    def rays(self, rows: slice, samples: int) -> Rays:
-        """The rays (rows * width * samples). The first of `samples` passes through the pixel centre."""
-        offsets = (0.5 + R2_STEPS * np.arange(samples)[:, None]) % 1.0 - 0.5
-        y, x = np.mgrid[rows, : self.width].astype(np.float64)
-        pixels = np.stack([x, y], axis=-1)[:, :, None, :] + offsets
-        pixels = (pixels - self.intrinsics[:2, 2]) / self.intrinsics.diagonal()[:2]
-        rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
-        first = rows.start if len(self.seconds) > 1 else 0
-        poses = self.camera_to_street[first : first + (len(y) if len(self.seconds) > 1 else 1)]
-        rays = (rays.reshape(len(poses), -1, 3) @ np.swapaxes(poses[:, :3, :3], 1, 2)).reshape(-1, 3)
-        moment = np.repeat(np.arange(first, first + len(poses), dtype=np.int32), len(rays) // len(poses))
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        return Rays(self.seconds, self.camera_to_street[:, :3, 3], rays, moment)
+    def rays(self, x: np.ndarray, y: np.ndarray, row: np.ndarray) -> Rays:
+        """The rays through points x, y (n,) in pixels, which belong to rows `row` (n,)."""
+        in_camera = np.empty((len(x), 3))
+        in_camera[:, 0] = (x - self.intrinsics[0, 2]) / self.intrinsics[0, 0]
+        in_camera[:, 1] = (y - self.intrinsics[1, 2]) / self.intrinsics[1, 1]
+        in_camera[:, 2] = 1.0
+        in_camera /= np.linalg.norm(in_camera, axis=1, keepdims=True)
+        poses = self.camera_to_street
+        if len(self.seconds) == 1:
+            moment, directions = np.zeros(len(x), np.int32), in_camera @ poses[0, :3, :3].T
+        else:
+            moment = row.astype(np.int32)
+            directions = np.einsum("nij,nj->ni", poses[moment, :3, :3], in_camera)
+        return Rays(self.seconds, poses[:, :3, 3], directions, moment)
 
     @property
     def pose(self) -> np.ndarray:
         """Camera to street (4, 4) at the image's timestamp: the middle of its readout."""
         return self.camera_to_street[len(self.camera_to_street) // 2]
-
-    def blocks(self, samples: int) -> Iterator[tuple[slice, Rays]]:
-        """Blocks of image rows and their rays."""
-        step = max(1, MAX_RAYS // (self.width * samples))
-        for y in range(0, self.height, step):
-            rows = slice(y, min(y + step, self.height))
-            yield rows, self.rays(rows, samples)
 
 
 @dataclass(frozen=True)
@@ -70,44 +68,73 @@ class Picture:
 
 
 def render(snapshot: StreetSnapshot, light: Light, camera: DemoCamera, samples: int) -> Picture:
-    """The image, each pixel averaged over `samples` rays."""
-    size = camera.height, camera.width
-    picture = Picture(np.empty((*size, 3)), np.empty(size), np.empty(size, np.int32), np.empty(size, np.uint8))
-    for rows, rays in camera.blocks(samples):
-        hits = snapshot.cast(rays)
-        radiance = _radiance(snapshot, light, camera, rays, hits, samples)
-        picture.radiance[rows] = radiance.reshape(-1, camera.width, samples, 3).mean(axis=2)
-        _enter_geometry(picture, snapshot, camera, rows, rays, hits, samples)
-    return Picture(picture.radiance * camera.gains, picture.depth, picture.objects, picture.classes)
+    """The image. Each pixel has a ray through its centre; where its surface ends or its light changes, it is averaged
+    over `samples` rays."""
+    picture, radiance, edges = _through_centers(snapshot, light, camera)
+    rows, columns = np.nonzero(edges)
+    for block in _blocks(len(rows) if samples > 1 else 0, samples - 1):
+        y, x = (np.repeat(at[block], samples - 1) for at in (rows, columns))
+        offsets = np.tile((0.5 + R2_STEPS * np.arange(1, samples)[:, None]) % 1.0 - 0.5, (len(rows[block]), 1))
+        rays = camera.rays(x + offsets[:, 0], y + offsets[:, 1], y)
+        found, _ = _radiance(snapshot, light, camera, rays, snapshot.cast(rays))
+        total = found.reshape(-1, samples - 1, 3).sum(axis=1) + radiance[rows[block], columns[block]]
+        radiance[rows[block], columns[block]] = total / samples
+    return replace(picture, radiance=radiance * camera.gains)
 
 
 def geometry(snapshot: StreetSnapshot, camera: DemoCamera) -> Picture:
-    """The image without its radiance, which is NaN."""
+    """The image without its radiance, which is empty."""
+    return _through_centers(snapshot, None, camera)[0]
+
+
+def _through_centers(
+    snapshot: StreetSnapshot, light: Light | None, camera: DemoCamera
+) -> tuple[Picture, np.ndarray, np.ndarray]:
+    """The geometry at pixel centres, the radiance there (h, w, 3) unless there is no `light`, and the pixels (h, w)
+    bool in which a surface ends or its light changes."""
+    count, caster = camera.width * camera.height, snapshot.caster
+    depth, objects, face = np.empty(count), np.empty(count, np.int32), np.empty(count, np.int64)
+    radiance, lit = np.empty((count if light else 0, 3)), np.zeros(count, dtype=bool)
+    for block in _blocks(count, 1):
+        y, x = np.divmod(np.arange(count)[block], camera.width)
+        rays = camera.rays(x.astype(np.float64), y.astype(np.float64), y)
+        hits = snapshot.cast(rays)
+        axes = camera.camera_to_street[rays.moment, :3, 2]
+        depth[block] = hits.distance * np.einsum("ni,ni->n", rays.directions, axes)
+        objects[block], face[block] = hits.object, hits.face
+        if light:
+            radiance[block], lit[block] = _radiance(snapshot, light, camera, rays, hits)
     size = camera.height, camera.width
-    picture = Picture(
-        np.full((*size, 3), np.nan), np.empty(size), np.empty(size, np.int32), np.empty(size, np.uint8)
-    )  # fmt: skip
-    for rows, rays in camera.blocks(1):
-        _enter_geometry(picture, snapshot, camera, rows, rays, snapshot.cast(rays), 1)
-    return picture
+    classes = np.where(face >= 0, caster.surface_class[face], int(SurfaceClass.SKY)).astype(np.uint8)
+    picture = Picture(np.empty((0, 0, 3)), depth.reshape(size), objects.reshape(size), classes.reshape(size))
+    surfaces = np.where(face >= 0, caster.surface[face], NO_HIT).reshape(size)
+    edges = _edges(surfaces, lit.reshape(size), picture.depth) if light else np.zeros(size, dtype=bool)
+    return picture, radiance.reshape(*size, 3) if light else radiance, edges
 
 
-def _enter_geometry(
-    picture: Picture, snapshot: StreetSnapshot, camera: DemoCamera, rows: slice, rays: Rays, hits: RayHits, samples: int
-) -> None:
-    """Enters what the ray through each pixel centre hits, the first of its `samples`."""
-    axes = camera.camera_to_street[rays.moment[::samples], :3, 2]
-    cosine = np.einsum("ni,ni->n", rays.directions[::samples], axes)
-    face = hits.face[::samples]
-    classes = np.where(face >= 0, snapshot.caster.surface_class[face], int(SurfaceClass.SKY))
-    picture.depth[rows] = (hits.distance[::samples] * cosine).reshape(-1, camera.width)
-    picture.objects[rows] = hits.object[::samples].reshape(-1, camera.width)
-    picture.classes[rows] = classes.reshape(-1, camera.width)
+def _edges(surfaces: np.ndarray, lit: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The pixels (h, w) bool that differ from one beside, above or below in surface, light or depth."""
+    edges, inverse_depth = np.zeros(surfaces.shape, dtype=bool), 1.0 / depth
+    for axis in (0, 1):
+        first, second = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
+        near = np.maximum(inverse_depth[first], inverse_depth[second])
+        differs = np.abs(inverse_depth[first] - inverse_depth[second]) > DEPTH_STEP * near
+        differs |= (surfaces[first] != surfaces[second]) | (lit[first] != lit[second])
+        edges[first] |= differs
+        edges[second] |= differs
+    return edges
+
+
+def _blocks(count: int, rays_each: int) -> Iterator[slice]:
+    """Slices of `count` items with at most MAX_RAYS rays each."""
+    step = max(1, MAX_RAYS // max(1, rays_each))
+    return (slice(start, min(start + step, count)) for start in range(0, count, step))
 
 
 def _radiance(
-    snapshot: StreetSnapshot, light: Light, camera: DemoCamera, rays: Rays, hits: RayHits, samples: int
-) -> np.ndarray:
+    snapshot: StreetSnapshot, light: Light, camera: DemoCamera, rays: Rays, hits: RayHits
+) -> tuple[np.ndarray, np.ndarray]:
+    """The radiance (n, 3) that arrives along rays, and whether the sun is visible from what they hit (n,) bool."""
     lit = np.zeros(len(rays), dtype=bool)
     if light.sun.any():
         hit = np.flatnonzero(hits.object != NO_HIT)
@@ -118,10 +145,10 @@ def _radiance(
     caster, radiance = snapshot.caster, np.empty_like(rays.directions)
     shade(
         rays.directions, rays.origins, rays.moment, hits.distance, hits.face, hits.normal, hits.weights, lit,
-        caster.texture, caster.texture_normal, caster.material, caster.color,
-        1.0 / (camera.intrinsics[0, 0] * np.sqrt(samples)), light, radiance,
+        caster.texture, caster.texture_normal, caster.material, caster.color, FILTER / camera.intrinsics[0, 0], light,
+        radiance,
     )  # fmt: skip
-    return radiance
+    return radiance, lit
 
 
 def to_bytes(radiance: np.ndarray, noise: float = 0.0, random: np.random.Generator | None = None) -> np.ndarray:

@@ -87,8 +87,8 @@ class MovingObject:
 class RayCaster:
     """The meshes of all `objects`, ready to be hit at any time.
 
-    `material` (f,), `color` (f, 3), `surface_class` (f,), `texture` (f, 3, 3) and `texture_normal` (f, 3) are those of
-    all faces; textures and their normals are in metres of the mesh's own texture space.
+    `material` (f,), `color` (f, 3), `surface_class` (f,), `surface` (f,), `texture` (f, 3, 3) and `texture_normal`
+    (f, 3) are those of all faces; textures and their normals are in metres of the mesh's own texture space.
     """
 
     def __init__(self, objects: Sequence[StreetObject]):
@@ -115,6 +115,14 @@ class RayCaster:
         edges = self.texture[:, 1:] - self.texture[:, :1]
         normals = np.cross(edges[:, 0], edges[:, 1])
         self.texture_normal = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        self.surface = self._surfaces(meshes)
+
+    def _surfaces(self, meshes: Sequence[ColoredMesh]) -> np.ndarray:
+        """The number (f,) of each face's surface: faces of one object, material, colour and direction share it."""
+        owners = [number for number, item in enumerate(self.objects) for _ in item.body.pieces]
+        owner = np.repeat(owners, [len(mesh.faces) for mesh in meshes])
+        rows = [owner, self.material, *(255 * self.color).round().T, *(8 * self.texture_normal).round().T]
+        return np.unique(np.stack(rows, axis=1).astype(np.int32), axis=0, return_inverse=True)[1].ravel()
 
     def at(self, seconds: np.ndarray, without: Collection[str] = ()) -> "StreetSnapshot":
         """The street at the times `seconds` (m,), without the moving objects of these names."""
