@@ -217,7 +217,7 @@ def test_without_frames_all_figures_are_null():
         pytest.param([], id="no frame"),
         pytest.param([(np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH, 3)), labels_of())], id="black"),
         pytest.param([(np.ones((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH, 3)), labels_of())], id="inverse"),
-        pytest.param([(*pair(9), labels_of(own_car=HEIGHT * WIDTH))], id="the own car alone"),
+        pytest.param([(*pair(9), labels_of(own_car=HEIGHT * WIDTH))], id="the ego vehicle alone"),
         pytest.param([(*pair(9), labels_of(moving_car=1500)), (*pair(9), labels_of(moving_car=50))], id="little"),
     ],
 )

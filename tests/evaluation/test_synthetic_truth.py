@@ -45,7 +45,7 @@ LIDAR = LidarDepthJob(
     holdout=HOLDOUT, images=ImageSettings(), own_car_radius=2.5, ray_spacing=(0.33, 1.33),
     box_margin=0.2,
 )  # fmt: skip
-OWN_CAR_ROWS = 12
+EGO_ROWS = 12
 """Number of rows at the lower edge of the masks that show the ego vehicle."""
 WORLD = World(key_frames=6, width=160, height=90)
 
@@ -55,7 +55,7 @@ def known(tmp_path_factory) -> DriveTruth:
     root = write_world(tmp_path_factory.mktemp("tiny"), WORLD)
     scene = scene_at(root, sweeps=False)
     labels = np.full((90, 160), LABELS["static"], dtype=np.uint8)
-    labels[90 - OWN_CAR_ROWS :] = LABELS["own_car"]
+    labels[90 - EGO_ROWS :] = LABELS["own_car"]
     masks = write_labels(tmp_path_factory.mktemp("masks"), scene, labels)
     path = write_truth(root, WORLD, scene)
     return DriveTruth(read_truth(path), path, recording_of(scene, masks, **HOLDOUT.model_dump()))
@@ -434,7 +434,7 @@ def test_without_the_recorded_poses_there_are_no_lateral_figures(known):
 
 def hulls(known: DriveTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Per key frame: the street without the leading car, and the pixels inside and outside its box (no ego vehicle)."""
-    free = np.arange(90)[:, None] < 90 - OWN_CAR_ROWS
+    free = np.arange(90)[:, None] < 90 - EGO_ROWS
     for frame, truth in frames_of(known, known.truth.without_leading("CAM_FRONT")):
         inside = rays_meet(leading_box(known, frame), frame.camera_to_world, frame)
         yield pixels_of(known, truth.image), inside & free, ~inside & free
@@ -448,7 +448,7 @@ def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known):
         assert result[region]["pixels"] == pytest.approx(sum(mask.sum() for mask in masks), abs=6)
         assert result[region]["psnr"] == pytest.approx(by_hand(GREY, images, masks), abs=0.02)
     assert result["box"]["pixels"] > 1000
-    assert result["box"]["pixels"] + result["outside"]["pixels"] == 6 * 160 * (90 - OWN_CAR_ROWS)
+    assert result["box"]["pixels"] + result["outside"]["pixels"] == 6 * 160 * (90 - EGO_ROWS)
 
 
 def test_pixels_of_the_ego_vehicle_are_neither_inside_nor_outside_the_removed_box(known, tmp_path):

@@ -77,7 +77,7 @@ DRIVERS = {
 
 
 def street_scene(tiny: Scene) -> Scene:
-    """The tiny drive with these vehicles in place of its own car; a truck is parked there and a pedestrian walks."""
+    """The tiny drive with these vehicles in place of its vehicle; a truck is parked there and a pedestrian walks."""
     others = [track for track in tiny.tracks if track.category != "vehicle.car"]
     return replace(tiny, tracks=(*others, *(_track(tiny, name, driver) for name, driver in DRIVERS.items())))
 
@@ -99,7 +99,7 @@ def street_actors() -> Actors:
 
 
 def street_model(*parts: Part) -> SplatModel:
-    """Some 150 Gaussians that stand still, the actors, and a sky of one colour; or just these parts before it."""
+    """Some 150 static Gaussians, the actors, and a sky of one colour; or just these parts before it."""
     rng = np.random.default_rng(0)
     places, colors = rng.uniform([5.0, -12.0, -0.5], [60.0, 12.0, 5.0], (150, 3)), rng.uniform(0.0, 1.0, (150, 3))
     made = parts or (round_gaussians(places, 0.4, colors=colors.tolist()), street_actors())

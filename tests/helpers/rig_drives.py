@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from drivesplat.demo.imaging import depth_and_objects
+from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor
 from PIL import Image
 
-from drivesplat.demo.imaging import depth_and_objects
 from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor
 from drivesplat.demo.street import EGO_VEHICLE
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.settings.world import WorldSettings
@@ -70,7 +70,7 @@ def _sweep(folder: Path, recorder: Recorder, index: int) -> Sweep:
 
 
 def true_body(camera: str, width: int = 160, seconds: float = 1.0) -> np.ndarray:
-    """The pixels (h, w) bool in which a camera sees the own car."""
+    """The pixels (h, w) bool in which a camera sees the ego vehicle."""
     recorder = recorder_of(width=width, own_car=True)
     number = [thing.name for thing in recorder.objects].index(EGO_VEHICLE)
     return depth_and_objects(recorder.snapshot(seconds), recorder.camera(RIG[camera], seconds))[1] == number

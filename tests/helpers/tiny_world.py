@@ -53,7 +53,7 @@ def default_things() -> list[Thing]:
 
 @dataclass
 class World:
-    """What is written: `speed` of the own car in m/s, images of `width` x `height` pixels, dimmed by `light`, so many
+    """The recording: `speed` of the ego vehicle in m/s, images of `width` x `height` pixels, dimmed by `light`, so many
     of them and of LiDAR sweeps between two key frames."""
 
     scenes: tuple[str, ...] = ("0001",)
@@ -74,7 +74,7 @@ class World:
         return np.array([[focal, 0.0, (self.width - 1) / 2], [0.0, focal, (self.height - 1) / 2], [0.0, 0.0, 1.0]])
 
     def ego_at(self, seconds: float) -> np.ndarray:
-        """The own car's position in the world of the drive (origin at its start)."""
+        """The ego vehicle's position in the world of the drive (origin at its start)."""
         return np.array([self.speed * seconds, 0.0, 0.0])
 
 

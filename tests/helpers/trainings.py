@@ -101,7 +101,7 @@ def untrained_street(settings: TrainSettings) -> SplatModel:
 
 
 def guided_views(device: torch.device = CPU) -> list[TrainingView]:
-    """Recorded views of which all is known that a training can be told."""
+    """Recorded views with every guide that a training can use."""
     views = []
     for view in recorded_views(device=device):
         rows = torch.arange(HEIGHT, device=device)[:, None].expand(HEIGHT, WIDTH)

@@ -110,7 +110,7 @@ class WorkflowCopy:
         under: tuple[str, ...] = (),
         timeout: float = 600,
     ) -> subprocess.CompletedProcess:
-        """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `cards`, by the program
+        """Runs Snakemake for `timeout` seconds at most, on a machine that seems to have these `gpus`, by the program
         `under` where one is given; the result holds its output (both streams) as `stdout`."""
         arguments = ("--cores", str(cores), *flags, "--", *targets)
         environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": gpus}

@@ -36,10 +36,10 @@ HELD_OUT = 2
 """A key frame of the group interpolation."""
 GHOST_AT = np.array([8.6, 1.2, 0.9])
 """Where the car was: 3.04 m before the camera at key frame HELD_OUT, 1.2 m nearer than the car is."""
-OWN_CAR_FROM = 44
-"""The row below which the own car's body hides what is in the image, the lower rows of the other car's box as well."""
+EGO_FROM_ROW = 44
+"""The first image row that the ego vehicle's body covers; it also covers the lower rows of the other car's box."""
 ROAD_AT = np.array([9.0, -2.5, 0.5])
-"""Beside the car's way."""
+"""Beside the car's path."""
 
 
 def one_car(scene: Scene, speed: float = SPEED) -> Scene:
@@ -69,9 +69,9 @@ def drive_of(
 
 @pytest.fixture(scope="module")
 def masks(tiny_scene, tmp_path_factory) -> Path:
-    """Label images, the same for every frame: the upper rows left out, the lowest the own car's body, static."""
+    """Label images, the same for every frame: the upper rows left out, the lowest the ego vehicle's body, static."""
     labels = np.full((54, 96), LABELS["static"], dtype=np.uint8)
-    labels[:10], labels[OWN_CAR_FROM:] = LABELS["left_out"], LABELS["own_car"]
+    labels[:10], labels[EGO_FROM_ROW:] = LABELS["left_out"], LABELS["own_car"]
     return write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
 
 
@@ -115,7 +115,7 @@ def test_the_rendering_is_that_of_the_model(panel_of_car):
 def test_psnr_of_vehicle_and_static_pixels_equals_skimage(panel_of_car, masks):
     panel, record, _ = panel_of_car
     static = np.zeros((54, 96), dtype=bool)
-    static[10:OWN_CAR_FROM] = True
+    static[10:EGO_FROM_ROW] = True
     assert record["static"]["psnr"] == pytest.approx(
         peak_signal_noise_ratio(panel.truth[static], panel.render[static], data_range=1.0)
     )
@@ -123,8 +123,8 @@ def test_psnr_of_vehicle_and_static_pixels_equals_skimage(panel_of_car, masks):
     box = np.zeros((54, 96), dtype=bool)
     (left, top), (right, bottom) = np.ceil(near_face(HELD_OUT) - 0.5).astype(int)
     box[top:bottom, left:right] = True
-    assert bottom > OWN_CAR_FROM
-    box[OWN_CAR_FROM:] = False
+    assert bottom > EGO_FROM_ROW
+    box[EGO_FROM_ROW:] = False
     assert record["subject"]["pixels"] == box.sum()
     assert record["vehicle"]["psnr"] == pytest.approx(
         peak_signal_noise_ratio(panel.truth[box], panel.render[box], data_range=1.0)

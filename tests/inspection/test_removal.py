@@ -181,13 +181,13 @@ def test_an_actors_gaussians_are_removed_at_any_place(tiny_scene):
 
 BEFORE_THE_BOX = [5.5, 0.85, 0.4]
 """On the car's way, nearer than its box and beside it in the image."""
-OWN_CAR_FROM = 36
-"""The row from which on the own car's body hides what is in the image, the lower part of the car's box as well."""
+EGO_FROM_ROW = 36
+"""The row from which on the ego vehicle's body hides what is in the image, the lower part of the car's box as well."""
 
 
 def test_pixels_of_the_ego_mask_are_neither_inside_nor_outside(tiny_scene, tmp_path):
     labels = np.full((54, 96), LABELS["static"], dtype=np.uint8)
-    labels[OWN_CAR_FROM:] = LABELS["own_car"]
+    labels[EGO_FROM_ROW:] = LABELS["own_car"]
     scene, part = one_car(tiny_scene, speed=6.0), round_gaussians([*PLACES, BEFORE_THE_BOX], 0.2)
     masks = write_labels(tmp_path, scene, labels)
     (whole, unmasked), (pair, record) = (
@@ -195,7 +195,7 @@ def test_pixels_of_the_ego_mask_are_neither_inside_nor_outside(tiny_scene, tmp_p
     )
     np.testing.assert_array_equal(whole.outside, ~whole.inside)
     hidden = np.zeros((54, 96), dtype=bool)
-    hidden[OWN_CAR_FROM:] = True
+    hidden[EGO_FROM_ROW:] = True
     for name in ("inside", "outside"):
         all_rows = getattr(whole, name)
         assert (all_rows & hidden).any() and (all_rows & ~hidden).any()
@@ -404,13 +404,13 @@ def test_a_box_that_fills_the_image_has_no_edge():
 
 
 def test_the_boundary_of_the_ego_mask_is_no_edge():
-    """Nothing changes but on the own car, in the rows below 14, which cross the hull's rows 8 to 19."""
+    """Nothing changes but on the ego vehicle, in the rows below 14, which cross the hull's rows 8 to 19."""
     seen = np.repeat(np.arange(HEIGHT)[:, None] < 14, WIDTH, axis=1)
     inside = pair_of().inside
     flat = np.full((HEIGHT, WIDTH, 3), 0.5) + np.linspace(0, 0.1, WIDTH)[None, :, None]
-    on_own_car = flat.copy()
-    on_own_car[14:] = 0.9
-    pair = pair_of(with_car=flat, without_car=on_own_car, inside=inside & seen, outside=~inside & seen)
+    on_ego_vehicle = flat.copy()
+    on_ego_vehicle[14:] = 0.9
+    pair = pair_of(with_car=flat, without_car=on_ego_vehicle, inside=inside & seen, outside=~inside & seen)
     assert figures(pair)["edge"]["ratio"] == pytest.approx(1.0)
 
 

@@ -146,7 +146,7 @@ def test_in_random_traffic_the_largest_moving_vehicle_is_chosen(tiny_scene, seed
     "still",
     [
         pytest.param(PARKED, id="parked"),
-        pytest.param(dataclasses.replace(LEADING, velocity=(0.9, 0.0)), id="slower than what moves"),
+        pytest.param(dataclasses.replace(LEADING, velocity=(0.9, 0.0)), id="slower than the threshold of motion"),
         pytest.param(WALKER, id="a person"),
         pytest.param(dataclasses.replace(LEADING, visibility=1), id="hardly visible"),
         pytest.param(dataclasses.replace(LEADING, position=(95.0, 0.0, 0.8)), id="too far"),
@@ -177,8 +177,8 @@ def test_nearer_boxes_hide_farther_ones(tiny_scene):
     assert (hidden.visible ^ expected).sum() <= 2
 
 
-def own_car_below(scene: Scene, row: int, folder: Path) -> Path:
-    """Masks (108, 192) of which the own car's body fills the rows from `row` on."""
+def ego_vehicle_below(scene: Scene, row: int, folder: Path) -> Path:
+    """Masks (108, 192) of which the ego vehicle's body fills the rows from `row` on."""
     labels = np.full((108, WIDTH), LABELS["static"], dtype=np.uint8)
     labels[row:] = LABELS["own_car"]
     return write_labels(folder, scene, labels)
@@ -187,7 +187,7 @@ def own_car_below(scene: Scene, row: int, folder: Path) -> Path:
 def test_pixels_of_the_ego_mask_do_not_count(tiny_scene, tmp_path):
     scene = with_actors(tiny_scene, LEADING)
     free = chosen(scene, SubjectSettings(key_frame=0))
-    recording = recorded(scene, masks=own_car_below(scene, 70, tmp_path))
+    recording = recorded(scene, masks=ego_vehicle_below(scene, 70, tmp_path))
     subject = choose_subject(recording, "CAM_FRONT", SubjectSettings(key_frame=0))
     assert free.visible[70:].any() and free.visible[:70].any()
     np.testing.assert_array_equal(subject.visible[:70], free.visible[:70])
@@ -199,14 +199,14 @@ def test_pixels_behind_the_ego_mask_do_not_count_in_the_choice(tiny_scene, tmp_p
     low = dataclasses.replace(LEADING, size=(4.0, 2.0, 1.0), position=(9.0, 0.3, 0.5), velocity=(7.0, 0.0))
     scene = with_actors(tiny_scene, low)
     row = int(np.flatnonzero(chosen(scene).visible.any(axis=1)).min()) + 2
-    subject = choose_subject(recorded(scene, masks=own_car_below(scene, row, tmp_path)), "CAM_FRONT", ANY)
+    subject = choose_subject(recorded(scene, masks=ego_vehicle_below(scene, row, tmp_path)), "CAM_FRONT", ANY)
     assert found(chosen(scene)) == ("leading", 0)
     assert subject.frame.sample_index > 0 and subject.visible[row:].sum() == 0
 
 
 def test_a_vehicle_completely_behind_the_ego_mask_is_not_chosen(tiny_scene, tmp_path):
     scene = with_actors(tiny_scene, LEADING)
-    assert choose_subject(recorded(scene, masks=own_car_below(scene, 0, tmp_path)), "CAM_FRONT", ANY) is None
+    assert choose_subject(recorded(scene, masks=ego_vehicle_below(scene, 0, tmp_path)), "CAM_FRONT", ANY) is None
 
 
 def test_a_completely_hidden_vehicle_is_not_chosen(tiny_scene):

@@ -266,7 +266,7 @@ def stretch(model):
 @pytest.mark.slow
 @pytest.mark.parametrize("body", [False, True])
 def test_a_training_with_triton_agrees_with_one_without(body, monkeypatch):
-    """Two iterations of background, cars and a cube map, with every term of the loss, and the own car's body."""
+    """Two iterations of background, cars and a cube map, with every term of the loss, and the ego vehicle's body."""
     ends = []
     for kernels in (True, False):
         monkeypatch.setattr(triton_support, "usable_for", lambda tensor, kernels=kernels: kernels)

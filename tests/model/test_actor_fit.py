@@ -73,7 +73,7 @@ def recorded(thing: Thing, motion: Motion, views: list[View]) -> list[TrainingVi
 
 
 def from_the_kerb(count: int = 24) -> list[View]:
-    """Views of a camera that stands still."""
+    """Views of a stationary camera."""
     return [looking_at([0.0, 0.0, 0.0], [0.5, -5.0, 1.5], float(time)) for time in np.linspace(0.0, 4.0, count)]
 
 

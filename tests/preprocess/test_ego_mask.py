@@ -213,7 +213,7 @@ def test_a_gradual_increase_of_variation_is_not_a_border(unseen):
     assert not contrasts(lower, 4.0 + 0.5 * (89.0 - rows), drive)
 
 
-# ---- what is told
+# ---- messages
 
 
 def test_an_outline_of_the_user_replaces_the_search_in_its_camera_only(seen):

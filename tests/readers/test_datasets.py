@@ -1,4 +1,4 @@
-"""Which modules read a dataset, and what is told where one lacks."""
+"""Which modules read a dataset, and the message where one lacks."""
 
 from pathlib import Path
 from typing import get_args

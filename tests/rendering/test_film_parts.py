@@ -1,4 +1,4 @@
-"""The film of a model's parts: everything, what stands still, and what moves."""
+"""The film of a model's parts: all, static and dynamic ones."""
 
 import json
 import time
@@ -39,7 +39,7 @@ def parts_film(scene: Scene, folder: Path, checkpoint: TrainedCheckpoint, **chan
 
 
 def test_scene_static_and_dynamic_parts_are_side_by_side(scene, tmp_path, reels):
-    """Each third is what a model of these parts alone shows; what moves stands before grey instead of the sky."""
+    """Each third is what a model of these parts alone shows; dynamic parts stand before grey instead of the sky."""
     whole = street_model()
     still, actors = street_model(whole.parts[0]), SplatModel([street_actors()], None).requires_grad_(False)
     record = parts_film(scene, tmp_path, checkpoint_of(whole))

@@ -20,7 +20,7 @@ STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "train", "evaluate", *LOOKS)
 
 
 def spelled(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> str:
-    """What a stage is told, of a film the one called `original`."""
+    """The settings of a stage, of a film the one called `original`."""
     config = values if isinstance(values, Config) else load(values)
     film = "original" if stage == "film" else None
     return stage_settings(config, stage, scene, None if stage in OF_SCENES else method, film)

@@ -190,7 +190,7 @@ def test_yaml_merges_stay_possible(tmp_path):
 
 @pytest.fixture(scope="module")
 def demo_actors() -> list[EditedActor]:
-    """What moves in the demo's drive, at all its key frames."""
+    """The dynamic objects of the demo's drive, at all its key frames."""
     recorder, times = Recorder(WorldSettings()), 0.5 * np.arange(20)
     return [
         EditedActor.recorded(

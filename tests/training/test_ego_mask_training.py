@@ -1,4 +1,4 @@
-"""What the own car's body hides teaches a training nothing: from outlines to what is, and what is not, learned."""
+"""What the ego vehicle's body hides teaches a training nothing: from outlines to what is, and what is not, learned."""
 
 import dataclasses
 import json
@@ -137,7 +137,7 @@ def test_only_cameras_that_see_the_body_are_asked_for_it(tmp_path):
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory) -> Path:
-    """A drive whose CAM_BACK sees the own car, through all stages before the training."""
+    """A drive whose CAM_BACK sees the ego vehicle, through all stages before the training."""
     folder = tmp_path_factory.mktemp("prepared")
     scene, images = rig_drive(folder, ["CAM_FRONT", "CAM_BACK"], own_car=True), ImageSettings()
     holdout = HoldoutSettings(every_nth=6, offset=3, last_block=0)

@@ -428,11 +428,11 @@ def test_entropy_has_gradients_for_actors_only():
     assert actors["opacities"].grad[actors["owner"] == 0].any()
 
 
-# ---- what the own car hides
+# ---- what the ego vehicle hides
 
 
 def beneath(seen: TrainingView) -> TrainingView:
-    """A view at whose lower left the own car's body is seen, told as the masks tell it."""
+    """A view at whose lower left the ego vehicle's body is seen and masked."""
     ego_mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     ego_mask[9:, :12] = True
     columns, rows = seen.lidar.pixels % WIDTH, seen.lidar.pixels // WIDTH

@@ -82,6 +82,6 @@ def test_a_training_whose_resume_state_was_altered_starts_at_0_and_is_the_same(i
     (tmp_path / "it/resume/state.npz").write_bytes(content)
     with caplog.at_level(logging.WARNING):
         model, summary = trained(tmp_path / "it", settings_of(), fingerprint=FINGERPRINT)
-    assert "means.npy is damaged" in caplog.text and "training starts at 0" in caplog.text
+    assert "parts.0.params.means.npy" in caplog.text and "training starts at 0" in caplog.text
     assert summary.resumed_at == [] and summary.iterations == ITERATIONS
     assert same_parameters(model, whole)

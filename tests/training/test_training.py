@@ -159,7 +159,7 @@ def test_actors_learn_with_the_background_but_for_those_that_are_absent():
 
 
 def test_a_degree_that_is_not_shown_as_yet_does_not_learn():
-    """Neither of what stands still nor of what turns."""
+    """Neither of static nor of turning parts."""
     settings = settings_of(sh_every=1.0, refine_start=1.0)
     model = untrained_street(settings)
     trainer = Trainer.begin(model, recorded_views(), settings, 0, CPU)

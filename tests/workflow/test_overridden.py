@@ -1,4 +1,4 @@
-"""A setting that was given and holds nowhere is told, with the place that sets another one."""
+"""A given setting without effect is reported with the override that replaces it."""
 
 import pytest
 import yaml

@@ -31,7 +31,7 @@ def test_a_scene_through_slurm_comes_out_as_one_that_runs_here(tmp_path):
     copies = {name: WorkflowCopy.make(tmp_path / name, methods={"vanilla": {}}) for name in ("here", "there")}
     assert copies["here"].run(TARGET).returncode == 0
     there = copies["there"]
-    there.config["device"] = "any"  # of the GPUs that SLURM is told there are none exists
+    there.config["device"] = "any"  # the GPUs configured in SLURM do not exist
     there.write_config()
     environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": "0"}
     done = subprocess.run(
