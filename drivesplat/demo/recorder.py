@@ -14,7 +14,7 @@ from drivesplat.demo.optics.lighting import Light, daylight, lamplight
 from drivesplat.demo.optics.raycast import RayCaster, Rays, StreetSnapshot
 from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time, recording_sensors
 from drivesplat.demo.street.edited import Variation, edited
-from drivesplat.demo.street.objects import EGO_BODY, StreetObject
+from drivesplat.demo.street.objects import EGO_BODY, EGO_VEHICLE, StreetObject
 from drivesplat.demo.street.street import build_street
 from drivesplat.demo.tokens import instance_token
 from drivesplat.scene.images import project
@@ -72,8 +72,10 @@ class Recorder:
         return instance_token(self.scene, name)
 
     def snapshot(self, seconds: np.ndarray, view: Viewpoint = RECORDED, for_lidar: bool = False) -> StreetSnapshot:
-        """The street at the times `seconds` (m,), as cameras see it."""
-        without = {name for name in (view.without, None if for_lidar else EGO_BODY) if name}
+        """The street at the times `seconds` (m,), as cameras or the LiDAR see it. From beside the recorded path the ego
+        vehicle is not there."""
+        hidden = (view.without, None if for_lidar and not view.left else EGO_BODY, EGO_VEHICLE if view.left else None)
+        without = {name for name in hidden if name}
         return self._caster(view.edit).at(np.atleast_1d(np.asarray(seconds, dtype=np.float64)), without)
 
     def ego_to_street(self, seconds: np.ndarray, view: Viewpoint = RECORDED) -> np.ndarray:

@@ -49,6 +49,11 @@ class TruthView:
     without: str | None
     frames: tuple[TruthFrame, ...]
 
+    @property
+    def is_recorded(self) -> bool:
+        """Whether it shows the drive as it was, from its own path."""
+        return not self.left_m and self.edit is None and self.without is None
+
     def by_image(self) -> dict[str, TruthFrame]:
         """The frames by the token of their image's sample_data."""
         return {frame.sample_data: frame for frame in self.frames}
@@ -87,7 +92,7 @@ class Truth:
 
     def recorded(self, camera: str) -> TruthView | None:
         """The view of a camera from its own path."""
-        return next((view for view in self._of(camera) if not view.left_m and view.without is None), None)
+        return next((view for view in self._of(camera) if view.is_recorded), None)
 
     def lateral(self, camera: str) -> list[TruthView]:
         """The views of a camera from beside its path."""
@@ -124,7 +129,10 @@ def _view(content: dict) -> TruthView:
     for frame in frames:
         if np.shape(frame.camera_to_global) != (4, 4):
             raise ValueError(f"the pose of key frame {frame.sample_index} is no 4x4 matrix")
-    return TruthView(**content, frames=frames)
+    view = TruthView(**content, frames=frames)
+    if not view.is_recorded and any(frame.image is None for frame in frames):
+        raise ValueError(f"a view of {view.camera} that was not recorded has no image")
+    return view
 
 
 def truth_image(path: str | Path, name: str) -> Path:

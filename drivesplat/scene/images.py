@@ -52,7 +52,10 @@ def write_image(path: str | Path, colors: np.ndarray) -> None:
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> None:
-    """Writes uint8 pixels (h, w) or (h, w, 3) as a PNG. Raises ResultError that names the path on failure."""
+    """Writes pixels as a PNG: uint8 (h, w) or (h, w, 3), or uint16 (h, w).
+
+    Raises ResultError that names the path on failure.
+    """
     with atomic_write(path) as file:
         Image.fromarray(pixels).save(file, format="PNG")
 
