@@ -49,7 +49,7 @@ FURNITURE: dict[str, tuple[Callable[[], ColoredMesh], set[SurfaceClass]]] = {
     "shelter": (lambda: scenery.bus_shelter(seeded()), {SurfaceClass.OBJECT, SurfaceClass.SIGN, SurfaceClass.POLE}),
     "advertising column": (lambda: scenery.advertising_column(seeded()), {SurfaceClass.OBJECT}),
     "utility pole": (scenery.utility_pole, {SurfaceClass.POLE}),
-    "door": (lambda: buildings.door(RED), {SurfaceClass.BUILDING}),
+    "door": (lambda: buildings.front_door(RED), {SurfaceClass.BUILDING}),
     "plain building": (lambda: buildings.building((0, 10, 0), (12, 22, 9), GREY), {SurfaceClass.BUILDING}),
     "building": (lambda: buildings.building((0, 10, 0), (16, 22, 12), GREY, seeded()), {SurfaceClass.BUILDING}),
 }

@@ -81,7 +81,7 @@ def balcony(width: float) -> ColoredMesh:
     return concatenate([slab, *rails, *bars, *sides]).classified(SurfaceClass.BUILDING)
 
 
-def door(color: Color) -> ColoredMesh:
+def front_door(color: Color) -> ColoredMesh:
     """An entrance on a wall along x at y = 0, towards y: a frame, a door with a handle, a step, a small roof."""
     parts = [
         box((-0.68, -0.02, 0.0), (-0.52, 0.16, 2.4), Material.PLAIN, STONE),
@@ -124,7 +124,7 @@ def _front(columns: int, floors: int, cell: np.ndarray, random: np.random.Genera
     for column in range(columns):
         center, color = (column + 0.5) * cell[0], AWNINGS[random.integers(len(AWNINGS))]
         if column == entrance:
-            parts.append(door(WOOD if random.uniform() < 0.5 else color).moved((center, 0.0, 0.0)))
+            parts.append(front_door(WOOD if random.uniform() < 0.5 else color).moved((center, 0.0, 0.0)))
         elif random.uniform() < 0.4:
             parts.append(awning(0.9 * cell[0], color).moved((center, 0.0, 0.0)))
         elif random.uniform() < 0.3:

@@ -36,10 +36,10 @@ def van(size: Numbers, color: Color) -> ColoredMesh:
         (front, 0.28 * height, 0.85 * y), (front - 0.03, 0.12 * height, 0.86 * y),
     ]  # fmt: skip
     screen = [(base, -0.9 * y, belt), (base, 0.9 * y, belt), (roof, 0.86 * y, top), (roof, -0.86 * y, top)]
-    door = [(0.19 * length, y, 0.5 * height), (base, 0.9 * y, belt), (roof, 0.86 * y, top),
+    cab_door = [(0.19 * length, y, 0.5 * height), (base, 0.9 * y, belt), (roof, 0.86 * y, top),
             (0.19 * length, 0.9 * y, top)]  # fmt: skip
     windows = [glass(screen, (0.06, 0.94), (0.06, 0.92))]
-    windows += [glass(face, (0.16, 0.88), (0.12, 0.86)) for face in both_sides(door)]
+    windows += [glass(face, (0.16, 0.88), (0.12, 0.86)) for face in both_sides(cab_door)]
     body, nose = symmetric_hull(cargo, Material.PAINT, color), symmetric_hull(cab, Material.PAINT, color)
     brand = BRANDS[int(1000 * sum(color)) % len(BRANDS)]
     panels = [
