@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from drivesplat.demo.layout import CURB, LANE, ROAD, SIDEWALK
 from drivesplat.demo.optics.materials import (
     CURB,
     LANE,
@@ -129,10 +130,10 @@ def test_only_paint_glass_metal_lamps_and_panes_mirror_and_only_lamps_and_panes_
 
 def test_road_markings_are_lighter_than_the_road_and_the_curb_than_both_grass_and_road():
     road = np.mean([ground(x, 1.7, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
-    line = np.mean([ground(x, 3.5, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
-    curb = np.mean([ground(x, 6.0, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
+    line = np.mean([ground(x, LANE, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
+    curb = np.mean([ground(x, (ROAD + CURB) / 2, 0.05)[0] for x in np.arange(0.0, 40.0, 0.13)])
     assert line > 4 * road and curb > 3 * road
-    red, green, blue = np.mean([ground(x, 12.0, 0.05) for x in np.arange(0.0, 40.0, 0.13)], axis=0)
+    red, green, blue = np.mean([ground(x, SIDEWALK + 2.5, 0.05) for x in np.arange(0.0, 40.0, 0.13)], axis=0)
     assert green > red > blue
 
 

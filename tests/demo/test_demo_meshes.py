@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drivesplat.demo.optics.materials import WINDOW
+from drivesplat.demo.layout import WINDOW
 from drivesplat.demo.shapes import buildings, mesh, plants, scenery, vehicle_parts, vehicles
 from drivesplat.demo.shapes.mesh import ColoredMesh, Material, SurfaceClass
 
