@@ -5,7 +5,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivesplat.demo.layout import CURB, LANE, ROAD, SIDEWALK
 from drivesplat.demo.optics.materials import (
     CURB,
     LANE,
