@@ -59,7 +59,9 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
     fit the street, ResultError where the disk is full or has no space for the world.
     """
     recorder = Recorder(job.world, job.scene, job.edits)
-    require_free_places(recorder)
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(1, context) as pool:  # this process must not use Embree: a fork does not survive it
+        pool.submit(_check_places, job).result()
     prepare_folder(root, provenance)
     source = sha256_text(canonical_json(provenance["stages"]))
     tables = NuScenesTables(job.scene, _description(job.world), source, START_US, job.world)
@@ -69,7 +71,7 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
     views, scans = planned_views(recorder), planned_scans(recorder)
     images = sum(file.sensor.is_camera for file in files)
     require_space(root, world_bytes(job.world, images, len(files) - images, len(views), len(scans)))
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _start_worker, (job, root)) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (job, root)) as pool:
         counts = pool.map(_write_file, files)
         visible = pool.map(_visible_fractions, range(job.world.key_frames))
         frames = [pool.map(_write_frame, repeat(plan), key_frames_of(recorder, plan)) for plan in views]
@@ -125,6 +127,10 @@ def _view(recorder: Recorder, plan: TruthPlan, frames: tuple[TruthFrame, ...]) -
 
 _worker: tuple[Recorder, Path]
 """In a worker process: the recorder and the dataset's root."""
+
+
+def _check_places(job: WorldJob) -> None:
+    require_free_places(Recorder(job.world, job.scene, job.edits))
 
 
 def _start_worker(job: WorldJob, root: Path) -> None:
