@@ -6,10 +6,12 @@ which rays are transformed with the pose of the piece at their time. No scene is
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import no_type_check
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
 
 from drivesplat.demo.shapes.mesh import ColoredMesh
@@ -56,11 +58,18 @@ class RayHits:
     weights: np.ndarray
 
 
+@cache
+def _device() -> EmbreeDevice:
+    """The device of this process: Embree fails after some hundreds."""
+    return EmbreeDevice()
+
+
 class EmbreePiece:
-    """Meshes in an Embree scene, in one frame. `faces`: index of each mesh's first face among all faces."""
+    """Meshes in an Embree scene, in one frame; `owners` and `first_faces` are the object's index and the index of the
+    first face among all faces, of each mesh."""
 
     def __init__(self, meshes: Sequence[ColoredMesh], owners: Sequence[int], first_faces: Sequence[int]):
-        self.scene = EmbreeScene()
+        self.scene = EmbreeScene(_device())
         self._triangles = [TriangleMesh(self.scene, mesh.triangles.astype(np.float32)) for mesh in meshes]
         self.owners, self.first_faces = np.array(owners, np.int32), np.array(first_faces)
 
