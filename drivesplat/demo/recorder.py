@@ -161,7 +161,8 @@ class Recorder:
 
     def _count_points(self, camera: DemoCamera, seconds: float, visible: np.ndarray, inside: np.ndarray) -> None:
         """Adds the number of surface points of each object that lie inside the image, and of those that are visible."""
-        time, snapshot = np.array([seconds]), self.snapshot(seconds)
+        time = np.array([seconds])
+        snapshot = self.snapshot(time)
         center = camera.pose[:3, 3]
         for number, item in enumerate(self.objects):
             if item.category is None:

@@ -147,13 +147,15 @@ class Place(Settings):
     track: Id
     name: Id = Field(alias="as")
     """The copy's id: letters, digits, '_', '-' and '.'."""
-    path: tuple[Waypoint, ...] = Field(min_length=1)
+    path: tuple[Waypoint, ...]
     """Points of its path, in time order. One point: it stands there, facing as the ego vehicle did."""
     yaw: float = Field(0.0, ge=-360, le=360)
     """Rotation to its left about its vertical axis (degrees)."""
 
     @model_validator(mode="after")
     def _times_increase(self) -> "Place":
+        if not self.path:
+            raise ValueError("give at least one point in 'path'")
         if any(later[0] <= earlier[0] for earlier, later in zip(self.path[:-1], self.path[1:], strict=True)):
             raise ValueError("the seconds of 'path' must increase from point to point")
         return self

@@ -11,7 +11,7 @@ from drivesplat.settings.world import WorldLidarSettings
 
 ELEVATIONS = {32: np.radians(np.linspace(-30.67, 10.67, 32)), 64: np.radians(np.linspace(-24.8, 2.0, 64))}
 """Of the Velodyne HDL-32E, which nuScenes uses, and of the HDL-64E (KITTI's); lowest first."""
-STEPS = {20.0: 1085, 10.0: 2083}
+STEPS = {20: 1085, 10: 2083}
 """Firings of a beam in one revolution, by revolutions a second."""
 MAX_RANGE, MIN_RANGE = 100.0, 0.9
 FOOTPRINT = 0.05
@@ -47,7 +47,7 @@ class ScanPattern:
         return np.stack([x, y, np.sin(elevation)], axis=-1)
 
 
-def scan_pattern(lidar: WorldLidarSettings, revolutions_hz: float) -> ScanPattern:
+def scan_pattern(lidar: WorldLidarSettings, revolutions_hz: int) -> ScanPattern:
     """The pattern of a sensor; unless it `spins`, all rays leave at the sweep's timestamp."""
     azimuths = np.linspace(-np.pi, np.pi, STEPS[revolutions_hz], endpoint=False)
     fractions = (FORWARD + azimuths / (2 * np.pi)) % 1.0 - 1.0
