@@ -81,11 +81,9 @@ def real_scene_root() -> Path:
 @pytest.fixture(scope="session")
 def demo_job():
     """The settings of a small synthetic drive by day."""
-    from drivesplat.settings.world import WorldJob, WorldSettings
+    from helpers.demo_worlds import CAMERAS, job_of, world_of
 
-    return WorldJob(
-        scene="demo", version="v1.0-mini", world=WorldSettings(width=160, key_frames=6, samples_per_pixel=1)
-    )
+    return job_of(world_of(width=160, key_frames=6, cameras=CAMERAS))
 
 
 @pytest.fixture(scope="session")

@@ -5,13 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from drivesplat.demo import meshes
-from drivesplat.demo.imaging import DemoCamera, depth_and_objects, render, to_bytes
-from drivesplat.demo.lighting import daylight, lamplight
-from drivesplat.demo.meshes import Material
-from drivesplat.demo.raycast import StreetSnapshot
-from drivesplat.demo.street import StreetObject
-from drivesplat.demo.traffic import StreetPath
+from drivesplat.demo.optics.imaging import DemoCamera, geometry, render, to_bytes
+from drivesplat.demo.optics.lighting import daylight, lamplight
+from drivesplat.demo.optics.raycast import RayCaster, StreetSnapshot
+from drivesplat.demo.shapes.mesh import Material, SurfaceClass, box
+from drivesplat.demo.street.objects import StreetObject, fixed
 
 SUN_HEIGHT = math.radians(50)
 SUN = np.array([math.cos(SUN_HEIGHT), 0.0, math.sin(SUN_HEIGHT)])
@@ -23,24 +21,33 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 
 def floor(top: float = 0.0) -> StreetObject:
     """A white plane; the texture of PLAIN fades where a pixel covers metres of it."""
-    mesh = meshes.box((-50.0, -50.0, top - 1.0), (50.0, 50.0, top), Material.PLAIN, (1.0, 1.0, 1.0))
-    return StreetObject("floor", mesh, StreetPath(0.0, 0.0))
+    mesh = box((-50.0, -50.0, top - 1.0), (50.0, 50.0, top), Material.PLAIN, (1.0, 1.0, 1.0))
+    return fixed("floor", mesh)
 
 
 def roof(at: float) -> StreetObject:
-    mesh = meshes.box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0))
-    return StreetObject("roof", mesh, StreetPath(0.0, 0.0))
+    mesh = box((at - 2.0, -2.0, 5.0), (at + 2.0, 2.0, 5.2), Material.PLAIN, (1.0, 1.0, 1.0))
+    return fixed("roof", mesh)
+
+
+def at_rest(objects: list[StreetObject]) -> StreetSnapshot:
+    return RayCaster(objects).at(np.zeros(1))
+
+
+def camera_of(intrinsics: np.ndarray, pose: np.ndarray, width: int, height: int) -> DemoCamera:
+    """A camera with a global shutter at second 0."""
+    return DemoCamera(intrinsics, np.zeros(1), pose[None], width, height)
 
 
 def one_pixel(rotation: np.ndarray, height: float, focal: float = 0.1) -> DemoCamera:
     """A camera of one pixel above the origin that looks straight along its axis."""
     pose = np.eye(4)
     pose[:3, :3], pose[2, 3] = rotation, height
-    return DemoCamera(np.diag([focal, focal, 1.0]), pose, 1, 1)
+    return camera_of(np.diag([focal, focal, 1.0]), pose, 1, 1)
 
 
 def radiance(objects: list[StreetObject], light, camera: DemoCamera) -> np.ndarray:
-    return render(StreetSnapshot(objects, 0.0), light, camera, 1)[0, 0]
+    return render(at_rest(objects), light, camera, 1).radiance[0, 0]
 
 
 def hazy(value: np.ndarray, distance: float) -> np.ndarray:
@@ -79,9 +86,9 @@ def test_rays_without_a_hit_show_the_sky(elevation):
 
 
 def test_by_day_clouds_whiten_some_of_the_sky():
-    camera = DemoCamera(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), np.eye(4), 41, 41)
-    snapshot = StreetSnapshot([floor(-100.0)], 0.0)
-    clear, cloudy = (render(snapshot, DARK._replace(clouds=c), camera, 1) for c in (0.0, 0.8))
+    camera = camera_of(np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]]), np.eye(4), 41, 41)
+    snapshot = at_rest([floor(-100.0)])
+    clear, cloudy = (render(snapshot, DARK._replace(clouds=c), camera, 1).radiance for c in (0.0, 0.8))
     changed = np.abs(clear - cloudy).max(axis=2) > 0.01
     assert 0.05 < changed.mean() < 0.95
     assert (cloudy[changed].std(axis=1) < clear[changed].std(axis=1)).all()
@@ -101,8 +108,8 @@ def test_a_street_lamp_follows_the_inverse_square_law():
 def test_headlights_shine_ahead_and_not_behind():
     ego = np.eye(4)
     night = lamplight(np.zeros((0, 3)), ego)
-    boxes = {x: meshes.box((x, -9, -9), (x + 1.0, 9, 9), Material.PLAIN, (1.0,) * 3) for x in (20.0, -21.0)}
-    wall = {x: StreetObject("wall", mesh, StreetPath(0.0, 0.0)) for x, mesh in boxes.items()}
+    boxes = {x: box((x, -9, -9), (x + 1.0, 9, 9), Material.PLAIN, (1.0,) * 3) for x in (20.0, -21.0)}
+    wall = {x: fixed("wall", mesh) for x, mesh in boxes.items()}
     forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     backward = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     ahead = radiance([wall[20.0]], night, one_pixel(forward, 0.7))
@@ -128,20 +135,21 @@ def test_sensor_noise_has_the_stated_strength():
 
 def test_depth_is_along_the_axis_and_infinite_in_the_sky():
     intrinsics = np.array([[10.0, 0, 10], [0, 10.0, 10], [0, 0, 1]])
-    camera = DemoCamera(intrinsics, one_pixel(DOWN, 4.0).camera_to_street, 21, 21)
-    depth, objects = depth_and_objects(StreetSnapshot([floor()], 0.0), camera)
-    np.testing.assert_allclose(depth, 4.0, rtol=1e-5)
-    assert (objects == 0).all()
-    upward = DemoCamera(camera.intrinsics, one_pixel(np.eye(3), 4.0).camera_to_street, 21, 21)
-    depth, objects = depth_and_objects(StreetSnapshot([floor()], 0.0), upward)
-    assert np.isinf(depth).all() and (objects == -1).all()
+    camera = camera_of(intrinsics, one_pixel(DOWN, 4.0).pose, 21, 21)
+    found = geometry(at_rest([floor()]), camera)
+    np.testing.assert_allclose(found.depth, 4.0, rtol=1e-5)
+    assert (found.objects == 0).all() and np.isnan(found.radiance).all()
+    upward = camera_of(camera.intrinsics, one_pixel(np.eye(3), 4.0).pose, 21, 21)
+    found = geometry(at_rest([floor()]), upward)
+    assert np.isinf(found.depth).all() and (found.objects == -1).all()
+    assert (found.classes == SurfaceClass.SKY).all()
 
 
 def test_one_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
-    camera = DemoCamera(np.array([[50.0, 0, 2], [0, 50.0, 1], [0, 0, 1]]), np.eye(4), 5, 3)
+    camera = camera_of(np.array([[50.0, 0, 2], [0, 50.0, 1], [0, 0, 1]]), np.eye(4), 5, 3)
 
     def pixels(samples: int) -> np.ndarray:
-        rays = camera.rays(slice(0, 3), samples)
+        rays = camera.rays(slice(0, 3), samples).directions
         return (rays[:, :2] / rays[:, 2:] * 50.0 + [2, 1]).reshape(3, 5, samples, 2)
 
     x, y = np.meshgrid(np.arange(5), np.arange(3))
@@ -154,10 +162,10 @@ def test_one_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
 
 
 def test_more_samples_smooth_edges_and_keep_the_mean():
-    wall = meshes.box((-50.0, 0.3, -9.0), (50.0, 20.0, 9.0), Material.PLAIN, (0.0, 0.0, 0.0))
-    objects = [StreetObject("wall", wall, StreetPath(0.0, 0.0))]
+    wall = box((-50.0, 0.3, -9.0), (50.0, 20.0, 9.0), Material.PLAIN, (0.0, 0.0, 0.0))
+    snapshot = at_rest([fixed("wall", wall)])
     intrinsics = np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]])
-    camera = DemoCamera(intrinsics, one_pixel(DOWN, 30.0).camera_to_street, 41, 41)
-    sharp, smooth = (render(StreetSnapshot(objects, 0.0), LIGHT, camera, samples)[..., 0] for samples in (1, 16))
+    camera = camera_of(intrinsics, one_pixel(DOWN, 30.0).pose, 41, 41)
+    sharp, smooth = (render(snapshot, LIGHT, camera, samples).radiance[..., 0] for samples in (1, 16))
     assert len(np.unique(smooth.round(2))) > len(np.unique(sharp.round(2)))
     assert smooth.mean() == pytest.approx(sharp.mean(), rel=0.1)

@@ -64,7 +64,7 @@ def test_absent_and_empty_folders_and_earlier_worlds_are_accepted(tmp_path):
 
 def test_preparing_removes_an_earlier_world_and_records_the_new_provenance(tmp_path):
     prepare_folder(tmp_path, {"stages": {"demo_world": {"code": "old"}}})
-    for folder in ("samples", "sweeps", "maps", "truth"):
+    for folder in ("samples", "sweeps", "maps", "truth", "semantic", "sky"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "old").write_text("")
     prepare_folder(tmp_path, {"stages": {"demo_world": {"code": "new"}}})
@@ -120,8 +120,9 @@ def test_a_worlds_stage_knows_its_scene_tables_and_street_alone(tmp_path):
     config = load({"datasets": {"demo": first}, "random_seed": 7, "train": {"iterations": 50}})
     told = json.loads(stage_settings(config, "demo_world", "demo"))
     assert told["scene"] == "demo" and told["version"] == "v1.0-mini"
-    assert told["world"] == {**WorldSettings().model_dump(mode="json"), "random_seed": 3, "night": True}
-    assert told.keys() == {"scene", "version", "world"}
+    expected = {"cameras": ["CAM_FRONT"], "random_seed": 3, "night": True}
+    assert told["world"] == {**WorldSettings().model_dump(mode="json"), **expected}
+    assert told.keys() == {"scene", "version", "world", "edits"} and told["edits"] == {}
 
 
 def test_wrong_settings_of_a_world_are_named(tmp_path):

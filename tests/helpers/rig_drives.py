@@ -5,17 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drivesplat.demo.imaging import depth_and_objects
-from drivesplat.demo.rig import KEY_FRAME_US, SENSORS, DemoSensor
 from PIL import Image
 
+from drivesplat.demo.optics.rig import DemoSensor
 from drivesplat.demo.recorder import Recorder
-from drivesplat.demo.street import EGO_VEHICLE
+from drivesplat.demo.street.objects import EGO_VEHICLE
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.settings.world import WorldSettings
+from helpers.demo_worlds import RIG
 
-RIG = {sensor.channel: sensor for sensor in SENSORS}
-START_US = 1_000_000_000
+START_US, KEY_FRAME_US = 1_000_000_000, 500_000
 KEY_FRAMES = 14
 
 
@@ -55,15 +54,14 @@ def _frame(folder: Path, recorder: Recorder, sensor: DemoSensor, index: int) -> 
     Image.fromarray(recorder.image(sensor, time_us)).save(path)
     return Frame(
         sensor.channel, START_US + time_us, str(path), camera.width, camera.height, camera.intrinsics,
-        camera.camera_to_street, recorder.ego_to_street(time_us * 1e-6), True, index, path.stem,
+        camera.pose, recorder.ego_pose(time_us * 1e-6), True, index, path.stem,
     )  # fmt: skip
 
 
 def _sweep(folder: Path, recorder: Recorder, index: int) -> Sweep:
     sensor, path = RIG["LIDAR_TOP"], folder / f"{index:02}.pcd.bin"
-    points, _ = recorder.sweep(sensor, index * KEY_FRAME_US)
-    points.tofile(path)
-    sensor_to_world = recorder.ego_to_street(index * KEY_FRAME_US * 1e-6) @ sensor.sensor_to_ego
+    recorder.sweep(sensor, index * KEY_FRAME_US).tofile(path)
+    sensor_to_world = recorder.ego_pose(index * KEY_FRAME_US * 1e-6) @ sensor.sensor_to_ego
     return Sweep(
         str(path), START_US + index * KEY_FRAME_US, sensor_to_world, True, index, path.stem, "LIDAR_TOP", "nuscenes"
     )
@@ -73,4 +71,4 @@ def true_body(camera: str, width: int = 160, seconds: float = 1.0) -> np.ndarray
     """The pixels (h, w) bool in which a camera sees the ego vehicle."""
     recorder = recorder_of(width=width, own_car=True)
     number = [thing.name for thing in recorder.objects].index(EGO_VEHICLE)
-    return depth_and_objects(recorder.snapshot(seconds), recorder.camera(RIG[camera], seconds))[1] == number
+    return recorder.geometry(RIG[camera], round(seconds * 1e6)).objects == number

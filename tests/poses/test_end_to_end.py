@@ -5,21 +5,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.classed import classed
+from helpers.demo_worlds import FRONT, pose_at
 from helpers.tiny_world import World
 from helpers.workflow_copy import WorkflowCopy
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
-from drivesplat.demo.rig import KEY_FRAME_US, SENSORS
 from drivesplat.poses.refine import refine_poses
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scene import Frame, Scene, Track, read_scene
 from drivesplat.settings.refine_poses import RefinePosesJob
 from drivesplat.settings.world import WorldSettings
 
-FRONT = next(sensor for sensor in SENSORS if sensor.channel == "CAM_FRONT")
-KEY_FRAMES = 6
+KEY_FRAMES, KEY_FRAME_US = 6, 500_000
 WIDTH = 400
 JOB = RefinePosesJob.model_validate({"refine_poses": {}, "random_seed": 0})
 SMALL = {"width": WIDTH, "key_frames": KEY_FRAMES, "samples_per_pixel": 1}
@@ -45,10 +44,10 @@ def filmed(recorder: Recorder, folder: Path) -> tuple[Scene, np.ndarray]:
             Frame("CAM_FRONT", int(time), str(path), *size, FRONT.intrinsics(WIDTH), ego @ FRONT.sensor_to_ego, ego,
                   True, index, str(index))
         )  # fmt: skip
-        truth.append(to_world @ STREET_TO_GLOBAL @ recorder.ego_to_street(time * 1e-6))
+        truth.append(to_world @ STREET_TO_GLOBAL @ recorder.ego_pose(time * 1e-6))
     tracks = [
         Track(
-            thing.name, *classed(thing.category), np.array(thing.mesh.size), times, np.arange(KEY_FRAMES),
+            thing.name, *classed(thing.category), np.array(thing.size), times, np.arange(KEY_FRAMES),
             np.stack([to_world @ recorder.box_to_global(thing, time * 1e-6) for time in times]),
             np.full(KEY_FRAMES, 4),
         )
@@ -86,10 +85,9 @@ def test_boxes_are_annotated_relative_to_the_ego_vehicle(pose_noise):
     recorder = Recorder(WorldSettings(pose_noise=pose_noise, **SMALL))
     for thing in (thing for thing in recorder.objects if thing.category):
         for seconds in (0.0, 1.3):
-            center = rigid(np.eye(3), np.array([0.0, 0.0, thing.mesh.size[2] / 2]))
-            on_street = thing.path.pose_at(seconds) @ center
+            on_street = pose_at(thing, seconds) @ rigid(np.eye(3), np.array([0.0, 0.0, thing.size[2] / 2]))
             seen = inverse(recorder.ego_to_global(seconds)) @ recorder.box_to_global(thing, seconds)
-            np.testing.assert_allclose(seen, inverse(recorder.ego_to_street(seconds)) @ on_street, atol=1e-8)
+            np.testing.assert_allclose(seen, inverse(recorder.ego_pose(seconds)) @ on_street, atol=1e-8)
             if not pose_noise:
                 stated = recorder.box_to_global(thing, seconds)
                 np.testing.assert_allclose(stated, STREET_TO_GLOBAL @ on_street, atol=1e-8)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from drivesplat.demo.tables import token
 from helpers import REPOSITORY
 
 from drivesplat.demo.recorder import Recorder
+from drivesplat.demo.tokens import instance_token
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
@@ -32,6 +32,7 @@ edits:
     - shift: {track: 7a, lateral: 3.5, start: 2.0}
     - swap: {track: 7a, with: 8b}
     - duplicate: {track: 7a, as: twin, longitudinal: -12}
+    - place: {track: 7a, as: placed, path: [[0, 10, 3.5], [4.5, -20, 3.5]], yaw: 5}
     - rescale: {track: twin, factor: 1.3}
     - ego: {lateral: 2.0, speed: 0.5}
 """
@@ -117,7 +118,7 @@ def test_a_file_of_another_form_is_refused(tmp_path, text, expected):
     assert refusal(text, tmp_path).startswith(expected)
 
 
-KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, rescale, ego"
+KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, place, rescale, ego"
 NAME = "cannot name a file: use letters, digits, '_', '-' and '.'"
 
 
@@ -169,6 +170,17 @@ def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, expected):
         ("duplicate", "track: x", "'as' is missing; there are: track, as, longitudinal, lateral, delay"),
         ("duplicate", "track: x, as: a/b", f"'as' 'a/b' {NAME}"),
         ("duplicate", "track: x, as: ego", "'as' 'ego' is a name kept for the camera's car; choose another"),
+        ("place", "track: x, as: y", "'path' is missing; there are: track, as, path, yaw"),
+        ("place", "track: x, as: y, path: [[0, 1]]", "'path.0.2' is missing; there are: track, as, path, yaw"),
+        ("place", "track: x, as: y, path: []", "give at least one point in 'path'"),
+        ("place", "track: x, as: y, path: [[1, 0, 0], [1, 5, 0]]",
+         "the seconds of 'path' must increase from point to point"),
+        ("place", "track: x, as: y, path: [[0, 0, 0], [2, 5, 0], [1, 9, 0]]",
+         "the seconds of 'path' must increase from point to point"),
+        ("place", "track: x, as: y, path: [[0, 501, 0]]", "'path.0.1' is 501: input should be less than or equal to 500"),
+        ("place", "track: x, as: ego, path: [[0, 5, 0]]",
+         "'as' 'ego' is a name kept for the camera's car; choose another"),
+        ("place", "track: x, as: a/b, path: [[0, 5, 0]]", f"'as' 'a/b' {NAME}"),
         ("rescale", "track: x, factor: 0.01", "'factor' is 0.01: input should be greater than or equal to 0.1"),
         ("ego", "", "give 'lateral', or a 'speed' other than 1"),
         ("ego", "speed: -1", "'speed' is -1: input should be greater than or equal to 0"),
@@ -194,7 +206,7 @@ def demo_actors() -> list[EditedActor]:
     recorder, times = Recorder(WorldSettings()), 0.5 * np.arange(20)
     return [
         EditedActor.recorded(
-            token("demo", "instance", thing.name), thing.category, np.asarray(thing.mesh.size),
+            instance_token("demo", thing.name), thing.category, thing.size,
             Motion(times, np.stack([recorder.box_to_global(thing, t) for t in times]), ((0, 19),), 0.25),
         )
         for thing in recorder.objects
