@@ -1,6 +1,7 @@
 """Pedestrians, bystanders, cyclists and dogs: placed where the front camera sees them in held-out frames."""
 
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
@@ -54,20 +55,20 @@ class Encounter:
 
 def people(world: WorldSettings, road: Road, ego: StreetPath, random: np.random.Generator) -> list[StreetObject]:
     """Pedestrians, bystanders, cyclists and dogs."""
-    walkers = [_walker(i, met, road, ego, random) for i, met in enumerate(encounters(world, world.pedestrians))]
-    standing = [_bystander(i, met, road, ego, random) for i, met in enumerate(encounters(world, world.bystanders))]
+    walkers = _walkers(world, road, ego, random)
+    standing = _bystanders(encounters(world, world.bystanders), road, ego, random)
     cyclists = [_cyclist(i, met, road, ego, random) for i, met in enumerate(encounters(world, world.cyclists))]
     dogs = [_dog(i, walkers[i], random) for i in range(min(world.dogs, len(walkers)))]
     return [*walkers, *standing, *cyclists, *dogs]
 
 
-def encounters(world: WorldSettings, count: int) -> list[Encounter]:
-    """When each of `count` people is met: one half at frames that the default protocol holds out between training
+def encounters(world: WorldSettings, number: int) -> list[Encounter]:
+    """When each of so many people is met: one half at frames that the default protocol holds out between training
     frames, the other at frames of its last block."""
     groups = held_out_key_frames(world.key_frames, HoldoutSettings())
     between, last = groups["interpolation"], groups["extrapolation"]
-    half = -(-count // 2) if between else 0
-    shares = ((between, half), (last, count - half))
+    half = -(-number // 2) if between else 0
+    shares = ((between, half), (last, number - half))
     frames = [frames[k * len(frames) // share] for frames, share in shares for k in range(share)]
     seconds = [frame / world.key_frame_hz for frame in frames]
     return [
@@ -81,22 +82,41 @@ def _place(ego: StreetPath, met: Encounter, ahead: float) -> float:
     return float(ego.along(np.array([met.second]))[0]) + ahead
 
 
-def _walker(
-    index: int, met: Encounter, road: Road, ego: StreetPath, random: np.random.Generator
-) -> StreetObject:  # fmt: skip
-    row, number = divmod(met.before, len(WALKWAYS))
-    walkway = WALKWAYS[number]
-    start = _place(ego, met, walkway.ahead + ABREAST * row) - walkway.speed * met.second
-    path = StreetPath(start, walkway.t, walkway.speed, road=road)
-    body = Person.drawn(random, walks=True)
-    return StreetObject(f"pedestrian {index}", body, path, "human.pedestrian.adult", "pedestrian.moving")
+def _walkers(world: WorldSettings, road: Road, ego: StreetPath, random: np.random.Generator) -> list[StreetObject]:
+    """Pedestrians, each in the first walkway where the others keep their distance."""
+    distance = ABREAST if not world.dogs else 2 * ABREAST
+    found: list[StreetObject] = []
+    taken: dict[Walkway, list[float]] = {walkway: [] for walkway in WALKWAYS}
+    for index, met in enumerate(encounters(world, world.pedestrians)):
+        places = (divmod(number, len(WALKWAYS)) for number in count(met.before))
+        starts = ((WALKWAYS[number], _start(met, WALKWAYS[number], row, ego)) for row, number in places)
+        walkway, start = next((w, s) for w, s in starts if all(abs(s - other) >= distance for other in taken[w]))
+        taken[walkway].append(start)
+        path = StreetPath(start, walkway.t, walkway.speed, road=road)
+        body = Person.drawn(random, walks=True)
+        found.append(StreetObject(f"pedestrian {index}", body, path, "human.pedestrian.adult", "pedestrian.moving"))
+    return found
 
 
-def _bystander(
-    index: int, met: Encounter, road: Road, ego: StreetPath, random: np.random.Generator
-) -> StreetObject:  # fmt: skip
-    side = (-1) ** (met.before + 1)
-    place = _place(ego, met, BYSTANDER_AHEAD + ABREAST * (met.before // 2))
+def _start(met: Encounter, walkway: Walkway, row: int, ego: StreetPath) -> float:
+    """The place s (metres) at second 0 of a pedestrian who is met in a walkway."""
+    return _place(ego, met, walkway.ahead + ABREAST * row) - walkway.speed * met.second
+
+
+def _bystanders(met: list[Encounter], road: Road, ego: StreetPath, random: np.random.Generator) -> list[StreetObject]:
+    """Bystanders on both sides, each at the first place that is free."""
+    found: list[StreetObject] = []
+    taken: dict[int, list[float]] = {-1: [], 1: []}
+    for index, encounter in enumerate(met):
+        start = _place(ego, encounter, BYSTANDER_AHEAD)
+        places = ((side, start + ABREAST * row) for row in range(len(met)) for side in (-1, 1))
+        side, place = next((a, s) for a, s in places if all(abs(s - other) >= ABREAST for other in taken[a]))
+        taken[side].append(place)
+        found.append(_bystander(index, side, place, road, random))
+    return found
+
+
+def _bystander(index: int, side: int, place: float, road: Road, random: np.random.Generator) -> StreetObject:
     path = StreetPath(
         place, side * WALL_SIDE, heading=-side * np.pi / 2, turning=random.uniform(0.6, 1.2),
         period=random.uniform(5.0, 8.0), road=road,

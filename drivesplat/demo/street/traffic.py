@@ -20,7 +20,8 @@ CREEP = 1.1
 QUEUE_AHEAD = (("truck", 3.6), ("car", 5.0), ("van", 5.5), ("car", 6.0))
 """Kind of each vehicle ahead of the ego vehicle in a queue, and the gap in metres before it."""
 QUEUE_ONCOMING = ("car", "truck", "car", "van", "car", "car", "truck", "car")
-ONCOMING_GAP = 2.2
+ONCOMING_GAP, ONCOMING_APPROACH = 2.2, 1.7
+"""Gap between oncoming vehicles of a queue, and how far one drives up to the standing one before it (metres)."""
 
 
 def ego_path(world: WorldSettings, road: Road) -> StreetPath:
@@ -56,10 +57,10 @@ def queue(world: WorldSettings, road: Road, random: np.random.Generator) -> list
         path = StreetPath(0.0, -LANE_CENTER, CREEP, 0.9 * CREEP, 0.03, 6.0 + 0.5 * i, road=road)
         objects.append(_queued(f"vehicle {i}", kind, path, front + gap, random))
         front += gap + objects[-1].size[0]
-    near = ego.s + 2.0
+    near, creep = ego.s + 2.0, min(0.25, ONCOMING_APPROACH / world.seconds)
     for i, kind in enumerate(QUEUE_ONCOMING):
         standing = i % 3 == 0
-        speed, surge = (0.0, 0.0) if standing else (-0.25, 0.2)
+        speed, surge = (0.0, 0.0) if standing else (-creep, 0.8 * creep)
         path = StreetPath(0.0, LANE_CENTER, speed, surge, 0.0, 5.0 + i, heading=np.pi, road=road)
         objects.append(_queued(f"oncoming {i}", kind, path, near, random))
         near += ONCOMING_GAP + objects[-1].size[0]
