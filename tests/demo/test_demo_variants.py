@@ -179,5 +179,3 @@ def test_width_sets_the_images_size_and_scales_the_intrinsics(width):
     scale = width / 1600
     assert camera.intrinsics[0, 0] == camera.intrinsics[1, 1] == pytest.approx(1266.4 * scale)
     np.testing.assert_allclose(camera.intrinsics[:2, 2] + 0.5, np.array([816.8, 492.0]) * scale)
-
-
