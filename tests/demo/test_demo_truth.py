@@ -1,26 +1,32 @@
-"""The truth beside the demo world: the view from the left, the street without the leading car, depth, instances."""
-
-import json
+"""The truth beside the demo world: depth, instances and classes of each key frame, from every viewpoint."""
 
 import numpy as np
 import pytest
+from helpers.demo_worlds import FRONT
 from PIL import Image
-from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from drivesplat.demo.imaging import DemoCamera, depth_and_objects, render, to_bytes
-from drivesplat.demo.raycast import StreetSnapshot
-from drivesplat.demo.rig import SENSORS
-from drivesplat.demo.tables import token
+from drivesplat.demo.optics.imaging import DemoCamera
+from drivesplat.demo.optics.raycast import NO_HIT
+from drivesplat.demo.recorder import Recorder, Viewpoint
+from drivesplat.demo.shapes.mesh import SurfaceClass
+from drivesplat.demo.tokens import instance_token
+from drivesplat.readers.truth import Truth, TruthFrame, TruthView, read_truth
 
-FRONT = next(sensor for sensor in SENSORS if sensor.channel == "CAM_FRONT")
 KEY_FRAMES, WIDTH, HEIGHT = 6, 160, 90
-KINDS = ("lateral", "without_leading", "depth", "instances")
+OFFSETS = {2.0: "left_2m", -2.0: "right_2m", 4.0: "left_4m"}
 
 
 @pytest.fixture(scope="module")
-def record(demo_root) -> dict:
-    return json.loads((demo_root / "truth" / "truth.json").read_text())
+def truth(demo_root) -> Truth:
+    return read_truth(demo_root / "truth/truth.json")
+
+
+@pytest.fixture(scope="module")
+def recorded(truth) -> TruthView:
+    found = truth.recorded("CAM_FRONT")
+    assert found is not None
+    return found
 
 
 @pytest.fixture(scope="module", params=[0, 3, 5])
@@ -28,18 +34,17 @@ def index(request) -> int:
     return request.param
 
 
-def png(root, record: dict, index: int, kind: str) -> np.ndarray:
-    return np.asarray(Image.open(root / "truth" / record["frames"][index][kind]))
+@pytest.fixture(params=OFFSETS)
+def lateral(request, truth) -> TruthView:
+    return next(view for view in truth.lateral("CAM_FRONT") if view.left_m == request.param)
 
 
-def seconds_of(index: int) -> float:
-    return (index * 500_000 - 35_500) * 1e-6
+def png(root, frame: TruthFrame, kind: str) -> np.ndarray:
+    return np.asarray(Image.open(root / "truth" / getattr(frame, kind)))
 
 
-def view(recorder, index: int) -> tuple[StreetSnapshot, DemoCamera]:
-    """The street and the front camera at a key frame."""
-    seconds = seconds_of(index)
-    return recorder.snapshot(seconds), recorder.camera(FRONT, seconds)
+def time_of(index: int) -> int:
+    return index * 500_000 - 35_500
 
 
 def points_of(depth: np.ndarray, camera: DemoCamera) -> np.ndarray:
@@ -47,120 +52,106 @@ def points_of(depth: np.ndarray, camera: DemoCamera) -> np.ndarray:
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.intrinsics).T
     in_camera = rays * np.where(np.isfinite(depth), depth, 0.0)[..., None]
-    return in_camera @ camera.camera_to_street[:3, :3].T + camera.camera_to_street[:3, 3]
+    return in_camera @ camera.pose[:3, :3].T + camera.pose[:3, 3]
 
 
-def test_truth_json_lists_every_key_frame_of_the_front_camera(record, demo_tables):
-    assert (record["schema"], record["scene"], record["camera"]) == (1, "demo", "CAM_FRONT")
-    assert (record["width"], record["height"], record["samples_per_pixel"]) == (WIDTH, HEIGHT, 1)
+def test_truth_json_lists_every_view_and_key_frame(truth, demo_tables):
+    assert (truth.scene, truth.width, truth.height, truth.samples_per_pixel) == ("demo", WIDTH, HEIGHT, 1)
+    assert truth.leading == instance_token("demo", "vehicle 0") and truth.pattern is None and truth.scans == ()
+    views = [(view.camera, view.left_m, view.edit, view.without) for view in truth.views]
+    assert views == [("CAM_FRONT", left, None, None) for left in (0.0, *OFFSETS)] + [
+        ("CAM_FRONT", 0.0, None, truth.leading)
+    ]
     images = [demo_tables.sample[i]["data"]["CAM_FRONT"] for i in range(KEY_FRAMES)]
-    assert [frame["sample_data"] for frame in record["frames"]] == images
-    assert [frame["sample_index"] for frame in record["frames"]] == list(range(KEY_FRAMES))
-    assert record["leading"] == token("demo", "instance", "vehicle 0")
+    for view in truth.views:
+        assert [frame.sample_data for frame in view.frames] == images
+        assert [frame.sample_index for frame in view.frames] == list(range(KEY_FRAMES))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_file_of_truth_json_is_there_in_the_images_size(record, demo_root, kind):
-    names = [frame[kind] for frame in record["frames"]]
-    assert sorted(names) == sorted(str(p.relative_to(demo_root / "truth")) for p in demo_root.glob(f"truth/{kind}/*"))
-    mode = {"depth": "I;16", "instances": "L"}.get(kind, "RGB")
-    for name in names:
+def test_every_file_of_truth_json_is_there_in_the_images_size(truth, demo_root):
+    names = [
+        (kind, name)
+        for view in truth.views
+        for frame in view.frames
+        for kind in ("image", "depth", "instances", "classes")
+        if (name := getattr(frame, kind)) is not None
+    ]
+    assert {name for _, name in names} == {str(p.relative_to(demo_root / "truth")) for p in demo_root.rglob("*.png")
+                                           if "truth" in p.parts}  # fmt: skip
+    for kind, name in names:
         with Image.open(demo_root / "truth" / name) as image:
-            assert (image.size, image.mode) == ((WIDTH, HEIGHT), mode)
+            mode = {"image": "RGB", "depth": "I;16"}.get(kind, "L")
+            assert (image.size, image.mode) == ((WIDTH, HEIGHT), mode), name
 
 
-def test_instances_list_the_annotated_objects(record, demo_root, demo_recorder, demo_tables):
-    assert {instance["token"] for instance in demo_tables.instance} <= set(record["instances"].values())
+def test_the_recorded_view_has_no_image_of_its_own_and_all_others_have(truth):
+    for view in truth.views:
+        own = not view.left_m and view.without is None
+        assert all((frame.image is None) == own for frame in view.frames)
+
+
+def test_instances_list_the_annotated_objects(truth, recorded, demo_root, demo_tables):
+    assert {instance["token"] for instance in demo_tables.instance} <= set(truth.instances.values())
     shown = set()
-    for index in range(KEY_FRAMES):
-        shown |= set(np.unique(png(demo_root, record, index, "instances")).tolist())
+    for frame in recorded.frames:
+        shown |= set(np.unique(png(demo_root, frame, "instances")).tolist())
     assert 0 in shown and len(shown) >= 6
-    assert {str(n) for n in shown - {0}} <= record["instances"].keys()
+    assert {str(n) for n in shown - {0}} <= truth.instances.keys()
 
 
-def test_instance_pixels_show_the_listed_object(record, demo_root, demo_recorder, index):
-    _, objects = depth_and_objects(*view(demo_recorder, index))
-    shown = png(demo_root, record, index, "instances")
-    numbers = {name: int(n) for n, name in record["instances"].items()}
+def test_instance_pixels_show_the_listed_object(truth, recorded, demo_root, demo_recorder, index):
+    objects = demo_recorder.geometry(FRONT, time_of(index)).objects
+    shown = png(demo_root, recorded.frames[index], "instances")
+    numbers = {name: int(n) for n, name in truth.instances.items()}
     for n, item in enumerate(demo_recorder.objects):
-        number = numbers.get(token("demo", "instance", item.name), 0)
+        number = numbers.get(instance_token("demo", item.name), 0)
         assert (number > 0) == (item.category is not None)
         if number:
             np.testing.assert_array_equal(shown == number, objects == n)
 
 
-def test_the_depth_image_decodes_to_metres(record, demo_root, demo_recorder, index):
-    depth, objects = depth_and_objects(*view(demo_recorder, index))
-    decoded = png(demo_root, record, index, "depth") / 256.0
-    sky = objects < 0
-    assert (decoded[sky] == 0).all() and 0.02 < sky.mean() < 0.9
-    near = ~sky & (depth < 255.0)
-    assert np.abs(decoded[near] - depth[near]).max() <= 0.5 / 256 + 1e-6
-    assert (decoded[~sky & (depth > 256.0)] == 65535 / 256).all()
-    heights = points_of(decoded, demo_recorder.camera(FRONT, seconds_of(index)))[-10:, :, 2]
-    assert np.abs(np.median(heights)) < 0.02, "the lower rows show the road"
+def test_classes_agree_with_objects(truth, recorded, demo_root, demo_recorder, index):
+    frame = recorded.frames[index]
+    classes, instances = png(demo_root, frame, "classes"), png(demo_root, frame, "instances")
+    assert truth.classes == {str(int(c)): c.name.lower() for c in SurfaceClass}
+    assert {int(n) for n in np.unique(classes)} <= {int(n) for n in truth.classes}
+    expected = {"vehicle.bicycle": "cyclist", "vehicle": "vehicle", "human": "person", "animal": "animal",
+                "movable_object": "object"}  # fmt: skip
+    names = {int(n): token for n, token in truth.instances.items()}
+    categories = {instance_token("demo", item.name): item.category for item in demo_recorder.objects}
+    for number in set(np.unique(instances).tolist()) - {0}:
+        category = categories[names[number]]
+        word = expected.get(category) or expected[category.split(".")[0]]
+        assert {truth.classes[str(c)] for c in np.unique(classes[instances == number])} == {word}, category
+    scenery = {truth.classes[str(c)] for c in np.unique(classes[instances == 0])}
+    assert {"road", "sidewalk", "building", "sky"} <= scenery
+    assert not scenery & {"vehicle", "person", "cyclist", "animal"}
 
 
-def sunlit_without(points: np.ndarray, sun: np.ndarray, item, seconds: float) -> np.ndarray:
-    """Which points (n, 3) have the box of `item`, a little larger, between them and the sun."""
-    to_object = np.linalg.inv(item.path.pose_at(seconds))
-    start, ray = points @ to_object[:3, :3].T + to_object[:3, 3], to_object[:3, :3] @ sun
-    length, width, height = item.mesh.size
-    low, high = np.array([-length / 2, -width / 2, 0.0]) - 0.05, np.array([length / 2, width / 2, height]) + 0.05
-    with np.errstate(divide="ignore"):
-        a, b = (low - start) / ray, (high - start) / ray
-    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-    return (enter < leave) & (leave > 0)
+def test_classes_of_the_ground_are_those_of_its_strips(recorded, demo_root, demo_recorder, index):
+    """By the distance from the centre line: the road up to 6.4 m, the sidewalk up to 10 m."""
+    frame, camera = recorded.frames[index], demo_recorder.camera(FRONT, time_of(index) * 1e-6)
+    depth = png(demo_root, frame, "depth") / 256.0
+    classes, points = png(demo_root, frame, "classes"), points_of(depth, camera)
+    low = (depth > 0) & (depth < 60) & (np.abs(points[..., 2]) < 0.02) & (png(demo_root, frame, "instances") == 0)
+    aside = np.abs(points[..., 1])
+    for near, far, name in ((0.0, 6.3, SurfaceClass.ROAD), (6.7, 9.9, SurfaceClass.SIDEWALK)):
+        found = classes[low & (aside > near) & (aside < far)]
+        assert len(found) > 20 and (found == name).mean() > 0.97
 
 
-@pytest.fixture(scope="module")
-def removal(record, demo_root, demo_recorder, index):
-    """Image and image without the leading car (both lossless), its pixels, and those it may shade."""
-    seconds = seconds_of(index)
-    image = demo_recorder.image(FRONT, index * 500_000 - 35_500)
-    without = png(demo_root, record, index, "without_leading")
-    number = next(int(n) for n, name in record["instances"].items() if name == record["leading"])
-    own = png(demo_root, record, index, "instances") == number
-    camera = demo_recorder.camera(FRONT, seconds)
-    depth, objects = depth_and_objects(demo_recorder.snapshot(seconds), camera)
-    leading = next(t for t in demo_recorder.objects if t.name == "vehicle 0")
-    shaded = sunlit_without(
-        points_of(depth, camera).reshape(-1, 3), demo_recorder.light(seconds).sun_direction, leading, seconds
+def test_the_depth_image_decodes_to_metres(recorded, demo_root, demo_recorder, index):
+    found, decoded = (
+        demo_recorder.geometry(FRONT, time_of(index)),
+        png(demo_root, recorded.frames[index], "depth") / 256.0,
     )
-    return image, without, own, shaded.reshape(own.shape) & (objects >= 0) & ~own
-
-
-def test_without_the_leading_car_only_its_pixels_and_its_shadow_change(removal):
-    image, without, own, shaded = removal
-    changed = (image != without).any(axis=2)
-    assert changed.any()
-    assert not (changed & ~own & ~shaded).any()
-
-
-def test_the_pixels_of_the_leading_car_change(removal):
-    image, without, own, _ = removal
-    assert own.sum() > 100
-    assert (image != without).any(axis=2)[own].mean() > 0.9
-
-
-def test_the_leading_cars_shadow_on_the_road_is_gone(removal):
-    image, without, own, _ = removal
-    change = without.astype(int) - image
-    beside = (change != 0).any(axis=2) & ~own
-    assert beside.sum() >= 5
-    assert (change[beside] >= 0).all() and change[beside].mean() > 10
-    rows, columns = np.nonzero(own)
-    at = np.argwhere(beside)
-    assert (at[:, 0] > rows.mean()).all(), "it lies on the road, below the car's middle"
-    assert (np.abs(at[:, 1] - columns.mean()) < 2 * np.ptp(columns)).all()
-
-
-def test_the_leading_car_leaves_no_trace_on_the_road_below_it(removal):
-    """What the car hid is road in the sun: as light as the road beside it."""
-    _, without, own, _ = removal
-    lower = own & (np.arange(HEIGHT)[:, None] > np.nonzero(own)[0].mean())
-    around = binary_dilation(lower, iterations=6) & ~binary_dilation(own, iterations=2)
-    assert without[lower].mean() > 0.6 * without[around].mean()
+    sky = found.objects == NO_HIT
+    assert (decoded[sky] == 0).all() and 0.02 < sky.mean() < 0.9
+    near = ~sky & (found.depth < 255.0)
+    assert np.abs(decoded[near] - found.depth[near]).max() <= 0.5 / 256 + 1e-6
+    assert (decoded[~sky & (found.depth > 256.0)] == 65535 / 256).all()
+    heights = points_of(decoded, demo_recorder.camera(FRONT, time_of(index) * 1e-6))[-10:, :, 2]
+    assert np.abs(np.median(heights)) < 0.02, "the lower rows show the road"
 
 
 def ego_to_global(tables, sample_data: str) -> np.ndarray:
@@ -171,45 +162,74 @@ def ego_to_global(tables, sample_data: str) -> np.ndarray:
     return matrix
 
 
-def test_camera_poses_agree_with_the_tables_and_lateral_ones_lie_two_metres_left(record, demo_tables):
-    for frame in record["frames"]:
-        ego = ego_to_global(demo_tables, frame["sample_data"])
-        here, there = np.array(frame["camera_to_global"]), np.array(frame["lateral_camera_to_global"])
-        in_ego = np.linalg.inv(ego) @ here
+def test_camera_poses_agree_with_the_tables(recorded, demo_tables):
+    for frame in recorded.frames:
+        in_ego = np.linalg.inv(ego_to_global(demo_tables, frame.sample_data)) @ np.array(frame.camera_to_global)
         np.testing.assert_allclose(in_ego[:3, 3], [1.701, 0.016, 1.511], atol=1e-6)
         assert in_ego[0, 2] > 0.999, "the camera looks ahead"
-        np.testing.assert_allclose(there[:3, 3] - here[:3, 3], 2.0 * ego[:3, 1], atol=1e-9)
-        np.testing.assert_allclose(there[:3, :3], here[:3, :3], atol=1e-12)
 
 
-def lateral_camera(record, demo_recorder, index: int) -> DemoCamera:
+def test_lateral_cameras_lie_to_the_left_and_turn_nowhere(lateral, recorded, demo_tables):
+    for frame, here in zip(lateral.frames, recorded.frames, strict=True):
+        left = ego_to_global(demo_tables, here.sample_data)[:3, 1]
+        before, after = (np.array(f.camera_to_global) for f in (here, frame))
+        np.testing.assert_allclose(after[:3, 3] - before[:3, 3], lateral.left_m * left, atol=1e-9)
+        np.testing.assert_allclose(after[:3, :3], before[:3, :3], atol=1e-12)
+
+
+def stated_camera(frame: TruthFrame, recorded: TruthView, recorder: Recorder) -> DemoCamera:
     """The camera that truth.json states, brought to the street by the known ego pose."""
-    frame = record["frames"][index]
-    camera = demo_recorder.camera(FRONT, seconds_of(index))
-    to_street = camera.camera_to_street @ np.linalg.inv(frame["camera_to_global"])
-    pose = to_street @ np.array(frame["lateral_camera_to_global"])
-    return DemoCamera(camera.intrinsics, pose, WIDTH, HEIGHT)
+    here = recorder.camera(FRONT, time_of(frame.sample_index) * 1e-6)
+    stated = np.array(recorded.frames[frame.sample_index].camera_to_global)
+    pose = here.pose @ np.linalg.inv(stated) @ np.array(frame.camera_to_global)
+    return DemoCamera(here.intrinsics, here.seconds, pose[None], WIDTH, HEIGHT)
 
 
-def test_the_lateral_view_agrees_with_its_stated_pose(record, demo_root, demo_recorder, index):
-    seconds = seconds_of(index)
-    camera = lateral_camera(record, demo_recorder, index)
-    expected = to_bytes(render(demo_recorder.snapshot(seconds), demo_recorder.light(seconds), camera, 1))
-    found = png(demo_root, record, index, "lateral")
-    assert (np.abs(found.astype(int) - expected) <= 2).all(axis=2).mean() > 0.99
-    assert (found != demo_recorder.image(FRONT, index * 500_000 - 35_500)).any(axis=2).mean() > 0.3
-
-
-def test_depth_and_lateral_view_agree_by_reprojection(record, demo_root, demo_recorder, index):
-    camera, lateral = demo_recorder.camera(FRONT, seconds_of(index)), lateral_camera(record, demo_recorder, index)
-    decoded = png(demo_root, record, index, "depth") / 256.0
-    points = points_of(decoded, camera)[(decoded > 0) & (decoded < 100)]
-    to_lateral = np.linalg.inv(lateral.camera_to_street)
-    in_lateral = points @ to_lateral[:3, :3].T + to_lateral[:3, 3]
-    pixels = in_lateral @ lateral.intrinsics.T
+def pixels_of(points: np.ndarray, camera: DemoCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column, row and depth (n,) of street points (n, 3)."""
+    to_camera = np.linalg.inv(camera.pose)
+    local = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    pixels = local @ camera.intrinsics.T
     x, y = np.round(pixels[:, :2] / pixels[:, 2:]).astype(int).T
-    inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
-    there = depth_and_objects(demo_recorder.snapshot(seconds_of(index)), lateral)[0][y[inside], x[inside]]
-    error = np.abs(in_lateral[inside, 2] / there - 1.0)
-    assert inside.sum() > 3000
-    assert np.median(error) < 0.01 and (error < 0.05).mean() > 0.8
+    return x, y, local[:, 2]
+
+
+def test_lateral_depth_and_instances_agree_by_reprojection(lateral, recorded, demo_root, demo_recorder, index):
+    """What the recorded view sees lies at the same place of the street in the lateral view of the same time."""
+    frame, here = lateral.frames[index], recorded.frames[index]
+    camera = demo_recorder.camera(FRONT, time_of(index) * 1e-6)
+    decoded = png(demo_root, here, "depth") / 256.0
+    near = (decoded > 0) & (decoded < 100)
+    x, y, depth = pixels_of(points_of(decoded, camera)[near], stated_camera(frame, recorded, demo_recorder))
+    inside = (depth > 0) & (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+    there = png(demo_root, frame, "depth")[y[inside], x[inside]] / 256.0
+    error = np.abs(depth[inside] / np.where(there > 0, there, np.inf) - 1.0)
+    same = error < 0.05
+    assert inside.sum() > 2500
+    assert np.median(error) < 0.01 and same.mean() > 0.75
+    for kind, share in (("instances", 0.97), ("classes", 0.93)):
+        a, b = png(demo_root, here, kind)[near][inside], png(demo_root, frame, kind)[y[inside], x[inside]]
+        assert (a == b)[same].mean() > share, kind
+        moved = png(demo_root, here, kind) != png(demo_root, frame, kind)
+        assert moved.mean() > 0.02, "the view is another one"
+
+
+def test_the_lateral_image_is_seen_from_its_stated_pose(lateral, demo_root, demo_recorder, index):
+    found = png(demo_root, lateral.frames[index], "image")
+    view = Viewpoint(left=lateral.left_m)
+    expected = demo_recorder.to_bytes(demo_recorder.picture(FRONT, time_of(index), view).radiance, FRONT, 0)
+    np.testing.assert_array_equal(found, expected)
+    assert (found != demo_recorder.image(FRONT, time_of(index))).any(axis=2).mean() > 0.3
+
+
+def test_the_view_without_the_leading_vehicle_shows_all_others(truth, recorded, demo_root, index):
+    number = next(int(n) for n, token in truth.instances.items() if token == truth.leading)
+    frame, here = truth.without_leading("CAM_FRONT").frames[index], recorded.frames[index]
+    before, after = (png(demo_root, f, "instances") for f in (here, frame))
+    own = before == number
+    assert own.sum() > 100 and not (after == number).any()
+    np.testing.assert_array_equal(before[~own], after[~own])
+    depths = [png(demo_root, f, "depth").astype(float) for f in (here, frame)]
+    np.testing.assert_array_equal(depths[0][~own], depths[1][~own])
+    behind = np.where(depths[1] == 0, np.inf, depths[1])
+    assert (behind[own] >= depths[0][own]).all()
