@@ -68,11 +68,18 @@ def _velocity(times: np.ndarray, positions: np.ndarray) -> tuple[float, np.ndarr
     lengths = np.linalg.norm(steps, axis=1)
     speeds, angles = lengths / np.diff(times), np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     degree = 1 if len(steps) >= 3 else 0
-    speed = float(Polynomial.fit(middles, speeds, degree)(0.0))
+    speed = _fitted(middles, speeds, degree)
     if speed < STANDSTILL_SPEED:
         return 0.0, np.zeros(2)
-    angle = Polynomial.fit(middles, angles, degree if speeds.min() > MIN_TURNING_SPEED else 0, w=lengths)(0.0)
+    angle = _fitted(middles, angles, degree if speeds.min() > MIN_TURNING_SPEED else 0, lengths)
     return speed, np.array([np.cos(angle), np.sin(angle)])
+
+
+def _fitted(times: np.ndarray, values: np.ndarray, degree: int, weights: np.ndarray | None = None) -> float:
+    """The value at second 0 of a polynomial fitted to `values` (k,) at `times` (k,)."""
+    if len(times) == 1:  # of which numpy 1.26 makes a domain of length 0
+        return float(values[0])
+    return float(Polynomial.fit(times, values, degree, w=weights)(0.0))
 
 
 def _slope(positions: np.ndarray) -> float:
