@@ -217,7 +217,7 @@ def test_a_wet_road_returns_less_than_a_dry_one_and_nothing_else_changes():
 
 
 def edge_scans(gap: float, grey: float) -> tuple[Scan, Scan, np.ndarray]:
-    """Scans without and with a divergence of 6 mrad of a plate 2 m wide and high, `gap` metres in front of a wall of the
+    """Scans without and with a divergence of 6 mrad of a plate 2 m wide and high, `gap` metres before a wall of the
     reflectance `grey`; and which rays (beams, steps) come within their cone of the plate's edge."""
     plate = fixed("plate", box((-1.0, 10.0, -1.0), (1.0, 10.02, 1.0), Material.PLAIN, (0.4,) * 3))
     behind = fixed("wall", box((-200.0, 10.0 + gap, -50.0), (200.0, 60.0, 50.0), Material.PLAIN, (grey,) * 3))

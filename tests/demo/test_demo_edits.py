@@ -1,0 +1,201 @@
+"""Edits of a synthetic world: its own objects stand where the steps of the edit say, all others stay."""
+
+import numpy as np
+import pytest
+from helpers.demo_worlds import LIDAR, edit_of, named, names_of, pose_at, recorder_of
+
+from drivesplat.demo.placed import require_free_places
+from drivesplat.demo.recorder import Recorder, Viewpoint
+from drivesplat.demo.street.objects import EGO_BODY
+from drivesplat.errors import ConfigError
+
+FILM_START = -0.0355
+"""Seconds of the first image after the first key frame: the zero of an edit's seconds."""
+TIMES = np.linspace(0.0, 9.4, 48)
+NUMBERED = recorder_of(cyclists=1)
+AHEAD, ONCOMING = (NUMBERED.instance(f"vehicle {i}") for i in (0, 1))
+EDITS = {
+    "removed": edit_of({"remove": {"track": ONCOMING}}),
+    "aside": edit_of({"shift": {"track": AHEAD, "lateral": 1.5}}),
+    "further": edit_of({"shift": {"track": AHEAD, "longitudinal": 4.0}}),
+    "turned": edit_of({"shift": {"track": ONCOMING, "yaw": 30.0}}),
+    "copied": edit_of({"duplicate": {"track": ONCOMING, "as": "twin", "longitudinal": -12.0, "lateral": 0.5}}),
+    "late": edit_of({"duplicate": {"track": ONCOMING, "as": "twin", "delay": 2.0}}),
+    "placed": edit_of({"place": {"track": ONCOMING, "as": "new", "path": [[0.0, 60.0, 3.5], [10.0, 10.0, 3.5]]}}),
+    "stopped": edit_of({"stop": {"track": AHEAD, "at": 4.0, "duration": 0.0}}),
+    "larger": edit_of({"rescale": {"track": AHEAD, "factor": 1.4}}),
+    "ego aside": edit_of({"ego": {"lateral": 1.0}}),
+    "ego slower": edit_of({"ego": {"speed": 0.5}}),
+    "ego later": edit_of({"ego": {"lateral": 2.0, "start": 4.0, "duration": 2.0}}),
+}
+ALTERED = {"removed": {"vehicle 1"}, "aside": {"vehicle 0"}, "further": {"vehicle 0"}, "turned": {"vehicle 1"},
+           "copied": {"twin"}, "late": {"twin"}, "placed": {"new"}, "stopped": {"vehicle 0"},
+           "larger": {"vehicle 0"}}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recorder() -> Recorder:
+    return recorder_of(EDITS, cyclists=1, lidar={"ego_returns": True})
+
+
+def poses(recorder: Recorder, name: str, edit: str | None = None) -> np.ndarray:
+    return named(recorder, name, edit).poses(TIMES)
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_objects_that_no_step_names_are_the_very_same(recorder, edit):
+    before = {item.name: item for item in recorder.objects if item.name != EGO_BODY}
+    after = {item.name: item for item in recorder.variation(edit).street.objects if item.name != EGO_BODY}
+    altered = ALTERED.get(edit, set())
+    assert {name for name in before | after if before.get(name) is not after.get(name)} == altered
+    assert recorder.variation(None).street.objects == recorder.objects
+
+
+def test_a_removed_vehicle_is_absent(recorder):
+    assert "vehicle 1" not in names_of(recorder, "removed") and "vehicle 1" in names_of(recorder)
+
+
+@pytest.mark.parametrize(("edit", "axis", "metres"), [("aside", 1, 1.5), ("further", 0, 4.0)])
+def test_a_shifted_vehicle_is_so_many_metres_aside_or_ahead_at_all_times(recorder, edit, axis, metres):
+    before, after = poses(recorder, "vehicle 0"), poses(recorder, "vehicle 0", edit)
+    moved = np.einsum("nji,nj->ni", before[:, :3, :3], after[:, :3, 3] - before[:, :3, 3])
+    expected = np.zeros(3)
+    expected[axis] = metres
+    np.testing.assert_allclose(moved, np.tile(expected, (len(TIMES), 1)), atol=0.03)
+
+
+def test_a_turned_vehicle_keeps_its_place(recorder):
+    before, after = poses(recorder, "vehicle 1"), poses(recorder, "vehicle 1", "turned")
+    np.testing.assert_allclose(after[:, :3, 3], before[:, :3, 3], atol=0.002)
+    turn = np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]
+    np.testing.assert_allclose(np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0])), 30.0, atol=0.02)
+
+
+def test_a_duplicate_follows_its_original(recorder):
+    """The oncoming vehicle drives against x: 12 m behind it are 12 m further along x, its left is towards -y."""
+    before, after = poses(recorder, "vehicle 1"), poses(recorder, "twin", "copied")
+    np.testing.assert_allclose(after[:, 0, 3] - before[:, 0, 3], 12.0, atol=0.05)
+    np.testing.assert_allclose(after[:, 1, 3] - before[:, 1, 3], -0.5, atol=0.15)
+    np.testing.assert_array_equal(poses(recorder, "vehicle 1", "copied"), before)
+
+
+def test_a_delayed_duplicate_is_where_its_original_was(recorder):
+    item, twin = named(recorder, "vehicle 1"), named(recorder, "twin", "late")
+    times = TIMES[TIMES > 2.0]
+    np.testing.assert_allclose(twin.poses(times), item.poses(times - 2.0), atol=2e-3)
+
+
+def test_a_placed_vehicle_drives_through_the_points_of_its_path(recorder):
+    """Points are relative to the ego vehicle at the first image; here it drives along x at y = -1.75."""
+    found, start = poses(recorder, "new", "placed"), recorder.ego_pose(FILM_START)
+    film = TIMES - FILM_START
+    on_path = np.stack([60.0 - 5.0 * film, np.full(len(film), 3.5), np.zeros(len(film))], axis=-1)
+    expected = on_path @ start[:3, :3].T + start[:3, 3]
+    np.testing.assert_allclose(found[:, :2, 3], expected[:, :2], atol=0.02)
+    forward = start[:3, :3] @ [-1.0, 0.0, 0.0]
+    assert (found[:, :3, 0] @ forward).min() > 0.9995, "it faces along its path"
+    assert np.abs(found[:, 2, 3]).max() < 0.1, "on the road, as high as the ego vehicle sways"
+
+
+def test_a_stopped_vehicle_stands(recorder):
+    found = named(recorder, "vehicle 0", "stopped")
+    at = pose_at(found, 4.0 + FILM_START)
+    np.testing.assert_allclose(found.poses(TIMES[TIMES > 4.0]), np.tile(at, ((TIMES > 4.0).sum(), 1, 1)), atol=2e-3)
+    np.testing.assert_allclose(at, pose_at(named(recorder, "vehicle 0"), 4.0 + FILM_START), atol=2e-3)
+
+
+def test_a_rescaled_vehicle_stays_on_the_ground(recorder):
+    before, after = named(recorder, "vehicle 0"), named(recorder, "vehicle 0", "larger")
+    np.testing.assert_allclose(after.size, 1.4 * before.size)
+    np.testing.assert_allclose(after.poses(TIMES), before.poses(TIMES), atol=5e-3)
+    lowest = (after.body.pieces[0].vertices @ pose_at(after, 3.0)[:3, :3].T + pose_at(after, 3.0)[:3, 3])[:, 2].min()
+    assert lowest == pytest.approx(0.0, abs=5e-3)
+
+
+def test_ego_steps_move_the_camera_the_lidar_and_the_ego_vehicles_body(recorder):
+    view = Viewpoint(edit="ego aside")
+    before, after = recorder.ego_to_street(TIMES), recorder.ego_to_street(TIMES, view)
+    np.testing.assert_allclose(after[:, :3, 3] - before[:, :3, 3], before[:, :3, 1], atol=1e-6)
+    np.testing.assert_allclose(after[:, :3, :3], before[:, :3, :3], atol=1e-6)
+    body = named(recorder, EGO_BODY, "ego aside")
+    np.testing.assert_allclose(body.poses(TIMES), after, atol=1e-9)
+    np.testing.assert_allclose(named(recorder, EGO_BODY).poses(TIMES), before, atol=1e-9)
+    scans = [recorder.scan(LIDAR, 2_000_000, v) for v in (Viewpoint(), view)]
+    own = [found.object == names_of(recorder, v).index(EGO_BODY) for found, v in zip(scans, (None, "ego aside"))]  # noqa: B905
+    np.testing.assert_allclose(scans[0].range[own[0] & own[1]], scans[1].range[own[0] & own[1]], atol=1e-4)
+    assert own[0].sum() > 100
+
+
+def test_a_slower_ego_vehicle_is_where_it_was_at_half_the_time(recorder):
+    film = TIMES - FILM_START
+    found = recorder.ego_to_street(TIMES, Viewpoint(edit="ego slower"))
+    np.testing.assert_allclose(found, recorder.ego_to_street(0.5 * film + FILM_START), atol=1e-9)
+
+
+def test_a_lane_change_begins_at_its_second_and_turns_the_ego_vehicle(recorder):
+    before, after = recorder.ego_to_street(TIMES), recorder.ego_to_street(TIMES, Viewpoint(edit="ego later"))
+    offset = np.einsum("ni,ni->n", after[:, :3, 3] - before[:, :3, 3], before[:, :3, 1])
+    film = TIMES - FILM_START
+    assert np.abs(offset[film < 4.0]).max() < 1e-9
+    np.testing.assert_allclose(offset[film > 6.01], 2.0, atol=1e-6)
+    halfway = recorder.ego_to_street(np.array([5.0 + FILM_START]), Viewpoint(edit="ego later"))[0]
+    there = recorder.ego_pose(5.0 + FILM_START)
+    turned = np.degrees(np.arctan2(halfway[:3, 0] @ there[:3, 1], halfway[:3, 0] @ there[:3, 0]))
+    speed = np.linalg.norm((recorder.ego_pose(5.01) - recorder.ego_pose(4.99))[:3, 3]) / 0.02
+    assert turned == pytest.approx(np.degrees(np.arctan2(1.875, speed)), abs=0.3), "a quintic's slope is 15/8"
+
+
+def refusal(settings: dict | None = None, **edits) -> str:
+    recorder = recorder_of(edits, key_frames=12, **(settings or {}))
+    with pytest.raises(ConfigError) as refused:
+        for name in edits:
+            recorder.variation(name)
+        require_free_places(recorder)
+    message = str(refused.value)
+    assert "\n" not in message
+    return message
+
+
+def placed(path: list, track: str = ONCOMING) -> dict:
+    return {"place": {"track": track, "as": "new", "path": path}}
+
+
+def test_an_unknown_track_is_named_with_those_there_are():
+    said = refusal(odd=edit_of({"remove": {"track": "ffff0000"}}))
+    assert said.startswith(
+        "scene demo, edit 'odd', step 1 (remove): no editable track has an id starting with 'ffff0000'"
+    )
+    assert AHEAD[:8] in said
+
+
+@pytest.mark.parametrize("name", ["pedestrian 0", "cyclist 0"])
+def test_people_and_riders_are_no_editable_tracks(name):
+    edits = {"odd": edit_of({"remove": {"track": NUMBERED.instance(name)}})}
+    with pytest.raises(ConfigError, match=r"step 1 \(remove\): no editable track has an id"):
+        recorder_of(edits, cyclists=1).variation("odd")
+
+
+def test_a_copy_cannot_be_named_after_a_pedestrian():
+    twin = {"duplicate": {"track": ONCOMING, "as": NUMBERED.instance("pedestrian 0")}}
+    assert "is the id of another track" in refusal(odd=edit_of(twin))
+
+
+def test_a_vehicle_placed_inside_a_parked_one_is_refused():
+    plain = recorder_of(key_frames=12)
+    parked = pose_at(named(plain, "parked 0"), 0.0)[:3, 3]
+    ahead = np.linalg.inv(plain.ego_pose(FILM_START)) @ [*parked, 1.0]
+    said = refusal(fine=EDITS["aside"], odd=edit_of(placed([[0.0, ahead[0] + 0.5, ahead[1]]])))
+    assert said == "scene demo, edit 'odd', step 1 (place): 'new' is inside parked 0 at 0.0 s; choose another path"
+
+
+def test_a_vehicle_that_drives_into_a_wall_is_refused_with_the_second():
+    steps = {"shift": {"track": AHEAD, "lateral": 0.2}}, placed([[0.0, 20.0, 3.5], [4.0, 40.0, 16.0]])
+    said = refusal({"parked": 0, "pedestrians": 0}, odd=edit_of(*steps))
+    assert said.startswith("scene demo, edit 'odd', step 2 (place): 'new' is inside ") and " s; choose another" in said
+    assert 0.5 < float(said.split(" at ")[1].split(" s")[0]) < 4.5
+
+
+def test_a_vehicle_on_the_free_road_is_accepted_and_one_that_is_removed_again_too():
+    clear = edit_of(placed([[0.0, 60.0, 3.5]]), {"remove": {"track": ONCOMING}})
+    gone = edit_of(placed([[0.0, 30.0, 14.0]]), {"remove": {"track": "new"}})
+    require_free_places(recorder_of({"clear": clear, "gone": gone}, key_frames=12))
