@@ -77,10 +77,10 @@ def gaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def test_rectangles_apart_have_a_positive_gap_and_crossed_ones_none():
     unit = np.array([[[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]]])
     turned = np.array([[[3.0, 0.0], [0.7, 0.7], [-0.7, 0.7]]])
-    assert gaps(unit, unit + [[[2.5, 0.0], [0, 0], [0, 0]]])[0] == pytest.approx(-1.5)
-    assert gaps(unit, unit + [[[0.0, 2.5], [0, 0], [0, 0]]])[0] == pytest.approx(0.5)
+    assert gaps(unit, [*unit, [[2.5, 0.0], [0, 0], [0, 0]]])[0] == pytest.approx(-1.5)
+    assert gaps(unit, [*unit, [[0.0, 2.5], [0, 0], [0, 0]]])[0] == pytest.approx(0.5)
     assert gaps(unit, turned)[0] == pytest.approx(-0.4)
-    assert gaps(unit, turned + [[[0.5, 0.0], [0, 0], [0, 0]]])[0] == pytest.approx(0.1)
+    assert gaps(unit, [*turned, [[0.5, 0.0], [0, 0], [0, 0]]])[0] == pytest.approx(0.1)
 
 
 def ego_rectangle(recorder: Recorder, seconds: np.ndarray) -> np.ndarray:

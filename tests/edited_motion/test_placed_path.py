@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from drivesplat.editing.edited_actors import EditedActor, edited_actors
-from drivesplat.editing.placed_path import placed_motion
 
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.placed_path import placed_motion
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
