@@ -48,8 +48,8 @@ def lamplight(lamps: np.ndarray, ego_to_street: np.ndarray) -> Light:
     headlight_origin = ego_to_street[:3, 3] + ego_to_street[:3, :3] @ np.array([3.6, 0.0, 0.7])
     return Light(
         np.array([0.0, 0.0, 1.0]), np.zeros(3), np.array([0.035, 0.04, 0.06]), np.array([0.02, 0.02, 0.02]),
-        np.array([0.006, 0.008, 0.02]), np.array([0.05, 0.045, 0.05]), 0.2, lamps, np.array([26.0, 19.0, 11.0]),
-        headlight_origin, ego_to_street[:3, 0].copy(), 90.0, 1.0,
+        np.array([0.006, 0.008, 0.02]), np.array([0.05, 0.045, 0.05]), 0.2, lamps, np.array([52.0, 39.0, 24.0]),
+        headlight_origin, ego_to_street[:3, 0].copy(), 180.0, 1.0,
     )  # fmt: skip
 
 
