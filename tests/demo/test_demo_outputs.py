@@ -23,7 +23,7 @@ from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.holdout import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
 
-KEY_FRAMES = 12
+KEY_FRAMES = 8
 AHEAD = recorder_of().instance("vehicle 0")
 JOB = job_of(
     world_of(
@@ -80,9 +80,9 @@ def test_key_frames_come_at_10_hz_and_images_at_20(root, scene):
 
 
 def test_at_10_hz_nothing_near_a_held_out_key_frame_is_trained_on(scene):
-    """Key frames 8 and the last: images within a quarter of a second are excluded, key frames too."""
-    holdout = HoldoutSettings(every_nth=8, offset=4, last_block=1, neighbourhood_s=0.15)
-    held = {4: "interpolation", KEY_FRAMES - 1: "extrapolation"}
+    """Key frame 3 and the last are held out: images less than 0.15 s away are excluded, key frames too."""
+    holdout = HoldoutSettings(every_nth=8, offset=3, last_block=1, neighbourhood_s=0.15)
+    held = {3: "interpolation", KEY_FRAMES - 1: "extrapolation"}
     for records, groups in ((scene.frames, frame_groups), (scene.sweeps, sweep_groups)):
         for record, group in zip(records, groups(scene, holdout), strict=True):
             near = min(abs(record.timestamp - scene.key_frame_timestamps[index]) for index in held)

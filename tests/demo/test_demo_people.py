@@ -26,7 +26,7 @@ def default() -> Recorder:
 
 @pytest.fixture(scope="module")
 def riders() -> Recorder:
-    return recorder_of(width=WIDTH, cyclists=4, bystanders=3, random_seed=1)
+    return recorder_of(width=WIDTH, cyclists=4, bystanders=6, random_seed=1)
 
 
 def scene_and_objects(recorder: Recorder) -> tuple[Scene, dict[int, np.ndarray]]:

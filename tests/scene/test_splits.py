@@ -13,13 +13,13 @@ from drivesplat.settings.images import HoldoutSettings
 INTERVAL = 500_000
 
 
-def drive(key_frames: int, cameras=("CAM_FRONT", "CAM_BACK"), between: int = 5) -> Scene:
+def drive(key_frames: int, cameras=("CAM_FRONT", "CAM_BACK"), between: int = 5, interval: int = INTERVAL) -> Scene:
     """A drive whose cameras have individual delays after the key frame, with `between` images between key frames."""
     frames, sweeps = [], []
     for c, camera in enumerate(cameras):
         for step in range((key_frames - 1) * (between + 1) + 1):
             index, part = divmod(step, between + 1)
-            time = index * INTERVAL + part * INTERVAL // (between + 1) + 7_000 * c
+            time = index * interval + part * interval // (between + 1) + 7_000 * c
             nearest = index if part <= (between + 1) / 2 else index + 1
             frames.append(
                 Frame(camera, time, "", 16, 9, np.eye(3), np.eye(4), np.eye(4), part == 0, nearest, f"{camera} {step}")
@@ -27,10 +27,10 @@ def drive(key_frames: int, cameras=("CAM_FRONT", "CAM_BACK"), between: int = 5) 
     for step in range((key_frames - 1) * 10 + 1):
         index, part = divmod(step, 10)
         sweeps.append(
-            Sweep("", step * INTERVAL // 10, np.eye(4), part == 0, index, f"sweep {step}", "LIDAR_TOP", "nuscenes")
+            Sweep("", step * interval // 10, np.eye(4), part == 0, index, f"sweep {step}", "LIDAR_TOP", "nuscenes")
         )
-    times = np.arange(key_frames) * INTERVAL
-    return Scene("0001", "", "", "", np.zeros(3), times, tuple(frames), tuple(sweeps), (), "nuscenes", 2.0)
+    times = np.arange(key_frames) * interval
+    return Scene("0001", "", "", "", np.zeros(3), times, tuple(frames), tuple(sweeps), (), "nuscenes", 1e6 / interval)
 
 
 def held_out(count: int, **settings) -> tuple[list[int], list[int]]:
@@ -147,3 +147,37 @@ def test_the_tiny_drives_image_sweep_215_ms_after_a_held_out_key_frame_is_exclud
         if key_frame < 9:
             expected[2 * key_frame + 1] = "excluded"
     assert groups == expected
+
+
+DENSE = 100_000
+"""Key frames at 10 Hz, as in Waymo and KITTI."""
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.16, 0.25, 0.6])
+def test_at_10_hz_key_frames_near_a_held_out_one_are_excluded_too(seconds):
+    """Neighbours 0.1 s away show the same: without the exclusion, models are measured on what they were trained on."""
+    scene = drive(30, between=1, interval=DENSE)
+    holdout = HoldoutSettings(every_nth=12, offset=6, last_block=2, neighbourhood_s=seconds)
+    held = {6: "interpolation", 18: "interpolation", 28: "extrapolation", 29: "extrapolation"}
+    for records, groups in ((scene.frames, frame_groups), (scene.sweeps, sweep_groups)):
+        for record, group in zip(records, groups(scene, holdout), strict=True):
+            if record.is_key_frame and record.sample_index in held:
+                assert group == held[record.sample_index]
+            else:
+                near = any(abs(record.timestamp - index * DENSE) < seconds * 1e6 for index in held)
+                assert group == ("excluded" if near else "train"), record.token
+
+
+def test_the_default_neighbourhood_is_that_of_2_hz():
+    """A quarter of a second: half the interval of nuScenes' key frames."""
+    groups = frame_groups(drive(20, cameras=("CAM_FRONT",), between=0, interval=DENSE), HoldoutSettings(last_block=0))
+    held = [index for index, group in enumerate(groups) if group == "interpolation"]
+    excluded = [index for index, group in enumerate(groups) if group == "excluded"]
+    assert held == [4, 12] and excluded == [2, 3, 5, 6, 10, 11, 13, 14]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.6])
+def test_below_5_hz_the_neighbourhood_is_half_an_interval_whatever_the_setting(seconds):
+    scene = drive(10)
+    holdout = HOLDOUT.model_copy(update={"neighbourhood_s": seconds})
+    assert frame_groups(scene, holdout) == frame_groups(scene, HOLDOUT)
