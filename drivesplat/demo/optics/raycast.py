@@ -4,6 +4,7 @@ Objects that stand still share one Embree scene in the street frame. A moving pi
 which rays are transformed with the pose of the piece at their time. No scene is built twice.
 """
 
+import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -59,8 +60,9 @@ class RayHits:
 
 
 @cache
-def _device() -> EmbreeDevice:
-    """The device of this process: Embree fails after some hundreds."""
+def embree_device(process: int) -> EmbreeDevice:
+    """The Embree device of a process. All scenes share it: a process cannot hold a thousand. A forked process needs its
+    own, since threads are not forked."""
     return EmbreeDevice()
 
 
@@ -69,7 +71,7 @@ class EmbreePiece:
     first face among all faces, of each mesh."""
 
     def __init__(self, meshes: Sequence[ColoredMesh], owners: Sequence[int], first_faces: Sequence[int]):
-        self.scene = EmbreeScene(_device())
+        self.scene = EmbreeScene(embree_device(os.getpid()))
         self._triangles = [TriangleMesh(self.scene, mesh.triangles.astype(np.float32)) for mesh in meshes]
         self.owners, self.first_faces = np.array(owners, np.int32), np.array(first_faces)
 
