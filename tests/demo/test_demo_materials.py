@@ -5,20 +5,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivesplat.demo.optics.materials import (
-    CURB,
-    LANE,
-    ROAD,
-    SIDEWALK,
+from drivesplat.demo.layout import CURB, LANE, ROAD, SIDEWALK
+from drivesplat.demo.optics.materials import facade, ground, surface
+from drivesplat.demo.optics.patterns import (
     coverage,
-    facade,
     fractal,
-    ground,
     hash_noise,
     plane_fractal,
     plane_noise,
     stripes,
-    surface,
     value_noise,
 )
 from drivesplat.demo.shapes.mesh import BARK, Material

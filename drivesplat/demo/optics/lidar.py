@@ -1,11 +1,13 @@
 """A spinning LiDAR: the time of each ray, reflectivity, dropped rays, mixed returns at edges."""
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 
 from drivesplat.demo.optics.lighting import facing_normal, texture_point
-from drivesplat.demo.optics.materials import GLASS, LEAVES, METAL, PAINT, ROAD_, SIGN, compiled, surface
+from drivesplat.demo.optics.materials import GLASS, LEAVES, METAL, PAINT, ROAD_, SIGN, surface
+from drivesplat.demo.optics.patterns import compiled
 from drivesplat.demo.optics.raycast import NO_HIT, RayHits, Rays, StreetSnapshot
 from drivesplat.settings.world import WorldLidarSettings
 
@@ -147,6 +149,7 @@ def _reflected(snapshot: StreetSnapshot, rays: Rays, hits: RayHits, wet: float) 
 
 
 @compiled
+@no_type_check
 def _reflect(directions, face, normal, weights, texture, texture_normal, material, color, wet, out):
     """Fills `out` (n,) with the reflected fraction; see `shade` in lighting.py for the arguments."""
     for i in range(len(directions)):
@@ -163,6 +166,7 @@ def _reflect(directions, face, normal, weights, texture, texture_normal, materia
 
 
 @compiled
+@no_type_check
 def infrared(material, visible, mirror, facing, wet):
     """Reflectivity at 905 nm of a surface whose mean reflectance to visible light is `visible`.
 

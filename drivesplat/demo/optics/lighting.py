@@ -1,11 +1,12 @@
 """Shading, compiled: sun, shadows and sky by day; street lamps, headlights and lit windows by night."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 
-from drivesplat.demo.optics.materials import LEAVES, ROAD_, compiled, fractal, surface, value_noise
+from drivesplat.demo.optics.materials import LEAVES, ROAD_, surface
+from drivesplat.demo.optics.patterns import compiled, fractal, value_noise
 
 
 class Light(NamedTuple):
@@ -54,6 +55,7 @@ def lamplight(lamps: np.ndarray, ego_to_street: np.ndarray) -> Light:
 
 
 @compiled
+@no_type_check
 def sky_color(dx, dy, dz, light):
     """Radiance r, g, b of the sky in a direction."""
     up = max(dz, 0.0)
@@ -74,6 +76,7 @@ def sky_color(dx, dy, dz, light):
 
 
 @compiled
+@no_type_check
 def lamp_irradiance(px, py, pz, nx, ny, nz, light):
     """Irradiance r, g, b of street lamps, which shine down, and headlights at a point p with normal n."""
     r = g = b = 0.0
@@ -99,6 +102,7 @@ def lamp_irradiance(px, py, pz, nx, ny, nz, light):
 
 
 @compiled
+@no_type_check
 def shade(
     directions, origins, moment, distance, face, normal, weights, lit, texture, texture_normal, material, color,
     pixel_angle, light, out,
@@ -148,6 +152,7 @@ def shade(
 
 
 @compiled
+@no_type_check
 def texture_point(corners, weights):
     """The point x, y, z of a face with `corners` (3, 3) at barycentric `weights` (2,) of the second and the third."""
     u, v = weights[0], weights[1]
@@ -159,6 +164,7 @@ def texture_point(corners, weights):
 
 
 @compiled
+@no_type_check
 def facing_normal(normal, direction):
     """The unit normal x, y, z on the viewer's side, and its cosine to the ray, at least 0.04."""
     length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2) + 1e-30
@@ -170,6 +176,7 @@ def facing_normal(normal, direction):
 
 
 @compiled
+@no_type_check
 def dot(v, x, y, z):
     """Scalar product of the first three elements of `v` with x, y, z."""
     return v[0] * x + v[1] * y + v[2] * z

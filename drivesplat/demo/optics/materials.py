@@ -5,123 +5,29 @@ do not flicker, and are not computed.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, no_type_check
-
-import numpy as np
+from typing import no_type_check
 
 from drivesplat.demo.layout import CROSSING, CURB, LANE, ROAD, SIDEWALK, WINDOW
+from drivesplat.demo.optics.patterns import (
+    compiled,
+    coverage,
+    fractal,
+    glyphs,
+    grain,
+    hash_noise,
+    plane_fractal,
+    plane_noise,
+    stripes,
+    tiles,
+    visible,
+)  # fmt: skip
 from drivesplat.demo.shapes.mesh import BARK, Material
-from drivesplat.kernels.cache import kernel
 
 PLAIN, ROAD_, FACADE, LEAVES, PAINT, GLASS, LAMP, CLOTH, STRIPES, METAL, SIGN = (int(m) for m in Material)
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A kernel; its arguments are numbers without annotations."""
-    return kernel(no_type_check(function), fastmath=True)
-
-
 @compiled
-def hash_noise(x, y, z):
-    """A pseudo-random number in [0, 1) for integer coordinates."""
-    h = np.uint32(np.int64(x) * 73856093 ^ np.int64(y) * 19349663 ^ np.int64(z) * 83492791)
-    h = (h ^ (h >> np.uint32(13))) * np.uint32(1274126177)
-    return ((h ^ (h >> np.uint32(16))) & np.uint32(0xFFFFFF)) / 16777216.0
-
-
-@compiled
-def plane_noise(x, y, seed):
-    """Value noise in [0, 1) with a wavelength of one unit on a plane, one per integer `seed`."""
-    ix, iy = math.floor(x), math.floor(y)
-    fx, fy = x - ix, y - iy
-    fx, fy = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy)
-    low = hash_noise(ix, iy, seed) * (1 - fx) + hash_noise(ix + 1, iy, seed) * fx
-    high = hash_noise(ix, iy + 1, seed) * (1 - fx) + hash_noise(ix + 1, iy + 1, seed) * fx
-    return low * (1 - fy) + high * fy
-
-
-@compiled
-def value_noise(x, y, z):
-    """Value noise in [0, 1) with a wavelength of one unit."""
-    iz = math.floor(z)
-    fz = (z - iz) ** 2 * (3 - 2 * (z - iz))
-    return plane_noise(x, y, iz) * (1 - fz) + plane_noise(x, y, iz + 1) * fz
-
-
-@compiled
-def visible(wavelength, footprint):
-    """Contrast in [0, 1] that remains of a detail of this size: none below a wavelength of one footprint."""
-    return min(1.0, max(0.0, wavelength / (2.0 * footprint + 1e-6) - 0.5))
-
-
-@compiled
-def fractal(x, y, z, wavelength, footprint):
-    """Three octaves of noise around 0 (about +-0.5); those finer than the footprint fade out."""
-    total, amplitude = 0.0, 0.5
-    for octave in range(3):
-        contrast = visible(wavelength, footprint)
-        if contrast == 0.0:
-            break
-        shift = 17.3 * octave
-        at = value_noise(x / wavelength + shift, y / wavelength + shift, z / wavelength - shift)
-        total += contrast * amplitude * (2 * at - 1)
-        amplitude *= 0.5
-        wavelength *= 0.37
-    return total
-
-
-@compiled
-def grain(x, y, wavelength, footprint):
-    """One octave of noise around 0 (+-1) on a plane."""
-    contrast = visible(wavelength, footprint)
-    return contrast * (2 * plane_noise(x / wavelength, y / wavelength, 40) - 1) if contrast > 0.0 else 0.0
-
-
-@compiled
-def plane_fractal(x, y, wavelength, footprint):
-    """`fractal` on a plane, at half the cost."""
-    coarse, middle = grain(x, y, wavelength, footprint), grain(x + 9.1, y, 0.37 * wavelength, footprint)
-    return 0.5 * coarse + 0.25 * middle + 0.125 * grain(x, y + 9.1, 0.137 * wavelength, footprint)
-
-
-@compiled
-def coverage(value, low, high, footprint):
-    """Fraction of a pixel at `value` that lies between `low` and `high`."""
-    width = footprint + 1e-4
-    return min(1.0, max(0.0, (value - low) / width + 0.5)) - min(1.0, max(0.0, (value - high) / width + 0.5))
-
-
-@compiled
-def stripes(value, period, width, footprint):
-    """Fraction of a pixel at `value` that lies in stripes from k * `period` to k * `period` + `width`."""
-    half, share = 0.5 * (footprint + 1e-4) / period, width / period
-    low, high = value / period - half, value / period + half
-    first, last = math.floor(low), math.floor(high)
-    covered = ((last - first) * share + min(high - last, share) - min(low - first, share)) / (2 * half)
-    return min(1.0, max(0.0, covered))
-
-
-@compiled
-def tiles(x, y, width, height, joint, footprint):
-    """Tiles in running bond: the fraction of a pixel in joints, and a tone around 0 (+-0.5) for each tile."""
-    row = math.floor(y / height)
-    x += 0.5 * width * (row % 2)
-    gaps = 1 - (1 - stripes(x, width, joint, footprint)) * (1 - stripes(y, height, joint, footprint))
-    contrast = visible(1.5 * height, footprint)
-    return gaps, contrast * (hash_noise(math.floor(x / width), row, 7) - 0.5) if contrast > 0.0 else 0.0
-
-
-@compiled
-def glyphs(x, y, height, seed, footprint):
-    """Fraction of a pixel covered by symmetric letters, within a line from y = 0 to y = `height`."""
-    letter = math.floor(x / (0.75 * height))
-    i, j = math.floor(4 * (x / (0.75 * height) - letter)), math.floor(5 * y / height)
-    drawn = i < 3 and hash_noise(letter, seed, 1) > 0.15 and hash_noise(letter, i % 2 + 4 * j, seed) < 0.55
-    return 0.34 + visible(0.25 * height, footprint) * ((1.0 if drawn else 0.0) - 0.34)
-
-
-@compiled
+@no_type_check
 def ground(x, y, footprint):
     """Linear reflectance of road, markings, curb, sidewalk and grass."""
     a = abs(y)
@@ -153,6 +59,7 @@ def ground(x, y, footprint):
 
 
 @compiled
+@no_type_check
 def asphalt(x, y, footprint):
     """Tone of asphalt around 1: stains, repaired patches, seams of tar, cracks, stones."""
     tone = 1 + 0.5 * plane_fractal(x, y, 3.0, footprint) + 0.5 * plane_fractal(x, y, 0.5, footprint)
@@ -173,6 +80,7 @@ def asphalt(x, y, footprint):
 
 
 @compiled
+@no_type_check
 def iron(x, y, footprint):
     """Tone around 1 of the cover of a manhole; 1 on bare asphalt."""
     cell = math.floor(x / 13.0)
@@ -185,6 +93,7 @@ def iron(x, y, footprint):
 
 
 @compiled
+@no_type_check
 def masonry(style, along, z, footprint):
     """Bricks (style 0), plaster (1) or slabs (2): tone around 1, fraction of joints and their reflectance."""
     tone = 1 + 0.3 * plane_fractal(along, z, 2.0, footprint)
@@ -197,6 +106,7 @@ def masonry(style, along, z, footprint):
 
 
 @compiled
+@no_type_check
 def interior(u, v, column, floor, footprint):
     """Reflectance r, g, b behind a pane at u, v metres in its cell: goods in shops, curtains and blinds above."""
     if footprint > 0.3:
@@ -218,6 +128,7 @@ def interior(u, v, column, floor, footprint):
 
 
 @compiled
+@no_type_check
 def facade(r, g, b, along, z, footprint):
     """A wall with windows, shops on the ground floor: reflectance r, g, b, mirror reflectance, emission at night."""
     column, floor = math.floor(along / WINDOW[0]), math.floor(z / WINDOW[1])
@@ -251,6 +162,7 @@ def facade(r, g, b, along, z, footprint):
 
 
 @compiled
+@no_type_check
 def lettering(r, g, b, along, z, footprint):
     """A panel with lines of letters about z = 0 and a picture above and below: as `facade`."""
     line, dark = math.floor((z + 0.15) / 0.3), 0.7 if r + g + b < 0.9 else 0.04
@@ -261,6 +173,7 @@ def lettering(r, g, b, along, z, footprint):
 
 
 @compiled
+@no_type_check
 def surface(material, r, g, b, x, y, z, nx, ny, nz, footprint):
     """Reflectance r, g, b, mirror reflectance and emission at night of a point with normal n in the object's frame."""
     if material == ROAD_:
