@@ -148,7 +148,7 @@ def write_truth(root: Path, recorder: Recorder, views: Iterable[TruthView], scan
     if scans:
         pattern = recorder.pattern
         with atomic_write((root / TRUTH_FILE).parent / PATTERN_FILE) as file:
-            np.savez(file, elevations=pattern.elevations, azimuths=pattern.azimuths, offsets=pattern.offsets)
+            np.savez_compressed(file, elevations=pattern.elevations, azimuths=pattern.azimuths, offsets=pattern.offsets)
     truth = Truth(
         scene=recorder.scene,
         width=world.width,
