@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from helpers.demo_worlds import FRONT
+from helpers.demo_worlds import FRONT, meshes_at, named, recorder_of
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from drivesplat.demo.optics.imaging import DemoCamera
 from drivesplat.demo.optics.raycast import NO_HIT
+from drivesplat.demo.output.truth import TruthPlan, key_frames_of
 from drivesplat.demo.recorder import Recorder, Viewpoint
 from drivesplat.demo.shapes.mesh import SurfaceClass
 from drivesplat.demo.tokens import instance_token
@@ -233,3 +234,23 @@ def test_the_view_without_the_leading_vehicle_shows_all_others(truth, recorded, 
     np.testing.assert_array_equal(depths[0][~own], depths[1][~own])
     behind = np.where(depths[1] == 0, np.inf, depths[1])
     assert (behind[own] >= depths[0][own]).all()
+
+
+def test_key_frames_at_which_the_camera_would_be_inside_an_object_are_left_out():
+    """4 m to the left is the lane of the oncoming vehicle, which passes the ego vehicle after five seconds."""
+    recorder = recorder_of(key_frame_hz=10, image_hz=10, key_frames=80, pedestrians=0, parked=0)
+    aside, oncoming = Viewpoint(left=4.0), named(recorder, "vehicle 1")
+    kept = key_frames_of(recorder, TruthPlan(FRONT, aside, ""))
+    inside, near = [], []
+    for index in range(80):
+        seconds = index * 0.1 - 0.0355
+        pose = recorder.ego_pose(seconds)
+        center = (pose @ FRONT.sensor_to_ego)[:3, 3] + 4.0 * pose[:3, 1]
+        corners = meshes_at(oncoming, seconds).reshape(-1, 3)  # it drives along x, so its box is upright
+        beyond = np.maximum(corners.min(axis=0) - center, center - corners.max(axis=0)).max()
+        inside += [index] if beyond < 0.0 else []
+        near += [index] if beyond < 0.25 else []
+    assert near and not set(kept) & {*inside, *near}
+    assert len(kept) >= 80 - len(near) - 2, "no others but those"
+    assert key_frames_of(recorder, TruthPlan(FRONT, Viewpoint(), "")) == list(range(80))
+    assert key_frames_of(recorder, TruthPlan(FRONT, Viewpoint(without="vehicle 1", left=4.0), "")) == list(range(80))
