@@ -39,7 +39,7 @@ rule edit:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=8)
     resources:
-        gpu=plan.cards,
+        gpu=plan.gpus,
         device=plan.device,
         mem_mb=8000,
         runtime=60,

@@ -65,7 +65,7 @@ rule film:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=8)
     resources:
-        gpu=plan.cards,
+        gpu=plan.gpus,
         device=plan.device,
         mem_mb=8000,
         runtime=60,
@@ -102,7 +102,7 @@ rule film_parts:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=8)
     resources:
-        gpu=plan.cards,
+        gpu=plan.gpus,
         device=plan.device,
         mem_mb=8000,
         runtime=60,
@@ -140,7 +140,7 @@ rule ghost_panel:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=4)
     resources:
-        gpu=plan.cards,
+        gpu=plan.gpus,
         device=plan.device,
         mem_mb=8000,
         runtime=15,
@@ -180,7 +180,7 @@ rule remove_actor:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=4)
     resources:
-        gpu=plan.cards,
+        gpu=plan.gpus,
         device=plan.device,
         mem_mb=8000,
         runtime=15,

@@ -53,7 +53,7 @@ rule evaluate:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=4)
     resources:
-        gpu=plan.cards,
+        gpu=plan.gpus,
         device=plan.device,
         mem_mb=8000,
         runtime=30,

@@ -27,7 +27,7 @@ rule train:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=2)
     resources:
-        gpu=plan.cards,
+        gpu=plan.gpus,
         device=plan.device,
         mem_mb=16000,
         runtime=240,

@@ -27,7 +27,7 @@ from drivesplat.readers.truth import read_truth
 from drivesplat.scene.masks import MasksRecord
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import REGIONS, region_mask, region_masks
-from drivesplat.scene.splits import HELD_OUT_GROUPS
+from drivesplat.scene.splits import HELD_OUT_GROUPS, NEIGHBOURHOOD_HZ
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
@@ -115,9 +115,17 @@ def truth_metrics(
 
 
 def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob) -> dict[str, Any]:
-    """The protocol of every figure."""
+    """The protocol of every figure. At NEIGHBOURHOOD_HZ and more, it also states the rate of key frames, the
+    neighbourhood, and the least time between a held-out and a training image."""
     measured = [i for images in measured_images(record, job.eval_camera).values() for i in images]
     width, height = record.image_size(measured[0] if measured else 0)
+    holdout, rate = job.holdout.model_dump(), record.scene.key_frame_hz
+    if rate is None or rate < NEIGHBOURHOOD_HZ:
+        del holdout["neighbourhood_s"]
+        at_rate = {}
+    else:
+        apart = np.abs(np.subtract.outer(record.timestamps[measured], record.timestamps[record.train_images]))
+        at_rate = {"key_frame_hz": rate, "nearest_training_s": float(apart.min()) * 1e-6 if apart.size else None}
     return {
         "version": record.scene.version,
         "cameras": list(job.cameras),
@@ -125,7 +133,7 @@ def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob
         "width": width,
         "height": height,
         "sweeps": job.sweeps,
-        "holdout": job.holdout.model_dump(),
+        "holdout": holdout,
         "held_out_frames": record.held_out_frames,
         "train_images": len(record.train_images),
         "poses": record.scene.poses,
@@ -135,6 +143,7 @@ def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob
         "lidar_missing": record.seed.lidar_missing,
         "images_missing": record.scene.missing_images,
         "key_frame_range": record.scene.key_frame_range,
+        **at_rate,
     }
 
 

@@ -60,8 +60,8 @@ class DriveTruth:
         recorded = self.truth.recorded(view.camera)
         true_poses = {token: frame.camera_to_global for token, frame in recorded.by_image().items()} if recorded else {}
         for index, truth in self.frames(view):
-            if truth.sample_data in true_poses:
-                frame, true_pose = self.recording.frame(index), np.array(true_poses[truth.sample_data])
+            if truth.token in true_poses:
+                frame, true_pose = self.recording.frame(index), np.array(true_poses[truth.token])
                 offset = inverse(true_pose) @ np.array(truth.camera_to_global)
                 yield index, dataclasses.replace(frame, camera_to_world=frame.camera_to_world @ offset), truth
 

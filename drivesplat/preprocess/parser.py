@@ -53,6 +53,7 @@ def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingR
             poses=scene.poses,
             key_frame_range=scene.key_frame_range,
             missing_images=scene.missing_images,
+            key_frame_hz=scene.key_frame_hz,
         ),
         seed=SeedInfo(**{key: value for key, value in seed.note.items() if key != "provenance"}),
     )

@@ -29,8 +29,8 @@ class TruthFrame:
     `classes`: 8 bits, a key of `Truth.classes`.
     """
 
-    sample_data: str
-    sample_index: int
+    token: str
+    key_frame: int
     camera_to_global: list[list[float]]
     image: str | None
     depth: str
@@ -56,7 +56,7 @@ class TruthView:
 
     def by_image(self) -> dict[str, TruthFrame]:
         """The frames by the token of their image's sample_data."""
-        return {frame.sample_data: frame for frame in self.frames}
+        return {frame.token: frame for frame in self.frames}
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class TruthScan:
     file. Its arrays (beams, steps), one entry per ray of the pattern: `range` without noise in metres (float32,
     infinite without a hit), `intensity` in [0, 1], `instance` as in instance images, `returned`."""
 
-    sample_data: str
-    sample_index: int
+    token: str
+    key_frame: int
     left_m: float
     edit: str | None
     file: str
@@ -128,7 +128,7 @@ def _view(content: dict) -> TruthView:
     frames = tuple(TruthFrame(**frame) for frame in content.pop("frames"))
     for frame in frames:
         if np.shape(frame.camera_to_global) != (4, 4):
-            raise ValueError(f"the pose of key frame {frame.sample_index} is no 4x4 matrix")
+            raise ValueError(f"the pose of key frame {frame.key_frame} is no 4x4 matrix")
     view = TruthView(**content, frames=frames)
     if not view.is_recorded and any(frame.image is None for frame in frames):
         raise ValueError(f"a view of {view.camera} that was not recorded has no image")

@@ -24,6 +24,7 @@ class SceneInfo:
     poses: str
     key_frame_range: list[int] | None = None
     missing_images: int = 0
+    key_frame_hz: float | None = None
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ class DeviceSettings(Settings):
     min_free_gb: float = Field(8.0, ge=0, le=1000)
     """Minimum free GPU memory (GB) for a training to start."""
     max_gb: float | None = Field(None, gt=0, le=1000)
-    """Maximum GPU memory of a job (GB), for cards that jobs share. null = no limit."""
+    """Maximum GPU memory of a job (GB), for GPUs that jobs share. null = no limit."""
 
     jobs_per_card: int = Field(1, ge=1, le=64)
     """Maximum number of jobs on one GPU. Further jobs wait. For more than 1, set Snakemake's resource as well:
-    `--resources gpu=<cards times this>`."""
+    `--resources gpu=<GPUs times this>`."""
 
     @model_validator(mode="before")
     @classmethod

@@ -78,7 +78,7 @@ class Plan(Outputs):
             self._devices[name] = canonical_json(device), int(on_gpu)
         return self._devices[name]
 
-    def cards(self, wildcards: Any) -> int:
+    def gpus(self, wildcards: Any) -> int:
         """The number of GPUs that a training or rendering of a scene takes: 1, or 0 on the CPU of this machine."""
         return self._device(wildcards.scene)[1]
 
@@ -86,7 +86,7 @@ class Plan(Outputs):
         """The threads of such a job: `on_gpu` with a GPU, otherwise half of the processors, since two jobs in parallel
         finish sooner than two in sequence on all processors."""
         on_cpu = max(1, len(os.sched_getaffinity(0)) // 2)
-        return lambda wildcards: on_gpu if self.cards(wildcards) else on_cpu
+        return lambda wildcards: on_gpu if self.gpus(wildcards) else on_cpu
 
     def known(self, names: Any) -> str:
         """A wildcard constraint that matches only these names."""

@@ -179,7 +179,7 @@ def test_scans_hold_every_ray_with_or_without_a_return(root, truth, recorder):
         assert {name: rays[name].shape for name in rays} == dict.fromkeys(
             ("range", "intensity", "instance", "returned"), (32, 1085)
         )
-        points = np.fromfile(root / rows[scan.sample_data]["filename"], np.float32).reshape(-1, 5)
+        points = np.fromfile(root / rows[scan.token]["filename"], np.float32).reshape(-1, 5)
         assert len(points) == rays["returned"].sum()
         np.testing.assert_array_equal(points[:, 4], np.nonzero(rays["returned"])[0])
         assert np.isinf(rays["range"]).any() and not rays["returned"][np.isinf(rays["range"])].any()
@@ -193,7 +193,7 @@ def test_returns_lie_where_range_pattern_and_poses_say(root, truth, recorder):
     """Range along each ray from the sensor's place at the ray's own time, within the noise of 2 cm."""
     scan, pattern = truth.scans[3], np.load(root / "truth" / truth.pattern)
     rays = np.load(root / "truth" / scan.file)
-    row = next(row for row in table(root, "sample_data") if row["token"] == scan.sample_data)
+    row = next(row for row in table(root, "sample_data") if row["token"] == scan.token)
     points = np.fromfile(root / row["filename"], np.float32).reshape(-1, 5)[:, :3].astype(float)
     beam, step = np.nonzero(rays["returned"])
     e, a = pattern["elevations"][beam], pattern["azimuths"][step]

@@ -66,7 +66,7 @@ def test_trainings_take_a_card_where_they_run_on_one_and_half_the_processors_els
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(12)))
     made = plan(device=device)
-    assert [made.cards(scene(name)) for name in ("demo", "0103")] == [demo, recorded]
+    assert [made.gpus(scene(name)) for name in ("demo", "0103")] == [demo, recorded]
     threads = made.threads(on_gpu=3)
     assert [threads(scene(name)) for name in ("demo", "0103")] == [3 if demo else 6, 3 if recorded else 6]
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {5})

@@ -65,8 +65,8 @@ def test_truth_json_lists_every_view_and_key_frame(truth, demo_tables):
     ]
     images = [demo_tables.sample[i]["data"]["CAM_FRONT"] for i in range(KEY_FRAMES)]
     for view in truth.views:
-        assert [frame.sample_data for frame in view.frames] == images
-        assert [frame.sample_index for frame in view.frames] == list(range(KEY_FRAMES))
+        assert [frame.token for frame in view.frames] == images
+        assert [frame.key_frame for frame in view.frames] == list(range(KEY_FRAMES))
 
 
 def test_every_file_of_truth_json_is_there_in_the_images_size(truth, demo_root):
@@ -165,14 +165,14 @@ def ego_to_global(tables, sample_data: str) -> np.ndarray:
 
 def test_camera_poses_agree_with_the_tables(recorded, demo_tables):
     for frame in recorded.frames:
-        in_ego = np.linalg.inv(ego_to_global(demo_tables, frame.sample_data)) @ np.array(frame.camera_to_global)
+        in_ego = np.linalg.inv(ego_to_global(demo_tables, frame.token)) @ np.array(frame.camera_to_global)
         np.testing.assert_allclose(in_ego[:3, 3], [1.701, 0.016, 1.511], atol=1e-6)
         assert in_ego[0, 2] > 0.999, "the camera looks ahead"
 
 
 def test_lateral_cameras_lie_to_the_left_and_turn_nowhere(lateral, recorded, demo_tables):
     for frame, here in zip(lateral.frames, recorded.frames, strict=True):
-        left = ego_to_global(demo_tables, here.sample_data)[:3, 1]
+        left = ego_to_global(demo_tables, here.token)[:3, 1]
         before, after = (np.array(f.camera_to_global) for f in (here, frame))
         np.testing.assert_allclose(after[:3, 3] - before[:3, 3], lateral.left_m * left, atol=1e-9)
         np.testing.assert_allclose(after[:3, :3], before[:3, :3], atol=1e-12)
@@ -180,8 +180,8 @@ def test_lateral_cameras_lie_to_the_left_and_turn_nowhere(lateral, recorded, dem
 
 def stated_camera(frame: TruthFrame, recorded: TruthView, recorder: Recorder) -> DemoCamera:
     """The camera that truth.json states, brought to the street by the known ego pose."""
-    here = recorder.camera(FRONT, time_of(frame.sample_index) * 1e-6)
-    stated = np.array(recorded.frames[frame.sample_index].camera_to_global)
+    here = recorder.camera(FRONT, time_of(frame.key_frame) * 1e-6)
+    stated = np.array(recorded.frames[frame.key_frame].camera_to_global)
     pose = here.pose @ np.linalg.inv(stated) @ np.array(frame.camera_to_global)
     return DemoCamera(here.intrinsics, here.seconds, pose[None], WIDTH, HEIGHT)
 

@@ -586,7 +586,7 @@ def test_frames_with_ground_truth_are_those_that_were_recorded(known):
     frames = known.recording.scene.frames
     for view in (known.truth.recorded("CAM_FRONT"), *known.truth.lateral("CAM_FRONT")):
         assert [index for index, _ in known.frames(view)] == list(range(6))
-        assert [truth.sample_data for _, truth in known.frames(view)] == [frame.token for frame in frames]
+        assert [truth.token for _, truth in known.frames(view)] == [frame.token for frame in frames]
     assert not list(known.frames(known.truth.recorded("CAM_BACK")))
 
 
@@ -634,7 +634,7 @@ def damaged(content: dict[str, Any], how: str) -> str:
         "with a foreign field": json.dumps({**content, "colour": "red"}),
         "without frames": first_view(frames=None),
         "with frames by name": first_view(frames={"0": view["frames"][0]}),
-        "with a short frame": first_view(frames=[{"sample_data": "a"}]),
+        "with a short frame": first_view(frames=[{"token": "a"}]),
         "with a foreign field of a view": first_view(colour="red"),
     }
     return spoilt[how]
@@ -681,7 +681,7 @@ def test_truth_json_is_read_completely(known):
     content, truth = good(known), read_truth(known.path)
     assert content.pop("schema") == 2
     assert json.loads(json.dumps(dataclasses.asdict(truth))) == content
-    tokens = [frame["sample_data"] for frame in content["views"][0]["frames"]]
+    tokens = [frame["token"] for frame in content["views"][0]["frames"]]
     assert list(truth.recorded("CAM_FRONT").by_image()) == tokens and len(tokens) == 6
 
 

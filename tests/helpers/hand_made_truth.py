@@ -42,7 +42,7 @@ def write_truth(root: Path, world: World, scene: Scene) -> Path:
     views.append(replace(_view(root, aside(empty, 0.0), scene, "empty"), without=LEADING))
     recorded = views[0]
     views.append(replace(recorded, left_m=2.0, edit="stop", frames=tuple(map(_unmade, recorded.frames))))
-    others = tuple(replace(_unmade(frame), sample_data=f"back {frame.sample_index}") for frame in recorded.frames)
+    others = tuple(replace(_unmade(frame), token=f"back {frame.key_frame}") for frame in recorded.frames)
     views += [replace(recorded, camera="CAM_BACK", left_m=left, frames=others) for left in (0.0, 2.0)]
     things = {str(number + 1): f"0001 instance {number}" for number in range(len(world.things))}
     truth = Truth(

@@ -97,8 +97,8 @@ def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> 
     for kind, name in names.items():
         write_png((root / TRUTH_FILE).parent / name, images[kind])
     pose = STREET_TO_GLOBAL @ recorder.camera(sensor, time_us * 1e-6, view).pose
-    sample_data = token(recorder.scene, sensor.channel, time_us)
-    return TruthFrame(sample_data, index, pose.tolist(), **{"image": None, **names})
+    image = token(recorder.scene, sensor.channel, time_us)
+    return TruthFrame(image, index, pose.tolist(), **{"image": None, **names})
 
 
 def _depth(picture: Picture) -> np.ndarray:
