@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drivesplat.demo.optics.imaging import DemoCamera, geometry, render, to_bytes
+from drivesplat.demo.optics.imaging import DemoCamera, geometry, render, sample_offsets, to_bytes
 from drivesplat.demo.optics.lighting import daylight, lamplight
 from drivesplat.demo.optics.raycast import RayCaster, StreetSnapshot
 from drivesplat.demo.shapes.mesh import Material, SurfaceClass, box
@@ -115,7 +115,7 @@ def test_headlights_shine_ahead_and_not_behind():
     ahead = radiance([wall[20.0]], night, one_pixel(forward, 0.7))
     behind = radiance([wall[-21.0]], night, one_pixel(backward, 0.7))
     distance = 20.0 - 3.6
-    assert ahead[0] - behind[0] == pytest.approx(90.0 / (distance**2 + 1), rel=0.1)
+    assert ahead[0] - behind[0] == pytest.approx(180.0 / (distance**2 + 1), rel=0.1)
 
 
 def test_development_is_a_gamma_of_the_exposed_radiance():
@@ -145,20 +145,20 @@ def test_depth_is_along_the_axis_and_infinite_in_the_sky():
     assert (found.classes == SurfaceClass.SKY).all()
 
 
-def test_one_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
+def test_rays_pass_through_the_given_points_of_the_image():
     camera = camera_of(np.array([[50.0, 0, 2], [0, 50.0, 1], [0, 0, 1]]), np.eye(4), 5, 3)
+    x, y = np.random.default_rng(0).uniform(-0.5, 4.5, (2, 40))
+    rays = camera.rays(x, y, np.zeros(40, np.int64)).directions
+    np.testing.assert_allclose(rays[:, :2] / rays[:, 2:] * 50.0 + [2, 1], np.stack([x, y], axis=-1), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0)
 
-    def pixels(samples: int) -> np.ndarray:
-        rays = camera.rays(slice(0, 3), samples).directions
-        return (rays[:, :2] / rays[:, 2:] * 50.0 + [2, 1]).reshape(3, 5, samples, 2)
 
-    x, y = np.meshgrid(np.arange(5), np.arange(3))
-    np.testing.assert_allclose(pixels(1)[:, :, 0], np.stack([x, y], axis=-1), atol=1e-9)
-    within = pixels(16) - np.stack([x, y], axis=-1)[:, :, None]
+def test_the_first_sample_is_a_pixels_centre_and_many_spread_evenly_over_it():
+    within = sample_offsets(16)
+    np.testing.assert_array_equal(within[0], 0.0)
     assert np.abs(within).max() <= 0.5
-    np.testing.assert_allclose(within.mean(axis=2), 0.0, atol=0.1)
-    quarters = (within[0, 0] > 0) @ [1, 2]
-    assert np.bincount(quarters, minlength=4).min() >= 2
+    np.testing.assert_allclose(within.mean(axis=0), 0.0, atol=0.1)
+    assert np.bincount((within > 0) @ [1, 2], minlength=4).min() >= 2
 
 
 def test_more_samples_smooth_edges_and_keep_the_mean():

@@ -6,7 +6,6 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
-from drivesplat.settings.holdout import HoldoutSettings
 from helpers.demo_worlds import CAMERAS, LIDAR, edit_of, job_of, recorder_of, world_of
 from PIL import Image
 
@@ -21,6 +20,7 @@ from drivesplat.scene.masks import mask_name
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
 
 KEY_FRAMES = 8

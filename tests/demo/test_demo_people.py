@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from drivesplat.settings.holdout import HoldoutSettings
 from helpers.demo_worlds import FRONT, annotated, names_of, recorder_of
 
 from drivesplat.demo.recorder import Recorder
 from drivesplat.scene.regions import MIN_PIXELS, fill, hulls_in, label_image, region_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import held_out_key_frames
+from drivesplat.settings.images import HoldoutSettings
 
 WIDTH = 400
 """The width of the default world."""

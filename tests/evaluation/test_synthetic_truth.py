@@ -342,7 +342,7 @@ def with_depths(known: DriveTruth, folder: Path, change: Callable[[np.ndarray], 
     for number, view in enumerate(known.truth.lateral("CAM_FRONT")):
         frames = []
         for frame, values in zip(view.frames, depths_of(known, view.left_m), strict=True):
-            path = folder / f"{number}_{frame.sample_index}.png"
+            path = folder / f"{number}_{frame.key_frame}.png"
             write_array(path, change(values))
             frames.append(dataclasses.replace(frame, depth=str(path)))
         views.append(dataclasses.replace(view, frames=tuple(frames)))

@@ -114,7 +114,7 @@ def test_the_record_describes_scene_and_seed(tiny_scene, seed):
     record = training_record(scene, seed, job())
     assert dataclasses.asdict(record.scene) == {
         "name": "0001", "dataset": "tiny", "version": "v1.0-mini", "poses": "refined", "key_frame_range": [0, 10],
-        "missing_images": 2,
+        "missing_images": 2, "key_frame_hz": 2.0,
     }  # fmt: skip
     assert dataclasses.asdict(record.seed) == {
         "lidar": 40, "triangulated": 0, "points_file": 0, "far": 10, "lidar_missing": 3, "extra_points": None,

@@ -76,12 +76,17 @@ def render(snapshot: StreetSnapshot, light: Light, camera: DemoCamera, samples: 
     rows, columns = np.nonzero(edges)
     for block in _blocks(len(rows) if samples > 1 else 0, samples - 1):
         y, x = (np.repeat(at[block], samples - 1) for at in (rows, columns))
-        offsets = np.tile((0.5 + R2_STEPS * np.arange(1, samples)[:, None]) % 1.0 - 0.5, (len(rows[block]), 1))
+        offsets = np.tile(sample_offsets(samples)[1:], (len(rows[block]), 1))
         rays = camera.rays(x + offsets[:, 0], y + offsets[:, 1], y)
         found, _ = _radiance(snapshot, light, camera, rays, snapshot.cast(rays))
         total = found.reshape(-1, samples - 1, 3).sum(axis=1) + radiance[rows[block], columns[block]]
         radiance[rows[block], columns[block]] = total / samples
     return replace(picture, radiance=radiance * camera.gains)
+
+
+def sample_offsets(samples: int) -> np.ndarray:
+    """Offsets (samples, 2) in pixels from a pixel's centre, which is the first; the others spread evenly over it."""
+    return (0.5 + R2_STEPS * np.arange(samples)[:, None]) % 1.0 - 0.5
 
 
 def geometry(snapshot: StreetSnapshot, camera: DemoCamera) -> Picture:
