@@ -15,6 +15,7 @@ Gain = Annotated[float, Field(gt=0, le=8)]
 
 
 Channel = CameraChannel | Literal["LIDAR_TOP"]
+WalkwayPlace = Literal["road", "sidewalk"]
 Offset = Annotated[float, Field(ge=-6, le=6)]
 
 
@@ -76,6 +77,8 @@ class WorldSettings(Settings):
     """
     pedestrians: int = Field(10, ge=0, le=24)
     """Number of walking pedestrians, who come into view of the front camera one after the other."""
+    walkways: tuple[WalkwayPlace, ...] = Field(("road", "sidewalk"), min_length=1)
+    """Where pedestrians walk: on the road beside parked vehicles, on the sidewalk."""
     bystanders: int = Field(0, ge=0, le=12)
     """Number of people who stand and turn."""
     cyclists: int = Field(0, ge=0, le=4)

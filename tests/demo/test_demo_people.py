@@ -84,3 +84,13 @@ def test_hulls_fit_people_and_riders(riders, of_riders, kind):
     ious = [iou for *_, iou in found]
     print(f"{kind}: {len(found)} in view, median {np.median(ious):.3f}, least {min(ious):.3f}")
     assert len(found) >= 3 and np.median(ious) > 0.5
+
+
+@pytest.mark.parametrize(("walkways", "low", "high"), [(["sidewalk"], 6.65, 10.0), (["road"], 2.7, 6.4)])
+def test_pedestrians_walk_where_they_are_asked_to(walkways, low, high):
+    recorder = Recorder(WorldSettings(pedestrians=9, walkways=walkways))
+    walkers = [item for item in recorder.objects if item.name.startswith("pedestrian")]
+    assert len(walkers) == 9
+    for item in walkers:
+        aside = np.abs(item.poses(np.linspace(0.0, 9.5, 20))[:, 1, 3])
+        assert (aside > low).all() and (aside < high).all(), item.name

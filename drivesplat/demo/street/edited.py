@@ -45,7 +45,7 @@ def edited(street: Street, scene: str, edit: Edit, name: str, seconds: float, fi
     """
     by_id = {instance_token(scene, item.name): item for item in street.objects if item.category}
     editable = {id: item for id, item in by_id.items() if isinstance(item.body, RigidBody) and _is_vehicle(item)}
-    times = np.arange(-MARGIN, seconds + MARGIN, 1.0 / MOTION_HZ)
+    times = np.linspace(-MARGIN, seconds + MARGIN, round((seconds + 2 * MARGIN) * MOTION_HZ) + 1)
     actors = [_recorded(id, item, times, film_start) for id, item in editable.items()]
     ego = street.ego.poses(np.arange(0.0, seconds, 0.1) + film_start)
     where, others = f"scene {scene}, edit {name!r}", by_id.keys() - editable.keys()

@@ -14,7 +14,7 @@ from drivesplat.demo.street.paths import StreetPath
 from drivesplat.demo.street.road import Road
 from drivesplat.scene.splits import held_out_key_frames
 from drivesplat.settings.images import HoldoutSettings
-from drivesplat.settings.world import WorldSettings
+from drivesplat.settings.world import WalkwayPlace, WorldSettings
 
 CYCLING_SPEED = 4.2
 BYSTANDER_AHEAD, CYCLIST_AHEAD = 15.0, 9.0
@@ -27,20 +27,24 @@ AT_ONCE_S, ABREAST = 0.45, 1.5
 
 @dataclass(frozen=True)
 class Walkway:
-    """Where pedestrians walk: `t` metres to the left of the centre line, at `speed` m/s along the road; one is placed
-    `ahead` metres of the ego vehicle, just within the front camera's field of view. All in one walkway have the same
-    speed, so that they keep their distances."""
+    """Where pedestrians walk: on the road beside parked vehicles or on the sidewalk (`place`), `t` metres to the left of
+    the centre line, at `speed` m/s along the road.
 
+    One is placed `ahead` metres of the ego vehicle, just within the front camera's field of view. All in one walkway
+    have the same speed, so that they keep their distances.
+    """
+
+    place: WalkwayPlace
     t: float
     speed: float
     ahead: float
 
 
 WALKWAYS = (
-    Walkway(-ROADSIDE, -1.25, 8.0),
-    Walkway(-SIDEWALK_PATH, 1.45, 12.0),
-    Walkway(ROADSIDE, 1.3, 12.0),
-    Walkway(SIDEWALK_PATH, -1.4, 18.0),
+    Walkway("road", -ROADSIDE, -1.25, 8.0),
+    Walkway("sidewalk", -SIDEWALK_PATH, 1.45, 12.0),
+    Walkway("road", ROADSIDE, 1.3, 12.0),
+    Walkway("sidewalk", SIDEWALK_PATH, -1.4, 18.0),
 )
 
 
@@ -86,10 +90,11 @@ def _walkers(world: WorldSettings, road: Road, ego: StreetPath, random: np.rando
     """Pedestrians, each in the first walkway where the others keep their distance."""
     distance = ABREAST if not world.dogs else 2 * ABREAST
     found: list[StreetObject] = []
-    taken: dict[Walkway, list[float]] = {walkway: [] for walkway in WALKWAYS}
+    walkways = [walkway for walkway in WALKWAYS if walkway.place in world.walkways]
+    taken: dict[Walkway, list[float]] = {walkway: [] for walkway in walkways}
     for index, met in enumerate(encounters(world, world.pedestrians)):
-        places = (divmod(number, len(WALKWAYS)) for number in count(met.before))
-        starts = ((WALKWAYS[number], _start(met, WALKWAYS[number], row, ego)) for row, number in places)
+        places = (divmod(number, len(walkways)) for number in count(met.before))
+        starts = ((walkways[number], _start(met, walkways[number], row, ego)) for row, number in places)
         walkway, start = next((w, s) for w, s in starts if all(abs(s - other) >= distance for other in taken[w]))
         taken[walkway].append(start)
         path = StreetPath(start, walkway.t, walkway.speed, road=road)
