@@ -88,7 +88,7 @@ def test_hulls_fit_people_and_riders(riders, of_riders, kind):
 
 @pytest.mark.parametrize(("walkways", "low", "high"), [(["sidewalk"], 6.65, 10.0), (["road"], 2.7, 6.4)])
 def test_pedestrians_walk_where_they_are_asked_to(walkways, low, high):
-    recorder = Recorder(WorldSettings(pedestrians=9, walkways=walkways))
+    recorder = recorder_of(pedestrians=9, walkways=walkways)
     walkers = [item for item in recorder.objects if item.name.startswith("pedestrian")]
     assert len(walkers) == 9
     for item in walkers:

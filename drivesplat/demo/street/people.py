@@ -27,8 +27,8 @@ AT_ONCE_S, ABREAST = 0.45, 1.5
 
 @dataclass(frozen=True)
 class Walkway:
-    """Where pedestrians walk: on the road beside parked vehicles or on the sidewalk (`place`), `t` metres to the left of
-    the centre line, at `speed` m/s along the road.
+    """Where pedestrians walk: on the road beside parked vehicles or on the sidewalk (`place`), `t` metres to the left
+    of the centre line, at `speed` m/s along the road.
 
     One is placed `ahead` metres of the ego vehicle, just within the front camera's field of view. All in one walkway
     have the same speed, so that they keep their distances.
