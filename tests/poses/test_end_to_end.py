@@ -76,7 +76,8 @@ def test_images_of_a_street_reduce_the_errors_of_noisy_poses(noisy, tmp_path):
     assert trial["after_px"] < 0.75 * trial["before_px"]
     points = refined.points.points
     assert len(points) > 50 and set(refined.points.seen_by) == set(range(KEY_FRAMES))
-    assert np.median(np.abs(points[:, 2])) < 10.0, "points are of the street, not of the sky"
+    on_street = (points[:, 2] > -2.0) & (points[:, 2] < 23.0)  # the tallest buildings end there
+    assert on_street.mean() > 0.9, "points are of the street, not of the sky"
 
 
 @pytest.mark.parametrize("pose_noise", [False, True])
