@@ -145,8 +145,8 @@ class Recorder:
         return returns(found, self.pattern, poses, at_timestamp)
 
     def _firings(self, sensor: DemoSensor, time_us: int, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
-        """Time (steps,) and pose, sensor to street (steps, 4, 4), of each azimuth step of a revolution."""
-        times = time_us * 1e-6 + self.pattern.offsets
+        """Time (m,) and pose, sensor to street (m, 4, 4), of each moment of a revolution."""
+        times = time_us * 1e-6 + self.pattern.moments[0]
         return times, self.ego_to_street(times, view) @ sensor.sensor_to_ego
 
     def visible_fractions(self, index: int) -> np.ndarray:
@@ -161,20 +161,21 @@ class Recorder:
 
     def _count_points(self, camera: DemoCamera, seconds: float, visible: np.ndarray, inside: np.ndarray) -> None:
         """Adds the number of surface points of each object that lie inside the image, and of those that are visible."""
-        time = np.array([seconds])
-        snapshot = self.snapshot(time)
-        center = camera.pose[:3, 3]
-        for number, item in enumerate(self.objects):
-            if item.category is None:
-                continue
-            points = surface_points(item, time)
-            pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
-            limit = np.array([camera.width, camera.height]) - 0.5
-            toward = points[(depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)] - center
-            toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-            rays = Rays(time, center[None], toward, np.zeros(len(toward), np.int32))
-            visible[number] += (snapshot.cast(rays).object == number).sum() if len(toward) else 0
-            inside[number] += len(toward)
+        time, center = np.array([seconds]), camera.pose[:3, 3]
+        numbers = [number for number, item in enumerate(self.objects) if item.category]
+        if not numbers:
+            return
+        points = np.concatenate([surface_points(self.objects[number], time) for number in numbers])
+        owner = np.repeat(numbers, SURFACE_POINTS)
+        pixels, depth = project(points, inverse(camera.pose), camera.intrinsics)
+        limit = np.array([camera.width, camera.height]) - 0.5
+        chosen = (depth > 0.1) & ((pixels > -0.5) & (pixels < limit)).all(axis=1)
+        toward, owner = points[chosen] - center, owner[chosen]
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        rays = Rays(time, center[None], toward, np.zeros(len(toward), np.int32))
+        found = self.snapshot(time).cast(rays).object
+        visible += np.bincount(owner[found == owner], minlength=len(visible))
+        inside += np.bincount(owner, minlength=len(inside))
 
     def ego_to_global(self, seconds: float) -> np.ndarray:
         """The ego pose (4, 4) in the tables. `world.pose_noise` gives it the errors of nuScenes: z = 0, and smooth

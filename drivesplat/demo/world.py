@@ -60,8 +60,9 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
     """
     recorder = Recorder(job.world, job.scene, job.edits)
     context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(1, context) as pool:  # this process must not use Embree: a fork does not survive it
-        pool.submit(_check_places, job).result()
+    if any(step.place for edit in job.edits.values() for step in edit.steps):
+        with ProcessPoolExecutor(1, context) as pool:
+            pool.submit(_check_places, job).result()
     prepare_folder(root, provenance)
     source = sha256_text(canonical_json(provenance["stages"]))
     tables = NuScenesTables(job.scene, _description(job.world), source, START_US, job.world)
@@ -71,7 +72,7 @@ def make_world(root: Path, job: WorldJob, provenance: Provenance, workers: int =
     views, scans = planned_views(recorder), planned_scans(recorder)
     images = sum(file.sensor.is_camera for file in files)
     require_space(root, world_bytes(job.world, images, len(files) - images, len(views), len(scans)))
-    with ProcessPoolExecutor(workers, context, _start_worker, (job, root)) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (recorder, root)) as pool:
         counts = pool.map(_write_file, files)
         visible = pool.map(_visible_fractions, range(job.world.key_frames))
         frames = [pool.map(_write_frame, repeat(plan), key_frames_of(recorder, plan)) for plan in views]
@@ -133,9 +134,9 @@ def _check_places(job: WorldJob) -> None:
     require_free_places(Recorder(job.world, job.scene, job.edits))
 
 
-def _start_worker(job: WorldJob, root: Path) -> None:
+def _start_worker(recorder: Recorder, root: Path) -> None:
     global _worker
-    _worker = Recorder(job.world, job.scene, job.edits), root
+    _worker = recorder, root
 
 
 def _write_file(file: SensorFile) -> np.ndarray | None:

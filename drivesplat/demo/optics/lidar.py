@@ -1,6 +1,7 @@
 """A spinning LiDAR: the time of each ray, reflectivity, dropped rays, mixed returns at edges."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import no_type_check
 
 import numpy as np
@@ -34,6 +35,12 @@ class ScanPattern:
     elevations: np.ndarray
     azimuths: np.ndarray
     offsets: np.ndarray
+
+    @cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """The distinct offsets (m,), and for each step the index (steps,) of its own."""
+        offsets, index = np.unique(self.offsets, return_inverse=True)
+        return offsets, index.ravel().astype(np.int32)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -74,7 +81,7 @@ def scan(
     snapshot: StreetSnapshot, pattern: ScanPattern, sensor_to_street: np.ndarray, seconds: np.ndarray,
     lidar: WorldLidarSettings, wet: float, random: np.random.Generator,
 ) -> Scan:  # fmt: skip
-    """One revolution. `sensor_to_street` (steps, 4, 4) and `seconds` (steps,) at the time of each azimuth."""
+    """One revolution. `seconds` (m,) are the times of the pattern's moments, `sensor_to_street` (m, 4, 4) the poses."""
     found = [_cast(snapshot, pattern, sensor_to_street, seconds, wet, *offset) for offset in _beam_offsets(lidar)]
     distance, power, objects = (np.stack(values) for values in zip(*found, strict=True))
     true_range, intensity, hit, echo = _strongest_echo(distance, power, objects)
@@ -91,7 +98,7 @@ def returns(scan: Scan, pattern: ScanPattern, sensor_to_street: np.ndarray, at_t
     objects is not."""
     ring, step = np.nonzero(scan.returned)
     local = scan.measured[ring, step, None] * pattern.directions()[ring, step]
-    to_timestamp = np.linalg.inv(at_timestamp) @ sensor_to_street
+    to_timestamp = (np.linalg.inv(at_timestamp) @ sensor_to_street)[pattern.moments[1]]
     points = np.einsum("nij,nj->ni", to_timestamp[step, :3, :3], local) + to_timestamp[step, :3, 3]
     intensity = (255.0 * scan.intensity[ring, step]).round()
     return np.column_stack([points, intensity, ring]).astype(np.float32)
@@ -109,8 +116,9 @@ def _cast(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Distance in metres, reflected fraction and object of the rays: (beams, steps) each."""
     local = pattern.directions(up, aside)
-    directions = np.einsum("sij,bsj->bsi", sensor_to_street[:, :3, :3], local).reshape(-1, 3)
-    moment = np.tile(np.arange(len(seconds), dtype=np.int32), len(pattern.elevations))
+    of_step = pattern.moments[1]
+    directions = np.einsum("sij,bsj->bsi", sensor_to_street[of_step, :3, :3], local).reshape(-1, 3)
+    moment = np.tile(of_step, len(pattern.elevations))
     rays = Rays(seconds, sensor_to_street[:, :3, 3], directions, moment)
     hits = snapshot.cast(rays)
     power = _reflected(snapshot, rays, hits, wet)
