@@ -106,7 +106,7 @@ def not_ego(item: StreetObject, left: float) -> bool:
     return not left or item.name not in EGO_PARTS
 
 
-@pytest.mark.parametrize("left", [0.0, 2.0])
+@pytest.mark.parametrize("left", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_some_ranges_are_those_of_every_triangle_tried_in_double_precision(recorder, left):
     found = recorder.scan(LIDAR, TIME_US, Viewpoint(left=left))
     numbers = [n for n, item in enumerate(recorder.objects) if item.moves and (found.object == n).any()]

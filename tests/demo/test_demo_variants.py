@@ -38,6 +38,7 @@ def still_street(tmp_path_factory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_the_same_settings_give_the_same_bytes_with_one_worker_and_with_two(tmp_path):
     light = {"night": True, "wet": True, "class_maps": True, "truth": {"lidar": True}}
     counts = {"vehicles": 1, "parked": 2, "pedestrians": 1, "cyclists": 1, "bystanders": 1, "dogs": 1}

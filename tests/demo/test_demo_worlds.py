@@ -74,6 +74,7 @@ def test_its_street_is_the_one_of_the_stored_digest(name, recorder):
     )
 
 
+@pytest.mark.slow
 def test_a_digest_depends_on_every_object_and_edit():
     from helpers.demo_worlds import edit_of, recorder_of
 

@@ -6,6 +6,7 @@ Meshes are in the frame of their object: metres, x forward, y left, z up, the gr
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cache
 
 import numpy as np
 import trimesh
@@ -122,7 +123,22 @@ def uniform(
 
 def box(low: Numbers, high: Numbers, material: Material, color: Color) -> ColoredMesh:
     """The axis-aligned box between two corners."""
-    return uniform(trimesh.creation.box(bounds=[low, high]), material, color)
+    unit = _unit_box()
+    start, extent = np.array(low, dtype=np.float64), np.subtract(high, low)
+    vertices, count = start + unit.vertices * extent, len(unit.faces)
+    return replace(
+        unit,
+        vertices=vertices,
+        texture=vertices,
+        material=np.full(count, int(material)),
+        color=np.tile(np.array(color, dtype=np.float64), (count, 1)),
+    )
+
+
+@cache
+def _unit_box() -> ColoredMesh:
+    """The box from the origin to (1, 1, 1); thousands of boxes are made of it."""
+    return uniform(trimesh.creation.box(bounds=[(0, 0, 0), (1, 1, 1)]), Material.PLAIN, (0.0, 0.0, 0.0))
 
 
 def cylinder(start: Numbers, end: Numbers, radius: float, material: Material, color: Color) -> ColoredMesh:
