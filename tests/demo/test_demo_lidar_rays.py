@@ -22,7 +22,9 @@ WORLDS = {
 }
 
 
-@pytest.fixture(scope="module", params=WORLDS)
+@pytest.fixture(
+    scope="module", params=["straight", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bend", "at once"))]
+)
 def recorder(request) -> Recorder:
     return recorder_of(**WORLDS[request.param])
 

@@ -20,7 +20,12 @@ WORLDS = {
 }
 
 
-@pytest.fixture(scope="module", params=WORLDS)
+SLOW = ("standing", "bend")
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in WORLDS]
+)
 def recorder(request) -> Recorder:
     return recorder_of(**WORLDS[request.param])
 
