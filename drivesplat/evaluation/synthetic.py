@@ -20,7 +20,15 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.removal import removal_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View, view_of
-from drivesplat.readers.truth import RULE, Truth, TruthFrame, TruthView, truth_image
+from drivesplat.readers.truth import (
+    DEPTH_LIMIT,
+    DEPTH_UNITS_PER_METRE,
+    RULE,
+    Truth,
+    TruthFrame,
+    TruthView,
+    truth_image,
+)  # fmt: skip
 from drivesplat.scene.images import continuous_intrinsics, read_image
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import fill, hull_of, label_image, region_masks
@@ -30,9 +38,6 @@ from drivesplat.scene.tracks import Box, box_at
 
 LATERAL_REGIONS = ("all", "static", "moving_vehicle")
 REMOVAL_REGIONS = ("box", "outside")
-DEPTH_UNITS_PER_METRE = 256.0
-DEPTH_LIMIT = 65535
-"""The largest value of a 16-bit depth image; farther depths are clipped to it."""
 
 
 @dataclass(frozen=True)

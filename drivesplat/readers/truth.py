@@ -17,6 +17,9 @@ SCHEMA = 2
 TRUTH_FILE = "truth/truth.json"
 """Below a dataset's root."""
 RULE = "demo_world"
+DEPTH_UNITS_PER_METRE = 256.0
+DEPTH_LIMIT = 65535
+"""The largest value of a 16-bit depth image; farther depths are clipped to it."""
 
 
 @dataclass(frozen=True)

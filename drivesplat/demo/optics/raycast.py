@@ -86,9 +86,8 @@ class EmbreePiece:
 
 @dataclass(frozen=True)
 class MovingObject:
-    """A moving object: its index, its pieces, and a sphere in its own frame that its pieces never leave."""
+    """A moving object: its pieces, and a sphere in its own frame that its pieces never leave."""
 
-    number: int
     item: StreetObject
     pieces: tuple[EmbreePiece, ...]
     center: np.ndarray
@@ -113,7 +112,7 @@ class RayCaster:
             if item.moves:
                 pieces = zip(item.body.pieces, firsts, strict=True)
                 scenes = tuple(EmbreePiece([mesh], [number], [first]) for mesh, first in pieces)
-                self._moving.append(MovingObject(number, item, scenes, *_bounding_sphere(item)))
+                self._moving.append(MovingObject(item, scenes, *_bounding_sphere(item)))
             else:
                 poses = item.piece_poses(np.zeros(1))[0]
                 placed = (mesh.transformed(pose) for mesh, pose in zip(item.body.pieces, poses, strict=True))
@@ -150,7 +149,7 @@ class StreetSnapshot:
             if moving.item.name not in without:
                 poses = moving.item.poses(seconds)
                 centers = poses[:, :3, :3] @ moving.center + poses[:, :3, 3]
-                self._moving.append((moving, centers, moving.item.piece_poses(seconds)))
+                self._moving.append((moving, centers, poses[:, None] @ moving.item.limb_poses(seconds)))
 
     def cast(self, rays: Rays) -> RayHits:
         """The first hit of each ray."""

@@ -12,11 +12,19 @@ from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
 from drivesplat.demo.shapes.mesh import SurfaceClass
 from drivesplat.demo.tokens import token
 from drivesplat.io.storage import atomic_write
-from drivesplat.readers.truth import TRUTH_FILE, Truth, TruthFrame, TruthScan, TruthView, write_truth_file
+from drivesplat.readers.truth import (
+    DEPTH_LIMIT,
+    DEPTH_UNITS_PER_METRE,
+    TRUTH_FILE,
+    Truth,
+    TruthFrame,
+    TruthScan,
+    TruthView,
+    write_truth_file,
+)  # fmt: skip
 from drivesplat.scene.images import write_png
 from drivesplat.scene.rigid import apply, inverse
 
-DEPTH_UNIT = 256.0
 LIDAR = SENSORS[0]
 PATTERN_FILE = "lidar/pattern.npz"
 CLEARANCE = 0.3
@@ -102,8 +110,8 @@ def write_frame(root: Path, recorder: Recorder, plan: TruthPlan, index: int) -> 
 
 
 def _depth(picture: Picture) -> np.ndarray:
-    depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNIT, 0.0)
-    return np.clip(depth + 0.5, 0, 65535).astype(np.uint16)
+    depth = np.where(np.isfinite(picture.depth), picture.depth * DEPTH_UNITS_PER_METRE, 0.0)
+    return np.clip(depth + 0.5, 0, DEPTH_LIMIT).astype(np.uint16)
 
 
 def _instances(recorder: Recorder, view: Viewpoint, picture: Picture) -> np.ndarray:

@@ -41,7 +41,11 @@ class StreetObject:
 
     def piece_poses(self, seconds: np.ndarray) -> np.ndarray:
         """Piece to street (n, pieces, 4, 4)."""
-        return self.poses(seconds)[:, None] @ self.body.poses(self.path.distance(seconds), seconds)
+        return self.poses(seconds)[:, None] @ self.limb_poses(seconds)
+
+    def limb_poses(self, seconds: np.ndarray) -> np.ndarray:
+        """Piece to object (n, pieces, 4, 4)."""
+        return self.body.poses(self.path.distance(seconds), seconds)
 
     def box_poses(self, seconds: np.ndarray) -> np.ndarray:
         """Box centre to street (n, 4, 4)."""
