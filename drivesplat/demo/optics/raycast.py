@@ -41,10 +41,6 @@ class Rays:
         """Origins (n, 3)."""
         return self.origins[self.moment]
 
-    def points(self, distance: np.ndarray) -> np.ndarray:
-        """The points (n, 3) at `distance` (n,) along each ray; those without a hit lie at the origin."""
-        return self.starts() + np.where(np.isfinite(distance), distance, 0.0)[:, None] * self.directions
-
 
 @dataclass(frozen=True)
 class RayHits:
