@@ -5,12 +5,14 @@ from typing import Any
 
 from benchmarks.quality.recipes import RecipeFile
 from benchmarks.quality.results import Result
+from benchmarks.quality.truth import truth_figures
 from drivesplat.evaluation.comparison import PSNRS, Figures, compare_runs, summarize, values_at
 from drivesplat.io.storage import canonical_json
 
 SCHEMA = 1
 FIGURES: Figures = {
     **PSNRS,
+    "moving_human": ("moving_human", "psnr"),
     "ssim": ("all", "ssim"),
     "lpips": ("all", "lpips"),
     "depth_error": ("depth", "median_relative_error"),
@@ -74,6 +76,7 @@ def _row(recipe: str, runs: list[Result], reference: list[dict[str, Any] | None]
         "recipe": recipe,
         "seeds": [run.seed for run in runs if run.evaluation],
         **compare_runs(figures, reference, FIGURES),
+        "truth": truth_figures(figures),
         **{name: summarize(values_at(figures, name)) for name in COSTS},
         "trained_on": {k: value for k, value in evaluations[0]["protocol"].items() if k not in MEASURING_PROTOCOL},
         "train_iterations": evaluations[0]["result"]["train_iterations"],

@@ -6,6 +6,7 @@ from typing import Any
 import yaml
 
 from benchmarks.quality.compare import COSTS, FIGURES, MEASURING_PROTOCOL
+from benchmarks.quality.truth import truth_tables
 from drivesplat.evaluation.comparison import (
     GROUP_PLACES,
     PSNR_COLUMNS,
@@ -23,7 +24,12 @@ LEGEND = (
 )
 OTHER_PROTOCOL = "The protocol differs from that of the first table, so the figures do not compare: {differences}."
 SHARED = "Shared: during training another job ran on the same GPU or processors; without it training takes less time."
-OPTIONAL = {"ssim": ("SSIM", 3), "lpips": ("LPIPS", 3), "depth_error": ("depth error", None)}
+OPTIONAL = {
+    "moving_human": ("moving people", 1),
+    "ssim": ("SSIM", 3),
+    "lpips": ("LPIPS", 3),
+    "depth_error": ("depth error", None),
+}
 """Columns for figures that at least one row has: their headings, and decimals (None: percent)."""
 
 
@@ -44,7 +50,8 @@ def markdown(record: dict[str, Any]) -> str:
 
 
 def _page(table: dict[str, Any], record: dict[str, Any], first: bool) -> list[str]:
-    """A table's protocol, a table of figures for each group of held-out frames, and one of costs."""
+    """A table's protocol, a table of figures for each group of held-out frames, tables against the truth of a synthetic
+    world, and one of costs."""
     rows, parts = table["rows"], []
     if not first:
         reference = record["tables"][0]["protocol"]
@@ -56,6 +63,7 @@ def _page(table: dict[str, Any], record: dict[str, Any], first: bool) -> list[st
     parts += [_protocol(table, record), LEGEND.format(reference=f"`{table['reference']}`")]
     failed = _failed(record) if first else []
     parts += [_figures(rows, group, failed) for group in measured_groups(rows, FIGURES)]
+    parts += truth_tables(rows)
     parts += ["Training data and costs:", _costs(rows)]
     return [*parts, SHARED] if any(row["shared"] for row in rows) else parts
 

@@ -117,6 +117,45 @@ def test_depth_error_and_lpips_have_columns_only_if_measured(compared):
     assert beyond[0][-1] == "gap"
 
 
+def test_moving_people_have_a_column_only_if_measured(compared):
+    evals = json.loads(json.dumps(EVALS))
+    for content, psnr in zip(evals["plain"], (15.0, 16.0), strict=True):
+        content["result"]["interpolation"]["moving_human"] = {"psnr": psnr}
+    between, beyond, _ = rows(markdown(compared(evals, TWO)))
+    assert between[0][-2:] == ["moving people", "SSIM"]
+    assert [line[-2] for line in between[2:]] == ["15.5", "-"]
+    assert "moving people" not in beyond[0]
+
+
+def test_figures_against_the_truth_have_tables_of_their_own(compared):
+    evals = json.loads(json.dumps(EVALS))
+    for seed, content in enumerate(evals["street"]):
+        content["result"] |= {
+            "lateral": {
+                "4.0": {"static": {"psnr": 20.0 + seed}, "moving_vehicle": None, "depth": None},
+                "-2.0": {
+                    "static": {"psnr": 22.0 + seed},
+                    "moving_vehicle": {"psnr": 18.0},
+                    "depth": {"median_relative_error": 0.01 + 0.02 * seed},
+                },
+            },
+            "removal": {"box": {"psnr": 17.0 + seed}, "not_removed": {"box": {"psnr": 12.0}}},
+        }
+    record = compared(evals, TWO)
+    plain, street = (row["truth"] for row in record["tables"][0]["rows"])
+    assert plain == {"lateral": {}, "removal": {"removed": None, "not_removed": None}}
+    assert street["lateral"]["-2.0"]["static"]["by_seed"] == [22.0, 23.0]
+    page = markdown(record)
+    *_, lateral, removal, _ = rows(page)
+    assert lateral[0] == ["recipe", "view", "static", "moving vehicles", "depth error"]
+    assert lateral[2:] == [
+        ["`street`", "2 m to the right", "22.5 (22.0 to 23.0)", "18.0 (18.0 to 18.0)", "2.0%"],
+        ["`street`", "4 m to the left", "20.5 (20.0 to 21.0)", "-", "-"],
+    ]
+    assert removal[2:] == [["`street`", "17.5 (17.0 to 18.0)", "12.0 (12.0 to 12.0)"]]
+    assert "beside the recorded path" in page and "beside the recorded path" not in markdown(compared(EVALS, TWO))
+
+
 OTHERWISE = {
     "width": {"width": 320},
     "holdout": {"holdout": {"every_nth": 4, "offset": 4, "last_block": 4}, "held_out_frames": {"interpolation": [4, 8],
