@@ -8,7 +8,6 @@ from drivesplat.demo.optics.raycast import NO_HIT, Rays
 from drivesplat.demo.recorder import Recorder, Viewpoint
 from drivesplat.demo.street.objects import StreetObject
 from drivesplat.errors import ConfigError
-from drivesplat.scene.rigid import apply
 
 CHECK_S = 0.1
 """Interval of the checks in seconds."""
@@ -38,19 +37,18 @@ def first_contact(recorder: Recorder, edit: str, name: str) -> tuple[float, str]
     if placed is None:  # a later step has removed it
         return None
     starts, ends = _lines_through(placed)
-    for seconds in np.arange(0.0, recorder.world.seconds, CHECK_S):
-        time = np.array([seconds])
-        pose = placed.poses(time)[0]
-        origins, toward = apply(pose, starts), (ends - starts) @ pose[:3, :3].T
-        length = np.linalg.norm(toward, axis=1)
-        rays = Rays(
-            np.full(len(starts), seconds), origins, toward / length[:, None], np.arange(len(starts), dtype=np.int32)
-        )
-        hits = recorder.snapshot(rays.seconds, Viewpoint(edit=edit, without=name)).cast(rays)
-        inside = (hits.object != NO_HIT) & (hits.distance < length)
-        if inside.any():
-            return float(seconds), objects[int(hits.object[np.flatnonzero(inside)[0]])].name
-    return None
+    times = np.arange(0.0, recorder.world.seconds, CHECK_S)
+    poses = np.repeat(placed.poses(times), len(starts), axis=0)
+    start, toward = np.tile(starts, (len(times), 1)), np.tile(ends - starts, (len(times), 1))
+    length = np.linalg.norm(toward, axis=1)
+    origins = np.einsum("nij,nj->ni", poses[:, :3, :3], start) + poses[:, :3, 3]
+    directions = np.einsum("nij,nj->ni", poses[:, :3, :3], toward / length[:, None])
+    rays = Rays(np.repeat(times, len(starts)), origins, directions, np.arange(len(poses), dtype=np.int32))
+    hits = recorder.snapshot(rays.seconds, Viewpoint(edit=edit, without=name)).cast(rays)
+    inside = np.flatnonzero((hits.object != NO_HIT) & (hits.distance < length))
+    if len(inside) == 0:
+        return None
+    return float(rays.seconds[inside[0]]), objects[int(hits.object[inside[0]])].name
 
 
 def _lines_through(item: StreetObject) -> tuple[np.ndarray, np.ndarray]:

@@ -4,8 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.demo_worlds import SMALL, named, pose_at, recorder_of
+from helpers.demo_worlds import SENSOR_SETTINGS, SMALL, named, pose_at, recorder_of, world_of
 from helpers.ground_rectangles import EGO_CENTER, EGO_SIZE, gaps, meetings, rectangles
+from helpers.world_digests import digest
 
 from drivesplat.demo.recorder import Recorder
 from drivesplat.settings.world import WorldSettings
@@ -60,6 +61,16 @@ def test_a_queue_takes_the_place_of_free_traffic():
     assert 3.0 < gap < 7.0, "at close range"
 
 
+def test_settings_of_sensors_and_light_leave_the_street_as_it_is():
+    """`recorder_of` shares a street among worlds that differ in them."""
+    other = {"night": True, "wet": True, "width": 64, "samples_per_pixel": 4, "cameras": ("CAM_BACK",),
+             "sweeps": ("LIDAR_TOP",), "image_hz": 20, "lidar_hz": 10, "readout_s": 0.02, "pose_noise": True,
+             "exposures": {"CAM_BACK": (1.1, 1.0, 0.9)}, "class_maps": True, "truth": {"lidar": True}}  # fmt: skip
+    assert set(other) == SENSOR_SETTINGS
+    worlds = world_of(key_frames=4), world_of(key_frames=4, lidar={"beams": 64, "spins": True}, **other)
+    assert len({digest(Recorder(world)) for world in worlds}) == 1
+
+
 def moved(rectangle: np.ndarray, x: float, y: float) -> np.ndarray:
     return rectangle + np.array([[[x, y], [0.0, 0.0], [0.0, 0.0]]])
 
@@ -87,10 +98,14 @@ def test_people_and_animals_avoid_lamps_bins_and_trees(recorder):
     seconds = np.arange(0.0, recorder.world.seconds, 0.2)
     walkers = [item for item in recorder.objects if (item.category or "").startswith(("human", "animal"))]
     for walker in walkers:
-        for time, (center, ahead, left) in zip(seconds, rectangles(walker, seconds), strict=True):
-            offset = points[np.abs(points - center).max(axis=1) < 2.0] - center
-            inside = (np.abs(offset @ ahead) < ahead @ ahead) & (np.abs(offset @ left) < left @ left)
-            assert not inside.any(), (walker.name, time)
+        found = rectangles(walker, seconds)
+        near = points[((points > found[:, 0].min(axis=0) - 2.0) & (points < found[:, 0].max(axis=0) + 2.0)).all(axis=1)]
+        offset = near - found[:, :1]
+        inside = [
+            np.abs((offset * half[:, None]).sum(axis=2)) < (half**2).sum(axis=1)[:, None]
+            for half in (found[:, 1], found[:, 2])
+        ]
+        assert not (inside[0] & inside[1]).any(), walker.name
 
 
 @pytest.mark.parametrize("ego", ["drives", "stands"])

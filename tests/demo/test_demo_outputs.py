@@ -23,7 +23,7 @@ from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
 
-KEY_FRAMES = 8
+KEY_FRAMES = 7
 AHEAD = recorder_of().instance("vehicle 0")
 JOB = job_of(
     world_of(

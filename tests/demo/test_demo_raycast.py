@@ -3,7 +3,7 @@
 import multiprocessing
 
 import numpy as np
-from helpers.demo_worlds import FRONT, names_of, recorder_of
+from helpers.demo_worlds import FRONT, names_of, world_of
 
 from drivesplat.demo.optics.raycast import RayCaster, Rays
 from drivesplat.demo.recorder import Recorder
@@ -46,12 +46,12 @@ def shown(recorder: Recorder) -> bytes:
 
 
 def _in_child(results) -> None:
-    results.put(shown(recorder_of(cyclists=1)))
+    results.put(shown(Recorder(world_of(cyclists=1))))
 
 
 def test_a_forked_process_casts_rays_of_its_own():
     """The parent has cast rays before it forks, as for the check of placed vehicles."""
-    recorder = recorder_of(cyclists=1)
+    recorder = Recorder(world_of(cyclists=1))
     assert "cyclist 0" in names_of(recorder)
     here = shown(recorder)
     context = multiprocessing.get_context("fork")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers.demo_worlds import named, recorder_of
+from helpers.demo_worlds import named, recorder_of, world_of
 
 from drivesplat.demo.street.objects import EGO_PARTS
 from drivesplat.demo.street.road import STRAIGHT, Road
@@ -23,7 +23,7 @@ def bend_and_grade(request) -> tuple[float, float]:
 @pytest.fixture
 def road(bend_and_grade) -> Road:
     bend, grade = bend_and_grade
-    return road_of(recorder_of(bend_deg=bend, grade=grade).world)
+    return road_of(world_of(bend_deg=bend, grade=grade))
 
 
 def test_metres_along_the_road_are_metres_on_the_map(road):
@@ -83,7 +83,7 @@ def test_poses_tilt_with_the_slope_and_face_along_the_road(road):
 
 
 def test_a_straight_level_road_is_the_street_itself():
-    assert road_of(recorder_of().world) is STRAIGHT and STRAIGHT.is_straight
+    assert road_of(world_of()) is STRAIGHT and STRAIGHT.is_straight
     places = np.random.default_rng(0).uniform(-50, 150, (20, 3))
     np.testing.assert_array_equal(STRAIGHT.points(places), places)
     poses = STRAIGHT.poses(places[:, 0], places[:, 1], np.zeros(20))

@@ -1,5 +1,6 @@
 """Small synthetic worlds, and what stands in them."""
 
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from drivesplat.demo.optics.rig import SENSORS, key_frame_time
 from drivesplat.demo.output.tables import visibility_level
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.street.objects import StreetObject
+from drivesplat.io.storage import canonical_json
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.world import WorldJob, WorldSettings
@@ -16,6 +18,14 @@ from helpers.classed import classed
 RIG = {sensor.channel: sensor for sensor in SENSORS}
 FRONT, LIDAR = RIG["CAM_FRONT"], RIG["LIDAR_TOP"]
 CAMERAS = tuple(channel for channel in RIG if channel != LIDAR.channel)
+SENSOR_SETTINGS = frozenset({
+    "width", "samples_per_pixel", "cameras", "sweeps", "image_hz", "lidar_hz", "readout_s", "pose_noise", "exposures",
+    "night", "wet", "class_maps", "truth",
+})  # fmt: skip
+"""Settings that do not change the street; of `lidar`, all but `ego_returns`."""
+STREETS_KEPT = 12
+_recorders: dict[str, Recorder] = {}
+"""A recorder of each street, by the settings of the street."""
 SMALL: dict[str, Any] = {"width": 96, "samples_per_pixel": 1, "cameras": ("CAM_FRONT",)}
 
 
@@ -33,8 +43,19 @@ def edit_of(*steps: dict) -> Edit:
 
 
 def recorder_of(edits: dict[str, Edit] | None = None, **settings: Any) -> Recorder:
-    """The recorder of `world_of(**settings)`."""
-    return Recorder(world_of(**settings), edits=edits)
+    """The recorder of `world_of(**settings)`. Recorders of equal streets share the street and its ray caster."""
+    world = world_of(**settings)
+    key = canonical_json([world.model_dump(exclude={*SENSOR_SETTINGS, "lidar"}), world.lidar.ego_returns])
+    if key not in _recorders:
+        if len(_recorders) >= STREETS_KEPT:
+            del _recorders[next(iter(_recorders))]
+        _recorders[key] = Recorder(world)
+    recorder = copy(_recorders[key])
+    recorder.world, recorder.edits = world, dict(edits or {})
+    if edits:
+        recorder._variations, recorder._casters = {None: recorder.variation()}, {None: recorder._caster(None)}
+    vars(recorder).pop("pattern", None)
+    return recorder
 
 
 def names_of(recorder: Recorder, edit: str | None = None) -> list[str]:

@@ -128,7 +128,10 @@ class RayCaster:
         owners = [number for number, item in enumerate(self.objects) for _ in item.body.pieces]
         owner = np.repeat(owners, [len(mesh.faces) for mesh in meshes])
         rows = [owner, self.material, *(255 * self.color).round().T, *(8 * self.texture_normal).round().T]
-        return np.unique(np.stack(rows, axis=1).astype(np.int32), axis=0, return_inverse=True)[1].ravel()
+        columns = np.stack(rows).astype(np.int64)
+        columns -= columns.min(axis=1, keepdims=True)
+        key = np.ravel_multi_index(tuple(columns), columns.max(axis=1) + 1)
+        return np.unique(key, return_inverse=True)[1]
 
     def at(self, seconds: np.ndarray, without: Collection[str] = ()) -> "StreetSnapshot":
         """The street at the times `seconds` (m,), without the moving objects of these names."""
