@@ -48,7 +48,6 @@ FURNITURE: dict[str, tuple[Callable[[], ColoredMesh], set[SurfaceClass]]] = {
     "bollard": (scenery.bollard, {SurfaceClass.POLE}),
     "shelter": (lambda: scenery.bus_shelter(seeded()), {SurfaceClass.OBJECT, SurfaceClass.SIGN, SurfaceClass.POLE}),
     "advertising column": (lambda: scenery.advertising_column(seeded()), {SurfaceClass.OBJECT}),
-    "utility pole": (scenery.utility_pole, {SurfaceClass.POLE}),
     "door": (lambda: buildings.front_door(RED), {SurfaceClass.BUILDING}),
     "plain building": (lambda: buildings.building((0, 10, 0), (12, 22, 9), GREY), {SurfaceClass.BUILDING}),
     "building": (lambda: buildings.building((0, 10, 0), (16, 22, 12), GREY, seeded()), {SurfaceClass.BUILDING}),

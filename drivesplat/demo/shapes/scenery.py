@@ -175,14 +175,3 @@ def overhead_wire(start: Numbers, end: Numbers, sag: float = 0.4, thickness: flo
         for a, b in pairwise(points)
     ]
     return concatenate(pieces).classified(SurfaceClass.POLE)
-
-
-def utility_pole(height: float = 8.0) -> ColoredMesh:
-    """A wooden pole with a crossbar along y, for overhead wires at y = -0.8 and 0.8, z = `height` - 0.35."""
-    pole = cylinder((0, 0, 0), (0, 0, height), 0.12, Material.PLAIN, WOOD)
-    bar = box((-0.05, -0.95, height - 0.6), (0.05, 0.95, height - 0.48), Material.PLAIN, WOOD)
-    insulators = [
-        cylinder((0, y, height - 0.5), (0, y, height - 0.33), 0.04, Material.PLAIN, (0.4, 0.35, 0.3))
-        for y in (-0.8, 0.8)
-    ]
-    return concatenate([pole, bar, *insulators]).classified(SurfaceClass.POLE)
