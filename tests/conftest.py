@@ -10,12 +10,12 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / "drives
 
 import pytest
 import torch
-from jaxtyping import install_import_hook
+from helpers.checked_types import check_types_of
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # asked for before Triton comes: its own library is kernels, too
 
-install_import_hook("drivesplat", "beartype.beartype")
+check_types_of("drivesplat")
 
 REPOSITORY = Path(__file__).parent.parent
 

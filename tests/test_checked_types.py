@@ -1,0 +1,39 @@
+"""The tests' own check of types and shapes, which nested functions share."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from helpers.checked_types import checked
+from jaxtyping import Float, TypeCheckError, jaxtyped
+
+
+def scaling(factor: float, kind: type) -> Callable:
+    @jaxtyped(typechecker=checked)
+    def scaled(values: Float[np.ndarray, "n"], others: Float[np.ndarray, "n"]) -> kind:
+        return kind(factor * (values + others).sum())
+
+    return scaled
+
+
+def test_nested_functions_are_checked_by_their_own_annotations():
+    for _ in range(2):
+        for factor, kind in ((2.0, float), (3.0, int), (4.0, str)):
+            result = scaling(factor, kind)(np.ones(3), np.ones(3))
+            assert result == kind(6.0 * factor) and type(result) is kind
+            for wrong in (np.ones(2), np.ones((3, 1)), np.arange(3), [1.0, 1.0, 1.0]):
+                with pytest.raises(TypeCheckError):
+                    scaling(factor, kind)(np.ones(3), wrong)
+
+
+def test_a_nested_function_that_returns_another_type_is_refused():
+    def made(value: object) -> Callable:
+        @jaxtyped(typechecker=checked)
+        def result() -> int:
+            return value
+
+        return result
+
+    assert made(3)() == 3
+    with pytest.raises(TypeCheckError):
+        made("3")()
