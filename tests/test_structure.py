@@ -1,10 +1,12 @@
 """The structure of the library: few places at its top, no import circles, bounded chains of imports."""
 
 import ast
+import functools
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 from helpers import REPOSITORY
+from helpers.syntax_trees import source_of, tree_of
 
 LIBRARY = "drivesplat"
 MAX_PLACES, MAX_LOOSE_MODULES = 26, 2
@@ -14,6 +16,7 @@ Graph = dict[str, set[str]]
 """What each module or package imports."""
 
 
+@functools.cache
 def modules() -> dict[str, Path]:
     """The library's modules by dotted name; a package is named without `__init__`."""
     files = (path for path in (REPOSITORY / LIBRARY).rglob("*.py") if "__pycache__" not in path.parts)
@@ -33,10 +36,10 @@ def imported(tree: ast.AST, known: set[str]) -> set[str]:
     return names & known
 
 
+@functools.cache
 def module_graph() -> Graph:
     files = modules()
-    trees = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in files.items()}
-    return {name: imported(tree, set(files)) - {name} for name, tree in trees.items()}
+    return {name: imported(tree_of(path), set(files)) - {name} for name, path in files.items()}
 
 
 def package_graph(graph: Graph) -> Graph:
@@ -93,7 +96,7 @@ def test_only_kernels_choose_between_triton_numba_and_torch():
         module
         for module, others in module_graph().items()
         if top(module) != "kernels"
-        and (any(f"{o}.".startswith(backends) for o in others) or "usable_for" in modules()[module].read_text())
+        and (any(f"{o}.".startswith(backends) for o in others) or "usable_for" in source_of(modules()[module]))
     }
     assert wrong == set()
 
@@ -112,7 +115,7 @@ def test_readers_of_intermediates_return_typed_records():
     untyped = {
         node.name
         for path in modules().values()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(tree_of(path))
         if isinstance(node, ast.FunctionDef) and node.name.startswith("read_") and node.returns
         if "dict[str, Any]" in ast.unparse(node.returns)
     }

@@ -1,0 +1,16 @@
+"""Python files of the project, each read and parsed once for all tests that look at them."""
+
+import ast
+import functools
+from pathlib import Path
+
+
+@functools.cache
+def source_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    """The syntax tree of a file; not to be changed."""
+    return ast.parse(source_of(path))
