@@ -2,10 +2,12 @@
 none near a held-out key frame reaches an input of the training."""
 
 import dataclasses
+import functools
 import json
 import logging
 import pickle
 import shutil
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,7 +30,7 @@ from drivesplat.scene.masks import read_sky_mask
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.actor_seed import ActorSeedJob
-from drivesplat.settings.config import load
+from drivesplat.settings.config import Config, load
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.images import HoldoutSettings, ParserJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
@@ -87,10 +89,23 @@ HOLDOUTS = {
 """The hold-out, the range of key frames that is read, and the key frames of the dataset held out then."""
 
 
-@pytest.fixture(params=HOLDOUTS.values(), ids=HOLDOUTS.keys())
-def case(request, root) -> tuple[Path, dict, tuple[int, int] | None, set[str]]:
-    """A drive, a hold-out, a range, and the held-out and excluded files, determined from the tables alone."""
-    holdout, frames, key_frames = request.param
+@pytest.fixture(scope="module")
+def whole(rich_root, tmp_path_factory) -> Callable[[str], dict[str, bytes]]:
+    """By the name of a hold-out: all inputs of a training on the undamaged drive."""
+
+    @functools.cache
+    def inputs(name: str) -> dict[str, bytes]:
+        holdout, frames, _ = HOLDOUTS[name]
+        return made(scene_at(rich_root, frames=frames, **EVERYTHING), holdout, tmp_path_factory.mktemp("whole"))
+
+    return inputs
+
+
+@pytest.fixture(params=HOLDOUTS)
+def case(request, root, whole) -> tuple[Path, dict, tuple[int, int] | None, set[str], dict[str, bytes]]:
+    """A drive, a hold-out, a range, the held-out and excluded files, determined from the tables alone, and the inputs
+    of a training before any file is damaged."""
+    holdout, frames, key_frames = HOLDOUTS[request.param]
     samples = sorted(table(root, "sample"), key=lambda sample: sample["timestamp"])
     near = set()
     for data in table(root, "sample_data"):
@@ -98,7 +113,7 @@ def case(request, root) -> tuple[Path, dict, tuple[int, int] | None, set[str]]:
             own = data["is_key_frame"] and data["sample_token"] == sample["token"]
             if own or (not data["is_key_frame"] and abs(data["timestamp"] - sample["timestamp"]) < HALF_AN_INTERVAL):
                 near.add(str(root / data["filename"]))
-    return root, holdout, frames, near
+    return root, holdout, frames, near, whole(request.param)
 
 
 def spoil(path: str, random: np.random.Generator) -> None:
@@ -109,25 +124,30 @@ def spoil(path: str, random: np.random.Generator) -> None:
         random.uniform(-25.0, 25.0, (4000, 5)).astype(np.float32).tofile(path)
 
 
-def job(stage: str, kind: type[S], holdout: dict) -> S:
-    """The settings of a stage in the config, without thinning of LiDAR points."""
-    whole = {"lidar_seed": {"far_points": 200, "voxel_size": 0.0}, "actors": {"min_points": 0}}
-    return settings_of(load({"datasets": {"nuscenes": {"scenes": ["0001"]}}, "holdout": holdout, **whole}), stage, kind)
+def config_of(holdout: dict) -> Config:
+    """A config without thinning of LiDAR points."""
+    all_points = {"lidar_seed": {"far_points": 200, "voxel_size": 0.0}, "actors": {"min_points": 0}}
+    return load({"datasets": {"nuscenes": {"scenes": ["0001"]}}, "holdout": holdout, **all_points})
 
 
 def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
     """All inputs of a training of the scene, each as bytes."""
+    config = config_of(holdout)
+
+    def job(stage: str, kind: type[S]) -> S:
+        return settings_of(config, stage, kind)
+
     groups = frame_groups(scene, HoldoutSettings(**holdout))
     training = [frame for frame, group in zip(scene.frames, groups, strict=True) if group == "train"]
-    seed = seed_points(scene, job("lidar_seed", SeedJob, holdout))
-    parser = training_record(scene, seed, job("parser", ParserJob, holdout))
-    make_masks(scene, job("masks", MaskJob, holdout), folder)
+    seed = seed_points(scene, job("lidar_seed", SeedJob))
+    parser = training_record(scene, seed, job("parser", ParserJob))
+    make_masks(scene, job("masks", MaskJob), folder)
     found = {
         "seed": seed,
-        "actors": actors_record(scene, job("actors", ActorSeedJob, holdout)),
-        "lidar_depth": lidar_depths(scene, job("lidar_depth", LidarDepthJob, holdout)),
-        "free_space": free_space_record(scene, job("free_space", FreeSpaceJob, holdout)),
-        "own_car": ego_mask_record(scene, job("own_car", EgoMaskJob, holdout)),
+        "actors": actors_record(scene, job("actors", ActorSeedJob)),
+        "lidar_depth": lidar_depths(scene, job("lidar_depth", LidarDepthJob)),
+        "free_space": free_space_record(scene, job("free_space", FreeSpaceJob)),
+        "own_car": ego_mask_record(scene, job("own_car", EgoMaskJob)),
         "sky": [read_sky_mask(folder, f.camera, f.timestamp, (f.width, f.height)) for f in training],
         "images": [Path(parser.image_paths[i]).read_bytes() for i in parser.splits["train"]],
     }
@@ -135,8 +155,7 @@ def made(scene: Scene, holdout: dict, folder: Path) -> dict[str, bytes]:
 
 
 def test_nothing_near_a_held_out_key_frame_reaches_a_training(case, tmp_path):
-    root, holdout, frames, near = case
-    before = made(scene_at(root, frames=frames, **EVERYTHING), holdout, tmp_path / "before")
+    root, holdout, frames, near, before = case
     random = np.random.default_rng(0)
     assert {Path(path).parent.parent.name for path in near} == {"samples", "sweeps"}
     for path in near:
@@ -145,12 +164,11 @@ def test_nothing_near_a_held_out_key_frame_reaches_a_training(case, tmp_path):
     assert {name for name in before if before[name] != after[name]} == set()
 
 
-@pytest.mark.parametrize("case", [HOLDOUTS[name] for name in (BOTH_KINDS, IN_A_RANGE)], indirect=True)
+@pytest.mark.parametrize("case", [BOTH_KINDS, IN_A_RANGE], indirect=True)
 def test_recordings_just_beyond_the_excluded_ones_reach_a_training(case, tmp_path):
     """Each kind of recording next to the held-out and excluded ones reaches the expected inputs."""
-    root, holdout, frames, near = case
+    root, holdout, frames, near, before = case
     scene = scene_at(root, frames=frames, **EVERYTHING)
-    before = made(scene, holdout, tmp_path / "before")
     images, sweeps = [f.image_path for f in scene.frames], [s.path for s in scene.sweeps]
     random = np.random.default_rng(0)
     for paths, reached in ((sweeps, {"seed", "lidar_depth", "free_space", "sky"}), (images, {"seed", "images"})):
@@ -235,8 +253,9 @@ def test_an_image_uses_the_training_sweep_nearest_in_time(rich_root):
         frame = scene.frames[number]
         nearest = min(training, key=lambda sweep: abs(sweep.timestamp - frame.timestamp))
         others = tuple(sweep for sweep in scene.sweeps if sweep is not nearest)
-        alone, without = (
-            lidar_depths(dataclasses.replace(scene, sweeps=sweeps), settings)[number] for sweeps in ((nearest,), others)
+        ((alone,), (without,)) = (
+            lidar_depths(dataclasses.replace(scene, frames=(frame,), sweeps=sweeps), settings)
+            for sweeps in ((nearest,), others)
         )
         assert abs(nearest.timestamp - frame.timestamp) <= 100_000
         assert pickle.dumps(alone) == pickle.dumps(whole[number]) != pickle.dumps(without)
