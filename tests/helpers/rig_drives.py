@@ -1,5 +1,6 @@
 """Short synthetic drives of some of the rig's cameras, recorded straight into a Scene."""
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ START_US, KEY_FRAME_US = 1_000_000_000, 500_000
 KEY_FRAMES = 14
 
 
+@functools.cache
 def recorder_of(**world: Any) -> Recorder:
     """A small street with little traffic; `world` is laid over it."""
     return Recorder(WorldSettings(**{"width": 160, "samples_per_pixel": 1, "vehicles": 1, "pedestrians": 0, **world}))
@@ -67,8 +69,11 @@ def _sweep(folder: Path, recorder: Recorder, index: int) -> Sweep:
     )
 
 
-def true_body(camera: str, width: int = 160, seconds: float = 1.0) -> np.ndarray:
-    """The pixels (h, w) bool in which a camera sees the ego vehicle."""
-    recorder = recorder_of(width=width, own_car=True)
+@functools.cache
+def true_body(camera: str) -> np.ndarray:
+    """The pixels (h, w) bool in which a camera sees the ego vehicle, a second after the start; read only."""
+    recorder = recorder_of(own_car=True)
     number = [thing.name for thing in recorder.objects].index(EGO_VEHICLE)
-    return recorder.geometry(RIG[camera], round(seconds * 1e6)).objects == number
+    body = recorder.geometry(RIG[camera], 1_000_000).objects == number
+    body.setflags(write=False)
+    return body

@@ -1,5 +1,6 @@
 """Poses of a synthetic drive refined from its images; and the stage among the others, as users run it."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +25,9 @@ JOB = RefinePosesJob.model_validate({"refine_poses": {}, "random_seed": 0})
 SMALL = {"width": WIDTH, "key_frames": KEY_FRAMES, "samples_per_pixel": 1}
 
 
-@pytest.fixture(scope="module")
-def noisy() -> Recorder:
-    return Recorder(WorldSettings(pose_noise=True, **SMALL))
+@functools.cache
+def recorder_of(pose_noise: bool) -> Recorder:
+    return Recorder(WorldSettings(pose_noise=pose_noise, **SMALL))
 
 
 def filmed(recorder: Recorder, folder: Path) -> tuple[Scene, np.ndarray]:
@@ -66,8 +67,8 @@ def wobble(scene: Scene, truth: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(errors[:, :3, :3]).as_rotvec(degrees=True).std(axis=0)
 
 
-def test_images_of_a_street_reduce_the_errors_of_noisy_poses(noisy, tmp_path):
-    scene, truth = filmed(noisy, tmp_path)
+def test_images_of_a_street_reduce_the_errors_of_noisy_poses(tmp_path):
+    scene, truth = filmed(recorder_of(pose_noise=True), tmp_path)
     refined = refine_poses(scene, JOB, threads=2)
     assert refined.record["refined"], refined.record["kept_because"]
     before, after = wobble(scene, truth), wobble(refined.scene, truth)
@@ -83,7 +84,7 @@ def test_images_of_a_street_reduce_the_errors_of_noisy_poses(noisy, tmp_path):
 @pytest.mark.parametrize("pose_noise", [False, True])
 def test_boxes_are_annotated_relative_to_the_ego_vehicle(pose_noise):
     """Under noisy poses they are still exact relative to the ego vehicle."""
-    recorder = Recorder(WorldSettings(pose_noise=pose_noise, **SMALL))
+    recorder = recorder_of(pose_noise)
     for thing in (thing for thing in recorder.objects if thing.category):
         for seconds in (0.0, 1.3):
             on_street = pose_at(thing, seconds) @ rigid(np.eye(3), np.array([0.0, 0.0, thing.size[2] / 2]))
