@@ -1,6 +1,7 @@
 """Renderings against the truth of a tiny world: the figures of simple models can be computed from the PNGs."""
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -64,6 +65,18 @@ def known(tmp_path_factory) -> DriveTruth:
 def flat_model(color=GREY, parts=()) -> SplatModel:
     """No Gaussians but those of `parts`; a sky of one colour."""
     return SplatModel([*parts, round_gaussians([])], ConstantSky(torch.tensor(color), 1e-2)).requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def lateral_of_grey(known) -> dict[str, Any]:
+    """The lateral figures of one colour."""
+    return lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)
+
+
+@pytest.fixture(scope="module")
+def removal_of_grey(known) -> dict[str, Any]:
+    """The removal figures of one colour."""
+    return removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
 
 
 def purple(places) -> Background:
@@ -136,8 +149,8 @@ def by_hand(color, images: list[np.ndarray], masks: list[np.ndarray]) -> float:
 
 
 @pytest.mark.parametrize("left", OFFSETS)
-def test_a_constant_colours_lateral_psnr_follows_from_the_pngs(known, left):
-    result = lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)
+def test_a_constant_colours_lateral_psnr_follows_from_the_pngs(known, lateral_of_grey, left):
+    result = lateral_of_grey
     assert list(result) == ["2.0", "-2.0", "4.0"]
     found = result[str(left)]
     assert found.keys() == {"all", "static", "moving_vehicle", "depth"}
@@ -159,19 +172,19 @@ def test_a_constant_colours_lateral_psnr_follows_from_the_pngs(known, left):
 
 
 @pytest.mark.parametrize("left", OFFSETS)
-def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known, left):
+def test_static_pixels_beside_the_path_are_those_of_the_view_from_there(known, lateral_of_grey, left):
     """They are outside all boxes of movable objects, as seen by the lateral camera and not the recorded one."""
     frames, static = lateral_frames(known, left), static_masks(known, left)
     recorded = [static_pixels(known, frame, frame.camera_to_world) for frame, _ in frames]
     images = [pixels_of(known, truth.image) for _, truth in frames]
-    result = lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)[str(left)]["static"]
+    result = lateral_of_grey[str(left)]["static"]
     assert result["pixels"] == pytest.approx(sum(mask.sum() for mask in static), rel=1e-4)
     assert result["psnr"] == pytest.approx(by_hand(GREY, images, static), abs=0.005)
     assert sum((a != b).sum() for a, b in zip(static, recorded, strict=True)) > 300, "the two views must differ"
 
 
 @pytest.mark.parametrize("left", OFFSETS)
-def test_pixels_of_moving_vehicles_are_those_of_the_car_ahead_seen_from_beside_the_path(known, left):
+def test_pixels_of_moving_vehicles_are_those_of_the_car_ahead_seen_from_beside_the_path(known, lateral_of_grey, left):
     """Neither the parked truck nor the pedestrian counts, nor pixels where one of them is nearer."""
     images, masks = [], []
     for frame, truth in lateral_frames(known, left):
@@ -184,7 +197,7 @@ def test_pixels_of_moving_vehicles_are_those_of_the_car_ahead_seen_from_beside_t
         car = next(i for i, box in enumerate(boxes) if box.track_id == LEADING)
         masks.append((np.argmin(reached, axis=0) == car) & np.isfinite(reached[car]))
         images.append(pixels_of(known, truth.image))
-    result = lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU)[str(left)]["moving_vehicle"]
+    result = lateral_of_grey[str(left)]["moving_vehicle"]
     assert result["pixels"] == pytest.approx(sum(mask.sum() for mask in masks), abs=6)
     assert result["psnr"] == pytest.approx(by_hand(GREY, images, masks), abs=0.02)
 
@@ -267,8 +280,10 @@ class Deep(SplatModel):
         return dataclasses.replace(picture, depth=torch.from_numpy(self._depth_of(view)).float())
 
 
-def depth_figure(known: DriveTruth, left: float, depth_of: Callable[[View], np.ndarray]) -> dict[str, Any] | None:
-    return lateral_metrics(Deep(depth_of), known, "CAM_FRONT", None, CPU)[str(left)]["depth"]
+def depth_figures(known: DriveTruth, depth_of: Callable[[View], np.ndarray]) -> dict[float, dict[str, Any] | None]:
+    """By offset."""
+    found = lateral_metrics(Deep(depth_of), known, "CAM_FRONT", None, CPU)
+    return {left: found[str(left)]["depth"] for left in OFFSETS}
 
 
 def left_of(view: View) -> float:
@@ -276,64 +291,70 @@ def left_of(view: View) -> float:
     return round(float(view.camera_to_world[1, 3]), 3)
 
 
-def frame_of(known: DriveTruth, view: View) -> Frame:
+@pytest.fixture(scope="module")
+def cast_depth(known) -> Callable[[View], np.ndarray]:
+    """The depth of a view, cast from where it is rendered; inf in the sky."""
     scene = known.recording.scene
-    return min(scene.frames, key=lambda frame: abs(scene.seconds(frame.timestamp) - view.time))
 
-
-def true_depth_of(known: DriveTruth) -> Callable[[View], np.ndarray]:
-    """The depth of a view, cast from where it is rendered; 5 m in the sky."""
+    @functools.cache
+    def cast_from(left: float, number: int) -> np.ndarray:
+        return true_depths(aside(WORLD, left), scene.frames[number])[..., 0]
 
     def depth(view: View) -> np.ndarray:
-        values = true_depths(aside(WORLD, left_of(view)), frame_of(known, view))[..., 0]
-        return np.where(np.isfinite(values), values, 5.0)
+        away = [abs(scene.seconds(frame.timestamp) - view.time) for frame in scene.frames]
+        return cast_from(left_of(view), int(np.argmin(away)))
 
     return depth
 
 
-@pytest.mark.parametrize("left", OFFSETS)
-def test_the_depth_error_is_the_median_over_static_pixels_of_known_depth(known, left):
+@pytest.fixture(scope="module")
+def true_depth(cast_depth) -> Callable[[View], np.ndarray]:
+    """The same, with 5 m in the sky."""
+    return lambda view: np.where(np.isfinite(cast_depth(view)), cast_depth(view), 5.0)
+
+
+def test_the_depth_error_is_the_median_over_static_pixels_of_known_depth(known):
     """A rendering that is 10 m deep everywhere. Neither the sky nor what is beyond the 16 bits has a known depth."""
 
-    def figure(of_left: float) -> tuple[float, int]:
-        pairs = zip(depths_of(known, of_left), static_masks(known, of_left), strict=True)
-        values = np.concatenate([depth[mask & (depth > 0) & (depth < 65535)] for depth, mask in pairs]) / 256.0
-        return np.median(np.abs(10.0 - values) / values), len(values)
-
-    values = np.stack(depths_of(known, left))
-    assert (values == 0).sum() > 1000 and (values == 65535).sum() > 100
-    found, (median, pixels) = depth_figure(known, left, lambda _: np.full((90, 160), 10.0)), figure(left)
-    assert found.keys() == {"median_relative_error", "pixels"}
-    assert found["median_relative_error"] == pytest.approx(median, rel=2e-4)
-    assert found["pixels"] == pytest.approx(pixels, rel=1e-4)
-    others = [figure(other)[0] for other in OFFSETS if other != left]
-    assert min(abs(other - median) for other in others) > 1e-3 * median, "the offsets must differ"
-
-
-@pytest.mark.parametrize("left", OFFSETS)
-def test_the_true_depth_has_no_error(known, left):
-    assert depth_figure(known, left, true_depth_of(known))["median_relative_error"] < 2e-4
+    all_found, expected = depth_figures(known, lambda _: np.full((90, 160), 10.0)), {}
+    for left in OFFSETS:
+        values = np.stack(depths_of(known, left))
+        assert (values == 0).sum() > 1000 and (values == 65535).sum() > 100
+        known_depth = np.stack(static_masks(known, left)) & (values > 0) & (values < 65535)
+        metres = values[known_depth] / 256.0
+        expected[left] = np.median(np.abs(10.0 - metres) / metres)
+        found = all_found[left]
+        assert found.keys() == {"median_relative_error", "pixels"}
+        assert found["median_relative_error"] == pytest.approx(expected[left], rel=2e-4)
+        assert found["pixels"] == pytest.approx(len(metres), rel=1e-4)
+    for left, median in expected.items():
+        others = [expected[other] for other in OFFSETS if other != left]
+        assert min(abs(other - median) for other in others) > 1e-3 * median, "the offsets must differ"
 
 
-@pytest.mark.parametrize("left", OFFSETS)
-def test_moving_pixels_and_the_sky_have_no_part_in_the_depth_error(known, left):
+def test_the_true_depth_has_no_error(known, true_depth):
+    for found in depth_figures(known, true_depth).values():
+        assert found["median_relative_error"] < 2e-4
+
+
+def test_moving_pixels_and_the_sky_have_no_part_in_the_depth_error(known, cast_depth, true_depth):
     """Their depth is wrong ninefold; that of the rest by a random share."""
-    true, random, spared = true_depth_of(known), np.random.default_rng(0), []
+    random, spared = np.random.default_rng(0), {left: [] for left in OFFSETS}
+    frames = known.recording.scene.frames
 
     def wrong(view: View) -> np.ndarray:
-        frame, pose = frame_of(known, view), view.camera_to_world.double().numpy()
-        sky = np.isinf(true_depths(aside(WORLD, left_of(view)), frame)[..., 0])
-        counts = static_pixels(known, frame, pose) & ~sky
+        pose = view.camera_to_world.double().numpy()
+        frame = min(frames, key=lambda frame: abs(known.recording.scene.seconds(frame.timestamp) - view.time))
+        counts = static_pixels(known, frame, pose) & np.isfinite(cast_depth(view))
         shares = random.uniform(0.0, 0.2, counts.shape)
-        if left_of(view) == left:
-            spared.append(np.where(counts, shares, np.nan)[true(view) < 255.9])
-        return true(view) * np.where(counts, 1.0 + shares, 10.0)
+        spared[left_of(view)].append(np.where(counts, shares, np.nan)[true_depth(view) < 255.9])
+        return true_depth(view) * np.where(counts, 1.0 + shares, 10.0)
 
-    found = depth_figure(known, left, wrong)["median_relative_error"]
-    shares = np.concatenate(spared)
-    assert found == pytest.approx(np.nanmedian(shares), rel=2e-3)
-    everywhere = np.median(np.nan_to_num(shares, nan=9.0))
-    assert everywhere > 1.05 * found, "other pixels must be many"
+    for left, found in depth_figures(known, wrong).items():
+        error, shares = found["median_relative_error"], np.concatenate(spared[left])
+        assert error == pytest.approx(np.nanmedian(shares), rel=2e-3)
+        everywhere = np.median(np.nan_to_num(shares, nan=9.0))
+        assert everywhere > 1.05 * error, "other pixels must be many"
 
 
 def with_depths(known: DriveTruth, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> DriveTruth:
@@ -371,9 +392,9 @@ def test_a_depth_error_over_too_few_pixels_is_null(known, tmp_path, a_frame, kno
     assert json.dumps(result, allow_nan=False)
 
 
-def test_a_rendering_without_depth_has_a_finite_error(known):
+def test_a_rendering_without_depth_has_a_finite_error(lateral_of_grey):
     """Nothing is rendered: depth 0."""
-    for found in lateral_metrics(flat_model(), known, "CAM_FRONT", None, CPU).values():
+    for found in lateral_of_grey.values():
         assert found["depth"]["median_relative_error"] == pytest.approx(1.0)
 
 
@@ -440,9 +461,9 @@ def hulls(known: DriveTruth) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarra
         yield pixels_of(known, truth.image), inside & free, ~inside & free
 
 
-def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known):
+def test_a_constant_colours_removal_psnr_follows_from_the_pngs(known, removal_of_grey):
     images, inside, outside = (list(items) for items in zip(*hulls(known), strict=True))
-    result = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
+    result = removal_of_grey
     assert result.keys() == {"box", "outside", "not_removed"}
     for region, masks in (("box", inside), ("outside", outside)):
         assert result[region]["pixels"] == pytest.approx(sum(mask.sum() for mask in masks), abs=6)
@@ -498,11 +519,10 @@ def unremoved(model: SplatModel, known: DriveTruth) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("knows", [False, True])
-def test_removing_a_car_equals_a_model_without_it(known, knows):
+def test_removing_a_car_equals_a_model_without_it(known, removal_of_grey, knows):
     """The figures equal those of a model without the car, and improve, for removal by box and by part."""
     model = flat_model(parts=[Riding(known, knows)])
-    removed = removal_metrics(model, known, "CAM_FRONT", MARGIN, None, CPU)
-    never = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
+    removed, never = removal_metrics(model, known, "CAM_FRONT", MARGIN, None, CPU), removal_of_grey
     for region in ("box", "outside"):
         assert removed[region]["psnr"] == pytest.approx(never[region]["psnr"], abs=1e-6)
         assert removed[region]["ssim"] == pytest.approx(never[region]["ssim"], abs=1e-6)
@@ -522,18 +542,18 @@ def test_the_removal_baseline_uses_the_same_pixels_of_the_unedited_model(known, 
     assert before["box"]["psnr"] < removed["box"]["psnr"] - 3.0
 
 
-def test_without_a_removal_there_is_no_baseline(known):
-    result = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
+def test_without_a_removal_there_is_no_baseline(removal_of_grey):
+    result = dict(removal_of_grey)
     assert result.pop("not_removed") == result
 
 
-def test_gaussians_outside_the_box_are_removed_only_by_their_part(known):
+def test_gaussians_outside_the_box_are_removed_only_by_their_part(known, removal_of_grey):
     """The same Gaussians three metres to the car's left."""
     by_box, by_actor = (
         removal_metrics(flat_model(parts=[Riding(known, knows, beside=3.0)]), known, "CAM_FRONT", MARGIN, None, CPU)
         for knows in (False, True)
     )
-    never = removal_metrics(flat_model(), known, "CAM_FRONT", MARGIN, None, CPU)
+    never = removal_of_grey
     assert by_actor["outside"]["psnr"] == pytest.approx(never["outside"]["psnr"], abs=1e-6)
     assert by_box["outside"]["psnr"] != pytest.approx(never["outside"]["psnr"], abs=0.05)
 

@@ -46,19 +46,22 @@ def seconds_of(timestamp: int) -> float:
     return (timestamp - START_US) * 1e-6
 
 
-def pixel_rays(world: World, subpixels: int = 1) -> np.ndarray:
-    """Rays of depth 1 (h, w, n, 3), in the world's axes, through n = `subpixels`**2 places spread over each pixel."""
+def depths_at(world: World, frame: Frame, rows: np.ndarray, columns: np.ndarray, subpixels: int = 1) -> np.ndarray:
+    """The depth (..., n) in metres of what a frame sees in n = `subpixels`**2 places spread over each of the pixels at
+    `rows` and `columns` (...); inf in the sky."""
     offsets = (np.arange(subpixels) + 0.5) / subpixels - 0.5
-    y, x, dy, dx = np.meshgrid(np.arange(world.height), np.arange(world.width), offsets, offsets, indexing="ij")
-    pixels = np.stack([x + dx, y + dy, np.ones_like(dx)], axis=-1).reshape(world.height, world.width, -1, 3)
-    return pixels @ np.linalg.inv(world.intrinsics).T @ CAMERA_TO_EGO.T
+    dy, dx = (offset.ravel() for offset in np.meshgrid(offsets, offsets, indexing="ij"))
+    x, y = columns[..., None] + dx, rows[..., None] + dy
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    rays = pixels @ np.linalg.inv(world.intrinsics).T @ CAMERA_TO_EGO.T
+    seconds = seconds_of(frame.timestamp)
+    depth, _ = cast(world, world.ego_at(seconds) + CAMERA_AT, rays, seconds)
+    return depth.reshape(x.shape)
 
 
 def true_depths(world: World, frame: Frame, subpixels: int = 1) -> np.ndarray:
-    """The depth (h, w, n) in metres of what a frame sees in `subpixels`**2 places of each pixel; inf in the sky."""
-    seconds, rays = seconds_of(frame.timestamp), pixel_rays(world, subpixels)
-    depth, _ = cast(world, world.ego_at(seconds) + CAMERA_AT, rays.reshape(-1, 3), seconds)
-    return depth.reshape(rays.shape[:3])
+    """The same for all pixels: (h, w, n)."""
+    return depths_at(world, frame, *np.indices((world.height, world.width)), subpixels)
 
 
 def shows(world: World, frame: Frame, thing: Thing, subpixels: int = 1) -> np.ndarray:

@@ -7,11 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.demo_worlds import job_of as world_job_of
+from helpers.demo_worlds import world_of
 from helpers.records import write_invalid
-from helpers.small_drives import HELD_OUT, NOTHING_HELD_OUT, Speeding, drive, scene_at, seconds_of, shows, true_depths
+from helpers.small_drives import (
+    HELD_OUT,
+    NOTHING_HELD_OUT,
+    Speeding,
+    depths_at,
+    drive,
+    scene_at,
+    seconds_of,
+    shows,
+    true_depths,
+)
 from helpers.tiny_world import CAMERA_AT, LIDAR_AT, Thing, World, cast_lidar
 from PIL import Image
 
+from drivesplat.demo.world import make_world
 from drivesplat.errors import ResultError
 from drivesplat.io.array_file import write_arrays
 from drivesplat.lidar.depth import split_sweep
@@ -75,7 +88,7 @@ def of(image: PixelDepths, values: np.ndarray) -> np.ndarray:
 
 def fits(world: World, frame, image: PixelDepths, within: float = 0.02) -> np.ndarray:
     """Whether each depth (m,) lies within the range of depths that its pixel shows at the image's own time."""
-    truth = of(image, true_depths(world, frame, subpixels=7))
+    truth = depths_at(world, frame, image.rows, image.columns, subpixels=7)
     return (image.depth > truth.min(axis=1) - within) & (image.depth < truth.max(axis=1) + within)
 
 
@@ -329,6 +342,14 @@ def demo_scene(root: Path) -> Scene:
         sweeps=False, on_missing="stop",
     )  # fmt: skip
     return extract_scene(source, root)
+
+
+@pytest.fixture(scope="module")
+def demo_root(tmp_path_factory) -> Path:
+    """A small synthetic drive with its truth: the front camera and LiDAR of the session's drive of that name."""
+    root = tmp_path_factory.mktemp("demo")
+    make_world(root, world_job_of(world_of(width=160, key_frames=6)), {"stages": {}}, workers=1)
+    return root
 
 
 def test_depths_of_the_demo_world_agree_with_its_ground_truth(demo_root):

@@ -5,11 +5,13 @@ import errno
 import json
 import logging
 import math
+import multiprocessing
 import os
 import pickle
 import resource
 import signal
 import sys
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -78,24 +80,38 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 NO_GUIDES = Guides(sky={}, moving={}, lidar={})
 
 
-def train_until_killed(folder: str) -> None:
-    """For a subprocess: a training that ends itself as `kill -9` would."""
+def train_whole_and_until_killed(folder: str) -> None:
+    """For a subprocess: a whole training with resume states, after which it says whether torch's compiler was read,
+    and one that ends itself as `kill -9` would."""
     torch.set_num_threads(1)
-    trained(Path(folder), settings_of(), EndingViews(recorded_views(), ENDED_AT, kill=True))
+    trained(Path(folder, "whole"), settings_of())
+    print("torch._dynamo" in sys.modules, flush=True)
+    trained(Path(folder, "killed"), settings_of(), EndingViews(recorded_views(), ENDED_AT, kill=True))
 
 
-def print_whether_torchs_compiler_is_read(folder: str) -> None:
-    """For a subprocess: a whole training with resume states."""
-    torch.set_num_threads(1)
-    trained(Path(folder), settings_of())
-    print("torch._dynamo" in sys.modules)
-
-
-def hold_the_lock(folder: str) -> None:
-    """For a subprocess: a trainer that works until it is killed."""
-    with resume_state.training_lock(Path(folder)):
-        print("held", flush=True)
+def hold_the_lock(folder: Path, held: Connection) -> None:
+    """For a forked process: a trainer that works until it is killed."""
+    with resume_state.training_lock(folder):
+        held.send("held")
         signal.pause()
+
+
+@dataclasses.dataclass(frozen=True)
+class Killed:
+    """What became of the process of `train_whole_and_until_killed`; `folder` is of the killed training."""
+
+    folder: Path
+    status: int
+    output: str
+    errors: str
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> Killed:
+    folder = tmp_path_factory.mktemp("trainings")
+    process = in_subprocess(train_whole_and_until_killed, str(folder))
+    output, errors = process.communicate(timeout=120)
+    return Killed(folder / "killed", process.returncode, output, errors)
 
 
 @pytest.fixture(scope="module")
@@ -333,13 +349,11 @@ def test_without_sky_pixels_the_sky_starts_at_the_mean_colour_of_all(known):
 # ---- what it survives
 
 
-def test_a_training_killed_halfway_resumes_and_ends_as_an_uninterrupted_one(uninterrupted, tmp_path):
-    process = in_subprocess(train_until_killed, str(tmp_path))
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == -signal.SIGKILL, errors
-    assert [path.name for path in (tmp_path / "resume").iterdir()] == ["state.npz"]
+def test_a_training_killed_halfway_resumes_and_ends_as_an_uninterrupted_one(uninterrupted, killed):
+    assert killed.status == -signal.SIGKILL, killed.errors
+    assert [path.name for path in (killed.folder / "resume").iterdir()] == ["state.npz"]
 
-    resumed, summary = trained(tmp_path, settings_of())
+    resumed, summary = trained(killed.folder, settings_of())
     whole, whole_summary = uninterrupted["mcmc"]
     views = recorded_views()
     assert summary.iterations == whole_summary.iterations == ITERATIONS
@@ -526,14 +540,18 @@ def test_a_full_disk_is_reported_with_the_file_name_and_keeps_the_earlier_checkp
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 def test_a_second_trainer_is_refused_naming_the_first_and_a_killed_one_frees_the_folder(tmp_path):
-    holder = in_subprocess(hold_the_lock, str(tmp_path / "resume"))
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    holder = context.Process(target=hold_the_lock, args=(tmp_path / "resume", there))
+    holder.start()
     try:
-        assert holder.stdout.readline() == "held\n", holder.stderr.read()
+        assert here.poll(60) and here.recv() == "held"
         assert_refused(tmp_path / "resume", holder.pid)
     finally:
         holder.kill()
-        holder.communicate()
+        holder.join()
     with resume_state.training_lock(tmp_path / "resume"):
         assert_refused(tmp_path / "resume", os.getpid())
 
@@ -775,10 +793,9 @@ def test_a_training_holds_no_more_gaussians_than_its_pixels_allow(tmp_path):
     assert json.loads(files.summary.read_text())["gaussians"] == 95
 
 
-def test_a_training_does_not_wait_for_torchs_compiler(tmp_path):
+def test_a_training_does_not_wait_for_torchs_compiler(killed):
     """Torch's own optimizers read it, for a second or more of every training."""
-    output, errors = in_subprocess(print_whether_torchs_compiler_is_read, str(tmp_path)).communicate(timeout=120)
-    assert output == "False\n", output + errors[-3000:]
+    assert killed.output == "False\n", killed.output + killed.errors[-3000:]
 
 
 def test_a_failed_training_leaves_no_result_but_its_resume_state(tmp_path):
