@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import tracemalloc
 from pathlib import Path
 
@@ -18,9 +19,16 @@ from drivesplat.settings.extract import SceneSource
 VERSION, SCENES = "v1.0-mini", ("0001", "0002", "0003")
 
 
+@pytest.fixture(scope="module")
+def three_scenes(tmp_path_factory) -> Path:
+    """A tiny dataset of three scenes, read only."""
+    return write_world(tmp_path_factory.mktemp("three"), World(scenes=SCENES))
+
+
 @pytest.fixture
-def root(tmp_path) -> Path:
-    return write_world(tmp_path / "nuscenes", World(scenes=SCENES))
+def root(three_scenes, tmp_path) -> Path:
+    """A copy of it that a test may change."""
+    return Path(shutil.copytree(three_scenes, tmp_path / "nuscenes"))
 
 
 def edit(root: Path, table: str, token: str, **changes) -> None:
