@@ -3,8 +3,10 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
+from functools import cache
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 from benchmarks.quality.__main__ import main, measure
 from benchmarks.quality.compare import quality
+from benchmarks.quality.recipes import RecipeFile
 from benchmarks.quality.results import Result, collect_results
 from benchmarks.quality.table import markdown
 from benchmarks.snakemake_run import Outcome, SnakemakeRun
@@ -25,13 +28,18 @@ from drivesplat.errors import ConfigError
 BAD = {"overrides": {"sky": "none"}}
 
 
-@pytest.fixture
-def compared(tmp_path):
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
     """Makes a record of recipes from eval.json contents by name and seed; all others have failed."""
 
+    @cache
+    def planned(recipes: str) -> tuple[RecipeFile, list[SnakemakeRun]]:
+        return recipe_file(tmp_path_factory.mktemp("planned"), recipes=json.loads(recipes))
+
     def compare(evals: dict[str, list[dict[str, Any] | None]], recipes: dict[str, Any]) -> dict[str, Any]:
-        file, runs = recipe_file(tmp_path, recipes=recipes)
+        file, runs = planned(json.dumps(recipes))
         for run in runs:
+            shutil.rmtree(run.folder, ignore_errors=True)
             for recipe in run.methods:
                 for seed, content in enumerate(evals[recipe]):
                     if content:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 import tempfile
 import time
 from datetime import datetime, timedelta
@@ -56,11 +57,19 @@ def test_arguments_that_the_recipe_file_sets_are_refused():
             is_dry_run(arguments)
 
 
-@pytest.fixture
-def runs(tmp_path):
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
     """Two recipes in one run, and a third in a run of its own."""
     recipes = {"a": {}, "b": {"overrides": {"sky": "mask"}}, "c": {"config": {"sweeps": True}}}
-    return recipe_file(tmp_path, recipes=recipes)[1]
+    return recipe_file(tmp_path_factory.mktemp("planned"), recipes=recipes)[1]
+
+
+@pytest.fixture
+def runs(planned):
+    """The same, without results."""
+    for run in planned:
+        shutil.rmtree(run.folder, ignore_errors=True)
+    return planned
 
 
 def ended(runs, *outcomes: Outcome) -> dict[tuple[str, int], Result]:
