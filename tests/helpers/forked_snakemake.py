@@ -13,9 +13,15 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from helpers import REPOSITORY
+from helpers.forked_scripts import fork_scripts, script_server
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["snakemake.cli"])
+_PRELOADED = [
+    "dpath", "encodings.idna", "jsonschema", "smart_open", "snakemake.benchmark", "snakemake.cli", "snakemake.profiles",
+    "snakemake.report.html_reporter", "snakemake.storage", "yte",
+]  # fmt: skip
+"""Snakemake, and what it imports when it is called."""
+_CONTEXT.set_forkserver_preload(_PRELOADED)
 
 
 def run_snakemake(
@@ -25,8 +31,9 @@ def run_snakemake(
 
     Raises subprocess.TimeoutExpired after `timeout` seconds, the process being ended.
     """
+    server = None if "-n" in arguments else script_server().address
     reader, writer = _CONTEXT.Pipe(duplex=False)
-    process = _CONTEXT.Process(target=_call, args=(list(arguments), str(folder), dict(environment), writer))
+    process = _CONTEXT.Process(target=_call, args=(list(arguments), str(folder), dict(environment), server, writer))
     process.start()
     writer.close()
     with ThreadPoolExecutor(1) as threads, open(os.dup(reader.fileno()), encoding="utf-8", errors="replace") as stream:
@@ -39,7 +46,9 @@ def run_snakemake(
         return subprocess.CompletedProcess(list(arguments), process.exitcode, output.result())
 
 
-def _call(arguments: list[str], folder: str, environment: dict[str, str], output: Connection) -> None:
+def _call(
+    arguments: list[str], folder: str, environment: dict[str, str], server: str | None, output: Connection
+) -> None:
     """In the forked process: as if Python had been started there for Snakemake."""
     for descriptor in (1, 2):
         os.dup2(output.fileno(), descriptor)
@@ -53,4 +62,6 @@ def _call(arguments: list[str], folder: str, environment: dict[str, str], output
 
     from snakemake.cli import main
 
+    if server:
+        fork_scripts(server)
     main(arguments)
