@@ -3,6 +3,7 @@
 import ast
 import pickle
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,7 @@ def test_no_script_reads_results_but_by_a_reader_that_is_tested():
     assert used <= tested
 
 
+@cache
 def calls(path: Path) -> list[tuple[str, ast.Call]]:
     """The calls in a module, by what is called: 'torch.load', 'open'."""
     return [

@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
@@ -9,6 +10,7 @@ ROWS = re.findall(r"^\| (\d+) \| (.+) \| (.+) \|$", (TESTS / "faults/README.md")
 FAULTS = 27
 
 
+@cache
 def functions(path: Path) -> set[str]:
     return {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
 

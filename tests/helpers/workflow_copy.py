@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -89,7 +90,7 @@ class WorkflowCopy:
 
     def again(self, folder: Path) -> "WorkflowCopy":
         """Another copy, with all that this one has made by now."""
-        return WorkflowCopy(Path(shutil.copytree(self.folder, folder, symlinks=True)), dict(self.config))
+        return WorkflowCopy(Path(shutil.copytree(self.folder, folder, symlinks=True)), deepcopy(self.config))
 
     def write_config(self, text: str | None = None) -> None:
         (self.folder / "mine.yaml").write_text(text or yaml.safe_dump(self.config, sort_keys=False))

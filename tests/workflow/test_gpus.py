@@ -163,10 +163,10 @@ def test_one_more_job_waits_with_a_warning_and_gets_the_gpu_of_a_killed_one(mach
 
 def test_on_one_gpu_one_job_at_a_time(machine):
     machine.set_uuids(["GPU-a"])
-    first, began = machine.start("0", seconds=1.5), time.monotonic()
+    first, began = machine.start("0", seconds=0.8), time.monotonic()
     assert machine.gpu_of(first) == "0"
     assert machine.gpu_of(machine.start("0")) == "0"
-    assert time.monotonic() - began > 1.5
+    assert time.monotonic() - began > 0.8
 
 
 def test_more_jobs_share_the_gpus_evenly_where_they_may(machine):

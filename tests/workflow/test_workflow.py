@@ -2,9 +2,9 @@
 
 import json
 import math
-import subprocess
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -36,15 +36,21 @@ edits:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> WorkflowCopy:
     """The workflow run to its end on one scene with two methods and two edits."""
+    copy = with_two_edits(tmp_path_factory.mktemp("finished"))
+    done = copy.run()
+    assert done.returncode == 0, done.stdout
+    return copy
+
+
+def with_two_edits(folder: Path) -> WorkflowCopy:
+    """A workflow of one scene with two methods and two edits."""
     copy = WorkflowCopy.make(
-        tmp_path_factory.mktemp("finished"),
+        folder,
         datasets={"nuscenes": {"dataroot": "data", "scenes": ["0001"], "edits": {"0001": "edits.yaml"}}},
         methods={"vanilla": {}, "street": {"parts": ["background", "actors"], "overrides": STREET}},
         actors={"random_points": 200},
     )
     (copy.folder / "edits.yaml").write_text(EDITS)
-    done = copy.run()
-    assert done.returncode == 0, done.stdout
     return copy
 
 
@@ -84,6 +90,23 @@ def test_the_report_has_a_row_per_scene_and_method(finished):
     assert report["left_out"] == [] and report["missing"] == []
     lines = (finished.folder / "results/gap_report.csv").read_text().splitlines()
     assert len(lines) == 3 and lines[0].startswith("scene,dataset,method")
+
+
+@pytest.mark.slow
+def test_scripts_in_new_interpreters_make_the_same_files(finished, tmp_path):
+    """In other tests scripts are forked from a process with other packages imported (`helpers.forked_scripts`)."""
+    copy = with_two_edits(tmp_path / "workflow")
+    done = copy.run(under=("env",))
+    assert done.returncode == 0, done.stdout
+    made, expected = (set(files_without_logs(one.folder / "results")) for one in (copy, finished))
+    assert made == expected and made
+
+
+def files_without_logs(results: Path) -> Iterator[Path]:
+    """Relative paths; TensorBoard's event files have names of their own."""
+    for path in results.rglob("*.*"):
+        if path.is_file() and not {"logs", "tensorboard"} & set(path.parts):
+            yield path.relative_to(results)
 
 
 def test_what_a_training_leaves_behind(finished):
@@ -159,9 +182,8 @@ def test_every_result_remembers_where_it_came_from(finished):
 
 
 def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
-    command = finished.command("--report", "report.zip")
-    done = subprocess.run(command, cwd=finished.folder, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
+    done = finished.run(flags=("--report", "report.zip"))
+    assert done.returncode == 0, done.stdout
     with zipfile.ZipFile(finished.folder / "report.zip") as report:
         names = {Path(name).name for name in report.namelist()}
         page = report.read("report/report.html").decode()
@@ -195,7 +217,6 @@ EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
-        ({}, {}),
         ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
         ({"methods": {"vanilla": {"overrides": {"sky": "mask"}}}}, ONE_TRAINING_AND_AFTER),
         ({"actors": {"humans": True}}, {"actors": 1, **STREETS_TRAINING_AND_AFTER}),
@@ -207,15 +228,14 @@ EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
          {"lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
         ({"lidar_seed": {"sweeps": True}}, EVERYTHING),
         ({"extract": {"on_missing": "warn"}}, EVERYTHING),
-        ({"refine_poses": {"rounds": 2}}, {}),
         ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
         ({"render": {"fps": 5}}, {"film": 4, **OF_ACTORS}),
         ({"render": {"edited_frames": True}}, {"edit": 2}),
         ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2, "gap_report": 1}),
         ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2, "gap_report": 1}),
         ({"export": {"viewer_gaussians": 100}}, {"export_viewer": 2}),
-        ({"device": {"kind": "cpu", "min_free_gb": 1}}, {}),
-        ({"lpips": {"enabled": False, "timeout_s": 3}}, {}),
+        ({"refine_poses": {"rounds": 2}, "device": {"kind": "cpu", "min_free_gb": 1},
+          "lpips": {"enabled": False, "timeout_s": 3}}, {}),
         ({"methods": {"third": {}}}, ONE_TRAINING_AND_AFTER),
     ],
 )  # fmt: skip
@@ -245,14 +265,13 @@ LEFT_GONE = "results/0001/street/edits/gone.mp4"
         ("  stop:", "  also_gone:\n    - remove: {track: 0001 instance 0}\n  stop:",
          {"edit": 1, "gap_report": 1}, None),
         ("  gone:\n    - remove: {track: 0001 instance 0}\n", "", {"gap_report": 1}, None),
-        (EDITS, EDITS, {}, None),
         (EDITS, """# written otherwise
 edits: {stop: [{shift: {lateral: 1, "track": "0001 instance 0", yaw: 0.0, start: null}},
                {stop: {duration: 2, at: 2.0, track: 0001 instance 0}}],
         gone: [{remove: {track: '0001 instance 0'}}]}
 """, {}, None),
     ],
-    ids=["a step", "another kind of step", "one more edit", "one edit less", "touched", "written otherwise"],
+    ids=["a step", "another kind of step", "one more edit", "one edit less", "written otherwise"],
 )  # fmt: skip
 def test_a_changed_step_reruns_its_edit_and_no_other(finished, old, new, expected, of_gone):
     path = finished.folder / "edits.yaml"
@@ -323,37 +342,55 @@ def test_changed_tables_rerun_the_scenes_whose_rows_they_change(finished):
     assert planned_with("sample_annotation", lambda rows: rows[3].update(size=[1.0, 2.0, 3.0])) == EVERYTHING
 
 
+COMMENTS = (
+    ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal'),
+    ("drivesplat/preprocess/masks.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast"),
+    ("drivesplat/settings/train.py", "Number of optimisation", "The number of optimisation"),
+    ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json'),
+)
+UNUSED = ("drivesplat/poses/refinement_record.py", "SCHEMA = 1", "SCHEMA = 2")
+
+
+@contextmanager
+def changed(copy: WorkflowCopy, *changes: tuple[str, str, str]) -> Iterator[None]:
+    """Files of the workflow changed for a while: `(file, old, new)`."""
+    before = {copy.folder / file: (copy.folder / file).read_text() for file, _, _ in changes}
+    for file, old, new in changes:
+        assert old in before[copy.folder / file]
+        (copy.folder / file).write_text(before[copy.folder / file].replace(old, new, 1))
+    try:
+        yield
+    finally:
+        for path, content in before.items():
+            path.write_text(content)
+
+
+def test_comments_and_code_of_other_settings_rerun_nothing(finished):
+    """`refine_poses` is not enabled."""
+    with changed(finished, *COMMENTS, UNUSED):
+        assert finished.planned() == {}
+
+
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
     [
         ("drivesplat/evaluation/metrics.py", "MIN_FRAME_PIXELS = 100", "MIN_FRAME_PIXELS = 90",
          {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2, "remove_actor": 2}),
-        ("drivesplat/evaluation/metrics.py", '"""Peak signal', '"""The peak signal', {}),
         ("drivesplat/preprocess/masks.py", "BRIGHT = 0.7", "BRIGHT = 0.71",
          {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
-        ("drivesplat/preprocess/masks.py", "BRIGHT = 0.7", "BRIGHT = 0.7  # overcast", {}),
         ("drivesplat/training/floaters.py", "LARGEST_STEP = 15.0", "LARGEST_STEP = 14.0", TRAINING_AND_AFTER),
-        ("drivesplat/settings/train.py", "Number of optimisation", "The number of optimisation", {}),
         ("drivesplat/scene/object_class.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
-        ("workflow_scripts/parser.py", '"""scene.json', '"""The scene.json', {}),
         ("drivesplat/io/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
         ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
         ("drivesplat/edited_motion/lateral_offset.py", "HEADING_SPEED = 1.0", "HEADING_SPEED = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
         ("drivesplat/report/gaps.py", "SCHEMA = 2", "SCHEMA = 3", {"gap_report": 1}),
         ("drivesplat/report/page/page.js", "Sliders", "The sliders", {"gap_report": 1}),
-        ("drivesplat/poses/refinement_record.py", "SCHEMA = 1", "SCHEMA = 2", {}),
     ],
 )  # fmt: skip
 def test_changed_code_reruns_exactly_the_stages_that_import_it(finished, file, old, new, expected):
-    path = finished.folder / file
-    before = path.read_text()
-    assert old in before
-    path.write_text(before.replace(old, new, 1))
-    try:
+    with changed(finished, (file, old, new)):
         assert finished.planned() == {rule: count for rule, count in expected.items() if count}
-    finally:
-        path.write_text(before)
 
 
 def test_a_truncated_result_is_named_with_the_rule_that_rebuilds_it(finished, tmp_path):
