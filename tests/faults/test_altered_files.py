@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import REPOSITORY
-from helpers.workflow_copy import WorkflowCopy
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
 FLIPS = 100
 READS_DATASET = re.compile(r"dataset=\((.*?)\)")
@@ -31,6 +31,7 @@ def finished(tmp_path_factory) -> WorkflowCopy:
         tmp_path_factory.mktemp("altered"),
         methods={"street": {"parts": ["background", "actors"], "overrides": street}},
         actors={"random_points": 200},
+        train=TINY_TRAINING | {"iterations": 20},
     )
     done = copy.run("results/0001/metrics.json", "results/0001/street/parts/parts.json")
     assert done.returncode == 0, done.stdout
@@ -138,14 +139,14 @@ DELETE = re.compile(r"(results/\S+): .*; delete (\S+) and rerun: the rule '(\w+)
 
 
 @pytest.mark.parametrize(
-    ("path", "rule", "lost"),
+    ("path", "rule", "lost", "target"),
     [
-        ("results/0001/masks/regions/CAM_FRONT/*.png", "masks", True),
-        ("results/0001/masks/sky/CAM_FRONT/*.png", "masks", False),
-        ("results/0001/seed.ply", "lidar_seed", False),
+        ("results/0001/masks/regions/CAM_FRONT/*.png", "masks", True, "results/0001/street/checkpoint.npz"),
+        ("results/0001/masks/sky/CAM_FRONT/*.png", "masks", False, "results/0001/street/checkpoint.npz"),
+        ("results/0001/seed.ply", "lidar_seed", False, "results/0001/parser.pkl"),
     ],
 )
-def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, lost):
+def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, lost, target):
     """Members that Snakemake does not know, lost and altered, and a declared output."""
     copy = finished.again(tmp_path / "copy")
     (copy.folder / "results/0001/parser.pkl").unlink()
@@ -156,7 +157,6 @@ def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, 
         damaged.unlink()
     else:
         damaged.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    target = "results/0001/street/checkpoint.npz"
     refused = copy.run(target)
     name, delete, named = DELETE.search(refused.stdout).groups()
     assert refused.returncode and named == rule and (copy.folder / name) == damaged
