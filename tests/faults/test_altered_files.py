@@ -11,6 +11,8 @@ import pytest
 from helpers import REPOSITORY
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
+pytestmark = [pytest.mark.workflow, pytest.mark.xdist_group("altered_files")]
+
 FLIPS = 100
 READS_DATASET = re.compile(r"dataset=\((.*?)\)")
 

@@ -21,9 +21,9 @@ from types import ModuleType
 from typing import Any, TextIO
 
 _PRELOADED = [
-    "cv2", "imageio_ffmpeg", "jaxtyping", "matplotlib.figure", "numba", "PIL.Image", "plyfile", "pxr.Usd", "pydantic",
-    "scipy.interpolate", "scipy.ndimage", "scipy.spatial.transform", "scipy.stats", "skimage.metrics",
-    "snakemake.logging", "torch", "torch.utils.tensorboard", "trimesh",
+    "cv2", "ffmpeg", "imageio_ffmpeg", "jaxtyping", "matplotlib.figure", "PIL.Image", "plyfile", "pxr.Usd",
+    "pydantic.json_schema", "scipy.interpolate", "scipy.ndimage", "scipy.spatial.transform", "scipy.stats",
+    "skimage.metrics", "snakemake.io", "snakemake.logging", "torch", "torch.utils.tensorboard", "trimesh",
 ]  # fmt: skip
 """Modules of other packages that scripts import."""
 _FORK = multiprocessing.get_context("fork")
@@ -43,6 +43,7 @@ class ScriptServer:
 
 @cache
 def script_server() -> ScriptServer:
+    """The one of this process, started when first asked for."""
     folder, environment = tempfile.TemporaryDirectory(), {**os.environ, "PYTHONPATH": ""}
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(f"{folder.name}/socket")
@@ -113,7 +114,10 @@ def _run(streams: list[int], script: str, folder: str, environment: dict[str, st
 
 
 if __name__ == "__main__":
+    from numba import njit
+
     for name in _PRELOADED:
         import_module(name)
+    njit("int64(int64)")(lambda number: number)  # loads and sets up its compiler
     gc.freeze()  # so that no collection in a forked process touches, and thereby copies, the memory of this one
     _serve(socket.socket(fileno=int(sys.argv[1])))
