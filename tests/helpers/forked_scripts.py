@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -89,12 +90,16 @@ def _serve(listener: socket.socket) -> None:
                     os.close(stream)
                 connection.close()
                 running[process.sentinel] = process, answers
-                print(process.pid, file=answers, flush=True)
+                _answer(answers, process.pid)
             else:
                 process, answers = running.pop(ready)
                 process.join()
-                print(process.exitcode, file=answers, flush=True)
-                answers.close()
+                _answer(answers, process.exitcode)
+
+
+def _answer(answers: TextIO, number: int) -> None:
+    with suppress(OSError):  # who has asked may have been killed
+        print(number, file=answers, flush=True)
 
 
 def _run(streams: list[int], script: str, folder: str, environment: dict[str, str]) -> None:
