@@ -27,7 +27,7 @@ from drivesplat.export.unique_names import unique_names
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_group, usd_matrix
 from drivesplat.io.storage import Provenance, atomic_path, unwritable
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, smooth_poses
+from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, recorded_timestamps, smooth_poses
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.export import ExportJob
@@ -72,11 +72,6 @@ def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]
     size = (frames[0].width, frames[0].height)
     K = continuous_intrinsics(frames[0], size)
     return [(scene.seconds(time), usd_camera(K, size, pose)) for time, pose in zip(times, poses, strict=True)]
-
-
-def recorded_timestamps(scene: Scene, camera: str) -> np.ndarray:
-    """The timestamps (n,) of a camera's images in microseconds: int64, increasing."""
-    return np.array([frame.timestamp for frame in recorded_frames(scene, camera)], dtype=np.int64)
 
 
 def splat_stage(

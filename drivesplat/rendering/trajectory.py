@@ -64,6 +64,11 @@ def recorded_frames(scene: Scene, camera: str) -> list[Frame]:
     return [by_time[timestamp] for timestamp in sorted(by_time)]
 
 
+def recorded_timestamps(scene: Scene, camera: str) -> np.ndarray:
+    """The timestamps (n,) of a camera's images in microseconds: int64, increasing."""
+    return np.array([frame.timestamp for frame in recorded_frames(scene, camera)], dtype=np.int64)
+
+
 def film_timestamps(first: int, last: int, fps: int) -> np.ndarray:
     """The times (n,) int64 of a film's frames: first + k / fps within [first, last], each rounded separately."""
     count = (last - first) * fps // 1_000_000 + 1

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.chromium import chromium, in_a_browser
+from helpers.classed import classed
 from helpers.hand_made import round_gaussians
 from helpers.hand_made_traffic import TRAJECTORIES, TURNING, Traffic, own_gaussians, placed
 from helpers.records import EMPTY_CHECKPOINT
@@ -17,16 +18,19 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.export import viewer
-from drivesplat.export.viewer import export_viewer, packed, sky_faces, viewer_page
+from drivesplat.export.sampled_motion import SampledMotion
+from drivesplat.export.trained_parts import SampledGroup
+from drivesplat.export.viewer import export_viewer, viewer_page
+from drivesplat.export.viewer_scene import RecordedPath, packed, recorded_path, sky_faces
 from drivesplat.model.background import Background
 from drivesplat.model.checkpoint import TrainedCheckpoint
-from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Sky
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.rigid import rigid
-from drivesplat.scene.scene import Frame
+from drivesplat.scene.scene import Frame, Track
 from drivesplat.settings.export import ExportJob
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 
@@ -36,7 +40,8 @@ WIDTH, HEIGHT = 240, 135
 SHOWN_WITHOUT_WORDS = """new Promise((done) => {
   const look = () => document.documentElement.dataset.shown === "yes" ? done() : setTimeout(look, 20);
   look();
-}).then(() => document.querySelectorAll("p").forEach((p) => (p.hidden = true)))"""
+}).then(() => document.querySelectorAll(".over").forEach((over) => (over.style.visibility = "hidden")))"""
+"""Waits for the first picture, then makes the controls over it invisible."""
 
 
 def splats(count: int = COUNT, sh_degree: int = 2) -> Gaussians:
@@ -60,6 +65,18 @@ def oblique_frame() -> Frame:
     pose = rigid(turned, np.array([5.0, -3.0, 1.6]))
     K = np.array([[410.0, 0.0, 250.5], [0.0, 400.0, 122.25], [0.0, 0.0, 1.0]])
     return Frame("CAM_FRONT", 0, "", 480, 270, K, pose, np.eye(4), True, 0, "")
+
+
+def path_from(frame: Frame) -> RecordedPath:
+    """Two seconds in which the camera rides two metres ahead from `frame`."""
+    ahead = rigid(frame.camera_to_world[:3, :3], frame.camera_to_world[:3, 3] + 2.0 * frame.camera_to_world[:3, 2])
+    return RecordedPath(frame, 0.0, np.array([0.0, 2.0]), np.stack([frame.camera_to_world, ahead]), (0.0, 0.5, 2.0))
+
+
+def page_of(gaussians: Gaussians, sky: Sky | None, antialiased: bool = False, title: str = "test") -> str:
+    """The page of a static splat."""
+    groups = {"background": SampledGroup(gaussians)}
+    return viewer_page(groups, sky, antialiased, path_from(oblique_frame()), title, PROVENANCE)
 
 
 def a_sky() -> CubemapSky:
@@ -134,22 +151,38 @@ def test_the_payload_has_the_gaussians_of_largest_coverage(page):
     np.testing.assert_allclose(scene["sh_range"] * root * abs(root), expected.sh[:, 1:], atol=scene["sh_range"] / 120)
 
 
-def test_objects_present_at_the_middle_image_are_placed_there(tmp_path, tiny_scene, monkeypatch):
-    """Two vehicles, of which one is absent then; beside a background without view dependence."""
+def test_objects_are_in_their_own_frames_with_their_motions(tmp_path, tiny_scene, monkeypatch):
+    """Two vehicles, of which one is absent at the middle image; beside a background without view dependence."""
     model = SplatModel([round_gaussians([[1.0, 2.0, 3.0]]), Traffic()], None)
     monkeypatch.setattr(viewer, "trained_model", lambda _: model)
     job = ExportJob(eval_camera="CAM_FRONT", gaussians=1000)
     export_viewer(tmp_path / "viewer.html", EMPTY_CHECKPOINT, tiny_scene, job, "street", PROVENANCE)
     scene, arrays = decoded((tmp_path / "viewer.html").read_text(encoding="utf-8"))
-    there = placed(own_gaussians(TURNING, 2.25), TRAJECTORIES[TURNING].pose(2.25))
-    assert (scene["count"], scene["coefficients"]) == (1 + len(there), 4)
-    np.testing.assert_allclose(arrays["means"].reshape(-1, 3), [[1.0, 2.0, 3.0], *there.means.tolist()], atol=1e-5)
-    np.testing.assert_allclose(arrays["sh0"].reshape(-1, 3)[1:], there.sh[:, 0], atol=1e-3)
+    own = {name: own_gaussians(name, 2.25) for name in TRAJECTORIES}
+    numbers = {record["name"]: number for number, record in enumerate(scene["groups"])}
+    assert scene["count"] == 1 + sum(map(len, own.values())) and not scene["has_sky"]
+    assert set(own) < set(numbers) and scene["groups"][0]["samples"] is None
+    for name, gaussians in own.items():
+        rows, record = arrays["group"] == numbers[name], scene["groups"][numbers[name]]
+        np.testing.assert_allclose(arrays["means"].reshape(-1, 3)[rows], gaussians.means, atol=1e-5)
+        np.testing.assert_allclose(arrays["sh0"].reshape(-1, 3)[rows], gaussians.sh[:, 0], atol=1e-3)
+        first, last = record["samples"]
+        seconds, poses = arrays["motion_seconds"][first:last], arrays["motion_poses"].reshape(-1, 3, 4)[first:last]
+        assert len(seconds) > 30 and (np.diff(seconds) > 0).all()
+        for second, pose in zip(seconds[::9], poses[::9], strict=True):
+            assert any(begin - 1e-3 <= second <= end + 1e-3 for begin, end in record["present"])
+            np.testing.assert_allclose(pose, TRAJECTORIES[name].pose(second)[:3], atol=2e-3)
+    assert [len(scene["groups"][numbers[name]]["present"]) for name in own] == [1, 2]
 
 
-def test_a_splat_without_view_dependence_is_written():
-    scene, arrays = decoded(viewer_page(splats(sh_degree=0), None, False, oblique_frame(), "t", {}))
-    assert scene["coefficients"] == 1 and len(arrays["shN"]) == 0 and not arrays["sky"].any()
+def test_the_recorded_camera_passes_its_images(tiny_scene):
+    path = recorded_path(tiny_scene, "CAM_FRONT")
+    frames = [frame for frame in tiny_scene.frames if frame.camera == "CAM_FRONT"]
+    for frame in frames:
+        row = int(np.abs(path.seconds - tiny_scene.seconds(frame.timestamp)).argmin())
+        np.testing.assert_allclose(path.camera_to_world[row], frame.camera_to_world, atol=1e-6)
+    assert path.key_frames == tuple(tiny_scene.seconds(f.timestamp) for f in frames if f.is_key_frame)
+    assert path.seconds[-1] == path.key_frames[-1] and np.diff(path.seconds).max() < 0.034
 
 
 def test_the_start_is_the_middle_key_frame_of_the_evaluated_camera(page, tiny_scene):
@@ -165,16 +198,14 @@ def test_title_and_provenance_are_escaped(page):
     assert "<title>0001 · vanilla</title>" in page
     assert json.loads(element(page, "provenance")) == PROVENANCE
     assert "<b>" not in page
-    assert "<title>&lt;i&gt; {{scene}}</title>" in viewer_page(
-        splats(), None, False, oblique_frame(), "<i> {{scene}}", {}
-    )
+    assert "<title>&lt;i&gt; {{scene}}</title>" in page_of(splats(), None, title="<i> {{scene}}")
 
 
 def test_the_page_is_deterministic_and_of_bounded_size(page):
-    again = [viewer_page(splats(), a_sky(), True, oblique_frame(), "t", PROVENANCE) for _ in range(2)]
+    again = [page_of(splats(), a_sky(), antialiased=True) for _ in range(2)]
     assert again[0] == again[1]
-    # 12 + 6 + 8 + 1 + 6 + 24 bytes a Gaussian and the sky, in base64 at worst; the rest of the page
-    assert len(page) < 1.34 * (57 * KEPT + 6 * 256**2 * 3) + 40_000
+    # 12 + 6 + 8 + 1 + 6 + 24 + 2 bytes a Gaussian and the sky, in base64 at worst; the rest of the page
+    assert len(page) < 1.34 * (59 * KEPT + 6 * 256**2 * 3) + 60_000
 
 
 def test_arrays_are_aligned_for_every_type():
@@ -231,7 +262,7 @@ def test_a_browser_renders_the_page_from_disk_as_the_model_does(tmp_path, antial
         assert psnr(plain, rendered(a_model(gaussians, sky, antialiased), frame.camera_to_world)) < 35.0
     model, pose = a_model(gaussians, sky, antialiased), frame.camera_to_world
     file = tmp_path / "viewer.html"
-    file.write_text(viewer_page(gaussians, sky, antialiased, frame, "test", {}), encoding="utf-8")
+    file.write_text(page_of(gaussians, sky, antialiased), encoding="utf-8")
     with chromium(tmp_path / "profile") as tab:
         tab.open(file, WIDTH, HEIGHT)
         tab.run(SHOWN_WITHOUT_WORDS)
@@ -257,9 +288,105 @@ def test_a_browser_renders_the_page_from_disk_as_the_model_does(tmp_path, antial
     assert psnr(start, dragged) < 35.0 > psnr(start, wheeled)
 
 
+CAR = "0a8dee9e8b4b4b0f8d6c2a5f1e3d4c5b"
+
+
+def car_pose(second: float) -> np.ndarray:
+    """A car ten metres ahead of `oblique_frame` that drives to the right at 3 m/s."""
+    camera = oblique_frame().camera_to_world
+    turned = Rotation.from_euler("z", 0.3).as_matrix()
+    return rigid(turned, camera[:3, 3] + 10.0 * camera[:3, 2] + 3.0 * (second - 1.0) * camera[:3, 0])
+
+
+def driving_car() -> SampledGroup:
+    """It is there for the first one and a half seconds."""
+    seconds = np.linspace(0.0, 1.5, 46)
+    poses = np.stack([car_pose(second) for second in seconds])
+    track = Track(CAR, *classed("vehicle.car"), np.array([4.0, 4.0, 4.0]), np.zeros(0, np.int64),
+                  np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.int64))  # fmt: skip
+    return SampledGroup(own_gaussians(TURNING, 0.0), SampledMotion(seconds, poses, ((0.0, 1.5),), 0.0), track)
+
+
+def set_second(second: float) -> str:
+    return f"""(() => {{
+      const time = document.getElementById("time");
+      time.value = {second};
+      time.dispatchEvent(new Event("input"));
+    }})()"""
+
+
+def tick(label: str) -> str:
+    return f"""[...document.querySelectorAll("#list label")]
+      .find((label) => label.textContent.includes("{label}")).firstChild.click()"""
+
+
+@in_a_browser
+def test_objects_move_with_the_time_and_can_be_hidden_and_picked(tmp_path):
+    street, car, sky, frame = splats(200, sh_degree=1), driving_car(), a_sky(), oblique_frame()
+    camera = frame.camera_to_world
+    file = tmp_path / "viewer.html"
+    page = viewer_page({"background": SampledGroup(street), CAR: car}, sky, False, path_from(frame), "test", {})
+    file.write_text(page, encoding="utf-8")
+
+    def expected(second: float | None, pose: np.ndarray = camera, behind: Sky | None = sky) -> np.ndarray:
+        parts = [street] if second is None else [street, placed(car.gaussians, car_pose(second))]
+        return rendered(a_model(concatenate(parts), behind), pose)
+
+    with chromium(tmp_path / "profile") as tab:
+        tab.open(file, WIDTH, HEIGHT)
+        tab.run(SHOWN_WITHOUT_WORDS)
+        assert psnr(tab.picture(), expected(0.0)) > 40.0
+        tab.run(set_second(1.2))
+        there = tab.picture()
+        assert psnr(there, expected(1.2)) > 40.0 > 35.0 > psnr(there, expected(0.0))
+        tab.run(tick("vehicle.car"))
+        hidden = tab.picture()
+        assert psnr(hidden, expected(None)) > 40.0
+        changed, own = np.abs(hidden - there).max(axis=2) > 0.02, np.abs(expected(1.2) - expected(None)).max(axis=2)
+        assert changed.any() and not (changed & (own < 0.004)).any(), "only the car's pixels"
+        tab.run(tick("sky"))
+        assert psnr(tab.picture(), expected(None, behind=None)) > 40.0
+        tab.run(f"{tick('vehicle.car')}; {tick('sky')}; {set_second(1.8)}")
+        assert psnr(tab.picture(), expected(None)) > 40.0, "absent by then"
+        tab.run(set_second(1.0))
+        for kind, buttons in (("mousePressed", 1), ("mouseReleased", 0)):
+            middle = (250.5 + 0.5) / 2, (122.25 + 0.5) / 2
+            tab.mouse(kind, round(middle[0]), round(middle[1]), button="left", buttons=buttons, clickCount=1)
+        about, step = (tab.run(f'document.getElementById("{name}").textContent') for name in ("about", "step"))
+        assert about.startswith(f"vehicle.car {CAR} · 3.0 m/s") and step == f'- remove: {{track: "{CAR[:8]}"}}'
+        tab.run(f'{set_second(0.5)}; document.getElementById("follow").click()')
+        ahead = rigid(camera[:3, :3], camera[:3, 3] + 0.5 * camera[:3, 2])
+        assert psnr(tab.picture(), expected(0.5, ahead)) > 40.0
+        assert tab.complaints == []
+
+
+@in_a_browser
+def test_play_moves_the_time_on_and_buttons_jump_to_key_frames(tmp_path):
+    file = tmp_path / "viewer.html"
+    file.write_text(page_of(splats(), None), encoding="utf-8")
+    clock = 'Number.parseFloat(document.getElementById("clock").textContent)'
+    with chromium(tmp_path / "profile") as tab:
+        tab.open(file, WIDTH, HEIGHT)
+        tab.run(SHOWN_WITHOUT_WORDS)
+        assert tab.run(clock) == 0.0
+        for button, second in (("next", 0.5), ("next", 2.0), ("previous", 0.5)):
+            tab.run(f'document.getElementById("{button}").click()')
+            tab.picture()
+            assert tab.run(clock) == second
+        tab.run('document.getElementById("play").click()')
+        tab.run("new Promise((done) => setTimeout(done, 400))")
+        tab.run('document.getElementById("play").click()')
+        tab.picture()
+        stopped = tab.run(clock)
+        assert 0.6 < stopped < 2.0
+        tab.picture()
+        assert tab.run(clock) == stopped
+        assert tab.complaints == []
+
+
 @in_a_browser
 def test_requests_and_errors_of_the_page_are_detected(tmp_path):
-    page = viewer_page(splats(), None, False, oblique_frame(), "test", {})
+    page = page_of(splats(), None)
     file = tmp_path / "viewer.html"
     file.write_text(page.replace('"use strict";', '"use strict"; fetch("https://example.org/x");', 1), encoding="utf-8")
     with chromium(tmp_path / "profile") as tab:

@@ -12,17 +12,16 @@ from drivesplat.demo.optics.rig import DemoSensor
 from drivesplat.demo.recorder import Recorder
 from drivesplat.demo.street.objects import EGO_VEHICLE
 from drivesplat.scene.scene import Frame, Scene, Sweep
-from drivesplat.settings.world import WorldSettings
+from helpers import demo_worlds
 from helpers.demo_worlds import RIG
 
 START_US, KEY_FRAME_US = 1_000_000_000, 500_000
 KEY_FRAMES = 14
 
 
-@functools.cache
 def recorder_of(**world: Any) -> Recorder:
     """A small street with little traffic; `world` is laid over it."""
-    return Recorder(WorldSettings(**{"width": 160, "samples_per_pixel": 1, "vehicles": 1, "pedestrians": 0, **world}))
+    return demo_worlds.recorder_of(**{"width": 160, "vehicles": 1, "pedestrians": 0, **world})
 
 
 def rig_drive(folder: Path, cameras: Sequence[str], key_frames: int = KEY_FRAMES, **world: Any) -> Scene:

@@ -3,6 +3,7 @@
 const ORBIT_METRES = 10; // the point that an orbit goes around lies so far ahead
 const WHEEL_METRES = 0.01; // a pixel of the wheel's travel
 const WALK_METRES = 0.004; // a millisecond of a key held down
+const CLICK_PIXELS = 4; // a pointer that moves less between press and release has clicked
 const STEEPEST = 1.5; // radians: short of straight up and down, where there is no heading
 
 const MOVES = {
@@ -61,18 +62,27 @@ function orbited(view, heading, pitch) {
   return moved(turned(moved(view, [0, 0, ORBIT_METRES]), heading, pitch), [0, 0, -ORBIT_METRES]);
 }
 
-// Calls show(view) whenever mouse, fingers or keys have changed the view.
-function followInput(canvas, start, show) {
+// The direction in the world of a point of the canvas, in its pixels.
+function rayAt(view, { focal, center }, x, y) {
+  return toWorld(rotationOf(view), [(x - center[0]) / focal[0], (y - center[1]) / focal[1], 1]);
+}
+
+// Calls show(view) whenever mouse, fingers or keys have changed the view, and pick(x, y) for a click without a drag.
+// Returns a function that sets the view.
+function followInput(canvas, start, show, pick) {
   let view = startView(start);
   const change = (next) => show((view = next));
   let drag = null;
-  canvas.addEventListener("pointerdown", (e) => (drag = { x: e.clientX, y: e.clientY, button: e.button }));
-  addEventListener("pointerup", () => (drag = null));
+  canvas.addEventListener("pointerdown", (e) => (drag = { x: e.clientX, y: e.clientY, button: e.button, way: 0 }));
+  addEventListener("pointerup", (e) => {
+    if (drag && drag.button === 0 && drag.way < CLICK_PIXELS) pick(e.clientX, e.clientY);
+    drag = null;
+  });
   addEventListener("pointercancel", () => (drag = null));
   addEventListener("pointermove", (e) => {
     if (!drag) return;
     const [dx, dy] = [e.clientX - drag.x, e.clientY - drag.y];
-    drag = { ...drag, x: e.clientX, y: e.clientY };
+    drag = { ...drag, x: e.clientX, y: e.clientY, way: drag.way + Math.abs(dx) + Math.abs(dy) };
     const focal = pinhole(start, canvas.clientWidth, canvas.clientHeight).focal[0];
     if (drag.button === 2) change(orbited(view, -dx / focal, -dy / focal));
     else if (drag.button === 1 || e.shiftKey) change(moved(view, [-dx, -dy, 0].map((d) => (d * ORBIT_METRES) / focal)));
@@ -86,6 +96,7 @@ function followInput(canvas, start, show) {
   }, { passive: false });
   followKeys((step) => change(moved(view, step)), () => change(startView(start)));
   change(view);
+  return change;
 }
 
 // Walks while keys are held, at one speed whatever the frame rate.
@@ -101,7 +112,7 @@ function followKeys(walk, restart) {
     requestAnimationFrame(step);
   };
   addEventListener("keydown", (e) => {
-    if (e.ctrlKey || e.metaKey || e.altKey) return;
+    if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("input, select, button")) return;
     if (e.code === "KeyR") restart();
     if (!(e.code in MOVES)) return;
     e.preventDefault();

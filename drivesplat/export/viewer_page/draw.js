@@ -51,8 +51,25 @@ function skyTexture(gl, unit, texels, size) {
   gl.texParameteri(gl.TEXTURE_CUBE_MAP, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
 }
 
-// The arrays of the page as textures, each on the unit at which the shaders look for it.
-function uploadTextures(gl, arrays, skySize, uniforms) {
+// The poses of the groups, a line for each: filled anew for every picture.
+function poseTexture(gl, unit, groups) {
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, 3, groups);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  const values = new Float32Array(12 * groups);
+  return (poses) => {
+    poses.forEach((pose, group) => pose && values.set(pose, 12 * group));
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 3, groups, gl.RGBA, gl.FLOAT, values);
+  };
+}
+
+// The arrays of the page as textures, each on the unit at which the shaders look for it. Returns the next free unit.
+function uploadTextures(gl, arrays, uniforms) {
   gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
   const formats = {
     means: [3, [gl.RGB32F, gl.RGB, gl.FLOAT]],
@@ -61,12 +78,12 @@ function uploadTextures(gl, arrays, skySize, uniforms) {
     opacities: [1, [gl.R8, gl.RED, gl.UNSIGNED_BYTE]],
     sh0: [3, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT]],
     shN: [3, [gl.RGB8_SNORM, gl.RGB, gl.BYTE]],
+    group: [1, [gl.R16UI, gl.RED_INTEGER, gl.UNSIGNED_SHORT]],
   };
   Object.entries(formats).forEach(([name, [channels, format]], unit) => {
     valueTexture(gl, unit, arrays[name], channels, format);
     gl.uniform1i(uniforms[name], unit);
   });
-  skyTexture(gl, Object.keys(formats).length, arrays.sky, skySize);
   return Object.keys(formats).length;
 }
 
@@ -92,30 +109,39 @@ function setCamera(gl, { made, uniforms }, rotation, position, { focal, center }
   gl.uniform2fv(uniforms.size, size);
 }
 
-// Returns draw(view): the sky, then the Gaussians over it, far to near. Throws where the browser has no WebGL 2.
+// Returns draw(view, poses, skyShown): the sky, then the Gaussians over it, far to near; `poses` has the pose of each
+// group, null where it is not shown. Throws where the browser has no WebGL 2.
 function painter(canvas, scene, arrays) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
   if (!gl) throw new Error("this browser has no WebGL 2; update it, or allow it to use the graphics card");
   const [sky, splat] = [program(gl, SKY_VERTEX, SKY_FRAGMENT), program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT)];
   gl.useProgram(splat.made);
-  const skyUnit = uploadTextures(gl, arrays, scene.sky_size, splat.uniforms);
+  const unit = uploadTextures(gl, arrays, splat.uniforms);
+  const setPoses = poseTexture(gl, unit, scene.groups.length);
+  gl.uniform1i(splat.uniforms.poses, unit);
   gl.uniform1f(splat.uniforms.shRange, scene.sh_range);
   gl.uniform1i(splat.uniforms.coefficients, scene.coefficients);
   gl.uniform1i(splat.uniforms.antialiased, scene.antialiased);
   gl.useProgram(sky.made);
-  gl.uniform1i(sky.uniforms.sky, skyUnit);
+  skyTexture(gl, unit + 1, arrays.sky, scene.sky_size);
+  gl.uniform1i(sky.uniforms.sky, unit + 1);
   geometry(gl);
+  gl.clearColor(0, 0, 0, 1);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-  const order = depthOrder(arrays.means, NEAR);
-  return (view) => {
+  const order = depthOrder(arrays.means, scene.groups.map((group) => group.gaussians), NEAR);
+  return (view, poses, skyShown) => {
     const size = [canvas.width, canvas.height];
     const [rotation, lens] = [rotationOf(view), pinhole(scene.start, ...size)];
-    const shown = order(rotation.map((row) => row[2]), view.position);
+    const shown = order(rotation.map((row) => row[2]), view.position, poses);
     gl.bufferData(gl.ARRAY_BUFFER, shown, gl.DYNAMIC_DRAW);
+    setPoses(poses);
     gl.viewport(0, 0, ...size);
+    gl.clear(gl.COLOR_BUFFER_BIT);
     gl.disable(gl.BLEND);
-    setCamera(gl, sky, rotation, view.position, lens, size);
-    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    if (skyShown) {
+      setCamera(gl, sky, rotation, view.position, lens, size);
+      gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    }
     gl.enable(gl.BLEND);
     setCamera(gl, splat, rotation, view.position, lens, size);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, shown.length);

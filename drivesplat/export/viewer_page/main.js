@@ -1,6 +1,7 @@
-// Opens the page: unpacks the arrays, then draws whenever the view or the window has changed.
+// Opens the page: unpacks the arrays, then draws whenever the view, the time or the window has changed.
 
-const HINT = "Drag: look · right drag: orbit · shift drag: pan · wheel or W A S D Q E: move · R: back to the start";
+const HINT = "Drag: look · right drag: orbit · shift drag: pan · wheel or W A S D Q E: move · R: back to the start · " +
+  "space: play · click: pick an object";
 
 // The arrays by name from zlib-compressed base64, one after the other in little-endian order (that of WebGL machines).
 async function unpacked(text, layout) {
@@ -9,7 +10,9 @@ async function unpacked(text, layout) {
   for (let i = 0; i < packed.length; i++) bytes[i] = packed.charCodeAt(i);
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   const buffer = await new Response(stream).arrayBuffer();
-  const kinds = { float32: Float32Array, float16: Uint16Array, uint8: Uint8Array, int8: Int8Array };
+  const kinds = {
+    float32: Float32Array, float16: Uint16Array, uint16: Uint16Array, uint8: Uint8Array, int8: Int8Array,
+  };
   return Object.fromEntries(layout.map(({ name, dtype, offset, length }) =>
     [name, new kinds[dtype](buffer, offset, length)]));
 }
@@ -21,16 +24,49 @@ async function openPage() {
   document.getElementById("payload").remove(); // no longer needed, megabytes
   const canvas = document.querySelector("canvas");
   const draw = painter(canvas, scene, arrays);
-  let [view, waiting] = [null, false];
+  const span = [arrays.camera_seconds[0], arrays.camera_seconds[arrays.camera_seconds.length - 1]];
+  const state = {
+    view: startView(scene.start), second: scene.start.second, playing: false, speed: 1, following: false,
+    sky: scene.has_sky, hidden: new Set(),
+  };
+  const poses = () => scene.groups.map((group, number) =>
+    state.hidden.has(number) ? null : groupPose(group, arrays, state.second));
+  let [waiting, before] = [false, null];
   const redraw = () => {
-    if (waiting || !view) return;
+    if (waiting) return;
     waiting = true;
-    requestAnimationFrame(() => {
+    requestAnimationFrame((now) => {
       waiting = false;
-      draw(view);
+      advance(now);
+      if (state.following) setView(recordedView(arrays, state.second), true);
+      draw(state.view, poses(), state.sky);
+      update();
       document.documentElement.dataset.shown = "yes";
+      if (state.playing) redraw();
     });
   };
+  const advance = (now) => {
+    if (state.playing && before !== null) {
+      const next = state.second + ((now - before) / 1000) * state.speed;
+      state.second = next > span[1] ? span[0] : next;
+    }
+    before = state.playing ? now : null;
+  };
+  const change = (part) => { Object.assign(state, part); redraw(); };
+  const update = timeBar(state, span, scene.key_frames, change);
+  shownList(state, scene.groups, scene.has_sky, change);
+  followCopy();
+  const pick = (x, y) => {
+    const ray = rayAt(state.view, pinhole(scene.start, canvas.clientWidth, canvas.clientHeight), x, y);
+    const number = pickedGroup(scene.groups, arrays, state.second, state.hidden, state.view.position, ray);
+    const group = number === null ? null : scene.groups[number];
+    showPicked(group, group && groupSpeed(group, arrays, state.second));
+  };
+  let followed = false;
+  const set = followInput(canvas, scene.start, (view) => {
+    change(followed ? { view } : { view, following: false }); // the user's hand ends the ride
+  }, pick);
+  const setView = (view, asRecorded) => { followed = asRecorded; set(view); followed = false; };
   const fit = () => {
     const sharpness = Math.min(devicePixelRatio, 2);
     canvas.width = Math.max(1, Math.round(canvas.clientWidth * sharpness));
@@ -39,7 +75,6 @@ async function openPage() {
   };
   canvas.addEventListener("webglcontextlost", () => tell("The browser lost access to the GPU: reload the page."));
   addEventListener("resize", fit);
-  followInput(canvas, scene.start, (next) => { view = next; redraw(); });
   fit();
   tell(HINT);
 }

@@ -4,11 +4,14 @@ const SPLAT_VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
+precision highp usampler2D;
 
 layout(location = 0) in vec2 corner;
 layout(location = 1) in uint index;
 
 uniform sampler2D means, scales, quats, opacities, sh0, shN;
+uniform usampler2D group; // the number of each Gaussian's rigid group
+uniform sampler2D poses; // a line for each group: three rows of [rotation | place], group to world
 uniform float shRange;
 uniform int coefficients;
 uniform bool antialiased;
@@ -73,10 +76,15 @@ vec3 radiance(uint i, vec3 d) {
 
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: nothing is drawn
-  vec3 mean = texel(means, index).xyz;
+  uint width = uint(textureSize(group, 0).x);
+  int line = int(texelFetch(group, ivec2(int(index % width), int(index / width)), 0).r);
+  vec4 rows[3] = vec4[3](
+    texelFetch(poses, ivec2(0, line), 0), texelFetch(poses, ivec2(1, line), 0), texelFetch(poses, ivec2(2, line), 0));
+  mat3 toWorld = transpose(mat3(rows[0].xyz, rows[1].xyz, rows[2].xyz));
+  vec3 mean = toWorld * texel(means, index).xyz + vec3(rows[0].w, rows[1].w, rows[2].w);
   vec3 p = (mean - position) * cameraToWorld;
   vec3 scale = texel(scales, index).xyz;
-  mat3 axes = rotation(texel(quats, index));
+  mat3 axes = toWorld * rotation(texel(quats, index));
   vec3 cov = projected(mat3(axes[0] * scale.x, axes[1] * scale.y, axes[2] * scale.z), p);
   float sharp = max(cov.x * cov.z - cov.y * cov.y, 0.0);
   cov.xz += EPS2D;
@@ -94,7 +102,7 @@ void main() {
     sigmas.y * sqrt(max(mid - spread, 0.0)) * vec2(-major.y, major.x);
   vec2 pixel = focal * p.xy / p.z + center + offset;
   gl_Position = vec4((2.0 * pixel / size - 1.0) * vec2(1.0, -1.0), 0.0, 1.0);
-  color = vec4(radiance(index, normalize(mean - position)), alpha);
+  color = vec4(radiance(index, normalize(mean - position) * toWorld), alpha);
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es

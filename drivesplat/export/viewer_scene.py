@@ -1,0 +1,169 @@
+"""The content of viewer.html: Gaussians by rigid group, their motions, the recorded camera, and the sky as arrays.
+
+Coefficients of spherical harmonics beyond the first are `sh_range` t |t| with t the stored byte over 127, finest where
+most of them are: near zero.
+"""
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.export.trained_parts import SampledGroup
+from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.part import Sky
+from drivesplat.rendering.color_bytes import to_uint8
+from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, recorded_timestamps, smooth_poses
+from drivesplat.scene.images import continuous_intrinsics
+from drivesplat.scene.scene import Frame, Scene
+
+POSES_PER_SECOND = 30
+
+
+@dataclass(frozen=True)
+class RecordedPath:
+    """The recorded camera: its poses `camera_to_world` (n, 4, 4) at `seconds` (n,) since the first image, the seconds
+    of its key frames, and the frame `start` of the first view with its second."""
+
+    start: Frame
+    start_second: float
+    seconds: np.ndarray
+    camera_to_world: np.ndarray
+    key_frames: tuple[float, ...]
+
+
+def recorded_path(scene: Scene, camera: str) -> RecordedPath:
+    """The path of a camera, starting at its middle key frame. Raises DatasetError if the scene has no key frame of
+    it."""
+    start, frames = scene.frames[scene.middle_key_frame(camera)], recorded_frames(scene, camera)
+    recorded = recorded_timestamps(scene, camera)
+    times = np.union1d(recorded, film_timestamps(frames[0].timestamp, frames[-1].timestamp, POSES_PER_SECOND))
+    return RecordedPath(
+        start,
+        scene.seconds(start.timestamp),
+        np.array([scene.seconds(time) for time in times]),
+        smooth_poses(recorded, np.stack([frame.camera_to_world for frame in frames]), times),
+        tuple(scene.seconds(frame.timestamp) for frame in frames if frame.is_key_frame),
+    )
+
+
+def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
+    """The Gaussians in the page's encoding, and the largest coefficient of spherical harmonics beyond the first.
+
+    `means` (n, 3) float32 and `scales` (n, 3) float16 in metres, unit `quats` (n, 4) float16, `opacities` (n,) uint8,
+    `sh0` (n, 3) float16, `shN` (n, k - 1, 3) int8.
+    """
+    shN = gaussians.shN.float()
+    sh_range = float(shN.detach().abs().max()) if shN.numel() else 0.0
+    roots = torch.sign(shN) * torch.sqrt(shN.abs() / (sh_range or 1.0))
+    largest = torch.finfo(torch.float16).max
+    arrays = {
+        "means": gaussians.means.float(),
+        "scales": gaussians.scales.clamp(max=largest).half(),
+        "quats": torch.nn.functional.normalize(gaussians.quats.float(), dim=-1).half(),
+        "opacities": torch.round(gaussians.opacities * 255.0).to(torch.uint8),
+        "sh0": gaussians.sh0[:, 0].clamp(-largest, largest).half(),
+        "shN": torch.round(roots * 127.0).to(torch.int8),
+    }
+    return {name: array.detach().contiguous().numpy() for name, array in arrays.items()}, sh_range
+
+
+def group_arrays(groups: Mapping[str, SampledGroup]) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+    """A record for each group, and the arrays of all: `group` (n,) uint16, the group's number of each Gaussian;
+    `motion_seconds` (m,) and `motion_poses` (m, 3, 4) float32, object to world, of all motions one after the other.
+
+    A record has the `gaussians` of the group, the intervals `present` (seconds) and the range `samples` of rows of its
+    motion; the last two are null for a static group.
+    """
+    records, seconds, poses = [], [np.zeros(0)], [np.zeros((0, 4, 4))]
+    for name, group in groups.items():
+        motion, track = group.motion, group.track
+        first = sum(map(len, seconds))
+        if motion is not None:
+            seconds.append(motion.seconds)
+            poses.append(motion.object_to_world)
+        records.append(
+            {
+                "name": name,
+                "category": track.category if track else None,
+                "size": track.size.tolist() if track else None,
+                "gaussians": len(group.gaussians),
+                "present": None if motion is None else [list(span) for span in motion.spans],
+                "samples": None if motion is None else [first, sum(map(len, seconds))],
+            }
+        )
+    counts = [len(group.gaussians) for group in groups.values()]
+    return records, {
+        "group": np.repeat(np.arange(len(counts)), counts).astype(np.uint16),
+        "motion_seconds": np.concatenate(seconds).astype(np.float32),
+        "motion_poses": np.concatenate(poses)[:, :3].astype(np.float32),
+    }
+
+
+def scene_record(
+    groups: Mapping[str, SampledGroup], sky: Sky | None, antialiased: bool, path: RecordedPath, sky_size: int
+) -> tuple[dict[str, Any], bytes]:
+    """What the page's scripts read, and the compressed arrays that it lists."""
+    gaussians = concatenate([group.gaussians for group in groups.values()])
+    arrays, sh_range = splat_arrays(gaussians)
+    records, motions = group_arrays(groups)
+    camera = {
+        "camera_seconds": path.seconds.astype(np.float32),
+        "camera_poses": path.camera_to_world[:, :3].astype(np.float32),
+    }
+    layout, payload = packed({**arrays, **motions, **camera, "sky": sky_faces(sky, sky_size)})
+    record = {
+        "count": len(gaussians),
+        "coefficients": 1 + gaussians.shN.shape[1],
+        "antialiased": antialiased,
+        "sh_range": sh_range,
+        "sky_size": sky_size,
+        "has_sky": sky is not None,
+        "start": {**start_pose(path.start), "second": path.start_second},
+        "key_frames": list(path.key_frames),
+        "groups": records,
+        "arrays": layout,
+    }
+    return record, payload
+
+
+@torch.no_grad()
+def sky_faces(sky: Sky | None, size: int) -> np.ndarray:
+    """The sky (6, size, size, 3) uint8 as an OpenGL cube map in world directions: faces +x -x +y -y +z -z."""
+    if sky is None:
+        return np.zeros((6, size, size, 3), np.uint8)
+    return torch.stack([to_uint8(sky.colors(rays)) for rays in cube_rays(size)]).numpy()
+
+
+def cube_rays(size: int) -> Float[Tensor, "6 size size 3"]:
+    """Unit directions of a cube map's texels (face, t, s): OpenGL 4.5 specification, table of section 8.13."""
+    line = (torch.arange(size) + 0.5) * (2.0 / size) - 1.0
+    t, s = torch.meshgrid(line, line, indexing="ij")
+    one = torch.ones_like(s)
+    faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
+    return torch.nn.functional.normalize(torch.stack([torch.stack(face, dim=-1) for face in faces]), dim=-1)
+
+
+def start_pose(frame: Frame) -> dict[str, Any]:
+    """The camera of a recorded frame: `K` in continuous pixels of width x height, OpenCV `camera_to_world` (4, 4)."""
+    return {
+        "width": frame.width,
+        "height": frame.height,
+        "K": continuous_intrinsics(frame, (frame.width, frame.height)).tolist(),
+        "camera_to_world": frame.camera_to_world.tolist(),
+    }
+
+
+def packed(arrays: dict[str, np.ndarray]) -> tuple[list[dict[str, Any]], bytes]:
+    """The offset (bytes) and length (values) of each array, and all arrays compressed with zlib."""
+    layout, content = [], bytearray()
+    for name, array in arrays.items():
+        content.extend(bytes(-len(content) % 4))
+        layout.append({"name": name, "dtype": array.dtype.name, "offset": len(content), "length": array.size})
+        content.extend(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return layout, zlib.compress(bytes(content), level=9)
