@@ -361,6 +361,33 @@ def test_objects_move_with_the_time_and_can_be_hidden_and_picked(tmp_path):
 
 
 @in_a_browser
+def test_boxes_are_drawn_around_their_objects(tmp_path):
+    """The lines of the box pass through the projections of its corners; nothing is drawn elsewhere."""
+    frame, car = oblique_frame(), driving_car()
+    file = tmp_path / "viewer.html"
+    page = viewer_page(
+        {"background": SampledGroup(splats(1, sh_degree=1)), CAR: car}, None, False, path_from(frame), "t", {}
+    )
+    file.write_text(page, encoding="utf-8")
+    with chromium(tmp_path / "profile") as tab:
+        tab.open(file, 2 * WIDTH, 2 * HEIGHT)
+        tab.run(SHOWN_WITHOUT_WORDS)
+        before = tab.picture()
+        tab.run(f"{tick('boxes')}; {set_second(0.0)}")
+        lines = np.abs(tab.picture() - before).max(axis=2) > 0.05
+        assert tab.complaints == []
+    signs = np.array([(x, y, z) for x in (-2.0, 2.0) for y in (-2.0, 2.0) for z in (-2.0, 2.0)])
+    corners = signs @ car_pose(0.0)[:3, :3].T + car_pose(0.0)[:3, 3]
+    seen = (corners - frame.camera_to_world[:3, 3]) @ frame.camera_to_world[:3, :3]
+    pixels = (seen @ frame.intrinsics.T)[:, :2] / seen[:, 2:] + 0.5
+    inside = pixels[((pixels > 0.0) & (pixels < [2 * WIDTH, 2 * HEIGHT])).all(axis=1)]
+    drawn = np.argwhere(lines)[:, ::-1] + 0.5
+    assert len(inside) == 7
+    assert (np.abs(inside[:, None] - drawn).max(axis=2).min(axis=1) < 2.0).all()
+    assert (drawn > pixels.min(axis=0) - 2.0).all() and (drawn < pixels.max(axis=0) + 2.0).all()
+
+
+@in_a_browser
 def test_play_moves_the_time_on_and_buttons_jump_to_key_frames(tmp_path):
     file = tmp_path / "viewer.html"
     file.write_text(page_of(splats(), None), encoding="utf-8")

@@ -35,7 +35,7 @@ function groupLabel(group) {
   return group.samples ? `${group.category || "object"} ${group.name.slice(0, 8)}` : group.name;
 }
 
-// A box to tick for the sky and for each group.
+// A box to tick for boxes, the recorded path, the sky and each group.
 function shownList(state, groups, hasSky, change) {
   const list = find("list");
   const add = (text, checked, set) => {
@@ -45,6 +45,8 @@ function shownList(state, groups, hasSky, change) {
     label.append(box, ` ${text}`);
     list.append(label);
   };
+  if (groups.some((group) => group.samples && group.size)) add("boxes", false, (on) => (state.boxes = on));
+  add("recorded path", false, (on) => (state.path = on));
   if (hasSky) add("sky", state.sky, (on) => (state.sky = on));
   groups.forEach((group, number) => add(groupLabel(group), true, (on) => {
     if (on) state.hidden.delete(number);

@@ -22,12 +22,12 @@ async function openPage() {
   const scene = JSON.parse(text("scene"));
   const arrays = await unpacked(text("payload"), scene.arrays);
   document.getElementById("payload").remove(); // no longer needed, megabytes
-  const canvas = document.querySelector("canvas");
-  const draw = painter(canvas, scene, arrays);
+  const [canvas, over] = [document.getElementById("splat"), document.getElementById("lines")];
+  const [draw, drawLines] = [painter(canvas, scene, arrays), linePainter(over, scene.start)];
   const span = [arrays.camera_seconds[0], arrays.camera_seconds[arrays.camera_seconds.length - 1]];
   const state = {
     view: startView(scene.start), second: scene.start.second, playing: false, speed: 1, following: false,
-    sky: scene.has_sky, hidden: new Set(),
+    sky: scene.has_sky, boxes: false, path: false, hidden: new Set(),
   };
   const poses = () => scene.groups.map((group, number) =>
     state.hidden.has(number) ? null : groupPose(group, arrays, state.second));
@@ -39,7 +39,9 @@ async function openPage() {
       waiting = false;
       advance(now);
       if (state.following) setView(recordedView(arrays, state.second), true);
-      draw(state.view, poses(), state.sky);
+      const groupPoses = poses();
+      draw(state.view, groupPoses, state.sky);
+      drawLines(state.view, linesAt(scene, arrays, groupPoses, state.second, state));
       update();
       document.documentElement.dataset.shown = "yes";
       if (state.playing) redraw();
@@ -69,8 +71,10 @@ async function openPage() {
   const setView = (view, asRecorded) => { followed = asRecorded; set(view); followed = false; };
   const fit = () => {
     const sharpness = Math.min(devicePixelRatio, 2);
-    canvas.width = Math.max(1, Math.round(canvas.clientWidth * sharpness));
-    canvas.height = Math.max(1, Math.round(canvas.clientHeight * sharpness));
+    for (const layer of [canvas, over]) {
+      layer.width = Math.max(1, Math.round(layer.clientWidth * sharpness));
+      layer.height = Math.max(1, Math.round(layer.clientHeight * sharpness));
+    }
     redraw();
   };
   canvas.addEventListener("webglcontextlost", () => tell("The browser lost access to the GPU: reload the page."));
