@@ -71,11 +71,12 @@ def render_edit(
     if colliding.any():
         first, last = seconds[colliding][[0, -1]]
         log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
-    placed, still = actor_placements(edited, seconds), Still(colliding)
+    placed = actor_placements(edited, seconds)
+    still = Still(avoided=colliding | (seconds > right.trained_until))
     before = recorded_shot(model, left, device)
     model.precompute(right.seconds)
     after = edited_frames(model, right.views(device), placed)
-    write_film(files.film, still.side_by_side(before, after), right, model, columns=2)
+    write_film(files.film, still.side_by_side(before, after), right, model, ["recorded", files.film.stem])
     write_png(files.still, still.picture)
     remove_frames(files.frames)
     images = write_frames(files.frames, edited_frames(model, large.views(device), placed)) if job.frames else []
@@ -143,7 +144,8 @@ def edited_frames(
 
 class Still:
     """The pair of a recorded and an edited frame that differ most: its `number` from 0 and side-by-side `picture`.
-    `avoided` (n,) bool frames are chosen only if there is no other."""
+    `avoided` (n,) bool frames are chosen only if there is no other: those inside a vehicle, and those beyond the last
+    training image."""
 
     number: int
     picture: np.ndarray

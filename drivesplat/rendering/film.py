@@ -4,7 +4,7 @@ films of its static and dynamic parts side by side."""
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
+from drivesplat.rendering.captions import captioned, last_training_second
 from drivesplat.rendering.frames import film_frame, film_frames, uint8_image
 from drivesplat.rendering.trajectory import CameraPath, film_intrinsics, film_path, recorded_frames
 from drivesplat.scene.scene import Scene
@@ -59,6 +60,11 @@ class Shot:
         """The time of each frame, since the first image of the scene."""
         return [self.scene.seconds(timestamp) for timestamp in self.cameras.timestamps]
 
+    @cached_property
+    def trained_until(self) -> float:
+        """The second of the camera's last training image; infinite if there is none."""
+        return last_training_second(self.scene, self.format.camera, self.format.holdout)
+
     def record(self) -> dict[str, Any]:
         """The cameras of the film, for other programs.
 
@@ -91,7 +97,7 @@ def render_film(
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)
-    figures = write_film(path, recorded_shot(model, shot, device), shot, model)
+    figures = write_film(path, recorded_shot(model, shot, device), shot, model, [f"{path.parent.name}: {path.stem}"])
     return {**shot.record(), "offset": job.trajectory.model_dump(), **figures}
 
 
@@ -105,22 +111,23 @@ def render_parts(
     shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
     model, device = open_model(checkpoint, device_settings)
     model.precompute(shot.seconds)
-    figures = write_film(
-        path, (_static_and_dynamic(model, view) for view in shot.views(device)), shot, model, columns=3
-    )
+    pictures = (_static_and_dynamic(model, view) for view in shot.views(device))
+    figures = write_film(path, pictures, shot, model, ["everything", "static", "moving"])
     return {**shot.record(), "shows": ["all", "still", "moving"], **figures}
 
 
 def write_film(
-    path: Path, pictures: Iterable[np.ndarray], shot: Shot, model: SplatModel, columns: int = 1
+    path: Path, pictures: Iterable[np.ndarray], shot: Shot, model: SplatModel, labels: Sequence[str]
 ) -> dict[str, Any]:
-    """Writes an MP4 of one image (h, w, 3) uint8 for each camera of `shot`, `columns` times as wide as a view of it;
-    returns `render_seconds` and `bytes`.
+    """Writes an MP4 of one image (h, w, 3) uint8 for each camera of `shot`, with a column as wide as a view of it for
+    each of `labels`, which its captions show; returns `render_seconds` and `bytes`.
 
     Raises DeviceError, which tells the size of `model`, where memory is exhausted, and ResultError where the film
     cannot be written.
     """
     began, count = time.perf_counter(), len(shot.cameras)
+    if shot.format.captions:
+        pictures = captioned(pictures, shot.seconds, labels, shot.trained_until)
     frames = tqdm(
         prefetch_items(pictures),
         total=count,
@@ -129,7 +136,7 @@ def write_film(
         disable=not sys.stderr.isatty(),
         mininterval=1.0,
     )
-    size = (columns * shot.size[0], shot.size[1])
+    size = (len(labels) * shot.size[0], shot.size[1])
     with explain_out_of_memory(lambda: len(model)):
         write_video(path, iter(frames), size, shot.format.fps, shot.format.crf, threads=torch.get_num_threads())
     seconds = time.perf_counter() - began

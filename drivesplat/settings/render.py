@@ -4,6 +4,7 @@ from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit
+from drivesplat.settings.images import HoldoutSettings
 
 
 class TrajectorySettings(Settings):
@@ -34,6 +35,8 @@ class RenderSettings(Settings):
     """Horizontal field of view in degrees. null = that of the evaluated camera."""
     crf: int = Field(18, ge=1, le=51)
     """H.264 constant rate factor. Lower values give better quality and larger files; 18 is visually lossless."""
+    captions: bool = True
+    """Write into films what is shown, the seconds of the drive, and where they go beyond the last training image."""
     edited_frames: bool = False
     """Also write the frames of edited drives as PNG, at full size, with labels in the JSON file."""
     trajectories: dict[str, TrajectorySettings] = Field(default_factory=_default_trajectories)
@@ -49,6 +52,8 @@ class FilmFormat(Settings):
     height: int
     horizontal_fov: float | None
     crf: int
+    captions: bool = False
+    holdout: HoldoutSettings = Field(default_factory=HoldoutSettings)
 
     def tile(self, columns: int) -> tuple[int, int]:
         """Width and height (pixels, even) of each of `columns` images side by side in a film of this width."""

@@ -167,7 +167,7 @@ def _evaluation(at: Place) -> dict[str, Any]:
 
 def _format(at: Place) -> dict[str, Any]:
     """The fields of a `FilmFormat`."""
-    fields = ("fps", "width", "height", "horizontal_fov", "crf")
+    fields = ("fps", "width", "height", "horizontal_fov", "crf", "captions")
     return {"camera": at.config.eval_camera, **{name: getattr(at.config.render, name) for name in fields}}
 
 

@@ -42,6 +42,7 @@ from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.edit import Edit
+from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.render import EditJob, FilmJob, TrajectorySettings
 
 CPU = DeviceSettings(kind="cpu")
@@ -197,6 +198,29 @@ def test_the_record_holds_the_edit_and_the_number_of_frames(busy):
     assert all(len(track["object_to_world"]) == 19 for track in record["tracks"])
     assert record["images"] == [f"it/{number:06d}.png" for number in range(19)]
     assert Edit.model_validate(record["edit"]) == edit_of(*BUSY)
+
+
+def test_captions_are_in_the_film_and_not_in_the_frames(scene, model, large, tmp_path):
+    plain, captioned = large, make(scene, model, tmp_path, *BUSY, width=128, height=72, captions=True, frames=True)
+    different = (plain.reels["it"] != captioned.reels["it"]).any(axis=3)
+    assert different.any(axis=(1, 2)).all() and different.mean() < 0.4
+    assert captioned.record["still_frame"] == plain.record["still_frame"]
+    bare = make(scene, model, tmp_path, *BUSY, width=128, height=72, frames=True)
+    np.testing.assert_array_equal(captioned.pictures(), bare.pictures())
+
+
+def test_the_still_is_not_beyond_the_last_training_image(scene, model, tmp_path):
+    """With all held out from a second before the largest difference, of a vehicle that falls behind."""
+    behind = {"speed": {"track": AHEAD, "factor": 0.5}}
+
+    def still_second(last_block: int) -> float:
+        holdout = HoldoutSettings(every_nth=0, last_block=last_block)
+        record = make(scene, model, tmp_path, behind, holdout=holdout).record
+        return scene.seconds(record["timestamps"][record["still_frame"]])
+
+    held_out = [t for t in scene.key_frame_timestamps if scene.seconds(int(t)) > still_second(0) - 1.0]
+    assert 1 < len(held_out) < len(scene.key_frame_timestamps) - 1
+    assert still_second(len(held_out)) < scene.seconds(int(held_out[0])) < still_second(0)
 
 
 def test_the_still_is_the_pair_with_the_largest_difference(large):
