@@ -42,6 +42,12 @@ def test_a_disabled_group_is_not_mentioned():
     assert not any("beyond" in line for line in lines)
 
 
+def test_a_drive_with_nothing_held_out_is_said_to_have_no_figures():
+    said = "No image is held out (holdout), so there are no figures of held-out images"
+    assert sentences({"methods": {"vanilla": method()}}, "m.json")[0] == said
+    assert said not in sentences({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}, "m.json")
+
+
 def test_a_static_scene_has_no_gap():
     lines = sentences({"methods": {"vanilla": method(interpolation=group(27.1, None))}}, "m.json")
     assert lines[0].endswith("static 27.1 dB, no moving vehicle to compare with")
