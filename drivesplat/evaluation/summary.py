@@ -25,7 +25,7 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
         for group, where in GROUP_PLACES.items():
             gap = method[group].get("gap_db")
             if (static := _psnr(method[group], "static")) is not None:
-                lines.append(f"{name}, frames {where}: static {static:.1f} dB, {_moving_vehicles(method[group], gap)}")
+                lines.append(f"{name}, frames {where}: {_with_moving_vehicles(static, method[group], gap)}")
         for offset, view in method.get("lateral", {}).items():
             if found := _lateral_figures(view):
                 metres, side = abs(float(offset)), "left" if float(offset) > 0 else "right"
@@ -83,11 +83,11 @@ def _lateral_figures(view: dict[str, Any]) -> list[str]:
     return found
 
 
-def _moving_vehicles(group: dict[str, Any], gap: float | None) -> str:
+def _with_moving_vehicles(static: float, group: dict[str, Any], gap: float | None) -> str:
     moving = _psnr(group, "moving_vehicle")
     if gap is None or moving is None:
-        return "no moving vehicle to compare with"
-    return f"moving vehicles {moving:.1f} dB: a gap of {gap:.1f} dB"
+        return f"static {static:.1f} dB, no moving vehicle to compare with"
+    return f"moving vehicles {moving:.1f} dB, static {static:.1f} dB: a gap of {gap:.1f} dB"
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The PSNR gap between static and moving pixels per scene and method, and its means over scenes.
 
-Means of gaps and closed fractions are over scenes with moving vehicles; in other scenes `gap_db` is that of parked
-vehicles, which no method has to close.
+Means of gaps and the share of a gap that a method closes are over scenes with moving vehicles; in other scenes `gap_db`
+is that of parked vehicles, which no method has to close.
 """
 
 from pathlib import Path
@@ -12,13 +12,15 @@ from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.provenance.record import differences
-from drivesplat.report.statistics import gap_closed, mean_over_scenes
+from drivesplat.report.statistics import PairedPsnr, gap_closed, mean_over_scenes
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.job_logs import why_missing
 
-SCHEMA = 2
-REGIONS = ("static", "vehicle", "moving_vehicle")
+SCHEMA = 3
+REGIONS = ("moving_vehicle", "static", "vehicle")
+WHOLE_IMAGE = ("psnr", "ssim", "lpips")
+"""The metrics of all pixels of an image."""
 
 
 def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
@@ -67,7 +69,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
 
 COLUMNS = (
     "scene", "dataset", "method",
-    *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", "lpips")),
+    *(f"{group}_{name}" for group in HELD_OUT_GROUPS for name in (*REGIONS, "gap_db", *WHOLE_IMAGE)),
     "gaussians", "train_seconds",
 )  # fmt: skip
 
@@ -103,7 +105,8 @@ def _row(record: dict[str, Any], method: str) -> dict[str, Any]:
         for region in REGIONS:
             row[f"{group}_{region}"] = result[group][region]["psnr"] if result[group][region] else None
         row[f"{group}_gap_db"] = result[group]["gap_db"]
-        row[f"{group}_lpips"] = result[group]["all"]["lpips"] if result[group]["all"] else None
+        whole = result[group]["all"] or dict.fromkeys(WHOLE_IMAGE)
+        row |= {f"{group}_{name}": whole[name] for name in WHOLE_IMAGE}
     costs = {"gaussians": result["gaussians"], "train_seconds": result["train_seconds"]}
     return {**row, **costs, "shown": result.get("shown")}
 
@@ -123,20 +126,22 @@ def _means(rows: list[dict[str, Any]], random_seed: int) -> list[dict[str, Any]]
 
 
 def _gaps_closed(rows: list[dict[str, Any]], reference: str | None, random_seed: int) -> list[dict[str, Any]]:
-    """The fraction of the reference's gap that every other method closes, by group of held-out frames."""
+    """The share of the reference's gap that every other method closes (`gap_closed`), by group of held-out frames."""
     methods = _by_method(rows)
     given = methods.pop(reference, {}) if reference else {}
     found = []
     for method, own in methods.items():
-        both = [scene for scene in own if scene in given]
-        gaps = {
-            group: [[moving_gap(of[scene], group) for scene in both] for of in (given, own)]
-            for group in HELD_OUT_GROUPS
-        }
-        closed = {group: gap_closed(*pair, random_seed) for group, pair in gaps.items()}
+        both = [(given[scene], row) for scene, row in own.items() if scene in given]
+        closed = {group: gap_closed(_paired(both, group), random_seed) for group in HELD_OUT_GROUPS}
         if any(closed.values()):
             found.append({"method": method, **closed})
     return found
+
+
+def _paired(rows: list[tuple[dict[str, Any], dict[str, Any]]], group: str) -> list[PairedPsnr]:
+    """The figures of a reference's and a method's rows of the same scenes, of scenes that have all of them."""
+    figures = ([row[f"{group}_{name}"] for row in pair for name in REGIONS[:2]] for pair in rows)
+    return [PairedPsnr(*found) for found in figures if None not in found]
 
 
 def _by_method(rows: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -159,26 +164,37 @@ def _figure(row: dict[str, Any], column: str) -> int | float | None:
 
 
 def summary_sentences(report: dict[str, Any]) -> list[str]:
-    """A sentence per method and group of held-out frames with moving vehicles."""
+    """A sentence per method and group of held-out frames with moving vehicles: their PSNR, the gap to static pixels,
+    and both compared with the reference."""
     lines = []
     closed = {item["method"]: item for item in report["gap_closed"]}
     for mean in report["means"]:
         for group in HELD_OUT_GROUPS:
-            gap = mean["figures"][f"{group}_gap_db"]
-            if gap is None:
+            moving, gap = (mean["figures"][f"{group}_{name}"] for name in ("moving_vehicle", "gap_db"))
+            if moving is None or gap is None:
                 continue
             scenes = f"{gap['scenes']} scene{'s' * (gap['scenes'] > 1)}"
-            width = _with_interval(gap, gap["mean"], "{:.1f}")
-            line = f"{mean['method']}, {GROUP_PLACES[group]}: gap {width} dB, {scenes}"
+            line = (
+                f"{mean['method']}, {GROUP_PLACES[group]}: moving vehicles {_decibels(moving, '{:.1f}')}, a gap of "
+                f"{_decibels(gap, '{:.1f}')} to static pixels, {scenes}"
+            )
             part = closed.get(mean["method"], {}).get(group)
-            if part:
-                share = _with_interval(part, part["fraction"], "{:.0%}")
-                line += f"; it closes {share} of the gap of {report['reference']}"
-            lines.append(line)
+            lines.append(line + (_compared(part, report["reference"]) if part else ""))
     return lines
 
 
-def _with_interval(found: dict[str, Any], value: float, fmt: str) -> str:
+def _compared(part: dict[str, Any], reference: str) -> str:
+    percent = {name: part[name] and 100.0 * part[name] for name in ("low", "high")}
+    share = _with_interval({"mean": 100.0 * part["fraction"], **percent}, "{:z.0f}")
+    moving, static = (_decibels(part[name], "{:+z.1f}") for name in ("moving_change", "static_change"))
+    return f"; against {reference}: moving vehicles {moving}, {share} % of its gap closed; static pixels {static}"
+
+
+def _decibels(found: dict[str, Any], form: str) -> str:
+    return f"{_with_interval(found, form)} dB"
+
+
+def _with_interval(found: dict[str, Any], form: str) -> str:
     if found["low"] is None or found["high"] is None:
-        return fmt.format(value)
-    return f"{fmt} ({fmt} to {fmt})".format(value, found["low"], found["high"])
+        return form.format(found["mean"])
+    return f"{form} ({form} to {form})".format(found["mean"], found["low"], found["high"])

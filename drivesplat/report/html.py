@@ -14,12 +14,16 @@ from drivesplat.report.plot import gap_plot
 
 MediaByMethod = Mapping[tuple[str, str], MethodMedia]
 NAMES = [{"key": name, "title": name, "form": "{}", "kind": "name"} for name in ("scene", "method")]
-FIGURES = [
-    {"key": "static", "title": "static", "form": "{:.1f}", "kind": "first"},
+REGION_FIGURES = [
+    {"key": "moving_vehicle", "title": "moving", "form": "{:.1f}", "kind": "first"},
+    {"key": "static", "title": "static", "form": "{:.1f}", "kind": ""},
     {"key": "vehicle", "title": "vehicle", "form": "{:.1f}", "kind": ""},
-    {"key": "moving_vehicle", "title": "moving", "form": "{:.1f}", "kind": ""},
     {"key": "gap_db", "title": "gap", "form": "{:.1f}", "kind": ""},
-    {"key": "lpips", "title": "LPIPS", "form": "{:.3f}", "kind": ""},
+]
+WHOLE_IMAGE_FIGURES = [
+    {"key": "psnr", "title": "PSNR ↑", "form": "{:.1f}", "kind": "first"},
+    {"key": "ssim", "title": "SSIM ↑", "form": "{:.3f}", "kind": ""},
+    {"key": "lpips", "title": "LPIPS ↓", "form": "{:.3f}", "kind": ""},
 ]
 """The columns of a group of held-out frames: key of the figure, title, format and CSS class."""
 COSTS = [
@@ -35,22 +39,33 @@ def report_page(report: dict[str, Any], media: MediaByMethod, costs: Sequence[di
     for row in report["rows"]:
         scenes.setdefault(row["scene"], []).append(row)
     configured = len(scenes) + len(report["left_out"]) + len(report["missing"])
-    figures = [{**column, "key": f"{group}_{column['key']}"} for group in GROUP_PLACES for column in FIGURES]
     return filled_page(
         page,
         report=report,
+        reference=report["reference"] or "a method without moving parts",
         state=f"{len(scenes)} of {configured} configured scenes",
         nothing="Nothing has been measured yet.",
         sentences=summary_sentences(report),
         plot=Markup(gap_plot(report)),
         places=GROUP_PLACES,
-        groups=[*((place, len(FIGURES)) for place in GROUP_PLACES.values()), ("", len(COSTS))],
-        columns=[*NAMES, *figures, *COSTS],
+        tables=[
+            _table("Moving vehicles and static pixels: PSNR in dB", REGION_FIGURES, []),
+            _table("Whole images, with the cost of training", WHOLE_IMAGE_FIGURES, COSTS),
+        ],
         scenes=scenes,
         media_of=lambda row: _looks(row, media.get((row["scene"], row["method"]), MethodMedia())),
         costs=costs,
         timed_methods=list(dict.fromkeys(method for total in costs for method in total["seconds_by_method"])),
     )
+
+
+def _table(title: str, of_groups: list[dict[str, str]], of_methods: list[dict[str, str]]) -> dict[str, Any]:
+    """A table of figures `of_groups` of held-out frames and `of_methods`: its title, the titles of groups of columns
+    with their numbers of columns, and the columns."""
+    figures = [{**column, "key": f"{group}_{column['key']}"} for group in GROUP_PLACES for column in of_groups]
+    groups = [(place, len(of_groups)) for place in GROUP_PLACES.values()]
+    groups += [("", len(of_methods))] if of_methods else []
+    return {"title": title, "groups": groups, "columns": [*NAMES, *figures, *of_methods]}
 
 
 def _looks(row: dict[str, Any], media: MethodMedia) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Means over scenes with confidence intervals: percentile bootstrap over scenes (Efron 1979)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,23 +21,51 @@ def mean_over_scenes(values: Sequence[int | float | None], random_seed: int) -> 
     return {"mean": float(np.mean(known)), "low": low, "high": high, "scenes": len(known)}
 
 
-def gap_closed(
-    reference: Sequence[float | None], own: Sequence[float | None], random_seed: int
-) -> dict[str, Any] | None:
-    """The `fraction` of a reference's gaps that a method closes, 1 - sum(own) / sum(reference), over the `scenes` that
-    have both gaps in dB, with the 95 % confidence interval `low` to `high`; no interval for one scene, None without
-    scenes or if the reference has no gap to close."""
-    pairs = [(a, b) for a, b in zip(reference, own, strict=True) if a is not None and b is not None]
-    if not pairs or sum(a for a, _ in pairs) <= 0.0:
+@dataclass(frozen=True)
+class PairedPsnr:
+    """PSNRs in dB on one scene, of moving vehicles and of static pixels, by a reference and by another method."""
+
+    reference_moving: float
+    reference_static: float
+    moving: float
+    static: float
+
+    @property
+    def gap(self) -> float:
+        """The reference's gap."""
+        return self.reference_static - self.reference_moving
+
+    @property
+    def moving_change(self) -> float:
+        """By how much the method is better than the reference on moving vehicles."""
+        return self.moving - self.reference_moving
+
+    @property
+    def static_change(self) -> float:
+        """By how much it is better on static pixels."""
+        return self.static - self.reference_static
+
+
+def gap_closed(scenes: Sequence[PairedPsnr], random_seed: int) -> dict[str, Any] | None:
+    """The `fraction` of a reference's gap that a method closes on moving vehicles, sum(moving_change) / sum(gap) over
+    the `scenes` (their number), with the 95 % confidence interval `low` to `high`; no interval for one scene. Static
+    pixels do not enter it: a method that only loses there closes nothing. With the mean `moving_change` and
+    `static_change` in dB, as of `mean_over_scenes`. None without scenes or if the reference has no gap to close."""
+    changes, gaps = (np.array([getattr(pair, name) for pair in scenes]) for name in ("moving_change", "gap"))
+    if not len(scenes) or gaps.sum() <= 0.0:
         return None
-    low, high = _interval(tuple(map(np.array, zip(*pairs, strict=True))), _fraction_closed, random_seed)
-    fraction = 1.0 - sum(b for _, b in pairs) / sum(a for a, _ in pairs)
-    return {"fraction": fraction, "low": low, "high": high, "scenes": len(pairs)}
+    low, high = _interval((changes, gaps), _ratio_of_sums, random_seed)
+    fraction = float(changes.sum() / gaps.sum())
+    by_region = {
+        name: mean_over_scenes([getattr(pair, name) for pair in scenes], random_seed)
+        for name in ("moving_change", "static_change")
+    }
+    return {"fraction": fraction, "low": low, "high": high, "scenes": len(scenes), **by_region}
 
 
-def _fraction_closed(reference: np.ndarray, own: np.ndarray, axis: int = -1) -> np.ndarray:
+def _ratio_of_sums(parts: np.ndarray, wholes: np.ndarray, axis: int = -1) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
-        return 1.0 - own.sum(axis=axis) / reference.sum(axis=axis)
+        return parts.sum(axis=axis) / wholes.sum(axis=axis)
 
 
 def _interval(

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from helpers.reports import NO_LOGS, PROTOCOL, expecting, group, method, metrics, region, report_job, stages
 
-from drivesplat.io.storage import write_csv
 from drivesplat.report.files import console_table
-from drivesplat.report.gaps import COLUMNS, gap_report, summary_sentences
+from drivesplat.report.gaps import gap_report, summary_sentences
+from drivesplat.report.tables import write_figures
 
 VANILLA_A = method(group(24.0, 17.0, 21.0, lpips=0.3), group(22.0, 14.0), gaussians=1000, seconds=60.0)
 VANILLA_B = method(group(26.0, None, 22.0, lpips=0.1), group(23.0), gaussians=3000, seconds=80.0)
@@ -37,14 +37,16 @@ def test_a_row_has_the_figures_of_both_groups(write):
         {
             "scene": "0061", "dataset": "nuscenes", "method": "vanilla",
             "interpolation_static": 24.0, "interpolation_vehicle": 19.0, "interpolation_moving_vehicle": 17.0,
-            "interpolation_gap_db": 7.0, "interpolation_lpips": 0.3,
+            "interpolation_gap_db": 7.0, "interpolation_psnr": 23.0, "interpolation_ssim": 0.8,
+            "interpolation_lpips": 0.3,
             "extrapolation_static": 22.0, "extrapolation_vehicle": 14.0, "extrapolation_moving_vehicle": 14.0,
-            "extrapolation_gap_db": 8.0, "extrapolation_lpips": None,
+            "extrapolation_gap_db": 8.0, "extrapolation_psnr": 21.0, "extrapolation_ssim": 0.8,
+            "extrapolation_lpips": None,
             "gaussians": 1000, "train_seconds": 60.0, "shown": None,
         }
     ]  # fmt: skip
     assert report["left_out"] == report["missing"] == [] and report["partial"] is False
-    assert report["schema"] == 2 and report["protocols"] == {"0061": PROTOCOL}
+    assert report["schema"] == 3 and report["protocols"] == {"0061": PROTOCOL}
 
 
 def test_a_region_that_is_null_is_null_in_its_row(write):
@@ -57,7 +59,7 @@ def test_a_group_without_a_single_image_is_null_in_its_row(write):
     nothing = {**dict.fromkeys(group(1.0)), "gap_db": None}
     record = metrics("0061", {"vanilla": method(nothing, group(22.0, 14.0))})
     (row,) = gap_report([write(record)], expecting("0061"), NO_LOGS)["rows"]
-    assert row["interpolation_static"] is row["interpolation_gap_db"] is row["interpolation_lpips"] is None
+    assert all(row[f"interpolation_{name}"] is None for name in ("static", "gap_db", "psnr", "ssim", "lpips"))
     assert row["extrapolation_static"] == 22.0
 
 
@@ -244,7 +246,7 @@ def test_configured_scenes_without_a_result_are_listed(write):
 def test_a_report_without_results_is_written(tmp_path):
     report = gap_report([], expecting("0061"), NO_LOGS)
     assert report["rows"] == report["means"] == [] and [item["scene"] for item in report["missing"]] == ["0061"]
-    write_csv(tmp_path / "gap_report.csv", COLUMNS, report["rows"])
+    write_figures(tmp_path / "gap_report.csv", report)
     assert len((tmp_path / "gap_report.csv").read_text().splitlines()) == 1
     assert "0061" in console_table(report)
 
@@ -266,35 +268,41 @@ def test_a_report_is_json_without_nan(report):
 
 def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
     before = copy.deepcopy(report)
-    write_csv(tmp_path / "gap_report.csv", COLUMNS, report["rows"])
+    write_figures(tmp_path / "gap_report.csv", report)
     with open(Path(tmp_path / "gap_report.csv"), newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    figures = ("static", "vehicle", "moving_vehicle", "gap_db", "lpips")
+    figures = ("moving_vehicle", "static", "vehicle", "gap_db", "psnr", "ssim", "lpips")
     assert list(rows[0]) == [
         "scene", "dataset", "method",
         *(f"interpolation_{name}" for name in figures), *(f"extrapolation_{name}" for name in figures),
         "gaussians", "train_seconds",
     ]  # fmt: skip
     assert [row["scene"] for row in rows] == ["0061", "0103"]
-    assert float(rows[0]["interpolation_gap_db"]) == 7.0
+    assert float(rows[0]["interpolation_gap_db"]) == 7.0 and float(rows[0]["interpolation_ssim"]) == 0.8
+    assert (rows[0]["gaussians"], rows[0]["train_seconds"]) == ("1000", "60.0")
     assert rows[1]["extrapolation_vehicle"] == rows[0]["extrapolation_lpips"] == ""
     assert report == before
 
 
 def test_the_console_table(report):
     lines = console_table(report).splitlines()
-    header = next(i for i, line in enumerate(lines) if "scene" in line and "method" in line)
-    table = lines[header : header + 4]
-    assert len({len(line) for line in table}) == 1, "columns line up"
-    assert max(map(len, table)) <= 120
-    first, second, mean = (line.split() for line in table[1:])
-    assert first == ["0061", "vanilla", "24.00", "19.00", "17.00", "7.00", "22.00", "14.00", "14.00", "8.00"]
-    assert second == ["0103", "vanilla", "26.00", "22.00", "-", "4.00", "23.00", "-", "-", "-"]
-    assert mean[:3] == ["mean", "vanilla", "25.00"]
-    assert any("interp" in word for word in table[0].split()) and any("extrap" in word for word in table[0].split())
-    notes = "\n".join(lines[header + 4 :])
+    headers = [i for i, line in enumerate(lines) if "scene" in line and "method" in line]
+    by_region, whole = (lines[header : header + 4] for header in headers)
+    for table in (by_region, whole):
+        assert len({len(line) for line in table}) == 1, "columns line up"
+        assert max(map(len, table)) <= 120
+        assert "interp." in table[0] and "extrap." in table[0]
+        assert "None" not in "\n".join(table) and "nan" not in "\n".join(table)
+    first, second, mean = (line.split() for line in by_region[1:])
+    assert first == ["0061", "vanilla", "17.00", "24.00", "19.00", "7.00", "14.00", "22.00", "14.00", "8.00"]
+    assert second == ["0103", "vanilla", "-", "26.00", "22.00", "4.00", "-", "23.00", "-", "-"]
+    assert mean[:4] == ["mean", "vanilla", "17.00", "25.00"]
+    first, second, mean = (line.split() for line in whole[1:])
+    assert first == ["0061", "vanilla", "23.00", "0.800", "0.300", "21.00", "0.800", "-", "1,000", "60"]
+    assert second == ["0103", "vanilla", "25.00", "0.800", "0.100", "22.00", "0.800", "-", "3,000", "80"]
+    assert mean == ["mean", "vanilla", "24.00", "0.800", "0.200", "21.50", "0.800", "-", "2,000", "70"]
+    notes = "\n".join(lines[headers[1] + 4 :])
     assert "0553" in notes and "train.iterations" in notes and "0655" in notes
-    assert "None" not in "\n".join(table)
 
 
 # ---- what it comes to
@@ -331,17 +339,58 @@ def test_one_scene_has_no_interval(write):
     assert mean["figures"]["interpolation_gap_db"] == {"mean": 7.0, "low": None, "high": None, "scenes": 1}
 
 
-def test_the_closed_fraction_is_over_scenes_with_moving_vehicles(write):
-    gaps = {"0061": (8.0, 2.0), "0103": (4.0, 2.0), "0553": (1.0, 1.0), "0655": (9.0, None)}
-    report = many(write, gaps, nothing_moves=("0553",))
+def compared(write, scenes: dict[str, tuple[tuple[float, float | None] | None, ...]]) -> dict[str, Any]:
+    """The report of scenes with PSNRs (static, moving) of vanilla and street between training frames."""
+    paths = []
+    for scene, both in scenes.items():
+        measured = {
+            name: method(group(own[0], own[1], own[0] - 3.0 if own[1] is None else None), group(20.0))
+            for name, own in zip(("vanilla", "street"), both, strict=True)
+            if own is not None
+        }
+        paths.append(write(metrics(scene, measured, stages(("vanilla", "street")))))
+    return gap_report(paths, expecting(*scenes, methods=("vanilla", "street")), NO_LOGS)
+
+
+def test_the_share_of_the_gap_closed_is_over_scenes_with_moving_vehicles(write):
+    """(moving of street - moving of vanilla) / (static of vanilla - moving of vanilla), summed over scenes."""
+    report = compared(
+        write,
+        {
+            "0061": ((25.0, 17.0), (26.0, 23.0)),
+            "0103": ((25.0, 21.0), (24.5, 22.0)),
+            "0553": ((25.0, None), (29.0, None)),
+            "0655": ((25.0, 16.0), None),
+        },
+    )
     (street,) = report["gap_closed"]
     assert street["method"] == "street" and street["extrapolation"] is None
-    assert street["interpolation"]["fraction"] == pytest.approx(1.0 - 4.0 / 12.0)
-    assert street["interpolation"]["scenes"] == 2
-    assert street["interpolation"]["low"] == pytest.approx(0.5)
-    assert street["interpolation"]["high"] == pytest.approx(0.75)
+    closed = street["interpolation"]
+    assert closed["fraction"] == pytest.approx((6.0 + 1.0) / (8.0 + 4.0)) and closed["scenes"] == 2
+    assert closed["low"] == pytest.approx(1.0 / 4.0) and closed["high"] == pytest.approx(6.0 / 8.0)
+    assert closed["moving_change"]["mean"] == pytest.approx(3.5)
+    assert closed["static_change"] == pytest.approx({"mean": 0.25, "low": -0.5, "high": 1.0, "scenes": 2})
     (line,) = [line for line in summary_sentences(report) if line.startswith("street, between")]
-    assert "2.0 (2.0 to 2.0) dB, 2 scenes" in line and "67% (50% to 75%) of the gap of vanilla" in line
+    assert line == (
+        "street, between training frames: moving vehicles 22.5 (22.0 to 23.0) dB, a gap of 2.8 (2.5 to 3.0) dB to "
+        "static pixels, 2 scenes; against vanilla: moving vehicles +3.5 (+1.0 to +6.0) dB, 58 (25 to 75) % of its gap "
+        "closed; static pixels +0.2 (-0.5 to +1.0) dB"
+    )
+
+
+@pytest.mark.parametrize(
+    ("street", "fraction", "words"),
+    [
+        ((22.0, 17.0), 0.0, "moving vehicles +0.0 dB, 0 % of its gap closed; static pixels -3.0 dB"),
+        ((22.0, 26.6), 1.2, "moving vehicles +9.6 dB, 120 % of its gap closed; static pixels -3.0 dB"),
+        ((26.0, 15.0), -0.25, "moving vehicles -2.0 dB, -25 % of its gap closed; static pixels +1.0 dB"),
+    ],
+)
+def test_lost_static_pixels_close_no_gap_and_are_stated(write, street, fraction, words):
+    report = compared(write, {"0061": ((25.0, 17.0), street)})
+    assert report["gap_closed"][0]["interpolation"]["fraction"] == pytest.approx(fraction)
+    assert report["gap_closed"][0]["interpolation"]["low"] is None, "one scene has no interval"
+    assert summary_sentences(report)[-1].endswith(words)
 
 
 def test_a_reference_without_a_gap_has_no_closed_fraction(write):

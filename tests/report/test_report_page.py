@@ -93,6 +93,27 @@ def test_a_page_has_the_images_and_links_of_its_methods(results):
     assert "data:image/jpeg" not in bare and ".mp4" not in bare and 'id="scene-0061"' in bare
 
 
+def test_a_page_has_the_metrics_of_whole_images_and_a_glossary(results):
+    """PSNR, SSIM, LPIPS, Gaussians and training time of every scene and method, and which way each is better."""
+    page = page_of(results)
+    tables = re.findall(r"<h3>([^<]*)</h3>\s*<div class=\"card wide\">(<table.*?</table>)", page, re.S)
+    titles = [title for title, _ in tables]
+    assert titles == ["Moving vehicles and static pixels: PSNR in dB", "Whole images, with the cost of training"]
+    heads = [re.findall(r"<button[^>]*>([^<]*)</button>", table) for _, table in tables]
+    assert heads[0] == ["scene", "method", *["moving", "static", "vehicle", "gap"] * 2]
+    whole = ["PSNR ↑", "SSIM ↑", "LPIPS ↓"]
+    assert heads[1] == ["scene", "method", *whole * 2, "Gaussians", "training, s"]
+    rows = re.findall(r"<tr>(<td.*?)</tr>", tables[1][1])
+    assert len(rows) == len(GAPS) * len(METHODS) + len(METHODS)
+    assert re.findall(r">([^<]*)</td>", rows[1]) == [
+        "0061", "street", "24.0", "0.800", "–", "19.0", "0.800", "–", "1,000", "60"
+    ]  # fmt: skip
+    explained = re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)", page)
+    names = {name.strip() for terms, _ in explained for name in terms.split(",")}
+    assert {"PSNR", "SSIM", "LPIPS", "moving", "static", "gap", "Gaussians", "share of the gap closed"} <= names
+    assert "Higher is better" in dict(explained)["PSNR"] and "Lower is better" in dict(explained)["LPIPS"]
+
+
 def test_a_page_is_deterministic(results):
     assert page_of(results) == page_of(results)
 
@@ -153,7 +174,7 @@ def test_the_plot_has_a_dot_for_every_scene_with_moving_vehicles(results):
 def test_in_a_browser_sorting_and_sliders_work_without_requests(results, tmp_path):
     file = tmp_path / "gap_report.html"
     file.write_text(page_of(results), encoding="utf-8")
-    cells = "[...document.querySelectorAll('tbody tr')].map((row) => row.cells[5].dataset.value)"
+    cells = "[...document.querySelector('table.sortable').tBodies[0].rows].map((row) => row.cells[5].dataset.value)"
     head = "document.querySelectorAll('th[data-column]')[5]"
     with chromium(tmp_path / "profile") as tab:
         tab.open(file, 1300, 900)
