@@ -68,7 +68,13 @@ rule export_viewer:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
     output:
-        viewer="<results>/{scene}/{method}/viewer.html",
+        viewer=report(
+            "<results>/{scene}/{method}/viewer.html",
+            caption="../report/viewer.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "viewer"},
+        ),
     log:
         "<logs>/{scene}/{method}/export_viewer.log",
     benchmark:

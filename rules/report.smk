@@ -2,7 +2,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/metrics.json of all scenes, with their pictures and films; where the report is the
 # only target, of the measured scenes, with the files that exist.
-# OUTPUTS: <results>/gap_report.html, gap_report.json and gap_report.csv, and a table on the console.
+# OUTPUTS: <results>/gap_report.html, gap_report.json and gap_report.csv, ghosts.html, .report/gap_report.html (the page
+# for Snakemake's report), and a table on the console.
 
 
 rule gap_report:
@@ -16,11 +17,19 @@ rule gap_report:
         # linked, not read: a new film does not change the report
         links=ancient(across_scenes.links),
     output:
-        page=report(
-            "<results>/gap_report.html",
+        page="<results>/gap_report.html",
+        # the same with the links of the archive that --report writes
+        archived=report(
+            "<results>/.report/gap_report.html",
             caption="../report/gap_report.rst",
             category="Across scenes",
             labels={"what": "the gap, by scene and method: the page"},
+        ),
+        ghosts=report(
+            "<results>/ghosts.html",
+            caption="../report/ghosts.rst",
+            category="Across scenes",
+            labels={"what": "ghosts, and published fixes"},
         ),
         table=report(
             "<results>/gap_report.csv",

@@ -6,12 +6,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
 from drivesplat.inspection.figures import draw_outline, image_grid, show
 from drivesplat.inspection.ghost_panel import GhostPanel
 from drivesplat.inspection.removal import RemovalPair
 
 MAX_ERROR = 0.5
 PATH_COLOR = "#4cc9f0"
+_FIXES = "\n".join(
+    [f"Published fixes of ghosts ({GHOSTS_DOCUMENT}):", *(f"{fix.method}: {fix.adds}" for fix in PUBLISHED_FIXES)]
+)
+_FIXES_HEIGHT = 1.4
+"""Inches."""
 
 
 def draw_panel(panel: GhostPanel, record: dict[str, Any], method: str) -> Figure:
@@ -37,6 +43,8 @@ def draw_panel(panel: GhostPanel, record: dict[str, Any], method: str) -> Figure
     if len(panel.path) > 1:
         axes[3].plot(*_clipped(panel.path, panel.truth.shape).T, color=PATH_COLOR, linewidth=2.0, alpha=0.9)
     _outline(axes, panel.outline)
+    figure.set_figheight(figure.get_figheight() + _FIXES_HEIGHT)
+    figure.supxlabel(_FIXES, x=0.01, ha="left", fontsize=12, linespacing=1.4)
     return figure
 
 

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from drivesplat.io.storage import atomic_write, write_json
+from drivesplat.report.archive import address_in_archive
 from drivesplat.report.gaps import gap_report, summary_sentences
+from drivesplat.report.ghosts import render_ghosts_page
 from drivesplat.report.html import report_page
 from drivesplat.report.media import collect_media
 from drivesplat.report.tables import gap_table, whole_image_table, write_figures
@@ -20,14 +22,22 @@ def write_report(
 ) -> None:
     """Writes the REPORT_FILES of these metrics.json files into the results folder, with these images and links in the
     page, and prints the table."""
-    page, record, table = (results / name for name in REPORT_FILES)
+    page, record, table, ghosts, archived = (results / name for name in REPORT_FILES)
     report = gap_report(list(metrics), job, results / "logs")
     media = collect_media([*pictures, *links], results)
     write_json(record, report)
     write_figures(table, report)
-    with atomic_write(page) as file:
-        file.write(report_page(report, media, _costs(results, job)).encode())
+    costs = _costs(results, job)
+    _write_text(ghosts, render_ghosts_page())
+    _write_text(page, report_page(report, media, costs))
+    _write_text(archived, report_page(report, media, costs, lambda name: address_in_archive(results / name)))
     print(console_table(report), flush=True)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.parent.mkdir(exist_ok=True)
+    with atomic_write(path) as file:
+        file.write(text.encode())
 
 
 def _costs(results: Path, job: ReportJob) -> list[dict[str, Any]]:

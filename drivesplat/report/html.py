@@ -1,11 +1,12 @@
 """gap_report.html: a page with embedded images, which needs no network, and links to films and viewers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from markupsafe import Markup
 
 from drivesplat.evaluation.comparison import GROUP_PLACES
+from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIXES
 from drivesplat.io.html_page import filled_page
 from drivesplat.report import page
 from drivesplat.report.gaps import summary_sentences
@@ -32,9 +33,15 @@ COSTS = [
 ]
 
 
-def report_page(report: dict[str, Any], media: MediaByMethod, costs: Sequence[dict[str, Any]] = ()) -> str:
-    """The page of a report with the `media` by scene and method and the total costs of scenes; links are relative to
-    the report's folder. Raises ResultError if an image cannot be read."""
+def report_page(
+    report: dict[str, Any],
+    media: MediaByMethod,
+    costs: Sequence[dict[str, Any]] = (),
+    address: Callable[[str], str] = str,
+) -> str:
+    """The page of a report with the `media` by scene and method and the total costs of scenes. `address` gives the
+    links to files by their paths relative to the results folder, by default these paths. Raises ResultError if an image
+    cannot be read."""
     scenes: dict[str, list[dict[str, Any]]] = {}
     for row in report["rows"]:
         scenes.setdefault(row["scene"], []).append(row)
@@ -54,6 +61,9 @@ def report_page(report: dict[str, Any], media: MediaByMethod, costs: Sequence[di
         ],
         scenes=scenes,
         media_of=lambda row: _looks(row, media.get((row["scene"], row["method"]), MethodMedia())),
+        address=address,
+        fixes=PUBLISHED_FIXES,
+        document=GHOSTS_DOCUMENT,
         costs=costs,
         timed_methods=list(dict.fromkeys(method for total in costs for method in total["seconds_by_method"])),
     )

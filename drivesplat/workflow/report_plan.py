@@ -10,7 +10,8 @@ from drivesplat.workflow.outputs import Outputs
 
 EVERYTHING = "all"
 REPORT_RULES = ("gap_report", "report")
-REPORT_FILES = ("gap_report.html", "gap_report.json", "gap_report.csv")
+REPORT_FILES = ("gap_report.html", "gap_report.json", "gap_report.csv", "ghosts.html", ".report/gap_report.html")
+"""The last is the page for Snakemake's report: its links are those of the archive."""
 
 
 class ReportPlan:

@@ -24,6 +24,7 @@ PARTS = (
     "benchmarks",
     "config.yaml",
     "config.schema.json",
+    "docs",
     "drivesplat",
     "envs",
     "presets",

@@ -15,6 +15,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
 from drivesplat.errors import DeviceError, ResultError
+from drivesplat.evaluation.published_fixes import PUBLISHED_FIXES
 from drivesplat.inspection.drawing import draw_panel, draw_removal
 from drivesplat.inspection.figures import save_figure
 from drivesplat.inspection.ghost_panel import GhostPanel, ghost_panel
@@ -433,3 +434,13 @@ def test_a_failed_write_keeps_the_previous_figure(still, tmp_path, monkeypatch):
         save_figure(path, draw_panel(*still, "vanilla"))
     assert str(path) in str(refusal.value)
     assert path.read_bytes() == b"older" and list(tmp_path.iterdir()) == [path]
+
+
+def test_the_panel_names_published_fixes_below_its_images(panel_of_car):
+    figure = draw_panel(*panel_of_car[:2], "vanilla")
+    text = figure.get_supxlabel()
+    assert "docs/ghosts.md" in text and all(f"{fix.method}: {fix.adds}" in text for fix in PUBLISHED_FIXES)
+    figure.canvas.draw()
+    below = figure._supxlabel.get_window_extent()
+    assert below.x1 < figure.bbox.x1, "it fits into the figure"
+    assert all(below.y1 <= axis.get_window_extent().y0 for axis in figure.axes[:4])

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.archives import NO_FILES, addresses, addresses_in_results, dead_links
+from helpers.chromium import chromium, in_a_browser
 from helpers.workflow_copy import WorkflowCopy, complaints
 from PIL import Image
 
+from drivesplat.evaluation.published_fixes import PUBLISHED_FIXES
 from drivesplat.io.video import read_footage
 from drivesplat.settings.report import HELD_OUT_PAIR
 
@@ -181,17 +184,74 @@ def test_every_result_remembers_where_it_came_from(finished):
         assert {"extract", "actors", "lidar_depth", "street/train"} < stages.keys(), name
 
 
-def test_snakemakes_report_holds_all_there_is_to_look_at(finished):
+@pytest.fixture(scope="module")
+def archive(finished, tmp_path_factory) -> Path:
+    """Snakemake's report of that run, unpacked elsewhere."""
     done = finished.run(flags=("--report", "report.zip"))
     assert done.returncode == 0, done.stdout
+    folder = tmp_path_factory.mktemp("archive")
     with zipfile.ZipFile(finished.folder / "report.zip") as report:
-        names = {Path(name).name for name in report.namelist()}
-        page = report.read("report/report.html").decode()
+        report.extractall(folder)
+    return folder / "report"
+
+
+def test_snakemakes_report_holds_all_there_is_to_look_at(archive):
+    names = [path.name for path in archive.rglob("*") if path.is_file()]
+    page = (archive / "report.html").read_text(encoding="utf-8")
     pictures = {"ghost_panel.png", "removal.png", "original.mp4", "lateral_2m.mp4", "metrics.json", "gap_report.csv"}
-    pictures |= {"gap_report.html"}
-    assert pictures | {"parts.mp4", "stop.mp4", "stop.png", "gone.mp4", "gone.png"} < names
+    pictures |= {"gap_report.html", "ghosts.html", "viewer.html", "tracks.png"}
+    assert pictures | {"parts.mp4", "stop.mp4", "stop.png", "gone.mp4", "gone.png"} < set(names)
+    assert names.count("viewer.html") == 2 and names.count("gap_report.html") == 1
     assert "Scene 0001" in page and "Across scenes" in page and "the moving vehicle that fills most pixels" in page
     assert "the moving parts on grey" in page and "the frame with the largest difference" in page
+    assert all(page.count(fix.method) >= 2 for fix in PUBLISHED_FIXES), "captions of ghost panels name published fixes"
+
+
+def test_every_link_of_the_pages_in_snakemakes_report_is_in_it(archive):
+    dead, links = dead_links(archive)
+    assert dead == set()
+    (page,) = archive.rglob("gap_report.html")
+    linked = {Path(address).name for address in addresses(page.read_text(encoding="utf-8"))}
+    assert {"original.mp4", "lateral_2m.mp4", "parts.mp4", "stop.mp4", "gone.mp4", "viewer.html"} < linked
+    captions = addresses_in_results((archive / "report.html").read_text(encoding="utf-8"))
+    assert sum(address.endswith("/ghosts.html") for address in captions) == 1 + 2, "itself, and two ghost panels"
+    assert links > 30
+
+
+def test_every_link_of_the_page_in_the_results_folder_is_in_it(finished):
+    page = finished.folder / "results/gap_report.html"
+    links = [at for at in addresses(page.read_text(encoding="utf-8")) if not at.startswith(NO_FILES)]
+    assert len(links) > 10 and all((page.parent / at).is_file() for at in links)
+
+
+def test_a_link_out_of_an_archive_is_dead(tmp_path):
+    (tmp_path / "a").mkdir()
+    text = '<a href="b.html">b</a><img src="http://x/y.png"><a href="../../c.html">c</a><a href="#d">d</a>'
+    (tmp_path / "a/a.html").write_text(text + '<a href="a.html#e">e</a>')
+    found = {"a/a.html: b.html", "a/a.html: http://x/y.png", "a/a.html: ../../c.html"}
+    assert dead_links(tmp_path / "a") == ({name.removeprefix("a/") for name in found}, 4)
+
+
+@in_a_browser
+def test_in_a_browser_snakemakes_report_requests_nothing_but_its_files(archive, tmp_path):
+    """Every page, and every result in Snakemake's page as a click on it shows it."""
+    with chromium(tmp_path / "profile") as tab:
+        pages = sorted(archive.rglob("*.html"))
+        for page in pages:
+            tab.open(page, 1000, 700)
+            tab.picture()
+        tab.open(archive / "report.html", 1000, 700)
+        shown = tab.run(
+            "Object.entries(results).map(([path, result]) => {"
+            " const kind = {'text/html': 'html', 'image/png': 'img'}[result.mime_type];"
+            " if (kind) app.setView({content: kind, contentPath: result.data_uri, resultPath: path});"
+            " return kind })"
+        )
+        tab.picture()
+        assert shown.count("html") == 4 and shown.count("img") >= 5
+    outside = [address for address in tab.requests if not address.startswith(("data:", "blob:"))]
+    assert {*map(Path.as_uri, pages)} <= set(outside)
+    assert [address for address in outside if not address.startswith(archive.as_uri())] == []
 
 
 OF_ACTORS = {"film_parts": 1, "edit": 2}

@@ -1,0 +1,34 @@
+"""ghosts.html, and where the published fixes of ghosts are named."""
+
+from helpers import REPOSITORY
+from helpers.archives import addresses
+
+from drivesplat.evaluation.published_fixes import PUBLISHED_FIXES
+from drivesplat.report.ghosts import render_ghosts_page
+
+
+def test_the_page_has_the_document_without_links_to_other_documents():
+    page = render_ghosts_page()
+    assert addresses(page) == ["data:,"] and ".md)" not in page
+    assert "<h2>Related methods</h2>" in page and page.count("<table>") == 4
+    assert all(f"<td>{fix.method}</td><td>{fix.adds}</td>" in page for fix in PUBLISHED_FIXES)
+
+
+def test_without_the_document_the_page_names_the_fixes_and_it(tmp_path):
+    page = render_ghosts_page(tmp_path / "ghosts.md")
+    assert "docs/ghosts.md" in page and all(fix.adds in page for fix in PUBLISHED_FIXES)
+
+
+def test_links_and_markup_of_the_document(tmp_path):
+    document = tmp_path / "ghosts.md"
+    document.write_text("[`street`](street.md#a) and [paper](https://x.org/1)\n\n| a | b |\n|---|---|\n| 1 | 2 |\n")
+    page = render_ghosts_page(document)
+    assert "<code>street</code> and" in page and "street.md" not in page and "<td>2</td>" in page
+    assert 'href="https://x.org/1"' in page
+
+
+def test_the_document_and_the_caption_of_the_ghost_panel_name_the_same_fixes():
+    document = (REPOSITORY / "docs/ghosts.md").read_text()
+    caption = (REPOSITORY / "report/ghost_panel.rst").read_text()
+    for fix in PUBLISHED_FIXES:
+        assert f"**{fix.method}** [" in document and f"- **{fix.method}**: {fix.adds}\n" in caption
