@@ -1,6 +1,7 @@
 # Pictures and films of trained methods: trajectories, ghosts of moving vehicles, removal of a vehicle.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl, masks/.
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl, masks/; actors.npz if a method has
+# actors.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
 # ghost_panel.png and .json;
@@ -9,13 +10,14 @@
 
 rule tracks:
     """
-    Lists every annotated object that can move, with class, speed and visible time, and draws the moving ones with the
-    ids that settings use.
+    Lists every annotated object that can move, with class, speed, visible time and whether it can be edited, and draws
+    the moving ones with the ids that settings use.
     """
     input:
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
+        actors=plan.actors,
     output:
         table="<results>/{scene}/tracks.csv",
         picture=report(

@@ -1,8 +1,8 @@
-"""scene.json as tracks.csv and tracks.png: the dynamic objects and their ids."""
+"""scene.json and actors.npz as tracks.csv and tracks.png: the dynamic objects and their ids."""
 
 from drivesplat.workflow.job import job
 from drivesplat.inspection.figures import save_figure
-from drivesplat.inspection.track_table import draw_tracks, subjects_by_image, track_rows, write_tracks
+from drivesplat.inspection.track_table import draw_tracks, editable_tracks, subjects_by_image, track_rows, write_tracks
 from drivesplat.scene.prepared_drive import read_prepared_drive
 from drivesplat.settings.inspection import TracksJob
 
@@ -10,6 +10,6 @@ with job(snakemake, dataset=("images",)) as current:
     files, camera = current.input, current.settings(TracksJob).eval_camera
     recording, _ = read_prepared_drive(files.scene, files.parser, files.masks)
     subjects = subjects_by_image(recording, camera)
-    rows = track_rows(recording, subjects)
+    rows = track_rows(recording, subjects, editable_tracks(files.actors))
     write_tracks(current.output.table, rows)
     save_figure(current.output.picture, draw_tracks(recording, subjects, rows, camera))

@@ -40,8 +40,9 @@ def show(axis: Axes, image: np.ndarray, title: str) -> None:
     axis.set_title(title, loc="left", fontsize=15)
 
 
-def draw_outline(axis: Axes, polygon: np.ndarray) -> np.ndarray:
-    """Draws the outline (n, 2) of a box, in continuous pixels, over an image; returns it in axes coordinates."""
+def draw_outline(axis: Axes, polygon: np.ndarray, color: str = BOX, line: str = "solid") -> np.ndarray:
+    """Draws the outline (n, 2) of a box, in continuous pixels, over an image; returns it in axes coordinates. `line` is
+    a line style of matplotlib."""
     outline = polygon - 0.5
-    axis.add_patch(Polygon(outline, fill=False, edgecolor=BOX, linewidth=1.5))
+    axis.add_patch(Polygon(outline, fill=False, edgecolor=color, linewidth=1.5, linestyle=line))
     return outline

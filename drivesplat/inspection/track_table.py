@@ -1,6 +1,6 @@
 """The stage `tracks`: the dynamic objects of a drive as a table, and as images with labels."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from drivesplat.inspection.figures import BOX, draw_outline, image_grid, show
 from drivesplat.inspection.subject import Subject, visible_subjects
 from drivesplat.io.storage import write_csv
+from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import MIN_PIXELS
 from drivesplat.scene.scene import Track
@@ -18,6 +19,9 @@ from drivesplat.scene.tracks import box_at, ever_moves, short_ids
 
 MAX_IMAGES = 6
 TITLE = "moving objects, labelled with the start of their ids in tracks.csv"
+DASHED = "; dashed: cannot be edited"
+NOT_EDITABLE = "#e5e7eb"
+"""The colour of the outlines of objects that cannot be edited."""
 MIN_PIXEL_SHARE = 0.5
 """An image shows an object well if the object has at least this share of its maximum number of pixels there."""
 NARROW_BOX_SHARE = 0.06
@@ -26,13 +30,15 @@ NARROW_BOX_SHARE = 0.06
 
 @dataclass(frozen=True)
 class TrackRow:
-    """A track in the table. `seconds`: from its first annotation to its last; `seconds_visible`: how long it is visible
-    to the evaluated camera; horizontal speeds in m/s; sizes in metres; `key_frame`: the one in which it has the most
-    `pixels` of that camera's images, None and 0 if it is never visible."""
+    """A track in the table. `editable`: whether methods with actors represent it with Gaussians of its own.
+    `seconds`: from its first annotation to its last; `seconds_visible`: how long it is visible to the evaluated
+    camera; horizontal speeds in m/s; sizes in metres; `key_frame`: the one in which it has the most `pixels` of
+    that camera's images, None and 0 if it is never visible."""
 
     id: str
     category: str
     moves: bool
+    editable: bool
     seconds: float
     seconds_visible: float
     speed_mean: float
@@ -53,18 +59,24 @@ def subjects_by_image(recording: PreparedDrive, camera: str) -> SubjectsByImage:
     return {index: visible_subjects(recording, index) for index in recording.scene.key_frames(camera)}
 
 
-def track_rows(recording: PreparedDrive, subjects: SubjectsByImage) -> list[TrackRow]:
-    """A row per dynamic track: moving ones first, then by visible time."""
+def editable_tracks(actors: Sequence[str]) -> set[str]:
+    """The ids of the tracks in files of actors that become actors of a model."""
+    records = (actor for path in actors for actor in read_actors(path).actors)
+    return {actor.id for actor in records if len(actor.points)}
+
+
+def track_rows(recording: PreparedDrive, subjects: SubjectsByImage, editable: Collection[str]) -> list[TrackRow]:
+    """A row per dynamic track: moving ones first, then by visible time. `editable`: the ids of editable tracks."""
     by_track: dict[str, list[Subject]] = {}
     for subject in (subject for seen in subjects.values() for subject in seen):
         by_track.setdefault(subject.box.track_id, []).append(subject)
     interval = recording.scene.key_frame_interval
     tracks = [track for track in recording.scene.tracks if track.object_class.is_dynamic]
-    rows = [_row(track, by_track.get(track.id, []), interval) for track in tracks]
+    rows = [_row(track, track.id in editable, by_track.get(track.id, []), interval) for track in tracks]
     return sorted(rows, key=lambda row: (not row.moves, -row.seconds_visible, -row.pixels, row.id))
 
 
-def _row(track: Track, seen: list[Subject], interval: float) -> TrackRow:
+def _row(track: Track, editable: bool, seen: list[Subject], interval: float) -> TrackRow:
     boxes = (box_at(track, int(time), interval) for time in track.timestamps)
     speeds = [box.speed for box in boxes if box is not None]
     largest = max(seen, key=lambda subject: subject.pixels, default=None)
@@ -73,6 +85,7 @@ def _row(track: Track, seen: list[Subject], interval: float) -> TrackRow:
         id=track.id,
         category=track.category,
         moves=ever_moves(track),
+        editable=editable,
         seconds=round(seconds, 2),
         seconds_visible=round(seconds * min(1.0, len(seen) / len(track.timestamps)), 2),
         speed_mean=round(float(np.mean(speeds)), 2),
@@ -90,7 +103,7 @@ def write_tracks(path: str | Path, rows: Sequence[TrackRow]) -> None:
 
 def draw_tracks(recording: PreparedDrive, subjects: SubjectsByImage, rows: Sequence[TrackRow], camera: str) -> Figure:
     """Few key frames that show every moving object well, at most MAX_IMAGES, with outlines and the starts of
-    their ids; the middle key frame if nothing moves."""
+    their ids; the outlines of those that cannot be edited are dashed. The middle key frame if nothing moves."""
     largest = {row.id: row.pixels for row in rows if row.moves and row.pixels >= MIN_PIXELS}
     moving = {
         i: [s for s in seen if s.box.track_id in largest and s.pixels >= MIN_PIXELS] for i, seen in subjects.items()
@@ -101,6 +114,8 @@ def draw_tracks(recording: PreparedDrive, subjects: SubjectsByImage, rows: Seque
     }
     chosen = covering_images(shown_well) or [recording.scene.middle_key_frame(camera)]
     title = f"Scene {recording.scene.name}: " + (TITLE if largest else "nothing moves")
+    editable = {row.id for row in rows if row.editable}
+    title += DASHED if largest.keys() - editable else ""
     names = short_ids(list(largest))
     columns = min(2, len(chosen))
     shape = recording.labels(chosen[0]).shape
@@ -108,7 +123,7 @@ def draw_tracks(recording: PreparedDrive, subjects: SubjectsByImage, rows: Seque
     for axis, index in zip(axes, chosen, strict=False):
         show(axis, recording.image(index), f"Key frame {recording.frame(index).sample_index}")
         for subject in moving[index]:
-            _label(axis, subject, names[subject.box.track_id], shape)
+            _label(axis, subject, names[subject.box.track_id], shape, subject.box.track_id in editable)
     return figure
 
 
@@ -125,10 +140,11 @@ def covering_images(pixels: Mapping[int, Mapping[str, int]]) -> list[int]:
     return sorted(chosen)
 
 
-def _label(axis: Axes, subject: Subject, name: str, shape: tuple[int, ...]) -> None:
-    outline = draw_outline(axis, subject.hull.polygon)
+def _label(axis: Axes, subject: Subject, name: str, shape: tuple[int, ...], editable: bool) -> None:
+    color = BOX if editable else NOT_EDITABLE
+    outline = draw_outline(axis, subject.hull.polygon, color, "solid" if editable else "dashed")
     x, y = np.clip(outline.min(axis=0), 0, [shape[1] * 0.9, shape[0] * 0.97])
-    box = {"facecolor": BOX, "edgecolor": "none", "pad": 1.5}
+    box = {"facecolor": color, "edgecolor": "none", "pad": 1.5}
     narrow = np.ptp(outline[:, 0]) < NARROW_BOX_SHARE * shape[1]  # horizontal labels of neighbours would overlap
     turn = {"rotation": 40 if narrow else 0, "rotation_mode": "anchor", "verticalalignment": "bottom"}
     axis.text(x, y, name, fontsize=9, bbox=box, **turn)

@@ -123,6 +123,13 @@ class Inputs:
 
         return result
 
+    def actors(self, wildcards: Any) -> list[str]:
+        """The actors of a scene, if any method has them."""
+        taken = (training_inputs(self.config, wildcards.scene, method) for method in self.config.methods)
+        return (
+            [f"{self.config.results_dir}/{wildcards.scene}/actors.npz"] if any("actors" in it for it in taken) else []
+        )
+
     def lpips_record(self, _: Any) -> list[str]:
         """The record of LPIPS's backbone, if LPIPS is enabled."""
         return [BACKBONE_RECORD] if self.config.lpips.enabled else []

@@ -2,10 +2,11 @@
 
 import csv
 import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 import pytest
-from helpers.hand_made import recording_of
+from helpers.hand_made import actor_record, recording_of
 from matplotlib.figure import Figure
 
 from drivesplat.errors import ResultError
@@ -13,10 +14,15 @@ from drivesplat.inspection.track_table import (
     MAX_IMAGES,
     covering_images,
     draw_tracks,
+    editable_tracks,
     subjects_by_image,
     track_rows,
     write_tracks,
 )
+from drivesplat.io.array_file import write_arrays
+from drivesplat.model.timeline import ActorTrack
+from drivesplat.scene.actor_record import ActorRecords
+from drivesplat.scene.motion import Motion
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.tracks import MIN_ID_LENGTH, short_ids
@@ -27,13 +33,13 @@ def recording(tiny_scene) -> PreparedDrive:
     return recording_of(tiny_scene)
 
 
-def rows_of(recording: PreparedDrive) -> list:
-    return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"))
+def rows_of(recording: PreparedDrive, editable: Collection[str] = ()) -> list:
+    return track_rows(recording, subjects_by_image(recording, "CAM_FRONT"), editable)
 
 
-def drawn(recording: PreparedDrive) -> Figure:
+def drawn(recording: PreparedDrive, editable: Collection[str] = ()) -> Figure:
     subjects = subjects_by_image(recording, "CAM_FRONT")
-    return draw_tracks(recording, subjects, track_rows(recording, subjects), "CAM_FRONT")
+    return draw_tracks(recording, subjects, track_rows(recording, subjects, editable), "CAM_FRONT")
 
 
 def texts(figure: Figure) -> list[str]:
@@ -99,6 +105,33 @@ def test_only_moving_objects_are_labelled(recording):
     dynamic_tracks = [row.id for row in rows if row.moves and row.pixels >= 100]
     assert len(dynamic_tracks) == len(found) == 2
     assert all(any(name.startswith(label) for name in dynamic_tracks) for label in found)
+
+
+def test_editable_tracks_are_those_of_actors_with_points(recording, tmp_path):
+    """The car is an actor, the walker has no points, the truck stands."""
+    car, walker = (next(row.id for row in rows_of(recording) if row.category.startswith(kind))
+                   for kind in ("vehicle.car", "human"))  # fmt: skip
+    track = next(track for track in recording.scene.tracks if track.id == car)
+    actor = actor_record(ActorTrack(car, track.size, Motion.of_track(recording.scene, track)))
+    empty = dataclasses.replace(actor, id=walker, points=actor.points[:0], points_rgb=actor.points_rgb[:0])
+    write_arrays(tmp_path / "actors.npz", ActorRecords([actor, empty], {"stages": {}}))
+    editable = editable_tracks([str(tmp_path / "actors.npz")])
+    assert editable == {car} and editable_tracks([]) == set()
+    assert {row.category: row.editable for row in rows_of(recording, editable)} == {
+        "vehicle.car": True, "human.pedestrian.adult": False, "vehicle.truck": False
+    }  # fmt: skip
+
+
+def test_what_cannot_be_edited_is_outlined_otherwise(recording):
+    car, walker = (row.id for row in sorted(rows_of(recording)[:2], key=lambda row: row.category, reverse=True))
+    figure = drawn(recording, {car})
+    outlines = {patch.get_linestyle() for axis in figure.axes for patch in axis.patches}
+    assert outlines == {"solid", "dashed"} and "dashed: cannot be edited" in figure.get_suptitle()
+    boxes = {text.get_text(): text.get_bbox_patch().get_facecolor() for axis in figure.axes for text in axis.texts}
+    assert boxes[short_ids([car, walker])[car]] != boxes[short_ids([car, walker])[walker]]
+    whole = drawn(recording, {car, walker})
+    assert {patch.get_linestyle() for axis in whole.axes for patch in axis.patches} == {"solid"}
+    assert "dashed" not in whole.get_suptitle()
 
 
 @pytest.mark.parametrize(

@@ -279,7 +279,7 @@ EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
     [
         ({"train": {"iterations": 61}}, TRAINING_AND_AFTER),
         ({"methods": {"vanilla": {"overrides": {"sky": "mask"}}}}, ONE_TRAINING_AND_AFTER),
-        ({"actors": {"humans": True}}, {"actors": 1, **STREETS_TRAINING_AND_AFTER}),
+        ({"actors": {"humans": True}}, {"actors": 1, "tracks": 1, **STREETS_TRAINING_AND_AFTER}),
         ({"train": {"actors": {"fourier": 3}}}, STREETS_TRAINING_AND_AFTER),
         ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
