@@ -11,7 +11,8 @@
 # make quality      RECIPES=file: train recipes with several seeds on one scene, and write their table (docs/quality.md)
 # make speed        FILE=file: training time and quality beside gsplat's example trainer (docs/speed.md)
 # make config       config.yaml and config.schema.json from the settings records; FORCE=--force overwrites changes
-.PHONY: demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch bench quality speed config
+# make help         this list
+.PHONY: help demo setup doctor test test-slow test-viewers lint test-gpu test-slurm test-batch bench quality speed config
 
 BIN := .venv/bin
 WORKERS ?= 2
@@ -20,6 +21,9 @@ CORES ?= all
 demo: setup
 	$(BIN)/snakemake --cores $(CORES) --configfile presets/demo.yaml -- all
 	@$(BIN)/python -m drivesplat.evaluation.summary results/demo/metrics.json
+
+help:
+	@sed -n 's/^# make/make/p' $(firstword $(MAKEFILE_LIST))
 
 setup:
 	@bash scripts/setup.sh

@@ -17,12 +17,14 @@
 #   snakemake --cores 2 --configfile presets/demo.yaml -- all
 #
 # rules/ says what depends on what, workflow_scripts/ calls one library function a rule, drivesplat/ is the library.
+import os
+
 from snakemake.utils import min_version
 
 min_version("9.27")
 
 
-configfile: "config.yaml"
+configfile: "config.yaml" if os.path.isfile("config.yaml") else os.path.join(workflow.basedir, "config.yaml")
 
 
 report: "report/workflow.rst"

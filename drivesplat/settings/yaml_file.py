@@ -11,8 +11,8 @@ from drivesplat.errors import ConfigError
 def read_yaml(path: str | Path, what: str) -> Any:
     """The content of a YAML file.
 
-    Raises ConfigError, one line with the file and `what` it is, where it cannot be read, is not YAML, or has a
-    duplicate key.
+    Raises ConfigError, one line with the file, its line and `what` it is, where it cannot be read, is not YAML, or has
+    a duplicate key.
     """
     try:
         return yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_EveryKeyOnce)  # a SafeLoader
@@ -21,7 +21,9 @@ def read_yaml(path: str | Path, what: str) -> Any:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: the {what} is not UTF-8 text ({error.reason})") from None
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not YAML: {error}") from None
+        mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"{path}{line}: not YAML: {getattr(error, 'problem', None) or error}") from None
 
 
 class _EveryKeyOnce(yaml.SafeLoader):

@@ -43,6 +43,9 @@ OF_ONE_SCENE = ("demo_world", "extract", "edit", "ghost_panel", "remove_actor")
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
 
+WORKFLOW = Path(__file__).parents[2]
+"""The folder of the Snakefile."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -210,7 +213,13 @@ def _world(at: Place) -> dict[str, Any]:
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
     """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
     path = config.datasets[config.dataset_of(scene)].edits.get(scene)
-    return read_edits(Path(path).expanduser()) if path else {}
+    return read_edits(edits_file(path)) if path else {}
+
+
+def edits_file(path: str) -> Path:
+    """The edits file at `path`; one that the workflow brings along is found from any working directory."""
+    given = Path(path).expanduser()
+    return given if given.exists() or not (WORKFLOW / given).is_file() else WORKFLOW / given
 
 
 def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:

@@ -101,12 +101,12 @@ def test_a_missing_file_is_reported_as_missing(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("edits: [", "edits.yaml: not YAML: while parsing a flow node"),
+        ("edits: [", "edits.yaml, line 1: not YAML: expected the node content"),
         ("steps: {}", "edits.yaml: an edits file holds the one key 'edits', under it a list of steps per name"),
         ("", "edits.yaml: an edits file holds the one key 'edits'"),
         ("edits: [1]", "edits.yaml: 'edits' is [1]; it holds a list of steps per name"),
-        ("edits: {}\nedits: {}", "edits.yaml: not YAML: the key 'edits' stands twice"),
-        ("edits: {a: [{stop: {track: x, at: 1, at: 2}}]}", "edits.yaml: not YAML: the key 'at' stands twice"),
+        ("edits: {}\nedits: {}", "edits.yaml, line 2: not YAML: the key 'edits' stands twice"),
+        ("edits: {a: [{stop: {track: x, at: 1, at: 2}}]}", "edits.yaml, line 1: not YAML: the key 'at' stands twice"),
         ("edits: {a b: []}", "edits.yaml: edit 'a b' cannot name a file: use letters, digits, '_', '-' and '.'"),
         ("edits: {../a: []}", "edits.yaml: edit '../a' cannot name a file: use letters, digits, '_', '-' and '.'"),
         ("edits: {0103: []}", "edits.yaml: edit 67 is not text: put the name in quotes"),
