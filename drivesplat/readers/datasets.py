@@ -1,9 +1,9 @@
 """The modules that read a dataset, found by name in the package `drivesplat.readers.<reader>`.
 
-`layout` locates the files (`find_root`, `table_files`) and is cheap to import; `reader` reads a scene (`read`). A
-dataset with LiDAR also has `sweep_file`, which reads a sweep (`drivesplat.readers.sweeps`); one with large tables has
-`scene_tables`, which splits them into a file per scene (`index_tables`, `scene_file`). `DatasetSettings.reader` lists
-the allowed names of readers.
+`layout` locates the files (`find_root`, `table_files`), names the cameras (`camera_names`) and is cheap to import;
+`reader` reads a scene (`read`). A dataset with LiDAR also has `sweep_file`, which reads a sweep
+(`drivesplat.readers.sweeps`); one with large tables has `scene_tables`, which splits them into a file per scene
+(`index_tables`, `scene_file`). `DatasetSettings.reader` lists the allowed names of readers.
 """
 
 from types import ModuleType

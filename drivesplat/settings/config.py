@@ -7,7 +7,7 @@ generated from it (`make config`). This module imports quickly, since the Snakef
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import Field, field_validator, model_validator
 
@@ -28,10 +28,12 @@ from drivesplat.settings.lidar_depth import LidarDepthSettings
 from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, merged
-from drivesplat.settings.names import require_name
+from drivesplat.settings.names import require_name, suggestion
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
+from drivesplat.settings.results_folder import ResultsFolder
 from drivesplat.settings.train import SkyKind, TrainSettings
+from drivesplat.settings.world import CameraChannel
 
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
@@ -88,8 +90,8 @@ class Config(Settings):
     device: DeviceSettings = DeviceSettings()
     random_seed: int = Field(0, ge=0, lt=2**31)
     """Random seed of all stages."""
-    results_dir: str = Field("results", min_length=1)
-    """Folder of all results. Give each experiment a folder of its own."""
+    results_dir: ResultsFolder = "results"
+    """Folder of all results, ~ for your home folder. Give each experiment a folder of its own."""
 
     @field_validator("accept_nuscenes_terms", mode="before")
     @classmethod
@@ -110,6 +112,7 @@ class Config(Settings):
     def _names_fit_together(self) -> "Config":
         owners: dict[str, str] = {}
         for name, dataset in self.datasets.items():
+            require_name(name, "dataset")
             for scene in dataset.scenes:
                 require_name(scene, "scene")
                 if owners.setdefault(scene, name) != name:
@@ -130,8 +133,17 @@ class Config(Settings):
             if scene not in owners:
                 raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")
         if self.eval_camera not in self.cameras:
-            raise ValueError(f"eval_camera {self.eval_camera} is not among cameras ({', '.join(self.cameras)})")
+            raise ValueError(self._no_eval_camera())
         return self
+
+    def _no_eval_camera(self) -> str:
+        """The message where `eval_camera` is not among `cameras`: perhaps since one of these is misspelled."""
+        message = f"eval_camera {self.eval_camera} is not among cameras ({', '.join(self.cameras)})"
+        known = get_args(CameraChannel)
+        for camera in self.cameras:
+            if camera not in known and suggestion(camera, known):
+                return f"{message}: {suggestion(camera, known)}nuScenes has {', '.join(known)}"
+        return message
 
     @model_validator(mode="after")
     def _variants_have_names_of_their_own(self) -> "Config":
@@ -177,7 +189,7 @@ class Config(Settings):
         """The name of a scene's dataset. Raises ConfigError, with the list of scenes, for an unknown scene."""
         if scene not in self.dataset_names:
             raise ConfigError(
-                f"scene {scene!r} is not in the config; "
+                f"scene {scene!r} is not in the config; {suggestion(scene, self.scenes)}"
                 f"there are: {', '.join(self.scenes)} (add it, quoted, to datasets.<name>.scenes)"
             )
         return self.dataset_names[scene]

@@ -10,7 +10,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.settings import quoted, validated
 from drivesplat.settings.edit import Edit, Step
-from drivesplat.settings.names import NAME
+from drivesplat.settings.names import MAX_LENGTH, NAME
 from drivesplat.settings.yaml_file import read_yaml
 
 RESERVED = ("ego",)
@@ -66,6 +66,8 @@ def _name(name: Any, what: str) -> str:
         raise ConfigError(f"{what} {name!r} is not text: put the name in quotes")
     if not re.fullmatch(NAME, name):
         raise ConfigError(f"{what} {name!r} cannot name a file: use letters, digits, '_', '-' and '.'")
+    if len(name) > MAX_LENGTH:
+        raise ConfigError(f"{what} {quoted(name)} has {len(name)} characters; use at most {MAX_LENGTH}")
     return name
 
 

@@ -1,9 +1,19 @@
-"""Checks of names: scenes and methods name folders, and scene numbers need quotes in YAML."""
+"""Checks of names: scenes, methods and datasets name folders, and scene numbers need quotes in YAML."""
 
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
-NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$"
+from drivesplat.settings import quoted
+
+NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]*"
+MAX_LENGTH = 100
+"""Characters of a name: file systems allow 255 bytes, and the workflow adds prefixes and suffixes."""
+RESERVED = ("logs", "benchmarks", "masks")
+"""Folders of the workflow beside those of scenes and methods."""
+RESULT_SUFFIXES = (".csv", ".html", ".json", ".mp4", ".npz", ".pkl", ".ply", ".png", ".usdz")
+"""Suffixes of files of the workflow beside folders of scenes and methods."""
 
 
 def require_text(scene: Any) -> None:
@@ -16,6 +26,18 @@ def require_text(scene: Any) -> None:
 
 
 def require_name(name: str, kind: str) -> None:
-    """Raises ValueError where `name`, of a scene or another `kind`, cannot name a folder."""
-    if not re.match(NAME, name) or name in ("logs", "benchmarks"):
+    """Raises ValueError where `name`, of a scene or another `kind`, cannot name a folder or is that of a result."""
+    if len(name) > MAX_LENGTH:
+        raise ValueError(f"{kind} {quoted(name)} has {len(name)} characters; use at most {MAX_LENGTH}")
+    if not re.fullmatch(NAME, name):
         raise ValueError(f"{kind} {name!r} cannot name a folder: use letters, digits, '_', '-' and '.'")
+    if name in RESERVED or name.endswith(RESULT_SUFFIXES):
+        raise ValueError(f"{kind} {name!r} cannot name a folder: results of the workflow are called so; rename it")
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """'did you mean 0103? ' for a `name` that resembles one of those `known`; empty if none does."""
+    names = list(known)
+    padded = [other for other in names if name and other.lstrip("0") == name.lstrip("0")]
+    found = [*padded, *get_close_matches(name, names, n=1)]
+    return f"did you mean {found[0]}? " if found else ""

@@ -1,17 +1,19 @@
 """Input functions of rules: the files to read depend on the config."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from drivesplat.errors import DriveSplatError
+from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.provenance.file_digests import record_output
 from drivesplat.readers.datasets import index, layout
 from drivesplat.readers.truth import TRUTH_FILE
 from drivesplat.scene.scene import REFINED
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
+from drivesplat.settings.names import suggestion
+from drivesplat.settings.world import CameraChannel
 from drivesplat.workflow.stages import refines_poses, training_inputs
 
 
@@ -74,6 +76,20 @@ class Inputs:
                 record_output(file, "extract", {}, {})
             self._folders[name] = folder
         return self._folders[name]
+
+    def refuse_unknown_cameras(self, name: str, cameras: Iterable[str]) -> None:
+        """Raises ConfigError, with the cameras that a dataset has, if `cameras` names another one."""
+        dataset = self.config.datasets[name]
+        if dataset.world:
+            known = list(dataset.world.cameras or get_args(CameraChannel))
+        else:
+            known = layout(dataset.reader).camera_names(Path(self._root(name)), dataset.version)
+        for camera in cameras:
+            if camera not in known:
+                meant = suggestion(camera, known)
+                raise ConfigError(
+                    f"dataset {name} has no camera {camera!r} (cameras); {meant}there are: {', '.join(known)}"
+                )
 
     @property
     def worlds(self) -> dict[str, str]:

@@ -17,6 +17,7 @@ from drivesplat.io.storage import canonical_json
 from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
+from drivesplat.settings.names import suggestion
 from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
@@ -119,7 +120,8 @@ class Plan(Outputs):
             )
         if len(path) > 1 and path[0] not in (*self.config.all_methods, "masks"):
             more = f"; for the ablation: {ablation.job.name_pattern}" if self.config.ablated else ""
-            raise ConfigError(f"method {path[0]!r} is not in the config; there are: {known}{more}")
+            meant = suggestion(path[0], self.config.methods)
+            raise ConfigError(f"method {path[0]!r} is not in the config; {meant}there are: {known}{more}")
 
     def _refuse_idle_variants(self, scene: str) -> None:
         """Raises ConfigError if a variant of the ablation has the settings of the whole method."""
@@ -151,12 +153,15 @@ class Plan(Outputs):
             require_permission(download_job(self.config))
 
     def refuse_absent_data(self, targets: list[str]) -> None:
-        """Raises DatasetError if the dataset of a target's scene is not at the configured path."""
+        """Raises DatasetError if the dataset of a target's scene is not at the configured path, ConfigError if it lacks
+        one of the cameras."""
         needing = [target for target in targets if target != DOWNLOAD]
         for scene in self._scenes_of(needing) if needing or not targets else ():
             of_scene = SimpleNamespace(scene=scene)
             _ = self.tables(of_scene), self.scene_tables(of_scene)
-            if self.config.datasets[self.config.dataset_of(scene)].world:
+            name = self.config.dataset_of(scene)
+            self.refuse_unknown_cameras(name, for_scene(self.config, scene).cameras)
+            if self.config.datasets[name].world:
                 refuse_foreign_data(Path(self.root(of_scene)))
 
     def _scenes_of(self, targets: list[str]) -> list[str]:

@@ -27,6 +27,7 @@ def test_every_allowed_reader_has_a_package_with_all_modules_and_every_package_i
 @pytest.mark.parametrize("name", sorted(ALLOWED))
 def test_the_modules_of_a_reader_have_their_functions(name):
     assert callable(layout(name).find_root) and callable(layout(name).table_files) and callable(reader(name).read)
+    assert callable(layout(name).camera_names)
 
 
 def test_the_tables_of_nuscenes_are_split_into_scenes_and_other_tables_are_read_whole():

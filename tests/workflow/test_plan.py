@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from helpers import REPOSITORY
 
-from drivesplat.errors import ConfigError
+from drivesplat.errors import ConfigError, DatasetError
+from drivesplat.readers.datasets import layout
 from drivesplat.settings.config import load
 from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
 from drivesplat.workflow import inputs
@@ -250,6 +251,30 @@ def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_
         made.report(others).refuse_empty()
     (tmp_path / "a1/metrics.json").touch()
     made.report(["report"]).refuse_empty()
+
+
+# ---- cameras
+
+
+def test_a_camera_that_a_dataset_lacks_is_refused_with_those_there_are(tiny_root, tmp_path):
+    """Before any job: of recorded datasets by their tables, of worlds by their settings."""
+    data = {"tiny": {"dataroot": str(tiny_root), "scenes": ["0001"]}}
+    made = Plan(
+        {"datasets": data, "cameras": ["CAM_FRONT", "CAM_BACKK"], "results_dir": str(tmp_path)}, str(REPOSITORY)
+    )
+    with pytest.raises(ConfigError, match=r"dataset tiny has no camera 'CAM_BACKK' .*there are: CAM_FRONT"):
+        made.refuse_absent_data(["results/0001/metrics.json"])
+    world = {"w": {"dataroot": "resources/w", "scenes": ["w"], "world": {"cameras": ["CAM_FRONT"]}}}
+    made = Plan({"datasets": world, "cameras": ["CAM_FRONT", "CAM_BACK"]}, str(REPOSITORY))
+    with pytest.raises(ConfigError, match=r"dataset w has no camera 'CAM_BACK' .*there are: CAM_FRONT"):
+        made.refuse_absent_data(["results/w/metrics.json"])
+
+
+def test_a_damaged_table_of_sensors_is_named(tmp_path):
+    (tmp_path / "v1.0-mini").mkdir()
+    (tmp_path / "v1.0-mini/sensor.json").write_text("[{]")
+    with pytest.raises(DatasetError, match=r"sensor\.json cannot be read"):
+        layout("nuscenes").camera_names(tmp_path, "v1.0-mini")
 
 
 # ---- targets

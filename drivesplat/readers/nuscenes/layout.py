@@ -1,5 +1,6 @@
 """The location of the files of nuScenes."""
 
+import json
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
@@ -49,6 +50,16 @@ def find_root(dataroot: str, version: str) -> Path:
 def table_files(root: Path, version: str, scene: str) -> list[Path]:
     """The files from which `read` reads a scene: for every scene all tables. Raises DatasetError as `all_tables`."""
     return all_tables(root, version)
+
+
+def camera_names(root: Path, version: str) -> list[str]:
+    """The names of the cameras that recorded a dataset. Raises DatasetError if the table of sensors is damaged."""
+    table = root / version / "sensor.json"
+    try:
+        rows = json.loads(table.read_text(encoding="utf-8"))
+        return [row["channel"] for row in rows if row["modality"] == "camera"]
+    except (KeyError, OSError, TypeError, ValueError) as error:
+        raise DatasetError(f"{table} cannot be read ({type(error).__name__}: {error}); unpack it again") from error
 
 
 def all_tables(root: Path, version: str) -> list[Path]:
