@@ -4,6 +4,8 @@ Means of gaps and the share of a gap that a method closes are over scenes with m
 is that of parked vehicles, which no method has to close.
 """
 
+import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +42,11 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
             record = read_json(path, rule="scene_metrics")
             checked_digest(path, warn=False)
             reasons = _mismatches(record, job.expected, measured)
-            scene_rows = [_row(record, method) for method in record["methods"]]
+            scene_rows = _rows(record)
             scene = record["scene"]
         except ResultError as error:
             reasons = [str(error)]
-        except (AttributeError, KeyError, TypeError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             why = f"not the metrics of a scene ({type(error).__name__}: {error})"
             reasons = [str(unreadable(path, "scene_metrics", why))]
         if reasons:
@@ -96,6 +98,22 @@ def _comparable(record: dict[str, Any]) -> dict[str, Any]:
     own = {key: record["protocol"][key] for key in _COMPARABLE}
     refined = "refine_poses" in record["provenance"]["stages"] and own["poses"] != "images"
     return own | ({"poses": "refined"} if refined else {})
+
+
+def _rows(record: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows of all methods of a scene. Raises ValueError where there is none, or a figure is no finite number."""
+    rows = [_row(record, method) for method in record["methods"]]
+    if not rows:
+        raise ValueError("it has no method")
+    for row in rows:
+        for column in COLUMNS[3:]:
+            value = row[column]
+            if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
+                raise ValueError(f"{column} of {row['method']} is {value!r}, not a number")
+        if row["shown"] is not None and row["shown"]["group"] not in (*GROUP_PLACES, "train"):
+            raise ValueError(f"the image shown of {row['method']} is of no group")
+    json.dumps(record, allow_nan=False)  # what the report repeats of it holds no NaN either
+    return rows
 
 
 def _row(record: dict[str, Any], method: str) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 import copy
 import csv
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -235,6 +237,43 @@ def test_a_foreign_result_is_left_out_and_named_with_file_and_rule(write, foreig
     report = gap_report(paths, expecting("0061", "0103"), NO_LOGS)
     assert [row["scene"] for row in report["rows"]] == ["0061"]
     assert "0103/metrics.json" in left_out(report, "0103") and "'scene_metrics'" in left_out(report, "0103")
+
+
+def without_figures(record: dict[str, Any]) -> dict[str, Any]:
+    return {**record, "methods": []}
+
+
+def with_figure(value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    def changed(record: dict[str, Any]) -> dict[str, Any]:
+        record["methods"]["vanilla"]["extrapolation"]["static"]["psnr"] = value
+        return record
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (with_figure(math.nan), "extrapolation_static of vanilla is nan, not a number"),
+        (with_figure(-math.inf), "extrapolation_static of vanilla is -inf, not a number"),
+        (with_figure("good"), "extrapolation_static of vanilla is 'good', not a number"),
+        (with_figure([20.0]), "not a number"),
+        (without_figures, "it has no method"),
+        (lambda record: {**record, "methods": {}}, "it has no method"),
+        (lambda record: {**record, "protocol": {**PROTOCOL, "extra_points": math.nan}}, "not the metrics of a scene"),
+        (lambda record: record["methods"]["vanilla"].update(shown="here") or record, "not the metrics of a scene"),
+        (lambda record: record["methods"]["vanilla"].update(shown={"group": 3}) or record, "is of no group"),
+    ],
+)
+def test_a_scene_whose_figures_are_no_numbers_is_left_out_and_named(write, change, why):
+    """With file and rule; the other scene stays, and the report can be written."""
+    broken = change(copy.deepcopy(metrics("0103", {"vanilla": VANILLA_A})))
+    paths = [write(metrics("0061", {"vanilla": VANILLA_A})), write(json.dumps(broken), "0103")]
+    report = gap_report(paths, expecting("0061", "0103"), NO_LOGS)
+    assert [row["scene"] for row in report["rows"]] == ["0061"] and report["partial"]
+    reason = left_out(report, "0103")
+    assert why in reason and "0103/metrics.json" in reason and "'scene_metrics'" in reason, reason
+    json.dumps(report, allow_nan=False)
 
 
 def test_configured_scenes_without_a_result_are_listed(write):

@@ -263,7 +263,7 @@ def test_a_camera_that_a_dataset_lacks_is_refused_with_those_there_are(tiny_root
         {"datasets": data, "cameras": ["CAM_FRONT", "CAM_BACKK"], "results_dir": str(tmp_path)}, str(REPOSITORY)
     )
     with pytest.raises(ConfigError, match=r"dataset tiny has no camera 'CAM_BACKK' .*there are: CAM_FRONT"):
-        made.refuse_absent_data(["results/0001/metrics.json"])
+        made.refuse_absent_data([f"{tmp_path}/0001/metrics.json"])
     world = {"w": {"dataroot": "resources/w", "scenes": ["w"], "world": {"cameras": ["CAM_FRONT"]}}}
     made = Plan({"datasets": world, "cameras": ["CAM_FRONT", "CAM_BACK"]}, str(REPOSITORY))
     with pytest.raises(ConfigError, match=r"dataset w has no camera 'CAM_BACK' .*there are: CAM_FRONT"):
