@@ -125,6 +125,8 @@ rule ghost_panel:
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
+        # its rule refuses wrong ids; its content does not enter the result
+        named_tracks=ancient(plan.named_tracks),
     output:
         panel=report(
             "<results>/{scene}/{method}/ghost_panel.png",
@@ -163,6 +165,8 @@ rule remove_actor:
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
+        # its rule refuses wrong ids; its content does not enter the result
+        named_tracks=ancient(plan.named_tracks),
     output:
         with_car="<results>/{scene}/{method}/with_car.png",
         without_car="<results>/{scene}/{method}/without_car.png",
