@@ -42,8 +42,10 @@ class DatasetSettings(Settings):
 
     @property
     def world_root(self) -> str:
-        """The folder in which `world` is generated."""
-        return str(Path(self.dataroot).expanduser())
+        """The folder in which `world` is generated: relative to the working directory where it is below it, since
+        Snakemake compares paths as text."""
+        path = Path(self.dataroot).expanduser()
+        return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
     @field_validator("scenes", mode="before")
     @classmethod

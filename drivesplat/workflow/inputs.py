@@ -1,5 +1,6 @@
 """Input functions of rules: the files to read depend on the config."""
 
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
@@ -41,7 +42,7 @@ class Inputs:
             return self.world_tables(name)
         if index(dataset.reader):
             return []
-        files = layout(dataset.reader).table_files(Path(self._root(name)), dataset.version, wildcards.scene)
+        files = layout(dataset.reader).table_files(Path(self._link(name)), dataset.version, wildcards.scene)
         return [str(file) for file in files]
 
     def scene_tables(self, wildcards: Any) -> list[str]:
@@ -53,8 +54,23 @@ class Inputs:
         return [str(tables.scene_file(self._scene_tables(name, tables), wildcards.scene))] if tables else []
 
     def root(self, wildcards: Any) -> str:
-        """The root of a scene's dataset. A dataset that has moved reruns everything."""
-        return self._root(self.config.dataset_of(wildcards.scene))
+        """The root of a scene's dataset as results name it: that of a recorded one is a link in the results folder,
+        so that a dataset that has moved, or whose path is written in another way, reruns nothing."""
+        name = self.config.dataset_of(wildcards.scene)
+        return self._root(name) if self.config.datasets[name].world else self._link(name)
+
+    def _link(self, name: str) -> str:
+        """The link to the root of a recorded dataset, brought up to date; the root itself where links are refused."""
+        link, root = Path(self.config.results_dir) / ".data" / name, Path(self._root(name)).absolute()
+        try:
+            if not link.is_symlink() or link.readlink() != root:
+                link.parent.mkdir(parents=True, exist_ok=True)
+                new = link.with_name(f".{name}-{os.getpid()}")
+                new.symlink_to(root)
+                new.replace(link)
+        except OSError:
+            return self._root(name)
+        return str(link)
 
     def _root(self, name: str) -> str:
         if name not in self._roots:

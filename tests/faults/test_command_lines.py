@@ -62,6 +62,19 @@ def test_the_workflow_runs_from_elsewhere_into_a_folder_of_its_own(copy, tmp_pat
     assert planned.returncode == 0 and "rule edit:" in planned.stdout, planned.stdout
 
 
+def test_a_dataset_that_has_moved_reruns_nothing_and_is_read_where_it_is(copy, tmp_path):
+    mine = copy.again(tmp_path / "workflow")
+    assert mine.run("results/0001/parser.pkl").returncode == 0
+    for dataroot, folder in ((str(mine.folder / "data"), "data"), ("moved", "moved")):
+        if folder == "moved":
+            (mine.folder / "data").rename(mine.folder / folder)
+        mine.config["datasets"] = {"nuscenes": {"dataroot": dataroot, "scenes": ["0001"]}}
+        mine.write_config()
+        assert mine.planned("results/0001/parser.pkl") == {}, dataroot
+    done = mine.run("results/0001/masks/masks.json")
+    assert done.returncode == 0, done.stdout
+
+
 def test_make_help_lists_every_target():
     listed = subprocess.run(["make", "help"], cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
     makefile = (REPOSITORY / "Makefile").read_text()

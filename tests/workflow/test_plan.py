@@ -1,6 +1,7 @@
 """What rules ask of the plan: inputs that only some methods take, and what a report may expect."""
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,7 +33,7 @@ def taken(made: Plan, scene: str, method: str) -> list[str]:
     return [file for stage in TRAINING_INPUTS for file in made.training_input(stage)(at)]
 
 
-def test_a_dataset_without_scene_tables_names_the_files_of_each_scene(monkeypatch):
+def test_a_dataset_without_scene_tables_names_the_files_of_each_scene(monkeypatch, tmp_path):
     """A scene that is added to it reruns no other."""
     files = SimpleNamespace(
         find_root=lambda dataroot, _: Path(dataroot),
@@ -40,10 +41,11 @@ def test_a_dataset_without_scene_tables_names_the_files_of_each_scene(monkeypatc
     )
     monkeypatch.setattr(inputs, "layout", lambda _: files)
     monkeypatch.setattr(inputs, "index", lambda _: None)
-    made = Plan({"datasets": {"a": {"dataroot": "there", "version": "v1", "scenes": ["a1", "a2"]}}}, str(REPOSITORY))
+    dataset = {"dataroot": "there", "version": "v1", "scenes": ["a1", "a2"]}
+    made = Plan({"datasets": {"a": dataset}, "results_dir": str(tmp_path)}, str(REPOSITORY))
     for scene in ("a1", "a2"):
         at = SimpleNamespace(scene=scene)
-        assert made.tables(at) == [f"there/v1/{scene}/poses.json"] and made.scene_tables(at) == []
+        assert made.tables(at) == [f"{tmp_path}/.data/a/v1/{scene}/poses.json"] and made.scene_tables(at) == []
 
 
 def test_actors_are_an_input_of_methods_with_that_part_alone():
@@ -251,6 +253,35 @@ def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_
         made.report(others).refuse_empty()
     (tmp_path / "a1/metrics.json").touch()
     made.report(["report"]).refuse_empty()
+
+
+def test_a_dataset_that_moves_keeps_its_root_in_results(tiny_root, tmp_path, monkeypatch):
+    """However its path is written; the link there leads to where it is."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(tiny_root, "data")
+    at, link = SimpleNamespace(scene="0001"), Path("out/.data/tiny")
+
+    def root(dataroot: str) -> str:
+        datasets = {"tiny": {"dataroot": dataroot, "scenes": ["0001"]}}
+        return Plan({"datasets": datasets, "results_dir": "out"}, str(REPOSITORY)).root(at)
+
+    assert root("data") == root("./data/") == root(str(tmp_path / "data")) == root("data/v1.0-mini") == str(link)
+    assert link.resolve() == tmp_path / "data"
+    Path("data").rename("moved")
+    assert root("moved") == str(link) and link.resolve() == tmp_path / "moved"
+    monkeypatch.setattr(Path, "symlink_to", lambda *_: (_ for _ in ()).throw(OSError("no links here")))
+    link.unlink()
+    assert root("moved") == "moved", "on a disk without links"
+
+
+def test_a_world_has_one_spelling_of_its_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for dataroot in ("resources/w", "./resources/w/", str(tmp_path / "resources/w")):
+        world = {"w": {"dataroot": dataroot, "scenes": ["w"], "world": {}}}
+        made = Plan({"datasets": world}, str(REPOSITORY))
+        assert made.root(SimpleNamespace(scene="w")) == "resources/w" and made.truth_file("w").startswith(
+            "resources/w/"
+        )
 
 
 # ---- cameras

@@ -271,7 +271,7 @@ TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
 AFTER_EXTRACTION = {
     "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
 }  # fmt: skip
-EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
+EVERYTHING = {"extract": 1, "own_car": 1, "named_tracks": 1, **AFTER_EXTRACTION}
 
 
 @pytest.mark.parametrize(
@@ -283,7 +283,7 @@ EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
         ({"train": {"actors": {"fourier": 3}}}, STREETS_TRAINING_AND_AFTER),
         ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
-         EVERYTHING | {"extract": 0}),
+         EVERYTHING | {"extract": 0, "named_tracks": 0}),
         ({"holdout": {"last_block": 3}},
          {"lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
         ({"lidar_seed": {"sweeps": True}}, EVERYTHING),
