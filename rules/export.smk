@@ -1,22 +1,54 @@
 # Exports for other programs: the Gaussians, with the recorded trajectory.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl.
-# OUTPUTS: <results>/{scene}/{method}/splat.ply, cameras.json, parts/parts.json (and the PLYs beside it); scene.usdz;
-# viewer.html.
+# OUTPUTS: <results>/{scene}/{method}/splat.ply, cameras.json, transforms.json, parts/parts.json (and the PLYs beside
+# it); scene.usdz; viewer.html; colmap/; splat.spz; splat.sog. `export.formats` says which of them `all` and `exports`
+# make. far.npz, which all of them but colmap/ read.
+
+
+rule far_gaussians:
+    """
+    Finds the Gaussians that lie too far away for other programs, and measures on all training views what leaving them
+    out changes.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        parser="<results>/{scene}/parser.pkl",
+    output:
+        far="<results>/{scene}/{method}/far.npz",
+    log:
+        "<logs>/{scene}/{method}/far_gaussians.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/far_gaussians.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=4)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=30,
+    params:
+        settings=plan.settings("far_gaussians"),
+        code=plan.code("far_gaussians"),
+    script:
+        "../workflow_scripts/far_gaussians.py"
 
 
 rule export:
     """
     Exports the Gaussians in 3DGS's PLY format, in one file and in one per part (background and each object), with the
-    recorded cameras and the motion of the objects.
+    recorded cameras (also as nerfstudio reads them) and the motion of the objects.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
     output:
         splat="<results>/{scene}/{method}/splat.ply",
         cameras="<results>/{scene}/{method}/cameras.json",
+        transforms="<results>/{scene}/{method}/transforms.json",
         parts="<results>/{scene}/{method}/parts/parts.json",
     log:
         "<logs>/{scene}/{method}/export.log",
@@ -41,6 +73,7 @@ rule export_usd:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
     output:
         usd="<results>/{scene}/{method}/scene.usdz",
@@ -66,6 +99,7 @@ rule export_viewer:
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
     output:
         viewer=report(
@@ -89,3 +123,79 @@ rule export_viewer:
         code=plan.code("export_viewer"),
     script:
         "../workflow_scripts/export_viewer.py"
+
+
+rule export_colmap:
+    """
+    Exports the recorded cameras and the seed points as a text model of COLMAP.
+    """
+    input:
+        scene=plan.scene,
+        parser="<results>/{scene}/parser.pkl",
+    output:
+        cameras="<results>/{scene}/{method}/colmap/cameras.txt",
+        images="<results>/{scene}/{method}/colmap/images.txt",
+        points="<results>/{scene}/{method}/colmap/points3D.txt",
+    log:
+        "<logs>/{scene}/{method}/export_colmap.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/export_colmap.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=15,
+    params:
+        settings=plan.settings("export_colmap"),
+        code=plan.code("export_colmap"),
+    script:
+        "../workflow_scripts/export_colmap.py"
+
+
+rule export_spz:
+    """
+    Exports the Gaussians as a compressed file, a tenth of the PLY, for web viewers.
+    """
+    input:
+        splat="<results>/{scene}/{method}/splat.ply",
+    output:
+        spz="<results>/{scene}/{method}/splat.spz",
+    log:
+        "<logs>/{scene}/{method}/export_spz.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/export_spz.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=8000,
+        runtime=15,
+    params:
+        settings=plan.settings("export_spz"),
+        code=plan.code("export_spz"),
+    script:
+        "../workflow_scripts/export_spz.py"
+
+
+rule export_sog:
+    """
+    Exports the Gaussians as SOG, PlayCanvas's compressed format, by @playcanvas/splat-transform.
+    """
+    input:
+        splat="<results>/{scene}/{method}/splat.ply",
+    output:
+        sog="<results>/{scene}/{method}/splat.sog",
+    log:
+        "<logs>/{scene}/{method}/export_sog.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/export_sog.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: 4
+    resources:
+        mem_mb=8000,
+        runtime=30,
+    params:
+        settings=plan.settings("export_sog"),
+        code=plan.code("export_sog"),
+    script:
+        "../workflow_scripts/export_sog.py"

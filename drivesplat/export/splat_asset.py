@@ -1,6 +1,7 @@
 """The stage `export`: a trained model as splat.ply, and its rigid groups as one PLY each.
 
-cameras.json has the recorded cameras, which place splat.ply in the world and in time. parts.json has the attributes and
+cameras.json has the recorded cameras, which place splat.ply in the world and in time; transforms.json has them as
+nerfstudio reads them. parts.json has the attributes and
 motions of the groups: other programs can compose the drive at any time, without a vehicle, or with a vehicle at another
 place.
 """
@@ -8,20 +9,23 @@ place.
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from drivesplat.export.nerfstudio import transforms_record
 from drivesplat.export.sampled_motion import SampledMotion
 from drivesplat.export.splat_ply import note_of, write_splat_ply
 from drivesplat.export.trained_parts import SampledGroup, digests, middle_timestamp, trained_gaussians, trained_groups
 from drivesplat.export.unique_names import unique_names
 from drivesplat.io.storage import Provenance, write_json
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
+from drivesplat.model.gaussians import with_sh_degree
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.export import SplatJob
 
 log = logging.getLogger(__name__)
 
@@ -62,22 +66,33 @@ class SplatFiles:
     splat: str | Path
     cameras: str | Path
     parts: str | Path
+    transforms: str | Path
 
 
 def export_splat(
-    files: SplatFiles, checkpoint: TrainedCheckpoint, record: TrainingRecord, scene: Scene, provenance: Provenance
+    files: SplatFiles,
+    checkpoint: TrainedCheckpoint,
+    record: TrainingRecord,
+    scene: Scene,
+    job: SplatJob,
+    provenance: Provenance,
 ) -> None:
     """Writes all Gaussians of a checkpoint: together at the time of the middle image, and group by group;
-    and the recorded cameras.
+    and the recorded cameras. PLYs have spherical harmonics of at least `job.sh_degree`.
 
     PLY headers contain only the digests of `provenance`, since viewers limit their length; JSON files contain all.
     """
     model = trained_model(checkpoint)
-    gaussians = trained_gaussians(model, scene)
-    groups = trained_groups(model, scene, np.array([frame.timestamp for frame in scene.frames]))
+    degree = job.sh_degree or 0
+    gaussians = with_sh_degree(trained_gaussians(model, scene), degree)
+    groups = {
+        name: replace(group, gaussians=with_sh_degree(group.gaussians, degree))
+        for name, group in trained_groups(model, scene, np.array([f.timestamp for f in scene.frames])).items()
+    }
     note = {"scene": scene.name, "origin": scene.origin.tolist(), **digests(provenance)}
     write_splat_ply(files.splat, gaussians, note)
     write_json(files.cameras, {**cameras_record(scene, record), "provenance": provenance})
+    write_json(files.transforms, {**transforms_record(scene, record), "provenance": provenance})
     write_parts(files.parts, groups, scene, provenance)
     log.info("%d Gaussians, %d groups, %d images", len(gaussians), len(groups), len(scene.frames))
 

@@ -51,6 +51,12 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     """Several sets as one, in order, with the highest SH degree of them; a single set is returned unchanged."""
     if len(sets) == 1:
         return sets[0]
-    coefficients = max(s.shN.shape[1] for s in sets)
-    sets = [replace(s, shN=F.pad(s.shN, (0, 0, 0, coefficients - s.shN.shape[1]))) for s in sets]
+    degree = max(s.sh_degree for s in sets)
+    sets = [with_sh_degree(s, degree) for s in sets]
     return Gaussians(**{f.name: torch.cat([getattr(s, f.name) for s in sets]) for f in fields(Gaussians)})
+
+
+def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same Gaussians with spherical harmonics of at least this degree: coefficients that they lack are 0."""
+    lacking = max(0, (degree + 1) ** 2 - 1 - gaussians.shN.shape[1])
+    return replace(gaussians, shN=F.pad(gaussians.shN, (0, 0, 0, lacking)))

@@ -1,15 +1,37 @@
 """Settings of exports."""
 
-from pydantic import Field
+from typing import Literal
+
+from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
 
+ExportFormat = Literal["ply", "usd", "viewer", "colmap", "spz", "sog"]
+
+MAX_DISTANCE = 1000.0
+"""Metres from the origin of the world beyond which no export holds a Gaussian: what lies there is the sky's."""
+
 
 class ExportSettings(Settings):
+    formats: tuple[ExportFormat, ...] = ("ply", "usd", "viewer", "colmap")
+    """What `snakemake` and `snakemake exports` make: 'ply' (splat.ply, parts, cameras.json, transforms.json), 'usd'
+    (scene.usdz), 'viewer' (viewer.html), 'colmap' (text model of cameras and seed points), 'spz' (compressed splat.spz)
+    and 'sog' (splat.sog; needs Node and @playcanvas/splat-transform). The other files are made on request."""
+    max_distance: float = Field(MAX_DISTANCE, gt=0, le=MAX_DISTANCE)
+    """Distance in metres from the world's origin within which all exported Gaussians lie. Those beyond are left out
+    where no training image shows it, and moved nearer along the line of sight otherwise. docs/exports.md"""
+    sh_degree: int | None = Field(None, ge=0, le=3)
+    """Minimum degree of spherical harmonics in PLY, spz and sog files, for viewers that insist on 3: higher
+    coefficients are 0. null: the degree of the training."""
     usd_gaussians: int = Field(1_000_000, ge=1)
     """Maximum number of Gaussians in scene.usdz. Those with the largest opacity times area are kept."""
     viewer_gaussians: int = Field(300_000, ge=1)
     """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
+
+    @field_validator("formats")
+    @classmethod
+    def _once(cls, value: tuple[ExportFormat, ...]) -> tuple[ExportFormat, ...]:
+        return tuple(dict.fromkeys(value))
 
 
 class ExportJob(Settings):
@@ -17,3 +39,15 @@ class ExportJob(Settings):
 
     eval_camera: str
     gaussians: int
+
+
+class FarJob(Settings):
+    """All settings that determine one far.npz."""
+
+    max_distance: float = MAX_DISTANCE
+
+
+class SplatJob(Settings):
+    """All settings that determine one splat.ply with its parts, or one splat.spz."""
+
+    sh_degree: int | None = None

@@ -7,6 +7,7 @@ from typing import Any
 
 from drivesplat.provenance.code_digest import code_digest
 from drivesplat.settings.config import Config, for_scene
+from drivesplat.settings.export import ExportFormat
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.stages import (
     METHOD_STAGES,
@@ -20,7 +21,15 @@ from drivesplat.workflow.stages import (
 
 SCRIPTS = "workflow_scripts"
 LOOKS = ("ghost_panel.png", "removal.png")
-EXPORTS = ("splat.ply", "parts/parts.json", "scene.usdz", "viewer.html")
+EXPORTS: dict[ExportFormat, tuple[str, ...]] = {
+    "ply": ("splat.ply", "parts/parts.json"),
+    "usd": ("scene.usdz",),
+    "viewer": ("viewer.html",),
+    "colmap": ("colmap/images.txt",),
+    "spz": ("splat.spz",),
+    "sog": ("splat.sog",),
+}
+"""The files of every format, one or two for each rule that makes them."""
 PARTS_FILM = "parts"
 """The film of a method's parts."""
 
@@ -79,8 +88,10 @@ class Outputs(Inputs):
         return [*tracks, *self.of_methods(lambda *_: LOOKS)]
 
     def exports(self, _: Any = None) -> list[str]:
-        """The exported files of the batch's scenes and methods."""
-        return self.of_methods(lambda *_: EXPORTS)
+        """The exported files of the batch's scenes and methods, in the formats of the settings."""
+        return self.of_methods(
+            lambda scene, _: [name for kind in for_scene(self.config, scene).export.formats for name in EXPORTS[kind]]
+        )
 
     def of_methods(self, names: Callable[[str, str], Iterable[str]], scenes: Iterable[str] | None = None) -> list[str]:
         """The files below the folders of all methods of `scenes`, by default the batch's; `names` gives those of one

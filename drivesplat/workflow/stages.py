@@ -18,7 +18,7 @@ from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.settings.export import ExportJob
+from drivesplat.settings.export import ExportJob, FarJob, SplatJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.images import ParserJob
@@ -267,9 +267,13 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "edit": (EditJob, _edit),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
-    "export": (Settings, _nothing),
+    "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),
+    "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree}),
     "export_usd": (ExportJob, lambda at: {"gaussians": at.config.export.usd_gaussians}),
     "export_viewer": (ExportJob, lambda at: {"gaussians": at.config.export.viewer_gaussians}),
+    "export_colmap": (Settings, _nothing),
+    "export_spz": (Settings, _nothing),
+    "export_sog": (Settings, _nothing),
 }
 """The record of every stage, and a function that gives those of its fields that are not sections of the config, or are
 changed for it."""

@@ -30,6 +30,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
+from drivesplat.settings.export import SplatJob
 
 DIGESTS = {"settings_sha256": "a" * 64, "code_sha256": "b" * 64, "inputs_sha256": "c" * 64}
 PROVENANCE = {**DIGESTS, "stages": {}}
@@ -45,8 +46,10 @@ def street() -> SplatModel:
 def export_all(folder, model, scene, monkeypatch):
     """What the stage writes into `folder` for a model; returns parts.json's content."""
     monkeypatch.setattr(splat_asset, "trained_model", lambda _: model)
-    files = SplatFiles(folder / "splat.ply", folder / "cameras.json", folder / "parts/parts.json")
-    export_splat(files, EMPTY_CHECKPOINT, recording_of(scene).record, scene, PROVENANCE)
+    files = SplatFiles(
+        *(folder / name for name in ("splat.ply", "cameras.json", "parts/parts.json", "transforms.json"))
+    )
+    export_splat(files, EMPTY_CHECKPOINT, recording_of(scene).record, scene, SplatJob(), PROVENANCE)
     return json.loads((folder / "parts/parts.json").read_text())
 
 

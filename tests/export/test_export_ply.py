@@ -19,6 +19,7 @@ from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.preprocess.parser import training_record
 from drivesplat.rasterization import rasterize
+from drivesplat.settings.export import SplatJob
 from drivesplat.settings.images import HoldoutSettings, ImageSettings, ParserJob
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 
@@ -219,13 +220,21 @@ def test_a_splat_that_cannot_be_written_is_named(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_the_stage_exports_every_gaussian_of_the_checkpoint(tmp_path, tiny_scene):
+def exported(folder, params, scene, job: SplatJob) -> SplatFiles:
+    """What the stage writes into `folder` for a background with these parameters, of degree 2."""
     settings = TrainSettings(gaussians=GaussianSettings(sh_degree=2))
-    params = trained_params(50, sh_degree=2)
     seed = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), {})
-    parser = training_record(tiny_scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings()))
-    files = SplatFiles(tmp_path / "splat.ply", tmp_path / "cameras.json", tmp_path / "parts/parts.json")
-    export_splat(files, checkpoint_of(params, settings), parser, tiny_scene, PROVENANCE)
+    parser = training_record(scene, seed, ParserJob(holdout=HoldoutSettings(), images=ImageSettings()))
+    files = SplatFiles(
+        *(folder / name for name in ("splat.ply", "cameras.json", "parts/parts.json", "transforms.json"))
+    )
+    export_splat(files, checkpoint_of(params, settings), parser, scene, job, PROVENANCE)
+    return files
+
+
+def test_the_stage_exports_every_gaussian_of_the_checkpoint(tmp_path, tiny_scene):
+    params = trained_params(50, sh_degree=2)
+    files = exported(tmp_path, params, tiny_scene, SplatJob())
     splat, cameras = files.splat, files.cameras
     vertices = PlyData.read(str(splat))["vertex"]
     np.testing.assert_array_equal(vertices["y"], params["means"][:, 1])
@@ -235,6 +244,20 @@ def test_the_stage_exports_every_gaussian_of_the_checkpoint(tmp_path, tiny_scene
     assert note_of(splat) == {"scene": "0001", "origin": tiny_scene.origin.tolist(), **DIGESTS}
     assert splat.read_bytes().index(b"end_header\n") < 8_000
     assert json.loads(cameras.read_text())["provenance"] == PROVENANCE
+
+
+@pytest.mark.parametrize(("asked", "degree"), [(3, 3), (2, 2), (1, 2), (None, 2)])
+def test_harmonics_have_at_least_the_degree_asked_for(tmp_path, tiny_scene, asked, degree):
+    """Coefficients that the training does not have are 0: the colours stay as they are."""
+    params = trained_params(20, sh_degree=2)
+    files = exported(tmp_path, params, tiny_scene, SplatJob(sh_degree=asked))
+    (part,) = json.loads(files.parts.read_text())["parts"]
+    assert part["sh_degree"] == degree
+    for path in (files.splat, files.parts.with_name(part["file"])):
+        names = [p.name for p in PlyData.read(str(path))["vertex"].properties]
+        assert sum(name.startswith("f_rest_") for name in names) == 3 * ((degree + 1) ** 2 - 1)
+        sh = read_splat_ply(path).sh
+        assert torch.equal(sh[:, 1:9], params["shN"]) and not sh[:, 9:].any()
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])

@@ -305,9 +305,11 @@ LOOK_SCRIPTS = {
     "edit": "street/edits/gone.mp4",
     "ghost_panel": "vanilla/ghost_panel.png",
     "remove_actor": "vanilla/with_car.png",
+    "far_gaussians": "vanilla/far.npz",
     "export": "vanilla/splat.ply",
     "export_usd": "vanilla/scene.usdz",
     "export_viewer": "vanilla/viewer.html",
+    "export_colmap": "vanilla/colmap/images.txt",
 }
 """Scripts, and a file of each that it cannot write."""
 

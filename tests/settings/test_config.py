@@ -14,7 +14,10 @@ from drivesplat.settings.config import Config, for_scene, load, merged
 from drivesplat.settings.config_document import config_schema, config_yaml
 from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
 
-LOOKS = ("tracks", "film", "ghost_panel", "remove_actor", "export", "export_usd", "export_viewer")
+LOOKS = (
+    "tracks", "film", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd", "export_viewer",
+    "export_colmap", "export_spz", "export_sog",
+)  # fmt: skip
 OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "tracks")
 STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "train", "evaluate", *LOOKS)
 
@@ -378,6 +381,9 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("removal.margin", 0.5), "remove_actor"),
         (at("export.usd_gaussians", 9), "export_usd"),
         (at("export.viewer_gaussians", 9), "export_viewer"),
+        (at("export.max_distance", 9), "far_gaussians"),
+        (at("export.sh_degree", 3), "export"),
+        (at("export.formats", ["ply"]), ""),
         (at("device", "cpu"), ""),
         (at("device.min_free_gb", 3), ""),
         (at("results_dir", "elsewhere"), ""),

@@ -117,7 +117,16 @@ def test_what_a_training_leaves_behind(finished):
     trained = {"checkpoint.npz", "train.json", "eval.json", "tensorboard", ".digests"} | set(HELD_OUT_PAIR.values())
     films = {f"{film}.{kind}" for film in ("original", "lateral_2m") for kind in ("mp4", "cameras.json")}
     looks = {"ghost_panel.png", "ghost_panel.json", "with_car.png", "without_car.png", "removal.png", "removal.json"}
-    exports = {"splat.ply", "cameras.json", "parts", "scene.usdz", "viewer.html"}
+    exports = {
+        "splat.ply",
+        "cameras.json",
+        "transforms.json",
+        "parts",
+        "scene.usdz",
+        "viewer.html",
+        "colmap",
+        "far.npz",
+    }
     of_both = trained | films | looks | exports
     assert of_both == {path.name for path in folder.iterdir()}
     assert list((folder / "tensorboard").glob("events.*"))
@@ -257,7 +266,8 @@ def test_in_a_browser_snakemakes_report_requests_nothing_but_its_files(archive, 
 OF_ACTORS = {"film_parts": 1, "edit": 2}
 """What a method with actors has and others have not."""
 FILMS_AND_LOOKS = {"film": 4, "ghost_panel": 2, "remove_actor": 2, **OF_ACTORS}
-EXPORTS = ("export", "export_usd", "export_viewer")
+EXPORTS = ("far_gaussians", "export", "export_usd", "export_viewer")
+COLMAP = {"export_colmap": 2}
 TRAINING_AND_AFTER = {
     "train": 2, "evaluate": 2, "scene_metrics": 1, "gap_report": 1, **FILMS_AND_LOOKS,
     **dict.fromkeys(EXPORTS, 2),
@@ -269,7 +279,7 @@ ONE_TRAINING_AND_AFTER = {
 STREETS_TRAINING_AND_AFTER = ONE_TRAINING_AND_AFTER | OF_ACTORS
 TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
 AFTER_EXTRACTION = {
-    "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER
+    "lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER, **COLMAP
 }  # fmt: skip
 EVERYTHING = {"extract": 1, "own_car": 1, "named_tracks": 1, **AFTER_EXTRACTION}
 
@@ -281,11 +291,12 @@ EVERYTHING = {"extract": 1, "own_car": 1, "named_tracks": 1, **AFTER_EXTRACTION}
         ({"methods": {"vanilla": {"overrides": {"sky": "mask"}}}}, ONE_TRAINING_AND_AFTER),
         ({"actors": {"humans": True}}, {"actors": 1, "tracks": 1, **STREETS_TRAINING_AND_AFTER}),
         ({"train": {"actors": {"fourier": 3}}}, STREETS_TRAINING_AND_AFTER),
-        ({"lidar_seed": {"voxel_size": 0.2}}, {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER}),
+        ({"lidar_seed": {"voxel_size": 0.2}},
+         {"lidar_seed": 1, "parser": 1, "tracks": 1, **TRAINING_AND_AFTER, **COLMAP}),
         ({"masks": {"own_car_polygons": {"CAM_FRONT": [[0, 1], [1, 1], [0.5, 0.9]]}}},
          EVERYTHING | {"extract": 0, "named_tracks": 0}),
         ({"holdout": {"last_block": 3}},
-         {"lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER}),
+         {"lidar_seed": 1, "parser": 1, "masks": 1, "tracks": 1, **TRAINING_INPUTS, **TRAINING_AND_AFTER, **COLMAP}),
         ({"lidar_seed": {"sweeps": True}}, EVERYTHING),
         ({"extract": {"on_missing": "warn"}}, EVERYTHING),
         ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
@@ -294,9 +305,11 @@ EVERYTHING = {"extract": 1, "own_car": 1, "named_tracks": 1, **AFTER_EXTRACTION}
         ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2, "gap_report": 1}),
         ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2, "gap_report": 1}),
         ({"export": {"viewer_gaussians": 100}}, {"export_viewer": 2}),
+        ({"export": {"sh_degree": 3, "formats": ["ply", "spz"]}}, {"export": 2, "export_spz": 2}),
+        ({"export": {"max_distance": 500}}, dict.fromkeys(EXPORTS, 2)),
         ({"refine_poses": {"rounds": 2}, "device": {"kind": "cpu", "min_free_gb": 1},
           "lpips": {"enabled": False, "timeout_s": 3}}, {}),
-        ({"methods": {"third": {}}}, ONE_TRAINING_AND_AFTER),
+        ({"methods": {"third": {}}}, {**ONE_TRAINING_AND_AFTER, "export_colmap": 1}),
     ],
 )  # fmt: skip
 def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, setting, expected):
