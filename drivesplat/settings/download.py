@@ -17,6 +17,9 @@ class NuscenesMiniSettings(Settings):
     archive that you trust, set the output of `sha256sum`. null = only the size is checked, with a warning."""
     timeout_s: float = Field(60.0, gt=0, le=3600)
     """Timeout of a silent connection (seconds)."""
+    min_kb_per_s: float = Field(5.0, ge=0)
+    """Minimum rate of a connection (kB/s), averaged over `timeout_s`. A slower one is broken off. 0 = no
+    minimum."""
     attempts: int = Field(3, ge=1, le=1000)
     """Number of successive connections that end within their first megabyte before a run gives up. The next run
     resumes the download."""

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, Literal, get_args
 
 from drivesplat.errors import ConfigError, DriveSplatError
@@ -150,6 +150,12 @@ class Inputs:
         """The user's extra seed points, if given."""
         path = for_scene(self.config, wildcards.scene).lidar_seed.points_file
         return [str(Path(path).expanduser())] if path else []
+
+    def refuse_special_points_file(self, scene: str) -> None:
+        """Raises ConfigError if the user's seed points are a folder, or a pipe that a job would wait for."""
+        for path in self.points_file(SimpleNamespace(scene=scene)):
+            if Path(path).exists() and not Path(path).is_file():
+                raise ConfigError(f"lidar_seed.points_file {path} is no regular file; name a PLY file of points")
 
     def training_input(self, stage: str) -> Callable[[Any], list[str]]:
         """The function of wildcards that gives the result of one of TRAINING_INPUTS, if the training reads it."""

@@ -154,13 +154,14 @@ class Plan(Outputs):
 
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError if the dataset of a target's scene is not at the configured path, ConfigError if it lacks
-        one of the cameras."""
+        one of the cameras, or if the points file is no file."""
         needing = [target for target in targets if target != DOWNLOAD]
         for scene in self._scenes_of(needing) if needing or not targets else ():
             of_scene = SimpleNamespace(scene=scene)
             _ = self.tables(of_scene), self.scene_tables(of_scene)
             name = self.config.dataset_of(scene)
             self.refuse_unknown_cameras(name, for_scene(self.config, scene).cameras)
+            self.refuse_special_points_file(scene)
             if self.config.datasets[name].world:
                 refuse_foreign_data(Path(self.root(of_scene)))
 

@@ -100,6 +100,18 @@ def test_a_silent_server_is_not_waited_for(archive, tmp_path, after):
     assert "timed out" in message and ("1,000 of" in message) == (after > 0)
 
 
+def test_a_server_that_trickles_is_left(archive, tmp_path):
+    """A byte at a time never is silence; what has come is kept."""
+    began = time.monotonic()
+    with served(Site(archive, trickle_s=0.05)) as site:
+        message = refused(site.job(tmp_path / "mini", attempts=1, timeout_s=0.5))
+        assert time.monotonic() - began < 4.0
+        assert "slower than nuscenes_mini.min_kb_per_s, 5 kB/s" in message and "are kept: run again" in message
+        site.trickle_s = None
+        download(site.job(tmp_path / "mini"))
+    assert (tmp_path / "mini/v1.0-mini/scene.json").is_file()
+
+
 def test_no_server_is_a_line(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -186,6 +198,27 @@ def through_a_link(tar: tarfile.TarFile, outside: Path) -> None:
     member("samples/out/evil")(tar, outside)
 
 
+def with_headers(name: str, **headers: str) -> Member:
+    """Adds an empty file with these headers of the PAX format."""
+
+    def add(tar: tarfile.TarFile, _: Path) -> None:
+        info = tarfile.TarInfo(name)
+        info.pax_headers = headers
+        tar.addfile(info)
+
+    return add
+
+
+def below_a_file(tar: tarfile.TarFile, outside: Path) -> None:
+    member("samples/evil")(tar, outside)
+    member("samples/evil/file")(tar, outside)
+
+
+def a_file_called_like_a_folder(tar: tarfile.TarFile, outside: Path) -> None:
+    member("samples/evil/file")(tar, outside)
+    member("samples/evil")(tar, outside)
+
+
 def many(tar: tarfile.TarFile, outside: Path) -> None:
     for number in range(300):
         member(f"samples/{number}")(tar, outside)
@@ -251,6 +284,13 @@ def repacked(archive: bytes, add: Member, outside: Path) -> bytes:
         pytest.param(member("evil", tarfile.FIFOTYPE), "neither a file nor a folder", id="fifo"),
         pytest.param(sparse, "neither a file nor a folder", id="sparse"),
         pytest.param(member("v1.0-mini/scene.json"), "is in it twice", id="twice"),
+        pytest.param(below_a_file, "is both a file and a folder", id="below a file"),
+        pytest.param(a_file_called_like_a_folder, "is both a file and a folder", id="a file called like a folder"),
+        pytest.param(member("d/" * 2500 + "evil"), "has a path of absurd length", id="deep"),
+        pytest.param(member("d" * 2000 + "/evil"), "has a path of absurd length", id="long"),
+        pytest.param(with_headers("evil", size="-5"), "impossible size or time", id="negative size"),
+        pytest.param(with_headers("evil", mtime="nan"), "impossible size or time", id="time that is no number"),
+        pytest.param(with_headers("evil", mtime="1e300"), "impossible size or time", id="absurd time"),
         pytest.param(declared("evil", tarfile.REGTYPE, 10**12), "more than 0.1 GB", id="absurd size"),
         pytest.param(member("evil", size=100_000_000), "more than 0.1 GB", id="zeros"),
         pytest.param(declared("evil", tarfile.XHDTYPE, 10**10), "absurd size", id="absurd header"),

@@ -6,7 +6,7 @@ import re
 import tarfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -36,6 +36,8 @@ class Site:
     cut_after: list[int] = field(default_factory=list)
     """After how many bytes the next connections break off, one each."""
     silent_after: int | None = None
+    trickle_s: float | None = None
+    """Seconds between two bytes."""
     status: int = 200
     wrong_range: bool = False
     heeds_conditions: bool = True
@@ -64,6 +66,12 @@ class Site:
         if self.length != -1:
             handler.send_header("Content-Length", str(len(body) if self.length is None else self.length))
         handler.end_headers()
+        if self.trickle_s is not None:
+            for place in range(len(body)):
+                with suppress(OSError):  # the client has left
+                    handler.wfile.write(body[place : place + 1])
+                if self.ended.wait(self.trickle_s):
+                    return
         if self.silent_after is not None:
             handler.wfile.write(body[: self.silent_after])
             self.ended.wait(5.0)

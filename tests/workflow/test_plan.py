@@ -1,6 +1,7 @@
 """What rules ask of the plan: inputs that only some methods take, and what a report may expect."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -299,6 +300,17 @@ def test_a_camera_that_a_dataset_lacks_is_refused_with_those_there_are(tiny_root
     made = Plan({"datasets": world, "cameras": ["CAM_FRONT", "CAM_BACK"]}, str(REPOSITORY))
     with pytest.raises(ConfigError, match=r"dataset w has no camera 'CAM_BACK' .*there are: CAM_FRONT"):
         made.refuse_absent_data(["results/w/metrics.json"])
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_a_points_file_that_is_a_pipe_or_a_folder_is_refused(tiny_root, tmp_path, make):
+    """A job would wait for the pipe's other end."""
+    make(tmp_path / "points.ply")
+    data = {"tiny": {"dataroot": str(tiny_root), "scenes": ["0001"]}}
+    seed = {"points_file": str(tmp_path / "points.ply")}
+    made = Plan({"datasets": data, "results_dir": str(tmp_path / "out"), "lidar_seed": seed}, str(REPOSITORY))
+    with pytest.raises(ConfigError, match=r"points_file .*/points\.ply is no regular file"):
+        made.refuse_absent_data([f"{tmp_path}/out/0001/metrics.json"])
 
 
 def test_a_damaged_table_of_sensors_is_named(tmp_path):

@@ -142,18 +142,25 @@ def _range_of(response: http.client.HTTPResponse, start: int, validator: str | N
 
 
 def _receive(source: NuscenesMiniSettings, response: http.client.HTTPResponse, part: Path, start: int) -> int:
-    """Writes the response to `part` from `start` on, up to a byte more than expected; returns the size of `part`."""
+    """Writes the response to `part` from `start` on, up to a byte more than expected; returns the size of `part`.
+
+    Raises TimeoutError if the server sends less than the least rate."""
     end = source.size_bytes + 1
     progress = byte_progress("download", source.size_bytes, start)
     with open(part, "r+b" if start else "wb") as file, progress:
         if not start:
             write_json(_record_of(part), {source.url: _validator(response.headers)})
         file.seek(start)
+        since, from_byte = time.monotonic(), start
         while start < end and (chunk := response.read1(min(CHUNK, end - start))):
             file.write(chunk)
             file.flush()
             start += len(chunk)
             progress.update(len(chunk))
+            if (seconds := time.monotonic() - since) >= source.timeout_s:
+                if start - from_byte < source.min_kb_per_s * 1000 * seconds:
+                    raise TimeoutError(f"slower than nuscenes_mini.min_kb_per_s, {source.min_kb_per_s:g} kB/s")
+                since, from_byte = time.monotonic(), start
         os.fsync(file.fileno())
     return start
 

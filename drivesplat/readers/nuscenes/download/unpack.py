@@ -19,6 +19,10 @@ from drivesplat.settings.download import NuscenesMiniSettings
 MAX_READ = 1 << 20
 """Maximum size of a header and of the padding: a tar file may declare names of gigabytes, which `tarfile` reads
 whole."""
+MAX_DEPTH, MAX_PATH = 32, 1000
+"""Maximum number of folders and of bytes in the path of a member."""
+MAX_MTIME = 1 << 33
+"""Maximum time of a member (seconds since 1970: the year 2242)."""
 DAMAGED = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError, ValueError, OverflowError, RecursionError)
 
 
@@ -74,15 +78,20 @@ def _counted(tar: tarfile.TarFile, progress: tqdm) -> Iterator[tarfile.TarInfo]:
 def _inspect(archive: Path, limits: NuscenesMiniSettings, required: list[str]) -> int:
     """The unpacked size of an archive in bytes. Raises BadArchiveError if it is unsafe, any of DAMAGED if it cannot be
     read to its end."""
-    size, names = 0, set()
+    size, names, files, folders = 0, set(), set(), set()
     with _Stream(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as tar:
         for count, member in enumerate(tar, start=1):
             name, why = str(PurePosixPath(member.name)), _objection(member)
             if not why and name in names and not member.isdir():
                 why = "is in it twice"
+            above = {str(folder) for folder in PurePosixPath(name).parents}
+            if not why and (files & above or (member.isfile() and name in folders)):
+                why = "is both a file and a folder"
             if why:
                 raise BadArchiveError(f"{archive.name} is refused: {member.name[:200]!r} {why}")
             names.add(name)
+            folders |= above
+            files |= {name} if member.isfile() else set()
             size += member.size
             if count > limits.max_files:
                 why = f"holds more than {limits.max_files:,} files and folders (nuscenes_mini.max_files)"
@@ -114,4 +123,8 @@ def _objection(member: tarfile.TarInfo) -> str | None:
         return "is no safe path for a file"
     if member.type not in (tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.DIRTYPE) or member.issparse():
         return "is neither a file nor a folder"
+    if len(path.parts) > MAX_DEPTH or len(member.name.encode(errors="replace")) > MAX_PATH:
+        return "has a path of absurd length"
+    if member.size < 0 or not 0 <= member.mtime < MAX_MTIME:
+        return "has an impossible size or time"
     return None
