@@ -13,8 +13,6 @@ rule edit:
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         scene=plan.scene,
-        # its rule refuses wrong ids; its content does not enter the result
-        named_tracks=ancient(plan.named_tracks),
     output:
         film=report(
             "<results>/{scene}/{method}/edits/{edit}.mp4",

@@ -125,8 +125,6 @@ rule ghost_panel:
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
-        # its rule refuses wrong ids; its content does not enter the result
-        named_tracks=ancient(plan.named_tracks),
     output:
         panel=report(
             "<results>/{scene}/{method}/ghost_panel.png",
@@ -165,8 +163,6 @@ rule remove_actor:
         scene=plan.scene,
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
-        # its rule refuses wrong ids; its content does not enter the result
-        named_tracks=ancient(plan.named_tracks),
     output:
         with_car="<results>/{scene}/{method}/with_car.png",
         without_car="<results>/{scene}/{method}/without_car.png",

@@ -3,8 +3,7 @@
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
 # where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
-# lidar_depth.npz and free_space.npz; where settings name tracks, named_tracks.json. The scene of all rules after these
-# (plan.scene) is the refined one where there is one.
+# lidar_depth.npz and free_space.npz. The scene of all rules after these (plan.scene) is the refined one where there is one.
 
 
 rule extract:
@@ -87,32 +86,6 @@ rule refine_poses:
         code=plan.code("refine_poses"),
     script:
         "../workflow_scripts/refine_poses.py"
-
-
-rule named_tracks:
-    """
-    Refuses a track id that no track of the scene has, in its edits and as its subject, before any training.
-    """
-    input:
-        scene="<results>/{scene}/scene.json",
-    output:
-        record="<results>/{scene}/named_tracks.json",
-    log:
-        "<logs>/{scene}/named_tracks.log",
-    benchmark:
-        "<benchmarks>/{scene}/named_tracks.tsv"
-    # before all other jobs that are ready: a wrong id stops the run
-    priority: 100
-    conda:
-        "../envs/drivesplat.yaml"
-    resources:
-        mem_mb=2000,
-        runtime=10,
-    params:
-        settings=plan.settings("named_tracks"),
-        code=plan.code("named_tracks"),
-    script:
-        "../workflow_scripts/named_tracks.py"
 
 
 rule lidar_seed:

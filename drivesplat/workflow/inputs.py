@@ -15,7 +15,7 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.world import CameraChannel
-from drivesplat.workflow.stages import refines_poses, scene_named_tracks, training_inputs
+from drivesplat.workflow.stages import refines_poses, training_inputs
 
 
 def unwritable_results(config: Config, error: OSError) -> DriveSplatError:
@@ -130,11 +130,6 @@ class Inputs:
         """The scene record that all stages read: with refined poses if they are enabled."""
         name = REFINED if refines_poses(self.config, wildcards.scene) else "scene.json"
         return f"{self.config.results_dir}/{wildcards.scene}/{name}"
-
-    def named_tracks(self, wildcards: Any) -> list[str]:
-        """The check of the tracks that a scene's edits and its subject name; none where they name no track."""
-        named = scene_named_tracks(self.config, wildcards.scene).any
-        return [f"{self.config.results_dir}/{wildcards.scene}/named_tracks.json"] if named else []
 
     def triangulated(self, stage: Literal["lidar_seed", "free_space"]) -> Callable[[Any], list[str]]:
         """The function of wildcards that gives the points triangulated by pose refinement, if the stage uses them."""

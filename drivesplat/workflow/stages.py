@@ -26,7 +26,6 @@ from drivesplat.settings.inspection import PanelJob, RemovalJob, SubjectSettings
 from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob
-from drivesplat.settings.named_tracks import NamedTracks, named_tracks
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
@@ -39,7 +38,7 @@ ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
-OF_ONE_SCENE = ("demo_world", "extract", "named_tracks", "edit", "ghost_panel", "remove_actor")
+OF_ONE_SCENE = ("demo_world", "extract", "edit", "ghost_panel", "remove_actor")
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
@@ -194,16 +193,6 @@ def _subject(at: Place) -> dict[str, Any]:
     return {"subject": at.config.subjects.get(at.scene, SubjectSettings())}
 
 
-def _named_tracks(at: Place) -> dict[str, Any]:
-    return dict(scene_named_tracks(at.config, at.scene))
-
-
-def scene_named_tracks(config: Config, scene: str) -> NamedTracks:
-    """The tracks that the edits and the subject of a scene name. Raises ConfigError if its edits file is invalid."""
-    subject = config.subjects.get(scene, SubjectSettings()).track
-    return named_tracks(scene, scene_edits(config, scene), subject)
-
-
 def _world(at: Place) -> dict[str, Any]:
     """Raises ConfigError where an edit whose truth is asked for does not exist."""
     world, edits = at.dataset.world, scene_edits(at.config, at.scene)
@@ -261,7 +250,6 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "scene_metrics": (Settings, _nothing),
     "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
     "tracks": (TracksJob, _nothing),
-    "named_tracks": (NamedTracks, _named_tracks),
     "film": (FilmJob, _film),
     "film_parts": (FilmFormat, _format),
     "edit": (EditJob, _edit),

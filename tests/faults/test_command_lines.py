@@ -1,7 +1,6 @@
 """Command lines that users type by mistake or from other folders, each through Snakemake itself."""
 
 import os
-import re
 import subprocess
 
 import pytest
@@ -80,32 +79,3 @@ def test_make_help_lists_every_target():
     makefile = (REPOSITORY / "Makefile").read_text()
     targets = makefile.partition(".PHONY: ")[2].partition("\n")[0].split()
     assert {line.split()[1] for line in listed.splitlines()} == set(targets) - {"lint"}
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"subjects": {"0001": {"track": "0001 instance 7"}}}, ["subjects.0001", "'0001 instance 7'"]),
-        ({"edits": "edits: {gone: [{remove: {track: x}}]}\n"}, ["edit 'gone', step 1 (remove)", "'x'"]),
-    ],
-    ids=["subject", "edit"],
-)
-def test_a_wrong_track_id_is_refused_before_the_training_and_deletes_nothing(copy, tmp_path, settings, words):
-    """Even by one core, which takes one job after the other; tracks.csv, where the ids stand, is made all the same."""
-    mine = copy.again(tmp_path / "workflow")
-    if "edits" in settings:
-        (mine.folder / "edits.yaml").write_text(settings["edits"])
-        mine.config["datasets"]["nuscenes"]["edits"] = {"0001": "edits.yaml"}
-    mine.config |= {"subjects": settings.get("subjects", {})}
-    mine.write_config()
-    there = [f"results/0001/street/{name}" for name in ("removal.png", "edits/gone.mp4")]
-    for name in there:
-        (mine.folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (mine.folder / name).write_text("of an earlier run")
-    target = there["edits" in settings]
-    done = mine.run(target, cores=1)
-    line = only_complaint(done)
-    assert all(word in line for word in ["named_tracks 0001", "0001 instance 0", *words]), line
-    assert set(re.findall(r"^(?:local)?rule (\w+):$", done.stdout, re.M)) == {"extract", "named_tracks"}
-    assert all((mine.folder / name).read_text() == "of an earlier run" for name in there)
-    assert "named_tracks" not in mine.planned("results/0001/tracks.csv")
