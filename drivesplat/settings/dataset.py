@@ -12,7 +12,13 @@ from drivesplat.settings.world import WorldSettings
 MINI_SCENES = ("0061", "0103", "0553", "0655", "0757", "0796", "0916", "1077", "1094", "1100")
 DEMO_OVERRIDES = {
     "lidar_seed": {"max_points": 25_000, "far_points": 8_000},
-    "train": {"iterations": 1_000, "cap_max": 40_000, "checkpoint_apart_s": 10.0},
+    "train": {
+        "iterations": 1_000,
+        "cap_max": 40_000,
+        "checkpoint_apart_s": 10.0,
+        "image_every": 250,
+        "psnr_every": 100,
+    },
     "render": {"fps": 15, "width": 800, "height": 450},
     "device": {"min_free_gb": 1.0},
 }

@@ -264,7 +264,10 @@ class TrainSettings(Settings):
     log_every: int = Field(100, ge=1)
     """Iterations between TensorBoard scalars, and between checks that losses and gradients are finite."""
     image_every: int = Field(5_000, ge=1)
-    """Iterations between TensorBoard images."""
+    """Iterations between TensorBoard images. The last iteration has one, too."""
+    psnr_every: int = Field(1_000, ge=0)
+    """Iterations between TensorBoard's PSNRs of a few training and held-out images. The last iteration has them, too.
+    0: none."""
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":
         """These settings with those at their defaults that have no effect on a method of `parts`: those of other moving

@@ -80,6 +80,11 @@ class Monitor:
         self._bar.update(advanced)
         self._bar.set_postfix(loss=f"{values['loss/total']:.4f}", gaussians=f"{values['gaussians']:,.0f}")
 
+    def psnrs(self, step: int, values: dict[str, float]) -> None:
+        with self._writing():
+            for name, value in values.items():
+                self._writer.add_scalar(name, value, step)
+
     def _log_progress(self, step: int, now: float) -> None:
         """Logs '43 %, 12.3 it/s, 120 s left' at most every LOGGED_EVERY_S, by the speed since the last message; the
         first iterations, which compile kernels, do not count. `drivesplat.workflow.costs.progress` reads it."""

@@ -22,12 +22,14 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.actor_record import ActorRecord, read_actors
 from drivesplat.scene.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.train import TrainJob, TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
+from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import Guides, TrainingView, load_views
 
@@ -53,14 +55,21 @@ class TrainingInputs:
         images = self.record.train_images
         sky_wanted = self.sky_known and (job.sky != "none" or job.train.sky_bce_weight)
         moving_wanted = self.actors and job.train.dynamic_weight
-        with_ego = [i for i in images if self.record.camera_name(i) in self.cameras_with_ego]
         return Guides(
             sky=_of_each(images, lambda i: read_sky_mask(*self._image(i))) if sky_wanted else {},
             moving=_of_each(images, self._moving) if moving_wanted else {},
             lidar={i: self.lidar_depth[i] for i in images} if self.lidar_depth else {},
             classes=_of_each(images, lambda i: read_classes(*self._image(i))) if self.semantic_classes(job) else {},
-            ego_mask=_of_each(with_ego, lambda i: read_labels(*self._image(i)) == LABELS["own_car"]),
+            ego_mask=_of_each(self.with_ego(images), self.ego_mask),
         )
+
+    def with_ego(self, images: Sequence[int]) -> list[int]:
+        """The images whose camera sees the ego vehicle."""
+        return [i for i in images if self.record.camera_name(i) in self.cameras_with_ego]
+
+    def ego_mask(self, index: int) -> np.ndarray:
+        """The mask (h, w) of the ego vehicle in an image."""
+        return read_labels(*self._image(index)) == LABELS["own_car"]
 
     def semantic_classes(self, job: TrainJob) -> int:
         """The number of semantic classes that `job` learns."""
@@ -122,12 +131,13 @@ class TrainingFiles:
 
 @dataclass(frozen=True)
 class Prepared:
-    """What the first iteration of a training needs."""
+    """What the first iteration of a training needs, and the images of its PSNR curves."""
 
     model: SplatModel
     views: list[TrainingView]
     settings: TrainSettings
     priors: GeometryPriors
+    curves: CurveViews
 
 
 def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
@@ -146,8 +156,26 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     )
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
         views = [dataclasses.replace(view, sky=None) for view in views]
+    with explain_out_of_memory(lambda: 0):
+        curves = curve_views(inputs, views, job, device)
     model = build_model(init, job.parts, job.sky, settings)
-    return Prepared(model, views, settings, geometry_priors(inputs.record, inputs.free_space, settings))
+    return Prepared(model, views, settings, geometry_priors(inputs.record, inputs.free_space, settings), curves)
+
+
+def curve_views(
+    inputs: TrainingInputs, views: list[TrainingView], job: TrainJob, device: torch.device
+) -> dict[str, list[TrainingView]]:
+    """The images of PSNR curves: a few of the training's `views`, and a few held-out ones, which nothing else in the
+    training uses."""
+    if not job.train.psnr_every:
+        return {}
+    record = inputs.record
+    held_out = evenly_spaced([int(i) for group in HELD_OUT_GROUPS for i in record.splits.get(group, ())])
+    masks = Guides(sky={}, moving={}, lidar={}, ego_mask=_of_each(inputs.with_ego(held_out), inputs.ego_mask))
+    return {
+        "psnr/train": [views[i] for i in evenly_spaced(range(len(views)))],
+        "psnr/held_out": load_views(record, masks, device, held_out),
+    }
 
 
 def run_training(
@@ -169,7 +197,7 @@ def run_training(
         )
         folders = TrainingFolders(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
         model, seed = begun.model, job.random_seed
-        summary = train(model, begun.views, begun.settings, seed, device, folders, begun.priors)
+        summary = train(model, begun.views, begun.settings, seed, device, folders, begun.priors, curves=begun.curves)
         write_checkpoint(files.checkpoint, TrainedCheckpoint.of(model, job, provenance))
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
     if os.getppid() == started_by:

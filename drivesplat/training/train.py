@@ -5,6 +5,7 @@ import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 
@@ -19,6 +20,7 @@ from drivesplat.training.clock import ITERATION, UNTIMED, Clock
 from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor
+from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
@@ -69,15 +71,17 @@ def train(
     folders: TrainingFolders,
     priors: GeometryPriors = NO_PRIORS,
     clock: Clock = UNTIMED,
+    curves: CurveViews = MappingProxyType({}),
 ) -> TrainingSummary:
-    """Fits `model` in place, resuming an interrupted run of the same training; `clock` times its stages.
+    """Fits `model` in place, resuming an interrupted run of the same training; `clock` times its stages. `curves` are
+    the images of PSNR curves in TensorBoard.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
         trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock)
-        run = TrainingRun.begin(trainer, folders)
+        run = TrainingRun.begin(trainer, folders, curves)
         with Monitor(folders.tensorboard, settings.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
         return run.summary()
@@ -94,9 +98,10 @@ class TrainingRun:
     began: float
     saved: float
     """When the state was last saved, or else when this run began (`time.monotonic`, as `began`)."""
+    curves: CurveViews
 
     @classmethod
-    def begin(cls, trainer: Trainer, folders: TrainingFolders) -> "TrainingRun":
+    def begin(cls, trainer: Trainer, folders: TrainingFolders, curves: CurveViews) -> "TrainingRun":
         """Resumes from the state in `folders` if this training wrote it; otherwise starts at 0."""
         if trainer.device.type == "cuda":
             torch.cuda.empty_cache()
@@ -104,12 +109,12 @@ class TrainingRun:
         saved = resume_state.resumable(folders.state, folders.fingerprint)
         if saved is None:
             shutil.rmtree(folders.tensorboard, ignore_errors=True)
-            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now)
+            return cls(trainer, folders, 0.0, [], now := time.monotonic(), now, curves)
         resume_state.restore(saved["state"], trainer.model, trainer.optimizers, trainer.densifiers, trainer.device)
         trainer.step = saved["step"]
         log.info("resuming at iteration %d of %d", trainer.step, trainer.settings.iterations)
         now = time.monotonic()
-        return cls(trainer, folders, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now)
+        return cls(trainer, folders, saved["seconds"], [*saved["resumed_at"], trainer.step], now, now, curves)
 
     @property
     def seconds(self) -> float:
@@ -138,6 +143,14 @@ class TrainingRun:
         }
         checkpoint_file.save(self.folders.state, content)
         self.saved = time.monotonic()
+
+    def psnrs(self) -> dict[str, float]:
+        """The PSNRs of the curves where they are due, otherwise none."""
+        step, settings = self.trainer.step, self.trainer.settings
+        if not settings.psnr_every or not _due(step, settings.psnr_every, settings):
+            return {}
+        t = self.trainer
+        return t.graphs.retry_without_graphs(lambda: curve_psnrs(t.model, self.curves, t.sh_degree()))
 
     @property
     def save_due(self) -> bool:
@@ -169,7 +182,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     empty = EmptySpace(*path, settings.floaters.radius, trainer.priors.free)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):
-            with_picture = (trainer.step + 1) % settings.image_every == 0
+            with_picture = _due(trainer.step + 1, settings.image_every, settings)
             terms, picture, view = trainer.fit_one(with_picture)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
@@ -178,10 +191,16 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
             if with_picture and picture is not None:
                 monitor.image(trainer.step, view, picture)
+            monitor.psnrs(trainer.step, run.psnrs())
             if run.save_due:
                 run.save()
     run.check()
     trainer.end()
+
+
+def _due(step: int, every: int, settings: TrainSettings) -> bool:
+    """Whether something is logged after iteration `step`: every so many iterations, and after the last."""
+    return step % every == 0 or step == settings.iterations
 
 
 def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> None:

@@ -1,6 +1,6 @@
 """The training images on the device, as uint8, with their cameras."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -57,12 +57,14 @@ class Guides:
     ego_mask: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
-def load_views(record: TrainingRecord, guides: Guides, device: torch.device) -> list[TrainingView]:
-    """The training images of a training record, with all masks at training resolution; a camera's images share the mask
-    of the ego vehicle."""
+def load_views(
+    record: TrainingRecord, guides: Guides, device: torch.device, images: Sequence[int] | None = None
+) -> list[TrainingView]:
+    """The images of a training record, by default those of training, with all masks at training resolution; a camera's
+    images share the mask of the ego vehicle."""
     views: list[TrainingView] = []
     known_masks: dict[bytes, Tensor] = {}
-    images = record.train_images
+    images = record.train_images if images is None else images
     recorded = prefetch(lambda i: read_image(record.image_paths[i], record.image_size(i)), images)
     for index, image in zip(images, recorded, strict=True):
         size = record.image_size(index)

@@ -99,7 +99,7 @@ def views_given(monkeypatch, folder: Path, inputs: TrainingInputs, job: TrainJob
     class EndedError(Exception):
         pass
 
-    def begin(model: SplatModel, views: list[TrainingView], *rest: Any) -> None:
+    def begin(model: SplatModel, views: list[TrainingView], *rest: Any, **named: Any) -> None:
         given.extend(views)
         raise EndedError
 

@@ -457,7 +457,7 @@ def test_comments_and_code_of_other_settings_rerun_nothing(finished):
         ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
         ("drivesplat/edited_motion/lateral_offset.py", "HEADING_SPEED = 1.0", "HEADING_SPEED = 0.5", {"edit": 2}),
         ("drivesplat/export/viewer_page/main.js", "Drag", "Pull", {"export_viewer": 2}),
-        ("drivesplat/report/gaps.py", "SCHEMA = 2", "SCHEMA = 3", {"gap_report": 1}),
+        ("drivesplat/report/gaps.py", "SCHEMA = 3", "SCHEMA = 4", {"gap_report": 1}),
         ("drivesplat/report/page/page.js", "Sliders", "The sliders", {"gap_report": 1}),
     ],
 )  # fmt: skip

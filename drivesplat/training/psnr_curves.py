@@ -1,0 +1,46 @@
+"""PSNR of a few training and held-out images during a training. Nothing of it enters the training."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.training.views import TrainingView
+
+MAX_IMAGES = 4
+"""Maximum number of images of a curve: rendering more would slow down short trainings."""
+
+CurveViews = Mapping[str, Sequence[TrainingView]]
+"""The images of each curve, by its name in TensorBoard."""
+
+
+def evenly_spaced(images: Sequence[int]) -> list[int]:
+    """Up to MAX_IMAGES of some images.
+
+    >>> evenly_spaced([2, 3, 5, 7, 11, 13, 17])
+    [2, 5, 11, 17]
+    """
+    count = min(MAX_IMAGES, len(images))
+    return [images[round(i * (len(images) - 1) / max(1, count - 1))] for i in range(count)]
+
+
+@torch.no_grad()
+def curve_psnrs(model: SplatModel, curves: CurveViews, sh_degree: int) -> dict[str, float]:
+    """The PSNR of each curve in dB, from the mean squared error of all its pixels outside the ego vehicle; identical
+    images are left out."""
+    names = [name for name, views in curves.items() if views]
+    if not names:
+        return {}
+    errors = torch.stack([_mean_squared_error(model, curves[name], sh_degree) for name in names])
+    psnrs = (-10.0 * torch.log10(errors)).tolist()
+    return {name: psnr for name, psnr in zip(names, psnrs, strict=True) if psnr != float("inf")}
+
+
+def _mean_squared_error(model: SplatModel, views: Sequence[TrainingView], sh_degree: int) -> Tensor:
+    errors = []
+    for view in views:
+        image = model.render(view.view, sh_degree).image.clamp(0.0, 1.0)
+        error = (image - view.target()).square()
+        errors.append((error if view.ego_mask is None else error[~view.ego_mask]).flatten())
+    return torch.cat(errors).mean()
