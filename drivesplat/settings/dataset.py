@@ -17,7 +17,7 @@ DEMO_OVERRIDES = {
         "cap_max": 40_000,
         "checkpoint_apart_s": 10.0,
         "image_every": 250,
-        "psnr_every": 100,
+        "psnr_every": 200,
     },
     "render": {"fps": 15, "width": 800, "height": 450},
     "device": {"min_free_gb": 1.0},

@@ -8,7 +8,7 @@ from torch import Tensor
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.training.views import TrainingView
 
-MAX_IMAGES = 4
+MAX_IMAGES = 3
 """Maximum number of images of a curve: rendering more would slow down short trainings."""
 
 CurveViews = Mapping[str, Sequence[TrainingView]]
@@ -19,7 +19,7 @@ def evenly_spaced(images: Sequence[int]) -> list[int]:
     """Up to MAX_IMAGES of some images.
 
     >>> evenly_spaced([2, 3, 5, 7, 11, 13, 17])
-    [2, 5, 11, 17]
+    [2, 7, 17]
     """
     count = min(MAX_IMAGES, len(images))
     return [images[round(i * (len(images) - 1) / max(1, count - 1))] for i in range(count)]
