@@ -28,16 +28,16 @@ def write_report(
     write_json(record, report)
     write_figures(table, report)
     costs = _costs(results, job)
-    _write_text(ghosts, render_ghosts_page())
-    _write_text(page, report_page(report, media, costs))
-    _write_text(archived, report_page(report, media, costs, lambda name: address_in_archive(results / name)))
+    _write_page(ghosts, render_ghosts_page())
+    _write_page(page, report_page(report, media, costs))
+    _write_page(archived, report_page(report, media, costs, lambda name: address_in_archive(results / name)))
     print(console_table(report), flush=True)
 
 
-def _write_text(path: Path, text: str) -> None:
+def _write_page(path: Path, page: str) -> None:
     path.parent.mkdir(exist_ok=True)
     with atomic_write(path) as file:
-        file.write(text.encode())
+        file.write(page.encode())
 
 
 def _costs(results: Path, job: ReportJob) -> list[dict[str, Any]]:

@@ -75,7 +75,9 @@ def test_a_dataset_that_has_moved_reruns_nothing_and_is_read_where_it_is(copy, t
 
 
 def test_make_help_lists_every_target():
-    listed = subprocess.run(["make", "help"], cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(
+        ["make", "--no-print-directory", "help"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    ).stdout
     makefile = (REPOSITORY / "Makefile").read_text()
     targets = makefile.partition(".PHONY: ")[2].partition("\n")[0].split()
     assert {line.split()[1] for line in listed.splitlines()} == set(targets) - {"lint"}
