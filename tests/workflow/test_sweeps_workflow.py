@@ -11,7 +11,7 @@ FROM_EXTRACTION_ON = {
     "extract", "own_car", "lidar_seed", "parser", "masks", "actors", "lidar_depth", "train", "evaluate",
     "scene_metrics",
 }  # fmt: skip
-MISSING = "data/sweeps/CAM_FRONT/0001__0010.jpg"
+MISSING = "sweeps/CAM_FRONT/0001__0010.jpg"
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +27,13 @@ def finished(tmp_path_factory) -> WorkflowCopy:
         extract={"on_missing": "warn"},
         **settings,
     )
-    (copy.folder / MISSING).unlink()
+    (copy.folder / "data" / MISSING).unlink()
     done = copy.run("results/0001/metrics.json")
     assert done.returncode == 0, done.stdout
-    assert f"image {MISSING} is missing; left out" in done.stdout and "Traceback" not in done.stdout
+    assert (
+        f"image results/.data/nuscenes/{MISSING.removeprefix('data/')} is missing; left out" in done.stdout
+        and "Traceback" not in done.stdout
+    )
     return copy
 
 
