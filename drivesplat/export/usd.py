@@ -27,7 +27,7 @@ from drivesplat.export.unique_names import unique_names
 from drivesplat.export.usd_splat import TIME_CODES_PER_SECOND, define_group, usd_matrix
 from drivesplat.io.storage import Provenance, atomic_path, unwritable
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, recorded_timestamps, smooth_poses
+from drivesplat.rendering.trajectory import recorded_frames, recorded_timestamps, sampled_path
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.export import ExportJob
@@ -64,13 +64,10 @@ def recorded_cameras(scene: Scene, camera: str) -> list[tuple[float, Gf.Camera]]
     Images have their own poses; between them the path is that of films, sampled densely enough for USD, which
     interpolates matrices entry by entry. Raises DatasetError if the camera has no images.
     """
-    frames = recorded_frames(scene, camera)
-    recorded = recorded_timestamps(scene, camera)
-    between = film_timestamps(frames[0].timestamp, frames[-1].timestamp, int(TIME_CODES_PER_SECOND))
-    times = np.union1d(recorded, between)
-    poses = smooth_poses(recorded, np.stack([frame.camera_to_world for frame in frames]), times)
-    size = (frames[0].width, frames[0].height)
-    K = continuous_intrinsics(frames[0], size)
+    times, poses = sampled_path(scene, camera, int(TIME_CODES_PER_SECOND))
+    first = recorded_frames(scene, camera)[0]
+    size = (first.width, first.height)
+    K = continuous_intrinsics(first, size)
     return [(scene.seconds(time), usd_camera(K, size, pose)) for time, pose in zip(times, poses, strict=True)]
 
 

@@ -14,15 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Sky
 from drivesplat.rendering.color_bytes import to_uint8
-from drivesplat.rendering.trajectory import film_timestamps, recorded_frames, recorded_timestamps, smooth_poses
+from drivesplat.rendering.trajectory import recorded_frames, sampled_path
 from drivesplat.scene.images import continuous_intrinsics
 from drivesplat.scene.scene import Frame, Scene
-
-POSES_PER_SECOND = 30
 
 
 @dataclass(frozen=True)
@@ -41,13 +40,12 @@ def recorded_path(scene: Scene, camera: str) -> RecordedPath:
     """The path of a camera, starting at its middle key frame. Raises DatasetError if the scene has no key frame of
     it."""
     start, frames = scene.frames[scene.middle_key_frame(camera)], recorded_frames(scene, camera)
-    recorded = recorded_timestamps(scene, camera)
-    times = np.union1d(recorded, film_timestamps(frames[0].timestamp, frames[-1].timestamp, POSES_PER_SECOND))
+    times, poses = sampled_path(scene, camera, SAMPLES_PER_SECOND)
     return RecordedPath(
         start,
         scene.seconds(start.timestamp),
         np.array([scene.seconds(time) for time in times]),
-        smooth_poses(recorded, np.stack([frame.camera_to_world for frame in frames]), times),
+        poses,
         tuple(scene.seconds(frame.timestamp) for frame in frames if frame.is_key_frame),
     )
 

@@ -69,6 +69,17 @@ def recorded_timestamps(scene: Scene, camera: str) -> np.ndarray:
     return np.array([frame.timestamp for frame in recorded_frames(scene, camera)], dtype=np.int64)
 
 
+def sampled_path(scene: Scene, camera: str, rate: int) -> tuple[np.ndarray, np.ndarray]:
+    """The timestamps (n,) of a camera's images and of `rate` times a second between them, and the poses (n, 4, 4) then.
+
+    Images have their own poses; between them the path is that of films. Raises DatasetError if the camera has no
+    images.
+    """
+    frames, recorded = recorded_frames(scene, camera), recorded_timestamps(scene, camera)
+    times = np.union1d(recorded, film_timestamps(frames[0].timestamp, frames[-1].timestamp, rate))
+    return times, smooth_poses(recorded, np.stack([frame.camera_to_world for frame in frames]), times)
+
+
 def film_timestamps(first: int, last: int, fps: int) -> np.ndarray:
     """The times (n,) int64 of a film's frames: first + k / fps within [first, last], each rounded separately."""
     count = (last - first) * fps // 1_000_000 + 1
