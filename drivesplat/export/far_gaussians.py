@@ -1,7 +1,8 @@
 """The stage `far_gaussians`: which Gaussians lie too far away for other programs, and what becomes of them in exports.
 
-A training leaves Gaussians up to 100 km away: nothing pulls one back that no image shows. They make bounding boxes
-infinite and use up the 16 bits by which web viewers sort. Beyond `max_distance` from the world's origin
+A training keeps Gaussians within `train.max_distance`. Without it, and where exports ask for less, Gaussians lie up to
+a thousand kilometres away: nothing pulls one back that no image shows. They make bounding boxes infinite and use up the
+16 bits by which web viewers sort. Beyond `max_distance` from the world's origin
 
 1. Gaussians are removed: all of them if that changes no pixel of any training view by more than MAX_CHANGE, which is
    measured by rendering every training view with and without them. What is seen instead is the sky model.
@@ -29,6 +30,7 @@ from drivesplat.io.storage import Provenance, unreadable
 from drivesplat.io.typed_record import typed_record
 from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.reach import INSIDE, reach_of
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rasterization import rasterize
@@ -40,8 +42,6 @@ MAX_CHANGE = 1.0 / 255.0
 """The largest change of a pixel of a training view: one step of 8 bits."""
 SHELL = 0.9
 """Moved Gaussians lie between this share of the distance and the distance, in their order."""
-_INSIDE = 1.0 - 1e-5
-"""Keeps moved Gaussians within the distance despite rounding."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +93,6 @@ def find_far(model: SplatModel, views: Sequence[View], max_distance: float, prov
         summary, len(means), 255 * changes.largest_change,
     )  # fmt: skip
     return changes
-
-
-def reach_of(views: Sequence[View], max_distance: float) -> float:
-    """The distance (metres) from the world's origin within which exported Gaussians lie: `max_distance`, or on a long
-    drive half of it beyond the farthest camera."""
-    cameras = [float(view.camera_to_world[:3, 3].norm()) for view in views]
-    return max([max_distance, *(distance + 0.5 * max_distance for distance in cameras)])
 
 
 def within_reach(checkpoint: TrainedCheckpoint, far: FarGaussians) -> TrainedCheckpoint:
@@ -204,7 +197,7 @@ def _nearer(
     distances = offsets.norm(dim=1)
     directions = offsets / distances[:, None]
     along = (centers * directions).sum(dim=1)
-    ends = (_INSIDE * reach) ** 2 - centers.square().sum(dim=1)
+    ends = (INSIDE * reach) ** 2 - centers.square().sum(dim=1)
     surface = (along.square() + ends).sqrt() - along
     moved = surface * (SHELL + (1.0 - SHELL) * (1.0 - surface / distances))
     return _array((centers + moved[:, None] * directions).float()), _array((moved / distances).float())

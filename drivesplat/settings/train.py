@@ -208,6 +208,10 @@ class TrainSettings(Settings):
     """Maximum number of Gaussians. GPU memory: about 0.4 GB per million, and as much again while rendering."""
     pixels_per_gaussian: float = Field(20.0, ge=0)
     """Minimum number of training pixels per Gaussian (0 disables the limit). More Gaussians overfit single views."""
+    max_distance: float | None = Field(1000.0, gt=0)
+    """Maximum distance of Gaussians from the world's origin (metres). Where a camera is farther than half of it from
+    the origin, half of it beyond the farthest camera applies. null = no limit: some Gaussians end up more than a
+    thousand kilometres away (docs/exports.md)."""
     gaussians: GaussianSettings = GaussianSettings()
     actors: ActorSettings = ActorSettings()
     mcmc: McmcSettings = McmcSettings()

@@ -1,6 +1,7 @@
 """The training loop: Gaussians fitted to the training images of a scene, with resume state and logs."""
 
 import logging
+import math
 import shutil
 import time
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from drivesplat.errors import TrainingError
 from drivesplat.io import checkpoint_file
 from drivesplat.kernels.cuda_graphs import capture_stream
 from drivesplat.machine.device import device_name, explain_out_of_memory
+from drivesplat.model.reach import bound_positions, reach_of
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import resume_state
@@ -25,6 +27,9 @@ from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
 log = logging.getLogger(__name__)
+
+BOUND_EVERY = 100
+"""Iterations between steps that bound positions. The last iteration ends with one, too."""
 
 
 @dataclass(frozen=True)
@@ -178,14 +183,17 @@ class TrainingRun:
 
 def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
-    path = camera_path(torch.stack([view.view.camera_to_world[:3, 3] for view in trainer.images.views]))
+    views = [view.view for view in trainer.images.views]
+    path = camera_path(torch.stack([view.camera_to_world[:3, 3] for view in views]))
     empty = EmptySpace(*path, settings.floaters.radius, trainer.priors.free)
+    reach = math.inf if settings.max_distance is None else reach_of(views, settings.max_distance)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):
             with_picture = _due(trainer.step + 1, settings.image_every, settings)
             terms, picture, view = trainer.fit_one(with_picture)
             with trainer.clock.stage("densification"):
                 _densify(run, picture, empty)
+                _bound(trainer, reach)
             if trainer.step % settings.log_every == 0:
                 run.check()
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
@@ -199,7 +207,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
 
 
 def _due(step: int, every: int, settings: TrainSettings) -> bool:
-    """Whether something is logged after iteration `step`: every so many iterations, and after the last."""
+    """Whether something is done after iteration `step`: every so many iterations, and after the last."""
     return step % every == 0 or step == settings.iterations
 
 
@@ -217,6 +225,13 @@ def _densify(run: TrainingRun, picture: Picture | None, empty: EmptySpace) -> No
     if empty.known and trainer.step % settings.floaters.every == 0:
         for part in (part for part in trainer.model.parts if not part.moves):
             fade_floaters(part, empty)
+
+
+def _bound(trainer: Trainer, reach: float) -> None:
+    """Now and then moves Gaussians beyond `reach` metres back."""
+    if math.isfinite(reach) and _due(trainer.step, BOUND_EVERY, trainer.settings):
+        for part in trainer.model.parts:
+            bound_positions(part, reach)
 
 
 def _scalars(terms: dict[str, torch.Tensor], trainer: Trainer) -> dict[str, float]:

@@ -10,11 +10,12 @@ from helpers.hand_made import Own, looking_at, recording_of, round_gaussians
 from pxr import Usd, UsdGeom
 
 from drivesplat.errors import ResultError
-from drivesplat.export.far_gaussians import MAX_CHANGE, find_far, reach_of, read_far, within_reach, write_far
+from drivesplat.export.far_gaussians import MAX_CHANGE, find_far, read_far, within_reach, write_far
 from drivesplat.export.splat_asset import SplatFiles, export_splat
 from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.export.usd import export_usd
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
+from drivesplat.model.reach import reach_of
 from drivesplat.model.sky import ConstantSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View

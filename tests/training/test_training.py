@@ -220,6 +220,21 @@ def test_gaussians_fade_in_free_space_but_for_those_of_actors(tmp_path, free):
     assert bool((still < 1e-3).all()) == (free is not None) and not (actors < 1e-3).any()
 
 
+@pytest.mark.parametrize(("limit", "farthest"), [(50.0, 50.0), (None, 7e5)])
+def test_gaussians_stay_within_the_maximum_distance(tmp_path, limit, farthest):
+    """The cameras of these views are near the origin; the last iteration ends with a check."""
+    settings = settings_of(iterations=3, refine_start=1.0, max_distance=limit)
+    model = untrained_street(settings)
+    with torch.no_grad():
+        for part in model.parts:
+            part.params["means"][0] = torch.tensor([3e5, -6e5, 2e5])
+    trained(tmp_path, settings, model=model)
+    for part in model.parts:
+        far = part.params["means"].detach()[0]
+        assert float(far.norm()) == pytest.approx(farthest, rel=1e-4)
+        assert torch.allclose(far / far.norm(), torch.tensor([3.0, -6.0, 2.0]) / 7.0, atol=1e-3)
+
+
 def test_a_training_applies_the_flatness_and_road_losses():
     """The terms are among those of an iteration, and pull on the background."""
     settings = settings_of(flatness_weight=0.2, road_weight=0.3)
