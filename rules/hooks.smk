@@ -26,6 +26,7 @@ onstart:
         if run_costs.print_estimate():
             sys.exit(0)
         try:
+            plan.refuse_wrong_tracks(workflow.dag.needrun_jobs())
             plan.hold_results()
         except DriveSplatError as error:
             sys.exit(f"drivesplat: {error}")

@@ -25,6 +25,7 @@ rule extract:
     resources:
         mem_mb=2000,
         runtime=30,
+        track_references=plan.track_references,
     params:
         settings=plan.settings("extract"),
         root=plan.root,
@@ -186,6 +187,7 @@ rule actors:
     resources:
         mem_mb=4000,
         runtime=15,
+        track_references=plan.track_references,
     params:
         settings=plan.settings("actors"),
         code=plan.code("actors"),

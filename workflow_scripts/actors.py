@@ -5,6 +5,7 @@ import dataclasses
 from drivesplat.workflow.job import job
 from drivesplat.io.array_file import write_arrays
 from drivesplat.preprocess.actor_seed import actors_record
+from drivesplat.preprocess.track_references import refuse_fixed_tracks
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.actor_seed import ActorSeedJob
@@ -12,5 +13,6 @@ from drivesplat.settings.actor_seed import ActorSeedJob
 with job(snakemake, dataset=("images", "sweeps")) as current:
     scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
     record = actors_record(scene, current.settings(ActorSeedJob), ego_mask)
+    refuse_fixed_tracks(current.track_references(), scene, [actor.id for actor in record.actors])
     provenance = current.provenance(scene.provenance, upstream)
     write_arrays(current.output.actors, dataclasses.replace(record, provenance=provenance))

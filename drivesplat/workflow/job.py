@@ -23,6 +23,7 @@ from drivesplat.provenance.file_digests import (
 from drivesplat.provenance.record import provenance
 from drivesplat.settings import Settings
 from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.track_references import TrackReferences
 from drivesplat.workflow.gpus import hold_gpu
 
 S = TypeVar("S", bound=Settings)
@@ -73,6 +74,10 @@ class Job:
         if settings.kind != "cpu" and self._gpu is None:  # a second lock would wait for the first
             self._gpu = hold_gpu(settings.jobs_per_card)
         return settings
+
+    def track_references(self) -> TrackReferences:
+        """The tracks that the settings of the scene name."""
+        return TrackReferences.model_validate_json(self._resources.track_references)
 
     def provenance(self, *upstream: Provenance, inputs: dict[str, str] | None = None) -> Provenance:
         """The provenance of this rule's result, made from results with the provenances `upstream`."""

@@ -5,7 +5,7 @@ Everything here must import and run quickly: it runs in the main process and in 
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +20,7 @@ from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
 from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
+from drivesplat.workflow.named_tracks import refuse_wrong_tracks, track_references
 from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import (
@@ -67,6 +68,15 @@ class Plan(Outputs):
         """The device settings of a scene's jobs as canonical JSON. A resource of the rules, not a param: moving to
         another machine reruns nothing."""
         return self._device(wildcards.scene)[0]
+
+    def track_references(self, wildcards: Any) -> str:
+        """The tracks that a scene's settings name as canonical JSON. A resource, not a param: it changes no result of
+        the stages that check it."""
+        return canonical_json(track_references(self.config, wildcards.scene).model_dump(mode="json"))
+
+    def refuse_wrong_tracks(self, jobs: Iterable[Any]) -> None:
+        """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that settings name."""
+        refuse_wrong_tracks(self.config, jobs, self.scene)
 
     def _device(self, scene: str) -> tuple[str, int]:
         """The device of a scene's jobs as canonical JSON, and how many GPUs each takes."""

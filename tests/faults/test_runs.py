@@ -108,6 +108,28 @@ def test_an_edit_that_there_is_none_of_stops_before_any_job(copy, target, words)
     assert not (copy.folder / "results/0001").exists()
 
 
+GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("edits", "subject", "words", "extracted"),
+    [
+        (GONE.format("0009"), None, ["edit 'gone', step 1 (remove): no track has an id starting with '0009'"], False),
+        (GONE.format("0001 instance 1"), None, ["edit 'gone'", "no editable track", "editable tracks: 0001"], True),
+        (EDITS, "0001", ["subjects.0001", "no track '0001'", "tracks that move: 0001 instance 0"], False),
+    ],
+    ids=["an edit of no track", "an edit of a parked car", "a subject"],
+)
+def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, words, extracted):
+    copy.config["subjects"] = {"0001": {"track": subject}}
+    done = with_edits(copy, edits).run("results/0001/street/train.json")
+    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
+    (line,) = complaints(done.stdout)
+    assert all(word in line for word in words), line
+    assert (copy.folder / "results/0001/scene.json").exists() == extracted
+    assert not (copy.folder / "results/0001/street").exists()
+
+
 @pytest.mark.parametrize(
     ("broken", "target", "words"),
     [

@@ -368,9 +368,27 @@ def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
         path.write_text(EDITS)
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
     (line,) = complaints(done.stdout)
-    words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"editable tracks: {CAR[:8]}")
+    words = ("scene 0001, edit 'typo', step 1 (remove)", "'abcd'", f"tracks that move: {CAR[:8]}")
     assert all(word in line for word in words), line
     assert not list((finished.folder / "results/0001/street/edits").glob("*typo*"))
+
+
+def test_a_wrong_track_is_refused_before_a_result_is_deleted(finished):
+    before = finished.config
+    pictures = ("removal.png", "ghost_panel.png")
+    had = [(finished.folder / f"results/0001/vanilla/{name}").read_bytes() for name in pictures]
+    finished.config = {**before, "subjects": {"0001": {"track": "0001 instance 9"}}}
+    finished.write_config()
+    try:
+        done = finished.run(*(f"results/0001/vanilla/{name}" for name in pictures))
+    finally:
+        finished.config = before
+        finished.write_config()
+    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
+    (line,) = complaints(done.stdout)
+    words = ("subjects.0001", "no track '0001 instance 9'", "did you mean 0001 instance", f"tracks that move: {CAR}")
+    assert all(word in line for word in words), line
+    assert [(finished.folder / f"results/0001/vanilla/{name}").read_bytes() for name in pictures] == had
 
 
 def test_order_comments_and_written_out_defaults_rerun_nothing(finished):
