@@ -33,6 +33,7 @@ try:
         if wanted != [COSTS]:
             plan.refuse_absent_data(wanted)
         run_costs.report_settings_without_effect()
+        run_costs.report_foreign_records()
 except DriveSplatError as error:
     sys.exit(f"drivesplat: {error}")
 

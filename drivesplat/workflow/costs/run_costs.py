@@ -24,6 +24,7 @@ from drivesplat.workflow.costs.progress import RunProgress, watch
 from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, write_costs
 from drivesplat.workflow.overridden import without_effect
 from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.snakemake_records import drop_foreign_records
 
 COSTS, ESTIMATE = "costs", "estimate"
 """Targets that run no job: the first updates and prints costs.csv, the second prints the estimate."""
@@ -45,6 +46,12 @@ class RunCosts:
         if wanted or COSTS not in self._targets:
             for sentence in without_effect(self._plan.config, self._plan.scenes_and_methods(wanted)):
                 _say(sentence)
+
+    def report_foreign_records(self) -> None:
+        """Removes records on which Snakemake would fail, and prints which."""
+        sentence = drop_foreign_records()
+        if sentence:
+            _say(sentence)
 
     def print_estimate(self) -> bool:
         """Prints the estimate in full if ESTIMATE is a target. Returns whether it is."""
