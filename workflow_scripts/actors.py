@@ -5,9 +5,9 @@ import dataclasses
 from drivesplat.workflow.job import job
 from drivesplat.io.array_file import write_arrays
 from drivesplat.preprocess.actor_seed import actors_record
-from drivesplat.preprocess.track_references import refuse_fixed_tracks
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene
+from drivesplat.scene.track_references import refuse_fixed_tracks
 from drivesplat.settings.actor_seed import ActorSeedJob
 
 with job(snakemake, dataset=("images", "sweeps")) as current:

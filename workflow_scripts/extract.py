@@ -5,9 +5,9 @@ from pathlib import Path
 
 from drivesplat.workflow.job import job
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.track_references import refuse_unknown_tracks
 from drivesplat.provenance.record import digests_of
 from drivesplat.scene.scene import write_scene
+from drivesplat.scene.track_references import refuse_unknown_tracks
 from drivesplat.settings.extract import SceneSource
 
 with job(snakemake) as current:

@@ -54,8 +54,8 @@ def refuse_wrong_tracks(config: Config, jobs: Iterable[Any], scene_file: Callabl
 def _refuse(references: TrackReferences, scene_file: str) -> None:
     if references.subject is None and not references.edits:
         return
-    from drivesplat.preprocess.track_references import refuse_unknown_tracks  # numpy; most runs name no tracks
     from drivesplat.scene.scene import read_scene
+    from drivesplat.scene.track_references import refuse_unknown_tracks  # numpy; most runs name no tracks
 
     try:
         scene = read_scene(scene_file)

@@ -112,6 +112,14 @@ def test_a_server_that_trickles_is_left(archive, tmp_path):
     assert (tmp_path / "mini/v1.0-mini/scene.json").is_file()
 
 
+def test_a_server_whose_headers_trickle_is_left(archive, tmp_path):
+    began = time.monotonic()
+    with served(Site(archive, trickle_s=0.05, headers_trickle=True)) as site:
+        message = refused(site.job(tmp_path / "mini", attempts=1, timeout_s=0.5))
+        assert time.monotonic() - began < 4.0
+    assert "no complete answer within 0.5 s" in message
+
+
 def test_no_server_is_a_line(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

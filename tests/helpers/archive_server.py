@@ -38,6 +38,8 @@ class Site:
     silent_after: int | None = None
     trickle_s: float | None = None
     """Seconds between two bytes."""
+    headers_trickle: bool = False
+    """Whether the headers arrive so, too."""
     status: int = 200
     wrong_range: bool = False
     heeds_conditions: bool = True
@@ -65,18 +67,26 @@ class Site:
             handler.send_header("Content-Range", f"bytes {first}-{len(self.content) - 1}/{len(self.content)}")
         if self.length != -1:
             handler.send_header("Content-Length", str(len(body) if self.length is None else self.length))
+        if self.headers_trickle:
+            self._trickle(handler, b"HTTP/1.1 200 OK\r\n" + 200 * b"X-Padding: 1\r\n")
+            return
         handler.end_headers()
-        if self.trickle_s is not None:
-            for place in range(len(body)):
-                with suppress(OSError):  # the client has left
-                    handler.wfile.write(body[place : place + 1])
-                if self.ended.wait(self.trickle_s):
-                    return
+        if self.trickle_s is not None and not self._trickle(handler, body):
+            return
         if self.silent_after is not None:
             handler.wfile.write(body[: self.silent_after])
             self.ended.wait(5.0)
             return
         handler.wfile.write(body[: self.cut_after.pop(0)] if self.cut_after else body)
+
+    def _trickle(self, handler: BaseHTTPRequestHandler, content: bytes) -> bool:
+        """Sends a byte at a time. Whether it came to the end."""
+        for place in range(len(content)):
+            with suppress(OSError):  # the client has left
+                handler.wfile.write(content[place : place + 1])
+            if self.ended.wait(self.trickle_s):
+                return False
+        return True
 
     def _start(self, handler: BaseHTTPRequestHandler) -> int:
         """Where its answer begins: a condition that does not hold makes it send all."""

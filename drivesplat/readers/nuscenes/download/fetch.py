@@ -18,6 +18,7 @@ from pathlib import Path
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import sha256_file, write_json
+from drivesplat.readers.nuscenes.download.connection import open_url
 from drivesplat.readers.nuscenes.download.console import announce, byte_progress
 from drivesplat.settings.download import NuscenesMiniSettings
 
@@ -111,7 +112,7 @@ def _connect(source: NuscenesMiniSettings, part: Path) -> None:
     start, size = size_of(part) if validator else 0, source.size_bytes
     headers = {"User-Agent": "drivesplat", **({"Range": f"bytes={start}-", "If-Range": validator} if start else {})}
     request = urllib.request.Request(source.url, headers=headers)
-    with urllib.request.urlopen(request, timeout=source.timeout_s) as response:
+    with open_url(request, source.timeout_s) as response:
         try:
             start, total = _range_of(response, start, validator)
         except ValueError:
