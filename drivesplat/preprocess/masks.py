@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from drivesplat.errors import DatasetError
+from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.lidar.sweeps import nearest_returns, sweeps_of
 from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import (
@@ -57,8 +57,10 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
     """Writes the masks of every image below `folder`; returns the record for masks.json. The ego vehicle's body is a
     region of its own, neither sky nor of any class. The sky of training images depends on training sweeps only.
 
-    Raises DatasetError naming the file where a user's mask is missing or unreadable.
+    Raises DatasetError naming the file where a user's mask is missing or unreadable, ConfigError where a user's folder
+    is the output.
     """
+    _refuse_own_folder(job, folder)
     groups, training = frame_groups(scene, job.holdout), sweeps_of(scene, job.holdout)
 
     def one(frame: Frame, group: Group) -> tuple[float, int, bool]:
@@ -118,14 +120,35 @@ def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) ->
     labels = _users_mask(job.masks.regions_folder, frame, size).copy()
     if labels.max() > max(LABELS.values()):
         raise DatasetError(
-            f"masks.regions_folder: {frame.camera}/{Path(frame.image_path).stem}.png holds label {labels.max()}; "
+            f"masks.regions_folder: {users_file(job.masks.regions_folder, frame)} holds label {labels.max()}; "
             f"the highest label is {max(LABELS.values())}"
         )
     return labels
 
 
 def _users_mask(folder: str, frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    return read_mask(Path(folder).expanduser() / frame.camera / f"{Path(frame.image_path).stem}.png", size)
+    return read_mask(users_file(folder, frame), size)
+
+
+def users_file(folder: str, frame: Frame) -> Path:
+    """The user's mask of an image: {camera}/{image name}.png or, as the workflow names its own, {camera}/{timestamp in
+    microseconds}.png. Raises DatasetError where neither exists."""
+    of_camera, name = Path(folder).expanduser() / frame.camera, Path(frame.image_path).stem
+    by_name, by_time = of_camera / f"{name}.png", of_camera / f"{frame.timestamp}.png"
+    for path in (by_name, by_time):
+        if path.exists():
+            return path
+    raise DatasetError(f"mask {by_name} is missing, and so is {by_time.name} (docs/masks.md)")
+
+
+def _refuse_own_folder(job: MaskJob, folder: Path) -> None:
+    """Raises ConfigError where a folder of the user's is that of the masks written here."""
+    for setting in ("regions_folder", "sky_folder", "semantic_folder"):
+        given = getattr(job.masks, setting)
+        if given and Path(given).expanduser().resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(
+                f"masks.{setting}: {given} is where the rule 'masks' writes; copy it, and name the copy (docs/masks.md)"
+            )
 
 
 def sky_mask(

@@ -12,12 +12,12 @@ EgoMaskKind = Literal["none", "polygons", "auto", "auto_measured"]
 
 class MaskSettings(Settings):
     regions_folder: str | None = None
-    """Folder of your own label images, {camera}/{image name}.png (labels as in drivesplat/scene/regions.py). null =
-    regions from the annotated boxes."""
+    """Folder of your own label images, {camera}/{image name}.png or {camera}/{timestamp}.png. null = regions from the
+    annotated boxes. docs/masks.md"""
     sky_folder: str | None = None
-    """Folder of your own sky masks (255 = sky), {camera}/{image name}.png. null = a heuristic."""
+    """Folder of your own sky masks (255 = sky), with files of the same names. null = a heuristic."""
     semantic_folder: str | None = None
-    """Folder of your own class maps (0, 1, 2, ...; 255 = unlabelled), {camera}/{image name}.png, for
+    """Folder of your own class maps (0, 1, 2, ...; 255 = unlabelled), with files of the same names, for
     train.semantic_weight. null = none."""
     own_car: EgoMaskKind = "auto"
     """Mask of the ego vehicle's body, which is excluded from training and from all regions. 'polygons': the outlines of

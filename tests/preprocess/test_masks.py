@@ -2,24 +2,26 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import REPOSITORY
 from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, World, cast
 from PIL import Image
 
-from drivesplat.errors import DatasetError, ResultError
+from drivesplat.errors import ConfigError, DatasetError, ResultError
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.masks import NO_SKY, make_masks, sky_mask
+from drivesplat.preprocess.masks import NO_SKY, make_masks, sky_mask, users_file
 from drivesplat.readers.sweeps import read_returns
-from drivesplat.scene.ego_mask import EgoMask
+from drivesplat.scene.ego_mask import NO_EGO_MASK, EgoMask
 from drivesplat.scene.images import project, read_image
 from drivesplat.scene.masks import UNLABELLED, mask_name, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, label_image, region_mask
 from drivesplat.scene.rigid import apply, inverse
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import Frame, Scene, write_scene
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.masks import MaskJob
 
@@ -242,6 +244,52 @@ def test_sky_is_unknown_if_none_is_found_unless_the_user_gives_masks(two_images,
     record = make_masks(scene, job(sky_folder=mine), tmp_path / "masks")
     assert record.sky_known is known
     assert [r.getMessage() for r in caplog.records] == ([] if known else [NO_SKY % "0001"])
+
+
+def test_masks_that_the_workflow_wrote_are_accepted_back(two_images, tmp_path):
+    """Copies of its own files, one of them edited; the ego vehicle's label among them."""
+    outline = ((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0))
+    make_masks(two_images, job(), tmp_path / "masks", seen_in_front(outline))
+    shutil.copytree(tmp_path / "masks", tmp_path / "mine")
+    at = ("CAM_FRONT", two_images.frames[1].timestamp, SIZE)
+    before, sky = read_labels(tmp_path / "masks", *at), read_sky_mask(tmp_path / "masks", *at)
+    edited = before.copy()
+    edited[:5] = LABELS["left_out"]
+    Image.fromarray(edited).save(tmp_path / f"mine/regions/CAM_FRONT/{at[1]}.png")
+    settings = job(regions_folder=str(tmp_path / "mine/regions"), sky_folder=str(tmp_path / "mine/sky"))
+    record = make_masks(two_images, settings, tmp_path / "again", NO_EGO_MASK)
+    np.testing.assert_array_equal(read_labels(tmp_path / "again", *at), edited)
+    np.testing.assert_array_equal(read_sky_mask(tmp_path / "again", *at), sky)
+    assert record.own_car == {"CAM_FRONT": "masks"} and (edited != before).any()
+
+
+def test_the_example_of_the_documentation_writes_masks_that_are_accepted(two_images, tmp_path, monkeypatch):
+    page = (REPOSITORY / "docs/masks.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    write_scene("results/0061/scene.json", two_images)
+    classes = np.arange(54 * 96).reshape(54, 96) % 12
+    exec(example, {"segment": lambda image: classes if image.shape == (54, 96, 3) else None})
+    record = make_masks(two_images, job(sky_folder="my_sky", semantic_folder="my_classes"), tmp_path / "masks")
+    at = (tmp_path / "masks", "CAM_FRONT", two_images.frames[1].timestamp, SIZE)
+    np.testing.assert_array_equal(read_sky_mask(*at), classes == 10)
+    np.testing.assert_array_equal(read_classes(*at), classes)
+    assert record.semantic_classes == 12 and record.sky == "masks"
+
+
+def test_the_name_of_the_image_comes_before_its_timestamp(two_images, tmp_path):
+    frame = two_images.frames[0]
+    folder = users_masks(two_images, tmp_path / "mine", np.full((54, 96), 1, dtype=np.uint8))
+    Image.fromarray(np.full((54, 96), 2, dtype=np.uint8)).save(folder / f"CAM_FRONT/{frame.timestamp}.png")
+    assert users_file(str(folder), frame).stem == Path(frame.image_path).stem
+
+
+@pytest.mark.parametrize("kind", ["regions", "sky", "semantic"])
+def test_the_folder_of_the_masks_themselves_is_refused(two_images, tmp_path, kind):
+    folder = tmp_path / "masks" / kind
+    with pytest.raises(ConfigError) as failure:
+        make_masks(two_images, job(**{f"{kind}_folder": str(folder)}), tmp_path / "masks")
+    assert f"masks.{kind}_folder: {folder}" in str(failure.value) and "copy it" in str(failure.value)
 
 
 def test_masks_of_the_user_are_resized_to_the_images(two_images, tmp_path):
