@@ -12,7 +12,7 @@ from drivesplat.inspection.ghost_panel import GhostPanel
 from drivesplat.inspection.removal import RemovalPair
 
 MAX_ERROR = 0.5
-PATH_COLOR = "#4cc9f0"
+PATH_COLOR = "#1d6fd1"
 _FIXES = "\n".join(
     [f"Published fixes of ghosts ({GHOSTS_DOCUMENT}):", *(f"{fix.method}: {fix.adds}" for fix in PUBLISHED_FIXES)]
 )
@@ -54,8 +54,8 @@ def _ghosts_title(ghosts: dict[str, Any] | None) -> str:
     if not ghosts["gaussians"]:
         return "Ghosts: none along the vehicle's path (blue)"
     count, mean = ghosts["gaussians"], ghosts["opacity_mean"]
-    amplified = f" (amplified {ghosts['drawn_times']:.1f}x)" if ghosts["drawn_times"] > 1.0 else ""
-    return f"Ghosts{amplified} along its path (blue): {count:,}, mean opacity {mean:.2f}"
+    amplified = f", amplified {ghosts['drawn_times']:.1f}x" if ghosts["drawn_times"] > 1.0 else ""
+    return f"Ghosts (red{amplified}) along its path (blue): {count:,}, mean opacity {mean:.2f}"
 
 
 def draw_removal(pair: RemovalPair, record: dict[str, Any], method: str) -> Figure:

@@ -21,8 +21,10 @@ from drivesplat.scene.rigid import inverse
 from drivesplat.settings.inspection import GhostSettings, PanelJob
 
 SCHEMA = 1
-DIMMED = 0.3
-MAX_AMPLIFICATION = 4.0
+PALE = (0.45, 0.95)
+"""The greys of the image behind ghosts: of black, and of its 98th percentile. Ghosts are red on it, day or night."""
+GHOST_COLOR = (0.85, 0.05, 0.1)
+MAX_AMPLIFICATION = 10.0
 """Maximum factor by which the opacity of ghosts is amplified to make them visible."""
 TARGET_OPACITY = 0.9
 """The amplified opacity of the 95th percentile."""
@@ -32,7 +34,7 @@ MIN_DEPTH = 0.5
 
 @dataclass(frozen=True)
 class GhostPanel:
-    """Images (h, w, 3) in [0, 1], `ghosts` being the dimmed image under the amplified ghosts; and in continuous pixels
+    """Images (h, w, 3) in [0, 1], `ghosts` being the pale image under the amplified ghosts; and in continuous pixels
     the `outline` (n, 2) of the box and the `path` (m, 2) of its centre on the ground, both empty without a moving
     vehicle."""
 
@@ -64,27 +66,32 @@ def ghost_panel(drive: TrainedDrive, job: PanelJob) -> tuple[GhostPanel, dict[st
         "ghosts": None,
         "why_null": None if subject else no_subject_reason(job.eval_camera),
     }
-    dimmed = DIMMED * np.repeat(truth.mean(axis=2, keepdims=True), 3, axis=2)
+    pale = pale_image(truth)
     if subject is None:
-        return GhostPanel(truth, render, dimmed, np.zeros((0, 2)), np.zeros((0, 2))), record
-    image, record["ghosts"] = _ghost_image(view, subject, dimmed, job.ghosts)
+        return GhostPanel(truth, render, pale, np.zeros((0, 2)), np.zeros((0, 2))), record
+    image, record["ghosts"] = _ghost_image(view, subject, pale, job.ghosts)
     return GhostPanel(truth, render, image, subject.hull.polygon, _ground_path(view, subject)), record
 
 
+def pale_image(image: np.ndarray) -> np.ndarray:
+    """An image (h, w, 3) in [0, 1] as pale greys, stretched to the range of PALE: (h, w, 3)."""
+    grey = image.mean(axis=2, keepdims=True)
+    bright = max(float(np.quantile(grey, 0.98)), 1e-3)
+    return np.repeat(PALE[0] + (PALE[1] - PALE[0]) * np.minimum(grey / bright, 1.0), 3, axis=2)
+
+
 def _ghost_image(
-    view: RenderedView, subject: Subject, dimmed: np.ndarray, settings: GhostSettings
+    view: RenderedView, subject: Subject, pale: np.ndarray, settings: GhostSettings
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """The amplified ghosts in their own colours over the `dimmed` image (h, w, 3), and their figures."""
+    """The amplified opacity of the ghosts over the `pale` image (h, w, 3), and their figures."""
     ghosts = ghosts_of(view, subject.box, settings)
-    alone = view.render(ghosts)
-    opacity = colors_of(alone.alpha)
+    opacity = colors_of(view.render(ghosts).alpha)
     covered = opacity >= MIN_COVERING_OPACITY
     amplification = 1.0
     if covered.any():
         amplification = float(np.clip(TARGET_OPACITY / np.quantile(opacity[covered], 0.95), 1.0, MAX_AMPLIFICATION))
-    own_color = colors_of(alone.splats) / np.maximum(opacity, 1e-6)[..., None]
     weight = np.minimum(amplification * opacity, 1.0)[..., None]
-    image = weight * own_color.clip(0.0, 1.0) + (1.0 - weight) * dimmed
+    image = weight * np.array(GHOST_COLOR) + (1.0 - weight) * pale
     figures = {"covered_share": float(covered.mean()), "drawn_times": amplification}
     return image, {**ghost_figures(view.gaussians, ghosts), **figures}
 

@@ -191,11 +191,16 @@ def test_the_path_is_interrupted_in_gaps_of_the_annotation(tiny_scene, masks, mi
         np.testing.assert_allclose(panel.path[seen[[breaks[0], breaks[0] + 1]]], ends, atol=0.6)
 
 
-def test_the_ghost_image_is_the_dimmed_image_except_for_the_ghost(panel_of_car):
+def pale(truth: np.ndarray) -> np.ndarray:
+    """Greys from 0.45 for black to 0.95 for the brightest two percent."""
+    grey = truth.mean(axis=2)[..., None].repeat(3, axis=2)
+    return np.interp(grey, [0.0, np.quantile(grey, 0.98)], [0.45, 0.95])
+
+
+def test_the_ghost_image_is_the_pale_image_except_for_the_ghost(panel_of_car):
     panel, record, drive = panel_of_car
     pixel = seen_at(drive, HELD_OUT, GHOST_AT[None])[0][0]
-    dimmed = 0.3 * panel.truth.mean(axis=2)[..., None]
-    changed = (np.abs(panel.ghosts - dimmed) > 1e-6).any(axis=2)
+    changed = (np.abs(panel.ghosts - pale(panel.truth)) > 1e-6).any(axis=2)
     assert record["ghosts"]["gaussians"] == 1
     assert near(pixel, 3.0).sum() > 20
     assert changed[near(pixel, 3.0)].all() and not changed[~near(pixel, 9.0)].any()
@@ -206,16 +211,15 @@ def test_the_ghost_image_is_the_dimmed_image_except_for_the_ghost(panel_of_car):
     assert near(road, 1.5).any() and not changed[near(road, 1.5)].any(), "and is not a ghost"
 
 
-def test_a_ghost_is_drawn_amplified_in_its_own_colour(tiny_scene, masks):
-    """Opacity 0.1 at the centre's pixel, drawn four times as strong: the most there is."""
-    drive = drive_of(one_car(tiny_scene), masks, places=[GHOST_AT], opacities=0.1, colors=(0.9, 0.1, 0.2))
+def test_a_ghost_is_drawn_amplified_in_red(tiny_scene, masks):
+    """Opacity 0.06 at the centre's pixel, drawn ten times as strong: the most there is. Its own colour is white."""
+    drive = drive_of(one_car(tiny_scene), masks, places=[GHOST_AT], opacities=0.06, colors=(0.9, 0.9, 0.9))
     panel, record = ghost_panel(drive, job_of())
     column, row = np.floor(seen_at(drive, HELD_OUT, GHOST_AT[None])[0][0]).astype(int)
-    dimmed = 0.3 * panel.truth[row, column].mean()
-    expected = 0.4 * np.array([0.9, 0.1, 0.2]) + 0.6 * dimmed
+    expected = 0.6 * np.array([0.85, 0.05, 0.1]) + 0.4 * pale(panel.truth)[row, column]
     np.testing.assert_allclose(panel.ghosts[row, column], expected, atol=0.02)
-    assert record["ghosts"]["opacity_mean"] == pytest.approx(0.1, abs=1e-6)
-    assert record["ghosts"]["drawn_times"] == 4.0
+    assert record["ghosts"]["opacity_mean"] == pytest.approx(0.06, abs=1e-6)
+    assert record["ghosts"]["drawn_times"] == 10.0
 
 
 @pytest.mark.parametrize("opacity", [0.3, 0.6, 0.99])
@@ -226,7 +230,7 @@ def test_ghosts_are_amplified_to_an_opacity_of_nine_tenths(tiny_scene, masks, op
     distance = np.hypot(x - pixel[0, 0], y - pixel[0, 1])
     profile = opacity * np.exp(-0.5 * distance**2 / ((59.52 * 0.1 / depth[0]) ** 2 + 0.3))
     strength = 0.9 / np.quantile(profile[profile >= 0.05], 0.95)
-    assert record["ghosts"]["drawn_times"] == pytest.approx(np.clip(strength, 1.0, 4.0), rel=0.08)
+    assert record["ghosts"]["drawn_times"] == pytest.approx(np.clip(strength, 1.0, 10.0), rel=0.08)
 
 
 def test_the_covered_share_counts_only_ghosts(panel_of_car):
@@ -240,9 +244,9 @@ def test_the_covered_share_counts_only_ghosts(panel_of_car):
     json.dumps(record, allow_nan=False)
 
 
-def test_without_ghosts_the_ghost_image_is_the_dimmed_image(tiny_scene, masks):
+def test_without_ghosts_the_ghost_image_is_the_pale_image(tiny_scene, masks):
     panel, record = ghost_panel(drive_of(one_car(tiny_scene), masks, places=[ROAD_AT]), job_of())
-    np.testing.assert_allclose(panel.ghosts, 0.3 * panel.truth.mean(axis=2)[..., None].repeat(3, axis=2))
+    np.testing.assert_allclose(panel.ghosts, pale(panel.truth))
     assert record["ghosts"]["gaussians"] == 0 and record["ghosts"]["covered_share"] == 0.0
     assert record["ghosts"]["opacity_mean"] is None
     json.dumps(record, allow_nan=False)
@@ -257,7 +261,7 @@ def test_without_a_moving_vehicle_the_middle_key_frame_is_shown_and_figures_are_
     panel, record = still
     recorded = np.asarray(Image.open(tiny_scene.frames[10].image_path).convert("RGB"))
     np.testing.assert_allclose(panel.truth * 255.0, recorded)
-    np.testing.assert_allclose(panel.ghosts, 0.3 * panel.truth.mean(axis=2)[..., None].repeat(3, axis=2))
+    np.testing.assert_allclose(panel.ghosts, pale(panel.truth))
     assert len(panel.outline) == len(panel.path) == 0
     assert record["key_frame"] == 5 and record["static"]["psnr"] > 0
     assert record["subject"] is None and record["vehicle"] is None and record["ghosts"] is None
