@@ -8,4 +8,5 @@ from drivesplat.settings.report import ReportJob
 
 with job(snakemake, check_inputs=False) as current:
     results, found = Path(current.output.page).parent, current.input
-    write_report(results, current.settings(ReportJob), found.metrics, found.pictures, found.links)
+    links = snakemake.params.links
+    write_report(results, current.settings(ReportJob), found.metrics, found.pictures, links)

@@ -16,7 +16,7 @@ REPORT_FILES = ("gap_report.html", "gap_report.json", "gap_report.csv", "ghosts.
 
 class ReportPlan:
     """The report of a `plan` for some `targets`: of all scenes, or of the measured ones where it is the only target. It
-    shows the pictures and films that exist; where everything is a target, it waits for them.
+    shows the pictures and names the films that exist, where everything is a target all of them.
 
     The inputs and settings are functions of wildcards: Snakemake calls them only if the report is to be made.
     """
@@ -60,9 +60,11 @@ class ReportPlan:
         return [*(_present(with_figures) if self._alone else with_figures), *self._shown(looks)]
 
     def links(self, _: Any = None) -> list[str]:
-        """The files that its page links to: films, edits and viewers."""
+        """The files that its page links to: films, edits and viewers, in an order that does not depend on files of
+        settings."""
         viewers = self._plan.of_methods(lambda *_: ["viewer.html"], self.scenes)
-        return self._shown([*self._plan.films(scenes=self.scenes), *self._plan.edits(scenes=self.scenes), *viewers])
+        films, edits = self._plan.films(scenes=self.scenes), self._plan.edits(scenes=self.scenes)
+        return self._shown(sorted([*films, *edits, *viewers]))
 
     def settings(self, _: Any = None) -> str:
         """The settings of its job as canonical JSON."""

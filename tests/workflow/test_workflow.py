@@ -359,6 +359,20 @@ def test_a_changed_step_reruns_its_edit_and_no_other(finished, old, new, expecte
         path.write_text(EDITS)
 
 
+def test_a_changed_step_hides_no_change_of_the_report(finished):
+    """The page links to the film, which is no reason to leave the page as it was."""
+    path = finished.folder / "edits.yaml"
+    path.write_text(EDITS.replace("at: 2}", "at: 2.5}"))
+    report = finished.folder / "drivesplat/report/gaps.py"
+    code = report.read_text(encoding="utf-8")
+    report.write_text(code + "\nNEW = 1\n", encoding="utf-8")
+    try:
+        assert finished.planned() == {"edit": 1, "gap_report": 1}
+    finally:
+        path.write_text(EDITS)
+        report.write_text(code, encoding="utf-8")
+
+
 def test_an_edit_of_a_track_that_there_is_none_of_fails_in_one_line(finished):
     path = finished.folder / "edits.yaml"
     path.write_text(EDITS + "  typo:\n    - remove: {track: abcd}\n")
