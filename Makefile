@@ -3,7 +3,7 @@
 # make doctor       check the machine and suggest remedies
 # make test         set-up, style, tests (no GPU, no dataset, no network beyond the set-up)
 # make test-slow    whole runs and fits that make test leaves out (two cores: three minutes)
-# make test-viewers the exported viewer and the report's page in Chromium (apt-get install chromium)
+# make test-viewers pages and exports in Chromium, and in other viewers (apt-get install chromium; docs/exports.md)
 # make test-gpu     tests that need a GPU: the rasterizers agree, trainings resume
 # make test-slurm   one scene through a real SLURM, started on this machine for the test (root on Debian; docs/cluster.md)
 # make test-batch   ten synthetic drives, one of them broken, as a batch (two cores: a quarter of an hour)

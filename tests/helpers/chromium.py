@@ -55,10 +55,11 @@ class Tab:
                     raise RuntimeError(f"{method}: {answer['error']}")
                 return answer["result"]
 
-    def open(self, file: Path, width: int, height: int) -> None:
-        """Opens a file in a window of so many pixels; returns once its scripts have run for the first time."""
+    def open(self, page: Path | str, width: int, height: int) -> None:
+        """Opens a file or an address in a window of so many pixels; returns once its scripts have run for the first
+        time."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-        self.call("Page.navigate", url=file.as_uri())
+        self.call("Page.navigate", url=page.as_uri() if isinstance(page, Path) else page)
         while self._receive().get("method") != "Page.loadEventFired":
             pass
 
