@@ -95,12 +95,14 @@ rule export_usd:
 
 rule export_viewer:
     """
-    Exports one HTML page that shows the splat interactively and offline, with a limited number of Gaussians.
+    Exports one HTML page that shows the splat interactively and offline, with a limited number of Gaussians, the
+    recorded images at key frames and the edits of the scene.
     """
     input:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         far="<results>/{scene}/{method}/far.npz",
         scene=plan.scene,
+        parser="<results>/{scene}/parser.pkl",
     output:
         viewer=report(
             "<results>/{scene}/{method}/viewer.html",

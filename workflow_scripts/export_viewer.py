@@ -1,15 +1,20 @@
 """checkpoint.npz as viewer.html: one page that shows the splat under a mouse."""
 
 from drivesplat.workflow.job import job
+from drivesplat.editing.drives import edited_drives
 from drivesplat.export.far_gaussians import read_far, within_reach
+from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND
 from drivesplat.export.viewer import export_viewer
 from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.scene import read_scene
-from drivesplat.settings.export import ExportJob
+from drivesplat.scene.training_record import read_training_record
+from drivesplat.settings.export import ViewerJob
 
-with job(snakemake) as current:
-    scene, checkpoint = read_scene(current.input.scene), read_checkpoint(current.input.checkpoint)
-    far = read_far(current.input.far)
-    provenance = current.provenance(scene.provenance, checkpoint.provenance, far.provenance)
-    settings, method = current.settings(ExportJob), current.wildcards.method
-    export_viewer(current.output.viewer, within_reach(checkpoint, far), scene, settings, method, provenance)
+with job(snakemake, dataset=("images",)) as current:
+    files, settings, method = current.input, current.settings(ViewerJob), current.wildcards.method
+    scene, record, far = read_scene(files.scene), read_training_record(files.parser), read_far(files.far)
+    checkpoint = read_checkpoint(files.checkpoint)
+    provenance = current.provenance(*(made.provenance for made in (scene, record, checkpoint, far)))
+    shown = within_reach(checkpoint, far)
+    edits = edited_drives(shown, scene, settings.eval_camera, settings.edits, SAMPLES_PER_SECOND)
+    export_viewer(current.output.viewer, shown, scene, record, settings, method, edits, provenance)

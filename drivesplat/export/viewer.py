@@ -10,20 +10,22 @@ The payload is base64 of zlib-compressed little-endian arrays, each at a multipl
 
 import base64
 import logging
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 
+from drivesplat.edited_motion.edited_drive import EditedDrive
 from drivesplat.export import viewer_page as template
 from drivesplat.export.thinning import thinned_groups
-from drivesplat.export.trained_parts import SampledGroup, trained_groups
-from drivesplat.export.viewer_scene import RecordedPath, recorded_path, scene_record
+from drivesplat.export.trained_parts import trained_groups
+from drivesplat.export.viewer_images import key_frame_images
+from drivesplat.export.viewer_scene import ViewerContent, recorded_path, scene_record
 from drivesplat.io.html_page import filled_page
 from drivesplat.io.storage import Provenance, atomic_write
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
-from drivesplat.model.part import Sky
 from drivesplat.rendering.trajectory import recorded_timestamps
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.export import ExportJob
+from drivesplat.scene.training_record import TrainingRecord
+from drivesplat.settings.export import ViewerJob
 
 log = logging.getLogger(__name__)
 
@@ -35,36 +37,37 @@ def export_viewer(
     path: str | Path,
     checkpoint: TrainedCheckpoint,
     scene: Scene,
-    job: ExportJob,
+    record: TrainingRecord,
+    job: ViewerJob,
     method: str,
+    edits: Sequence[EditedDrive],
     provenance: Provenance,
 ) -> None:
     """Writes the page with the `job.gaussians` Gaussians of a checkpoint that have the largest coverage, viewed from
     the middle key frame of `job.eval_camera`.
 
-    Objects move as recorded, in the colours of the drive's middle image. Raises DatasetError if the scene has no key
-    frame of that camera.
+    Objects move as recorded or as one of `edits` says, in the colours of the drive's middle image. Raises DatasetError
+    if the scene has no key frame of that camera or one of their images cannot be read.
     """
     model, recorded = trained_model(checkpoint), recorded_path(scene, job.eval_camera)
     groups = trained_groups(model, scene, recorded_timestamps(scene, job.eval_camera))
     kept = thinned_groups(groups, job.gaussians)
-    page = viewer_page(kept, model.sky, model.antialiased, recorded, f"{scene.name} · {method}", provenance)
+    content = ViewerContent(
+        kept, model.sky, model.antialiased, recorded,
+        edits=edits,
+        images=key_frame_images(scene, record, job.eval_camera, job.image_width),
+        method=method, methods=job.methods,
+    )  # fmt: skip
+    page = viewer_page(content, f"{scene.name} · {method}", provenance)
     with atomic_write(path) as file:
         file.write(page.encode())
     after, before = (sum(len(group.gaussians) for group in of.values()) for of in (kept, groups))
     log.info("%d of %d Gaussians, %.1f MB", after, before, len(page) * 1e-6)
 
 
-def viewer_page(
-    groups: Mapping[str, SampledGroup],
-    sky: Sky | None,
-    antialiased: bool,
-    path: RecordedPath,
-    title: str,
-    provenance: Provenance,
-) -> str:
-    """The text of the page, deterministic. Its first view is that of `path.start`; without a sky the background is
-    black."""
-    scene, payload = scene_record(groups, sky, antialiased, path, SKY_SIZE)
+def viewer_page(content: ViewerContent, title: str, provenance: Provenance) -> str:
+    """The text of the page, deterministic. Its first view is that of the path's `start`; without a sky the background
+    is black."""
+    scene, payload = scene_record(content, SKY_SIZE)
     encoded = base64.b64encode(payload).decode()
     return filled_page(template, title=title, provenance=provenance, scene=scene, payload=encoded)

@@ -5,7 +5,7 @@ most of them are: near zero.
 """
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND
+from drivesplat.edited_motion.edited_drive import EditedDrive, Instance, InstanceMotion
+from drivesplat.export.sampled_motion import SAMPLES_PER_SECOND, SampledMotion
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import Sky
@@ -34,6 +35,21 @@ class RecordedPath:
     seconds: np.ndarray
     camera_to_world: np.ndarray
     key_frames: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ViewerContent:
+    """What a page shows: rigid groups, a sky (None: black), the recorded camera, edited drives, the recorded `images`
+    (records of `viewer_images`), and the methods of which it has pages beside it."""
+
+    groups: Mapping[str, SampledGroup]
+    sky: Sky | None
+    antialiased: bool
+    path: RecordedPath
+    edits: Sequence[EditedDrive] = ()
+    images: Sequence[dict[str, Any]] = ()
+    method: str = ""
+    methods: Sequence[str] = ()
 
 
 def recorded_path(scene: Scene, camera: str) -> RecordedPath:
@@ -71,60 +87,97 @@ def splat_arrays(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], float]:
     return {name: array.detach().contiguous().numpy() for name, array in arrays.items()}, sh_range
 
 
-def group_arrays(groups: Mapping[str, SampledGroup]) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-    """A record for each group, and the arrays of all: `group` (n,) uint16, the group's number of each Gaussian;
-    `motion_seconds` (m,) and `motion_poses` (m, 3, 4) float32, object to world, of all motions one after the other.
+class PoseRows:
+    """Poses of many motions one after the other: `seconds` (m,) and `poses` (m, 3, 4)."""
 
-    A record has the `gaussians` of the group, the intervals `present` (seconds) and the range `samples` of rows of its
-    motion; the last two are null for a static group.
-    """
-    records, seconds, poses = [], [np.zeros(0)], [np.zeros((0, 4, 4))]
-    for name, group in groups.items():
-        motion, track = group.motion, group.track
-        first = sum(map(len, seconds))
-        if motion is not None:
-            seconds.append(motion.seconds)
-            poses.append(motion.object_to_world)
-        records.append(
-            {
-                "name": name,
-                "category": track.category if track else None,
-                "size": track.size.tolist() if track else None,
-                "gaussians": len(group.gaussians),
-                "present": None if motion is None else [list(span) for span in motion.spans],
-                "samples": None if motion is None else [first, sum(map(len, seconds))],
-            }
-        )
-    counts = [len(group.gaussians) for group in groups.values()]
-    return records, {
-        "group": np.repeat(np.arange(len(counts)), counts).astype(np.uint16),
-        "motion_seconds": np.concatenate(seconds).astype(np.float32),
-        "motion_poses": np.concatenate(poses)[:, :3].astype(np.float32),
-    }
+    def __init__(self) -> None:
+        self._seconds: list[np.ndarray] = [np.zeros(0)]
+        self._poses: list[np.ndarray] = [np.zeros((0, 4, 4))]
+
+    def add(self, seconds: np.ndarray, poses: np.ndarray) -> list[int]:
+        """Appends poses (n, 4, 4) at `seconds` (n,); returns the range of their rows."""
+        first = sum(map(len, self._seconds))
+        self._seconds.append(seconds)
+        self._poses.append(poses)
+        return [first, first + len(seconds)]
+
+    def arrays(self, name: str) -> dict[str, np.ndarray]:
+        """The rows as float32 arrays `{name}_seconds` and `{name}_poses`."""
+        seconds, poses = np.concatenate(self._seconds), np.concatenate(self._poses)[:, :3]
+        return {f"{name}_seconds": seconds.astype(np.float32), f"{name}_poses": poses.astype(np.float32)}
 
 
-def scene_record(
-    groups: Mapping[str, SampledGroup], sky: Sky | None, antialiased: bool, path: RecordedPath, sky_size: int
-) -> tuple[dict[str, Any], bytes]:
+def motion_record(motion: SampledMotion | InstanceMotion | None, rows: PoseRows) -> dict[str, Any]:
+    """The intervals `present` (seconds) and the range `samples` of rows of a motion; null for a static group."""
+    if motion is None:
+        return {"present": None, "samples": None}
+    samples = rows.add(motion.seconds, motion.object_to_world)
+    return {"present": [list(span) for span in motion.spans], "samples": samples}
+
+
+def group_records(groups: Mapping[str, SampledGroup], rows: PoseRows) -> list[dict[str, Any]]:
+    """A record for each group: the number of its `gaussians`, its motion, and what its track says."""
+    return [
+        {
+            "name": name,
+            "category": group.track.category if group.track else None,
+            "size": group.track.size.tolist() if group.track else None,
+            "gaussians": len(group.gaussians),
+            **motion_record(group.motion, rows),
+        }
+        for name, group in groups.items()
+    ]
+
+
+def edit_records(
+    drives: Sequence[EditedDrive], groups: Sequence[str], rows: PoseRows, camera_rows: PoseRows
+) -> list[dict[str, Any]]:
+    """A record for each edited drive: its `instances`, each with the number of its `group` and what differs from it,
+    and the range of rows of its `camera`; null: as recorded."""
+    return [
+        {
+            "name": drive.name,
+            "instances": [_instance_record(instance, groups, rows) for instance in drive.instances],
+            "camera": drive.camera and camera_rows.add(drive.camera.seconds, drive.camera.camera_to_world),
+        }
+        for drive in drives
+    ]
+
+
+def _instance_record(instance: Instance, groups: Sequence[str], rows: PoseRows) -> dict[str, Any]:
+    record: dict[str, Any] = {"id": instance.id, "group": groups.index(instance.source)}
+    if instance.motion is None:
+        return record
+    changed = {"category": instance.category, "size": instance.size.tolist(), "scale": instance.scale}
+    return {**record, **changed, **motion_record(instance.motion, rows)}
+
+
+def scene_record(content: ViewerContent, sky_size: int) -> tuple[dict[str, Any], bytes]:
     """What the page's scripts read, and the compressed arrays that it lists."""
+    groups, path = content.groups, content.path
     gaussians = concatenate([group.gaussians for group in groups.values()])
     arrays, sh_range = splat_arrays(gaussians)
-    records, motions = group_arrays(groups)
-    camera = {
-        "camera_seconds": path.seconds.astype(np.float32),
-        "camera_poses": path.camera_to_world[:, :3].astype(np.float32),
-    }
-    layout, payload = packed({**arrays, **motions, **camera, "sky": sky_faces(sky, sky_size)})
+    motions, cameras = PoseRows(), PoseRows()
+    records = group_records(groups, motions)
+    camera = cameras.add(path.seconds, path.camera_to_world)
+    edits = edit_records(content.edits, [*groups], motions, cameras)
+    sky = {"sky": sky_faces(content.sky, sky_size)}
+    layout, payload = packed({**arrays, **motions.arrays("motion"), **cameras.arrays("camera"), **sky})
     record = {
         "count": len(gaussians),
         "coefficients": 1 + gaussians.shN.shape[1],
-        "antialiased": antialiased,
+        "antialiased": content.antialiased,
         "sh_range": sh_range,
         "sky_size": sky_size,
-        "has_sky": sky is not None,
+        "has_sky": content.sky is not None,
         "start": {**start_pose(path.start), "second": path.start_second},
         "key_frames": list(path.key_frames),
+        "camera": camera,
         "groups": records,
+        "edits": edits,
+        "images": list(content.images),
+        "method": content.method,
+        "methods": list(content.methods),
         "arrays": layout,
     }
     return record, payload

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.edit import Edit
 
 ExportFormat = Literal["ply", "usd", "viewer", "colmap", "spz", "sog"]
 
@@ -27,6 +28,9 @@ class ExportSettings(Settings):
     """Maximum number of Gaussians in scene.usdz. Those with the largest opacity times area are kept."""
     viewer_gaussians: int = Field(300_000, ge=1)
     """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
+    viewer_images: int = Field(640, ge=0, le=3840)
+    """Width in pixels of the recorded images in viewer.html, one JPEG per key frame, about 30 KB each at 640. 0 = none.
+    """
 
     @field_validator("formats")
     @classmethod
@@ -35,10 +39,19 @@ class ExportSettings(Settings):
 
 
 class ExportJob(Settings):
-    """All settings that determine one scene.usdz or one viewer.html."""
+    """All settings that determine one scene.usdz."""
 
     eval_camera: str
     gaussians: int
+
+
+class ViewerJob(ExportJob):
+    """All settings that determine one viewer.html: the width of its images, the edits of the scene that it plays, and
+    the methods between whose pages it switches."""
+
+    image_width: int = 0
+    edits: dict[str, Edit] = Field(default_factory=dict)
+    methods: tuple[str, ...] = ()
 
 
 class FarJob(Settings):

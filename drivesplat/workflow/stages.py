@@ -18,7 +18,7 @@ from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.settings.export import ExportJob, FarJob, SplatJob
+from drivesplat.settings.export import ExportJob, FarJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.images import ParserJob
@@ -38,7 +38,7 @@ ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
-OF_ONE_SCENE = ("demo_world", "extract", "edit", "ghost_panel", "remove_actor")
+OF_ONE_SCENE = ("demo_world", "extract", "edit", "ghost_panel", "remove_actor", "export_viewer")
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
@@ -188,6 +188,17 @@ def _edit(at: Place) -> dict[str, Any]:
     return {"edit": edits[at.film], "frames": at.config.render.edited_frames, **_format(at)}
 
 
+def _viewer(at: Place) -> dict[str, Any]:
+    """The edits of a method that can be edited, and the methods that have pages, too."""
+    export, editable = at.config.export, at.config.all_methods[at.method].moving_parts
+    return {
+        "gaussians": export.viewer_gaussians,
+        "image_width": export.viewer_images,
+        "edits": scene_edits(at.config, at.scene) if editable else {},
+        "methods": tuple(sorted(at.config.methods)),
+    }
+
+
 def _subject(at: Place) -> dict[str, Any]:
     """The vehicle that the user selected for the scene."""
     return {"subject": at.config.subjects.get(at.scene, SubjectSettings())}
@@ -258,7 +269,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),
     "export": (SplatJob, lambda at: {"sh_degree": at.config.export.sh_degree}),
     "export_usd": (ExportJob, lambda at: {"gaussians": at.config.export.usd_gaussians}),
-    "export_viewer": (ExportJob, lambda at: {"gaussians": at.config.export.viewer_gaussians}),
+    "export_viewer": (ViewerJob, _viewer),
     "export_colmap": (Settings, _nothing),
     "export_spz": (Settings, _nothing),
     "export_sog": (Settings, _nothing),

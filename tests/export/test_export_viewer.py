@@ -10,90 +10,46 @@ import numpy as np
 import pytest
 import torch
 from helpers.chromium import chromium, in_a_browser
-from helpers.classed import classed
-from helpers.hand_made import round_gaussians
-from helpers.hand_made_traffic import TRAJECTORIES, TURNING, Traffic, own_gaussians, placed
+from helpers.hand_made import recording_of, round_gaussians
+from helpers.hand_made_traffic import TRAJECTORIES, Traffic, own_gaussians, placed
 from helpers.records import EMPTY_CHECKPOINT
+from helpers.viewer_pages import (
+    CAR,
+    HEIGHT,
+    PROVENANCE,
+    SHOWN_WITHOUT_WORDS,
+    WIDTH,
+    a_model,
+    a_sky,
+    car_pose,
+    driving_car,
+    oblique_frame,
+    page_of,
+    path_from,
+    psnr,
+    rendered,
+    set_second,
+    settled,
+    splats,
+    tick,
+)
 from scipy.spatial.transform import Rotation
 from torch import nn
 
 from drivesplat.export import viewer
-from drivesplat.export.sampled_motion import SampledMotion
 from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.viewer import export_viewer, viewer_page
-from drivesplat.export.viewer_scene import RecordedPath, packed, recorded_path, sky_faces
-from drivesplat.model.background import Background
+from drivesplat.export.viewer_scene import ViewerContent, packed, recorded_path, sky_faces
 from drivesplat.model.checkpoint import TrainedCheckpoint
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import concatenate
 from drivesplat.model.part import Sky
 from drivesplat.model.sky import CubemapSky
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import View
 from drivesplat.scene.rigid import rigid
-from drivesplat.scene.scene import Frame, Track
-from drivesplat.settings.export import ExportJob
+from drivesplat.settings.export import ViewerJob
 from drivesplat.settings.train import GaussianSettings, TrainJob, TrainSettings
 
-COUNT, KEPT = 60, 40
-PROVENANCE = {"settings_sha256": "a" * 64, "stages": {"train": {"note": "</script><b>"}}}
-WIDTH, HEIGHT = 240, 135
-SHOWN_WITHOUT_WORDS = """new Promise((done) => {
-  const look = () => document.documentElement.dataset.shown === "yes" ? done() : setTimeout(look, 20);
-  look();
-}).then(() => document.querySelectorAll(".over").forEach((over) => (over.style.visibility = "hidden")))"""
-"""Waits for the first picture, then makes the controls over it invisible."""
-
-
-def splats(count: int = COUNT, sh_degree: int = 2) -> Gaussians:
-    """In front of `oblique_frame`."""
-    generator = torch.Generator().manual_seed(3)
-    random = torch.rand(count, 7, generator=generator)
-    places = torch.stack([12.0 * random[:, 0] - 6.0, 6.0 * random[:, 1] - 3.0, 5.0 + 15.0 * random[:, 2]], dim=1)
-    pose = torch.from_numpy(oblique_frame().camera_to_world).float()
-    sh = torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator)
-    sh[:, 1:] *= 0.2
-    return Gaussians.of(
-        places @ pose[:3, :3].T + pose[:3, 3], torch.randn(count, 4, generator=generator),
-        0.02 + 0.8 * random[:, 3:6] ** 3, 0.05 + 0.95 * random[:, 6], sh,
-    )  # fmt: skip
-
-
-def oblique_frame() -> Frame:
-    """A camera that is pitched and rolled a little, its principal point off the middle, at half of 480 x 270."""
-    down_right = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    turned = Rotation.from_euler("zyx", [0.7, 0.08, 0.03]).as_matrix() @ down_right
-    pose = rigid(turned, np.array([5.0, -3.0, 1.6]))
-    K = np.array([[410.0, 0.0, 250.5], [0.0, 400.0, 122.25], [0.0, 0.0, 1.0]])
-    return Frame("CAM_FRONT", 0, "", 480, 270, K, pose, np.eye(4), True, 0, "")
-
-
-def path_from(frame: Frame) -> RecordedPath:
-    """Two seconds in which the camera rides two metres ahead from `frame`."""
-    ahead = rigid(frame.camera_to_world[:3, :3], frame.camera_to_world[:3, 3] + 2.0 * frame.camera_to_world[:3, 2])
-    return RecordedPath(frame, 0.0, np.array([0.0, 2.0]), np.stack([frame.camera_to_world, ahead]), (0.0, 0.5, 2.0))
-
-
-def page_of(gaussians: Gaussians, sky: Sky | None, antialiased: bool = False, title: str = "test") -> str:
-    """The page of a static splat."""
-    groups = {"background": SampledGroup(gaussians)}
-    return viewer_page(groups, sky, antialiased, path_from(oblique_frame()), title, PROVENANCE)
-
-
-def a_sky() -> CubemapSky:
-    sky = CubemapSky(8, torch.tensor([0.4, 0.6, 0.8]), 0.01)
-    with torch.no_grad():
-        sky.params["texels"].add_(
-            0.5 * torch.randn(sky.params["texels"].shape, generator=torch.Generator().manual_seed(1))
-        )
-    return sky
-
-
-def a_model(gaussians: Gaussians, sky: Sky | None, antialiased: bool = False) -> SplatModel:
-    params = {
-        "means": gaussians.means, "quats": gaussians.quats, "scales": torch.log(gaussians.scales),
-        "opacities": torch.logit(gaussians.opacities), "sh0": gaussians.sh[:, :1], "shN": gaussians.sh[:, 1:],
-    }  # fmt: skip
-    return SplatModel([Background(params, GaussianSettings(sh_degree=gaussians.sh_degree), 1.0)], sky, antialiased)
+KEPT = 40
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +63,8 @@ def checkpoint():
 @pytest.fixture(scope="module")
 def page(tmp_path_factory, checkpoint, tiny_scene) -> str:
     path = tmp_path_factory.mktemp("viewer") / "viewer.html"
-    job = ExportJob(eval_camera="CAM_FRONT", gaussians=KEPT)
-    export_viewer(path, checkpoint, tiny_scene, job, "vanilla", PROVENANCE)
+    job = ViewerJob(eval_camera="CAM_FRONT", gaussians=KEPT)
+    export_viewer(path, checkpoint, tiny_scene, recording_of(tiny_scene).record, job, "vanilla", (), PROVENANCE)
     return path.read_text(encoding="utf-8")
 
 
@@ -128,10 +84,12 @@ def decoded(page: str) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 def test_the_page_has_no_address_to_request(page):
+    markup = re.sub(r"<script.*?</script>", "", page, flags=re.S)
     assert "default-src 'none'" in page and "connect-src" not in page
-    assert re.findall(r"""\b(?:src|href|srcset|action|data)\s*=\s*["']?([^"'\s>]+)""", page) == ["data:,"]
+    assert re.findall(r"""\b(?:src|href|srcset|action|data)\s*=\s*["']?([^"'\s>]+)""", markup) == ["data:,"]
     assert not re.search(r"https?:|wss?:|@import|url\(|\bimport\b", page)
-    assert not re.search(r"\b(fetch|importScripts|XMLHttpRequest|WebSocket|EventSource|sendBeacon|Worker)\b", page)
+    assert not re.search(r"\b(fetch|importScripts|XMLHttpRequest|WebSocket|EventSource|sendBeacon)\b", page)
+    assert re.findall(r"\bnew \w*Worker\((\w+)", page) == ["address"] and "worker-src blob:" in page
 
 
 def test_the_payload_has_the_gaussians_of_largest_coverage(page):
@@ -155,15 +113,16 @@ def test_objects_are_in_their_own_frames_with_their_motions(tmp_path, tiny_scene
     """Two vehicles, of which one is absent at the middle image; beside a background without view dependence."""
     model = SplatModel([round_gaussians([[1.0, 2.0, 3.0]]), Traffic()], None)
     monkeypatch.setattr(viewer, "trained_model", lambda _: model)
-    job = ExportJob(eval_camera="CAM_FRONT", gaussians=1000)
-    export_viewer(tmp_path / "viewer.html", EMPTY_CHECKPOINT, tiny_scene, job, "street", PROVENANCE)
+    job, record = ViewerJob(eval_camera="CAM_FRONT", gaussians=1000), recording_of(tiny_scene).record
+    export_viewer(tmp_path / "viewer.html", EMPTY_CHECKPOINT, tiny_scene, record, job, "street", (), PROVENANCE)
     scene, arrays = decoded((tmp_path / "viewer.html").read_text(encoding="utf-8"))
     own = {name: own_gaussians(name, 2.25) for name in TRAJECTORIES}
     numbers = {record["name"]: number for number, record in enumerate(scene["groups"])}
     assert scene["count"] == 1 + sum(map(len, own.values())) and not scene["has_sky"]
     assert set(own) < set(numbers) and scene["groups"][0]["samples"] is None
+    owner = np.repeat(np.arange(len(numbers)), [group["gaussians"] for group in scene["groups"]])
     for name, gaussians in own.items():
-        rows, record = arrays["group"] == numbers[name], scene["groups"][numbers[name]]
+        rows, record = owner == numbers[name], scene["groups"][numbers[name]]
         np.testing.assert_allclose(arrays["means"].reshape(-1, 3)[rows], gaussians.means, atol=1e-5)
         np.testing.assert_allclose(arrays["sh0"].reshape(-1, 3)[rows], gaussians.sh[:, 0], atol=1e-3)
         first, last = record["samples"]
@@ -205,7 +164,7 @@ def test_the_page_is_deterministic_and_of_bounded_size(page):
     again = [page_of(splats(), a_sky(), antialiased=True) for _ in range(2)]
     assert again[0] == again[1]
     # 12 + 6 + 8 + 1 + 6 + 24 + 2 bytes a Gaussian and the sky, in base64 at worst; the rest of the page
-    assert len(page) < 1.34 * (59 * KEPT + 6 * 256**2 * 3) + 60_000
+    assert len(page) < 1.34 * (59 * KEPT + 6 * 256**2 * 3) + 80_000
 
 
 def test_arrays_are_aligned_for_every_type():
@@ -238,20 +197,6 @@ def test_the_sky_has_the_orientation_of_opengl():
         np.testing.assert_allclose(faces[face, row, column] / 127.5 - 1.0, [x, y, z], atol=2.5 / size)
 
 
-def rendered(model: SplatModel, pose: np.ndarray) -> np.ndarray:
-    """What the model shows to a camera like `oblique_frame` at half its size: (135, 240, 3) in [0, 1]."""
-    frame = oblique_frame()
-    K = torch.from_numpy(frame.intrinsics).float()
-    K[:2, 2] += 0.5
-    K[:2] *= 0.5
-    with torch.no_grad():
-        return model.render(View(K, torch.from_numpy(pose).float(), WIDTH, HEIGHT, 0.0)).image.clamp(0, 1).numpy()
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(-10.0 * np.log10(np.mean((a - b) ** 2)))
-
-
 @in_a_browser
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_a_browser_renders_the_page_from_disk_as_the_model_does(tmp_path, antialiased):
@@ -266,17 +211,17 @@ def test_a_browser_renders_the_page_from_disk_as_the_model_does(tmp_path, antial
     with chromium(tmp_path / "profile") as tab:
         tab.open(file, WIDTH, HEIGHT)
         tab.run(SHOWN_WITHOUT_WORDS)
-        start = tab.picture()
+        start = settled(tab)
         tab.mouse("mousePressed", 100, 60, button="left", clickCount=1)
         tab.mouse("mouseMoved", 130, 60, button="left", buttons=1)
         tab.mouse("mouseReleased", 130, 60, button="left", clickCount=1)
-        dragged = tab.picture()
+        dragged = settled(tab)
         tab.key("KeyR", "r")
-        restarted = tab.picture()
+        restarted = settled(tab)
         tab.mouse("mouseWheel", 100, 60, deltaX=0, deltaY=-100)
-        wheeled = tab.picture()
+        wheeled = settled(tab)
         assert tab.complaints == []
-        assert {url for url in tab.requests if not url.startswith("data:")} == {file.as_uri()}
+        assert {url for url in tab.requests if not url.startswith(("data:", "blob:null/"))} == {file.as_uri()}
     assert psnr(start, rendered(model, pose)) > 40.0
     np.testing.assert_array_equal(restarted, start)
     # the street follows the mouse: 30 pixels to the right turn the camera left by 30 / fx, about the world's z
@@ -288,44 +233,13 @@ def test_a_browser_renders_the_page_from_disk_as_the_model_does(tmp_path, antial
     assert psnr(start, dragged) < 35.0 > psnr(start, wheeled)
 
 
-CAR = "0a8dee9e8b4b4b0f8d6c2a5f1e3d4c5b"
-
-
-def car_pose(second: float) -> np.ndarray:
-    """A car ten metres ahead of `oblique_frame` that drives to the right at 3 m/s."""
-    camera = oblique_frame().camera_to_world
-    turned = Rotation.from_euler("z", 0.3).as_matrix()
-    return rigid(turned, camera[:3, 3] + 10.0 * camera[:3, 2] + 3.0 * (second - 1.0) * camera[:3, 0])
-
-
-def driving_car() -> SampledGroup:
-    """It is there for the first one and a half seconds."""
-    seconds = np.linspace(0.0, 1.5, 46)
-    poses = np.stack([car_pose(second) for second in seconds])
-    track = Track(CAR, *classed("vehicle.car"), np.array([4.0, 4.0, 4.0]), np.zeros(0, np.int64),
-                  np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.int64))  # fmt: skip
-    return SampledGroup(own_gaussians(TURNING, 0.0), SampledMotion(seconds, poses, ((0.0, 1.5),), 0.0), track)
-
-
-def set_second(second: float) -> str:
-    return f"""(() => {{
-      const time = document.getElementById("time");
-      time.value = {second};
-      time.dispatchEvent(new Event("input"));
-    }})()"""
-
-
-def tick(label: str) -> str:
-    return f"""[...document.querySelectorAll("#list label")]
-      .find((label) => label.textContent.includes("{label}")).firstChild.click()"""
-
-
 @in_a_browser
 def test_objects_move_with_the_time_and_can_be_hidden_and_picked(tmp_path):
     street, car, sky, frame = splats(200, sh_degree=1), driving_car(), a_sky(), oblique_frame()
     camera = frame.camera_to_world
     file = tmp_path / "viewer.html"
-    page = viewer_page({"background": SampledGroup(street), CAR: car}, sky, False, path_from(frame), "test", {})
+    groups = {"background": SampledGroup(street), CAR: car}
+    page = viewer_page(ViewerContent(groups, sky, False, path_from(frame)), "test", {})
     file.write_text(page, encoding="utf-8")
 
     def expected(second: float | None, pose: np.ndarray = camera, behind: Sky | None = sky) -> np.ndarray:
@@ -335,19 +249,19 @@ def test_objects_move_with_the_time_and_can_be_hidden_and_picked(tmp_path):
     with chromium(tmp_path / "profile") as tab:
         tab.open(file, WIDTH, HEIGHT)
         tab.run(SHOWN_WITHOUT_WORDS)
-        assert psnr(tab.picture(), expected(0.0)) > 40.0
+        assert psnr(settled(tab), expected(0.0)) > 40.0
         tab.run(set_second(1.2))
-        there = tab.picture()
+        there = settled(tab)
         assert psnr(there, expected(1.2)) > 40.0 > 35.0 > psnr(there, expected(0.0))
         tab.run(tick("vehicle.car"))
-        hidden = tab.picture()
+        hidden = settled(tab)
         assert psnr(hidden, expected(None)) > 40.0
         changed, own = np.abs(hidden - there).max(axis=2) > 0.02, np.abs(expected(1.2) - expected(None)).max(axis=2)
         assert changed.any() and not (changed & (own < 0.004)).any(), "only the car's pixels"
         tab.run(tick("sky"))
-        assert psnr(tab.picture(), expected(None, behind=None)) > 40.0
+        assert psnr(settled(tab), expected(None, behind=None)) > 40.0
         tab.run(f"{tick('vehicle.car')}; {tick('sky')}; {set_second(1.8)}")
-        assert psnr(tab.picture(), expected(None)) > 40.0, "absent by then"
+        assert psnr(settled(tab), expected(None)) > 40.0, "absent by then"
         tab.run(set_second(1.0))
         for kind, buttons in (("mousePressed", 1), ("mouseReleased", 0)):
             middle = (250.5 + 0.5) / 2, (122.25 + 0.5) / 2
@@ -356,7 +270,7 @@ def test_objects_move_with_the_time_and_can_be_hidden_and_picked(tmp_path):
         assert about.startswith(f"vehicle.car {CAR} · 3.0 m/s") and step == f'- remove: {{track: "{CAR[:8]}"}}'
         tab.run(f'{set_second(0.5)}; document.getElementById("follow").click()')
         ahead = rigid(camera[:3, :3], camera[:3, 3] + 0.5 * camera[:3, 2])
-        assert psnr(tab.picture(), expected(0.5, ahead)) > 40.0
+        assert psnr(settled(tab), expected(0.5, ahead)) > 40.0
         assert tab.complaints == []
 
 
@@ -365,16 +279,15 @@ def test_boxes_are_drawn_around_their_objects(tmp_path):
     """The lines of the box pass through the projections of its corners; nothing is drawn elsewhere."""
     frame, car = oblique_frame(), driving_car()
     file = tmp_path / "viewer.html"
-    page = viewer_page(
-        {"background": SampledGroup(splats(1, sh_degree=1)), CAR: car}, None, False, path_from(frame), "t", {}
-    )
+    groups = {"background": SampledGroup(splats(1, sh_degree=1)), CAR: car}
+    page = viewer_page(ViewerContent(groups, None, False, path_from(frame)), "t", {})
     file.write_text(page, encoding="utf-8")
     with chromium(tmp_path / "profile") as tab:
         tab.open(file, 2 * WIDTH, 2 * HEIGHT)
         tab.run(SHOWN_WITHOUT_WORDS)
-        before = tab.picture()
+        before = settled(tab)
         tab.run(f"{tick('boxes')}; {set_second(0.0)}")
-        lines = np.abs(tab.picture() - before).max(axis=2) > 0.05
+        lines = np.abs(settled(tab) - before).max(axis=2) > 0.05
         assert tab.complaints == []
     signs = np.array([(x, y, z) for x in (-2.0, 2.0) for y in (-2.0, 2.0) for z in (-2.0, 2.0)])
     corners = signs @ car_pose(0.0)[:3, :3].T + car_pose(0.0)[:3, 3]
@@ -398,15 +311,15 @@ def test_play_moves_the_time_on_and_buttons_jump_to_key_frames(tmp_path):
         assert tab.run(clock) == 0.0
         for button, second in (("next", 0.5), ("next", 2.0), ("previous", 0.5)):
             tab.run(f'document.getElementById("{button}").click()')
-            tab.picture()
+            settled(tab)
             assert tab.run(clock) == second
         tab.run('document.getElementById("play").click()')
         tab.run("new Promise((done) => setTimeout(done, 400))")
         tab.run('document.getElementById("play").click()')
-        tab.picture()
+        settled(tab)
         stopped = tab.run(clock)
         assert 0.6 < stopped < 2.0
-        tab.picture()
+        settled(tab)
         assert tab.run(clock) == stopped
         assert tab.complaints == []
 

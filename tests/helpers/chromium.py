@@ -60,6 +60,10 @@ class Tab:
         time."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Page.navigate", url=page.as_uri() if isinstance(page, Path) else page)
+        self.wait_for_load()
+
+    def wait_for_load(self) -> None:
+        """Returns once a page that is being opened has run its scripts for the first time."""
         while self._receive().get("method") != "Page.loadEventFired":
             pass
 

@@ -1,16 +1,7 @@
-// The camera under the mouse. World: metres, z up. Camera: OpenCV (x right, y down, z forward), never rolled by hand.
+// Views and their changes. World: metres, z up. Camera: OpenCV (x right, y down, z forward), never rolled by hand.
 
 const ORBIT_METRES = 10; // the point that an orbit goes around lies so far ahead
-const WHEEL_METRES = 0.01; // a pixel of the wheel's travel
-const WALK_METRES = 0.004; // a millisecond of a key held down
-const CLICK_PIXELS = 4; // a pointer that moves less between press and release has clicked
 const STEEPEST = 1.5; // radians: short of straight up and down, where there is no heading
-
-const MOVES = {
-  KeyW: [0, 0, 1], ArrowUp: [0, 0, 1], KeyS: [0, 0, -1], ArrowDown: [0, 0, -1],
-  KeyA: [-1, 0, 0], ArrowLeft: [-1, 0, 0], KeyD: [1, 0, 0], ArrowRight: [1, 0, 0],
-  KeyE: [0, -1, 0], KeyQ: [0, 1, 0],
-};
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
@@ -67,58 +58,12 @@ function rayAt(view, { focal, center }, x, y) {
   return toWorld(rotationOf(view), [(x - center[0]) / focal[0], (y - center[1]) / focal[1], 1]);
 }
 
-// Calls show(view) whenever mouse, fingers or keys have changed the view, and pick(x, y) for a click without a drag.
-// Returns a function that sets the view.
-function followInput(canvas, start, show, pick) {
-  let view = startView(start);
-  const change = (next) => show((view = next));
-  let drag = null;
-  canvas.addEventListener("pointerdown", (e) => (drag = { x: e.clientX, y: e.clientY, button: e.button, way: 0 }));
-  addEventListener("pointerup", (e) => {
-    if (drag && drag.button === 0 && drag.way < CLICK_PIXELS) pick(e.clientX, e.clientY);
-    drag = null;
-  });
-  addEventListener("pointercancel", () => (drag = null));
-  addEventListener("pointermove", (e) => {
-    if (!drag) return;
-    const [dx, dy] = [e.clientX - drag.x, e.clientY - drag.y];
-    drag = { ...drag, x: e.clientX, y: e.clientY, way: drag.way + Math.abs(dx) + Math.abs(dy) };
-    const focal = pinhole(start, canvas.clientWidth, canvas.clientHeight).focal[0];
-    if (drag.button === 2) change(orbited(view, -dx / focal, -dy / focal));
-    else if (drag.button === 1 || e.shiftKey) change(moved(view, [-dx, -dy, 0].map((d) => (d * ORBIT_METRES) / focal)));
-    else change(turned(view, dx / focal, dy / focal));
-  });
-  canvas.addEventListener("contextmenu", (e) => e.preventDefault());
-  canvas.addEventListener("wheel", (e) => {
-    e.preventDefault();
-    const pixels = e.deltaY * (e.deltaMode === 1 ? 30 : 1);
-    change(moved(view, [0, 0, -pixels * WHEEL_METRES]));
-  }, { passive: false });
-  followKeys((step) => change(moved(view, step)), () => change(startView(start)));
-  change(view);
-  return change;
-}
-
-// Walks while keys are held, at one speed whatever the frame rate.
-function followKeys(walk, restart) {
-  const held = new Set();
-  let last = 0;
-  const step = (now) => {
-    if (!held.size) return;
-    const metres = Math.min(now - last, 100) * WALK_METRES;
-    last = now;
-    const directions = [...held].map((code) => MOVES[code]);
-    walk([0, 1, 2].map((i) => metres * directions.reduce((sum, direction) => sum + direction[i], 0)));
-    requestAnimationFrame(step);
-  };
-  addEventListener("keydown", (e) => {
-    if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("input, select, button")) return;
-    if (e.code === "KeyR") restart();
-    if (!(e.code in MOVES)) return;
-    e.preventDefault();
-    if (!held.size) requestAnimationFrame((now) => { last = now; step(now); });
-    held.add(e.code);
-  });
-  addEventListener("keyup", (e) => held.delete(e.code));
-  addEventListener("blur", () => held.clear());
+// What two fingers do that go from two points, `before`, to two others: a step of the camera, which moves the street at
+// ORBIT_METRES along with them; apart by a factor e goes as far ahead.
+function pinchStep(before, after, focal) {
+  const middle = ([a, b]) => [(a.x + b.x) / 2, (a.y + b.y) / 2];
+  const apart = ([a, b]) => Math.max(1, Math.hypot(a.x - b.x, a.y - b.y));
+  const [from, to] = [middle(before), middle(after)];
+  const pan = [0, 1].map((i) => ((from[i] - to[i]) * ORBIT_METRES) / focal);
+  return [...pan, ORBIT_METRES * Math.log(apart(after) / apart(before))];
 }

@@ -33,11 +33,13 @@ function valueTexture(gl, unit, values, channels, [internal, format, type]) {
   }
   const padded = new values.constructor(width * height * channels);
   padded.set(values);
+  const texture = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0 + unit);
-  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+  gl.bindTexture(gl.TEXTURE_2D, texture);
   gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, padded);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  return texture;
 }
 
 function skyTexture(gl, unit, texels, size) {
@@ -51,20 +53,32 @@ function skyTexture(gl, unit, texels, size) {
   gl.texParameteri(gl.TEXTURE_CUBE_MAP, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
 }
 
-// The poses of the groups, a line for each: filled anew for every picture.
-function poseTexture(gl, unit, groups) {
-  gl.activeTexture(gl.TEXTURE0 + unit);
+// Which instance each row belongs to; set anew for another drive.
+function instanceTexture(gl, unit) {
+  let texture = null;
+  return (ranges) => {
+    const numbers = new Uint16Array(ranges.reduce((sum, { begin, end }) => sum + end - begin, 0));
+    ranges.forEach(({ begin, end, row }, number) => numbers.fill(number, row, row + end - begin));
+    gl.deleteTexture(texture);
+    texture = valueTexture(gl, unit, numbers, 1, [gl.R16UI, gl.RED_INTEGER, gl.UNSIGNED_SHORT]);
+  };
+}
+
+// The poses of the instances, a line for each: filled anew for every picture.
+function poseTexture(gl, unit) {
   const texture = gl.createTexture();
+  gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D, texture);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, 3, groups);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  const values = new Float32Array(12 * groups);
-  return (poses) => {
-    poses.forEach((pose, group) => pose && values.set(pose, 12 * group));
+  return (ranges) => {
+    const values = new Float32Array(16 * ranges.length);
+    ranges.forEach(({ begin, row, pose }, line) => {
+      if (pose) values.set([...pose, begin - row, 1], 16 * line);
+    });
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 3, groups, gl.RGBA, gl.FLOAT, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 4, ranges.length, 0, gl.RGBA, gl.FLOAT, values);
   };
 }
 
@@ -78,7 +92,6 @@ function uploadTextures(gl, arrays, uniforms) {
     opacities: [1, [gl.R8, gl.RED, gl.UNSIGNED_BYTE]],
     sh0: [3, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT]],
     shN: [3, [gl.RGB8_SNORM, gl.RGB, gl.BYTE]],
-    group: [1, [gl.R16UI, gl.RED_INTEGER, gl.UNSIGNED_SHORT]],
   };
   Object.entries(formats).forEach(([name, [channels, format]], unit) => {
     valueTexture(gl, unit, arrays[name], channels, format);
@@ -87,7 +100,7 @@ function uploadTextures(gl, arrays, uniforms) {
   return Object.keys(formats).length;
 }
 
-// Two triangles over [-1, 1]², and for every instance which Gaussian it is.
+// Two triangles over [-1, 1]², and for each drawing of them its row.
 function geometry(gl) {
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
@@ -109,32 +122,36 @@ function setCamera(gl, { made, uniforms }, rotation, position, { focal, center }
   gl.uniform2fv(uniforms.size, size);
 }
 
-// Returns draw(view, poses, skyShown): the sky, then the Gaussians over it, far to near; `poses` has the pose of each
-// group, null where it is not shown. Throws where the browser has no WebGL 2.
+// Returns { setDrive, setOrder, draw }. setDrive(ranges) tells which rows there are, setOrder(rows) which are drawn, far
+// to near; draw(view, ranges, skyShown) draws the sky, then them over it. A range has with `pose` the pose of its
+// instance, null if it is not shown. Throws where the browser has no WebGL 2.
 function painter(canvas, scene, arrays) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
   if (!gl) throw new Error("this browser has no WebGL 2; update it, or allow it to use the graphics card");
   const [sky, splat] = [program(gl, SKY_VERTEX, SKY_FRAGMENT), program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT)];
   gl.useProgram(splat.made);
   const unit = uploadTextures(gl, arrays, splat.uniforms);
-  const setPoses = poseTexture(gl, unit, scene.groups.length);
-  gl.uniform1i(splat.uniforms.poses, unit);
+  const [setDrive, setPoses] = [instanceTexture(gl, unit), poseTexture(gl, unit + 1)];
+  gl.uniform1i(splat.uniforms.instance, unit);
+  gl.uniform1i(splat.uniforms.poses, unit + 1);
   gl.uniform1f(splat.uniforms.shRange, scene.sh_range);
   gl.uniform1i(splat.uniforms.coefficients, scene.coefficients);
   gl.uniform1i(splat.uniforms.antialiased, scene.antialiased);
   gl.useProgram(sky.made);
-  skyTexture(gl, unit + 1, arrays.sky, scene.sky_size);
-  gl.uniform1i(sky.uniforms.sky, unit + 1);
+  skyTexture(gl, unit + 2, arrays.sky, scene.sky_size);
+  gl.uniform1i(sky.uniforms.sky, unit + 2);
   geometry(gl);
   gl.clearColor(0, 0, 0, 1);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-  const order = depthOrder(arrays.means, scene.groups.map((group) => group.gaussians), NEAR);
-  return (view, poses, skyShown) => {
+  let count = 0;
+  const setOrder = (rows) => {
+    count = rows.length;
+    gl.bufferData(gl.ARRAY_BUFFER, rows, gl.DYNAMIC_DRAW);
+  };
+  const draw = (view, ranges, skyShown) => {
     const size = [canvas.width, canvas.height];
     const [rotation, lens] = [rotationOf(view), pinhole(scene.start, ...size)];
-    const shown = order(rotation.map((row) => row[2]), view.position, poses);
-    gl.bufferData(gl.ARRAY_BUFFER, shown, gl.DYNAMIC_DRAW);
-    setPoses(poses);
+    setPoses(ranges);
     gl.viewport(0, 0, ...size);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.disable(gl.BLEND);
@@ -144,6 +161,7 @@ function painter(canvas, scene, arrays) {
     }
     gl.enable(gl.BLEND);
     setCamera(gl, splat, rotation, view.position, lens, size);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, shown.length);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
   };
+  return { setDrive, setOrder, draw };
 }

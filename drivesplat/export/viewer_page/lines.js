@@ -53,19 +53,20 @@ function cutOff(from, to) {
   return [from[2] < near ? cut : from, to[2] < near ? cut : to];
 }
 
-// The lines of a second: boxes of the shown objects, and the recorded path with the camera on it.
-function linesAt(scene, arrays, poses, second, { boxes, path }) {
+// The lines of a second: boxes of the shown instances, and the path of the camera, by its rows, with the camera on it.
+function linesAt(scene, arrays, instances, poses, rows, second, { boxes, path }) {
   const segments = [];
   const add = (points, edges, color) => edges.forEach(([a, b]) => segments.push([points[a], points[b], color]));
   if (boxes) {
-    scene.groups.forEach((group, number) => {
-      if (group.size && poses[number]) add(boxCorners(poses[number], group.size), BOX_EDGES, "#ffd166");
+    instances.forEach(({ size }, number) => {
+      if (size && poses[number]) add(boxCorners(poses[number], size), BOX_EDGES, "#ffd166");
     });
   }
   if (path) {
-    const places = Array.from(arrays.camera_seconds, (_, i) => [3, 7, 11].map((j) => arrays.camera_poses[12 * i + j]));
+    const places = [];
+    for (let i = rows[0]; i < rows[1]; i++) places.push([3, 7, 11].map((j) => arrays.camera_poses[12 * i + j]));
     places.slice(1).forEach((place, i) => segments.push([places[i], place, "#06d6a0"]));
-    const pose = poseBetween(arrays.camera_seconds, arrays.camera_poses, [0, places.length], second);
+    const pose = poseBetween(arrays.camera_seconds, arrays.camera_poses, rows, second);
     add(frustumCorners(pose, scene.start), FRUSTUM_EDGES, "#06d6a0");
   }
   return segments;

@@ -1,8 +1,5 @@
 // Opens the page: unpacks the arrays, then draws whenever the view, the time or the window has changed.
 
-const HINT = "Drag: look · right drag: orbit · shift drag: pan · wheel or W A S D Q E: move · R: back to the start · " +
-  "space: play · click: pick an object";
-
 // The arrays by name from zlib-compressed base64, one after the other in little-endian order (that of WebGL machines).
 async function unpacked(text, layout) {
   const packed = atob(text);
@@ -17,35 +14,70 @@ async function unpacked(text, layout) {
     [name, new kinds[dtype](buffer, offset, length)]));
 }
 
+// The drive that the state names: its instances, where their rows are, and the rows of its camera's path.
+function driveOf(scene, edit) {
+  const instances = instancesOf(scene.groups, edit);
+  return { edit, instances, ranges: rowRanges(scene.groups, instances), camera: cameraRows(scene, edit) };
+}
+
+// The ranges of a drive's instances with their poses at the state's second, null for those not shown; and these poses
+// without scale.
+function posed({ instances, ranges }, arrays, { second, hidden }) {
+  const poses = instances.map((one) => (hidden.has(one.id) ? null : instancePose(one, arrays, second)));
+  return [ranges.map((range, i) => ({ ...range, pose: scaledPose(poses[i], instances[i].scale) })), poses];
+}
+
+function openingState(scene) {
+  return {
+    view: startView(scene.start), second: scene.start.second, playing: false, speed: 1, following: false,
+    sky: scene.has_sky, boxes: false, path: false, hidden: new Set(), edit: null, image: "none", opacity: 0.5,
+    ...stateIn(location.hash, scene.edits),
+  };
+}
+
 async function openPage() {
   const text = (id) => document.getElementById(id).textContent;
   const scene = JSON.parse(text("scene"));
   const arrays = await unpacked(text("payload"), scene.arrays);
   document.getElementById("payload").remove(); // no longer needed, megabytes
   const [canvas, over] = [document.getElementById("splat"), document.getElementById("lines")];
-  const [draw, drawLines] = [painter(canvas, scene, arrays), linePainter(over, scene.start)];
-  const span = [arrays.camera_seconds[0], arrays.camera_seconds[arrays.camera_seconds.length - 1]];
-  const state = {
-    view: startView(scene.start), second: scene.start.second, playing: false, speed: 1, following: false,
-    sky: scene.has_sky, boxes: false, path: false, hidden: new Set(),
-  };
-  const poses = () => scene.groups.map((group, number) =>
-    state.hidden.has(number) ? null : groupPose(group, arrays, state.second));
-  let [waiting, before] = [false, null];
+  const [paint, drawLines] = [painter(canvas, scene, arrays), linePainter(over, scene.start)];
+  const [state, showImage] = [openingState(scene), imageLayer(scene.images, scene.start)];
+  const span = scene.camera.map((row, end) => arrays.camera_seconds[row - end]);
+  let [drive, waiting, before] = [null, false, null];
   const redraw = () => {
     if (waiting) return;
     waiting = true;
     requestAnimationFrame((now) => {
       waiting = false;
       advance(now);
-      if (state.following) setView(recordedView(arrays, state.second), true);
-      const groupPoses = poses();
-      draw(state.view, groupPoses, state.sky);
-      drawLines(state.view, linesAt(scene, arrays, groupPoses, state.second, state));
-      update();
-      document.documentElement.dataset.shown = "yes";
+      show();
       if (state.playing) redraw();
     });
+  };
+  const change = (part) => { Object.assign(state, part); redraw(); };
+  const sorter = sorterOf(arrays.means.slice(), NEAR, (rows) => { paint.setOrder(rows); redraw(); });
+  const fillList = shownList(state, scene.has_sky, change);
+  const update = timeBar(state, span, scene.key_frames, change);
+  const show = () => {
+    const another = !drive || drive.edit !== state.edit;
+    if (another) {
+      drive = driveOf(scene, state.edit);
+      fillList(drive.instances);
+      showPicked(null);
+    }
+    if (state.following) state.view = cameraView(arrays, drive.camera, state.second);
+    if (showImage(state, canvas)) fit();
+    const [ranges, poses] = posed(drive, arrays, state);
+    const seen = [rotationOf(state.view).map((row) => row[2]), state.view.position, ranges];
+    if (another) {
+      paint.setDrive(ranges);
+      paint.setOrder(sorter.now(...seen));
+    } else sorter.later(...seen);
+    paint.draw(state.view, ranges, state.sky);
+    drawLines(state.view, linesAt(scene, arrays, drive.instances, poses, drive.camera, state.second, state));
+    update();
+    document.documentElement.dataset.shown = sorter.settled() ? "yes" : "sorting";
   };
   const advance = (now) => {
     if (state.playing && before !== null) {
@@ -54,37 +86,34 @@ async function openPage() {
     }
     before = state.playing ? now : null;
   };
-  const change = (part) => { Object.assign(state, part); redraw(); };
-  const update = timeBar(state, span, scene.key_frames, change);
-  shownList(state, scene.groups, scene.has_sky, change);
   followCopy();
+  editChooser(scene, state, change);
+  imageChooser(scene, state, change);
+  methodChooser(scene, state);
+  const hideHint = hints();
+  const byHand = (view) => { hideHint(); change({ view, following: false }); }; // the user's hand ends the ride
   const pick = (x, y) => {
     const ray = rayAt(state.view, pinhole(scene.start, canvas.clientWidth, canvas.clientHeight), x, y);
-    const number = pickedGroup(scene.groups, arrays, state.second, state.hidden, state.view.position, ray);
-    const group = number === null ? null : scene.groups[number];
-    showPicked(group, group && groupSpeed(group, arrays, state.second));
+    const found = pickedInstance(drive.instances, posed(drive, arrays, state)[1], state.view.position, ray);
+    showPicked(found, drive.instances.map(({ id }) => id), found && instanceSpeed(found, arrays, state.second));
   };
-  let followed = false;
-  const set = followInput(canvas, scene.start, (view) => {
-    change(followed ? { view } : { view, following: false }); // the user's hand ends the ride
-  }, pick);
-  const setView = (view, asRecorded) => { followed = asRecorded; set(view); followed = false; };
+  const restart = () => byHand(startView(scene.start));
+  followInput(canvas, scene.start, (moved) => byHand(moved(state.view)), restart, pick);
   const fit = () => {
     const sharpness = Math.min(devicePixelRatio, 2);
     for (const layer of [canvas, over]) {
       layer.width = Math.max(1, Math.round(layer.clientWidth * sharpness));
       layer.height = Math.max(1, Math.round(layer.clientHeight * sharpness));
     }
-    redraw();
   };
   canvas.addEventListener("webglcontextlost", () => tell("The browser lost access to the GPU: reload the page."));
-  addEventListener("resize", fit);
+  addEventListener("resize", () => { fit(); redraw(); });
   fit();
-  tell(HINT);
+  redraw();
 }
 
 function tell(sentence) {
-  document.getElementById("hint").textContent = sentence;
+  Object.assign(document.getElementById("hint"), { textContent: sentence, hidden: false });
 }
 
 openPage().catch((error) => {

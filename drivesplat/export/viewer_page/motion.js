@@ -1,4 +1,4 @@
-// Where the rigid groups and the recorded camera are at a second. Poses are 12 values: three rows of [rotation | place].
+// Where instances of rigid groups and the camera of a drive are at a second. Poses are 12 values: three rows of [rotation | place].
 
 // The pose between two samples, interpolated entry by entry: samples are dense enough for a millimetre.
 function poseBetween(seconds, poses, [first, last], second) {
@@ -17,40 +17,46 @@ function poseBetween(seconds, poses, [first, last], second) {
 
 const STANDING = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]);
 
-function isPresent(group, second) {
-  return !group.present || group.present.some(([first, last]) => first <= second && second <= last);
+function isPresent(instance, second) {
+  return !instance.present || instance.present.some(([first, last]) => first <= second && second <= last);
 }
 
-// The pose of a group at a second; null while it is absent.
-function groupPose(group, arrays, second) {
-  if (!group.samples) return STANDING;
-  if (!isPresent(group, second)) return null;
-  return poseBetween(arrays.motion_seconds, arrays.motion_poses, group.samples, second);
+// The pose of an instance at a second, without its scale; null while it is absent.
+function instancePose({ samples, present }, arrays, second) {
+  if (!samples) return STANDING;
+  if (!isPresent({ present }, second)) return null;
+  return poseBetween(arrays.motion_seconds, arrays.motion_poses, samples, second);
 }
 
-// Metres per second of a moving group at a second.
-function groupSpeed(group, arrays, second) {
+// The same pose for its Gaussians, which grow with `scale` about their origin.
+function scaledPose(pose, scale) {
+  return scale === 1 || !pose ? pose : pose.map((x, i) => (i % 4 === 3 ? x : scale * x));
+}
+
+// Metres per second of a moving instance at a second.
+function instanceSpeed({ samples }, arrays, second) {
   const step = 0.05;
   const [before, after] = [second - step, second + step].map((at) =>
-    poseBetween(arrays.motion_seconds, arrays.motion_poses, group.samples, at));
-  const [first, last] = group.samples.map((row) => arrays.motion_seconds[Math.min(row, group.samples[1] - 1)]);
+    poseBetween(arrays.motion_seconds, arrays.motion_poses, samples, at));
+  const [first, last] = samples.map((row) => arrays.motion_seconds[Math.min(row, samples[1] - 1)]);
   const passed = Math.min(second + step, last) - Math.max(second - step, first);
   const way = Math.hypot(...[3, 7, 11].map((i) => after[i] - before[i]));
   return passed > 0 ? way / passed : 0;
 }
 
-// The recorded camera as a view; `view` holds heading, pitch, roll and position.
-function recordedView(arrays, second) {
-  const pose = poseBetween(arrays.camera_seconds, arrays.camera_poses, [0, arrays.camera_seconds.length], second);
-  const rows = [0, 4, 8].map((i) => Array.from(pose.subarray(i, i + 4)));
-  return { ...anglesOf(rows.map((row) => row.slice(0, 3))), position: rows.map((row) => row[3]) };
+// The camera of a drive as a view, by the rows of its path; `view` holds heading, pitch, roll and position.
+function cameraView(arrays, rows, second) {
+  const pose = poseBetween(arrays.camera_seconds, arrays.camera_poses, rows, second);
+  const lines = [0, 4, 8].map((i) => Array.from(pose.subarray(i, i + 4)));
+  return { ...anglesOf(lines.map((line) => line.slice(0, 3))), position: lines.map((line) => line[3]) };
 }
 
-// The moving group whose box a ray from `origin` along `direction` (world) meets first at a second; null if none.
-function pickedGroup(groups, arrays, second, hidden, origin, direction) {
+// The moving instance whose box, at its pose, a ray from `origin` along `direction` (world) meets first; null if none.
+// `poses` has null for those that are not shown.
+function pickedInstance(instances, poses, origin, direction) {
   let [nearest, found] = [Infinity, null];
-  groups.forEach((group, number) => {
-    const pose = group.samples && group.size && !hidden.has(number) ? groupPose(group, arrays, second) : null;
+  instances.forEach((instance, number) => {
+    const pose = instance.samples && instance.size ? poses[number] : null;
     if (!pose) return;
     let [enter, leave] = [0, Infinity];
     for (let axis = 0; axis < 3; axis++) {
@@ -59,11 +65,11 @@ function pickedGroup(groups, arrays, second, hidden, origin, direction) {
         from += pose[4 * row + axis] * (origin[row] - pose[4 * row + 3]);
         along += pose[4 * row + axis] * direction[row];
       }
-      const ends = [-group.size[axis] / 2, group.size[axis] / 2].map((end) => (end - from) / along);
+      const ends = [-instance.size[axis] / 2, instance.size[axis] / 2].map((end) => (end - from) / along);
       enter = Math.max(enter, Math.min(...ends));
       leave = Math.min(leave, Math.max(...ends));
     }
-    if (enter < leave && enter < nearest) [nearest, found] = [enter, number];
+    if (enter < leave && enter < nearest) [nearest, found] = [enter, instance];
   });
   return found;
 }

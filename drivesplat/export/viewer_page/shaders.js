@@ -7,11 +7,11 @@ precision highp sampler2D;
 precision highp usampler2D;
 
 layout(location = 0) in vec2 corner;
-layout(location = 1) in uint index;
+layout(location = 1) in uint row;
 
 uniform sampler2D means, scales, quats, opacities, sh0, shN;
-uniform usampler2D group; // the number of each Gaussian's rigid group
-uniform sampler2D poses; // a line for each group: three rows of [rotation | place], group to world
+uniform usampler2D instance; // the number of each row's instance
+uniform sampler2D poses; // a line for each instance: three rows of [rotation | place], and [first, shown, -, -]
 uniform float shRange;
 uniform int coefficients;
 uniform bool antialiased;
@@ -76,8 +76,11 @@ vec3 radiance(uint i, vec3 d) {
 
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: nothing is drawn
-  uint width = uint(textureSize(group, 0).x);
-  int line = int(texelFetch(group, ivec2(int(index % width), int(index / width)), 0).r);
+  uint width = uint(textureSize(instance, 0).x);
+  int line = int(texelFetch(instance, ivec2(int(row % width), int(row / width)), 0).r);
+  vec4 state = texelFetch(poses, ivec2(3, line), 0);
+  if (state.y == 0.0) return; // not shown any more: the order is of a moment ago
+  uint index = uint(int(row) + int(state.x)); // of the Gaussian
   vec4 rows[3] = vec4[3](
     texelFetch(poses, ivec2(0, line), 0), texelFetch(poses, ivec2(1, line), 0), texelFetch(poses, ivec2(2, line), 0));
   mat3 toWorld = transpose(mat3(rows[0].xyz, rows[1].xyz, rows[2].xyz));
@@ -102,7 +105,7 @@ void main() {
     sigmas.y * sqrt(max(mid - spread, 0.0)) * vec2(-major.y, major.x);
   vec2 pixel = focal * p.xy / p.z + center + offset;
   gl_Position = vec4((2.0 * pixel / size - 1.0) * vec2(1.0, -1.0), 0.0, 1.0);
-  color = vec4(radiance(index, normalize(mean - position) * toWorld), alpha);
+  color = vec4(radiance(index, normalize((mean - position) * toWorld)), alpha);
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es

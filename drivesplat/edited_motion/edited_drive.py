@@ -1,0 +1,61 @@
+"""An edited drive as programs play it: which objects there are, where, and the camera's path, as dense samples.
+
+An object of an edited drive is an instance of the Gaussians of a track; copies are further instances of the same.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivesplat.edited_motion.edited_actors import EditedActor
+
+
+@dataclass(frozen=True)
+class InstanceMotion:
+    """Poses `object_to_world` (n, 4, 4) at `seconds` (n,) since the first image. The object is present only during
+    `spans`, each from its first to its last second."""
+
+    seconds: np.ndarray
+    object_to_world: np.ndarray
+    spans: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Instance:
+    """An object of an edited drive with the Gaussians of the track `source`, scaled by `scale` about the centre of its
+    box, which then has `size` (3,) metres. It moves by `motion`; None: as recorded."""
+
+    id: str
+    source: str
+    category: str
+    size: np.ndarray
+    scale: float
+    motion: InstanceMotion | None
+
+
+@dataclass(frozen=True)
+class CameraMotion:
+    """A camera with poses `camera_to_world` (n, 4, 4) at `seconds` (n,) since the first image."""
+
+    seconds: np.ndarray
+    camera_to_world: np.ndarray
+
+
+@dataclass(frozen=True)
+class EditedDrive:
+    """An edit: its objects that can move, and its camera; None: as recorded."""
+
+    name: str
+    instances: tuple[Instance, ...]
+    camera: CameraMotion | None
+
+
+def sampled_actor(actor: EditedActor, seconds: np.ndarray) -> InstanceMotion:
+    """The motion of an edited actor at those of `seconds` (n,) at which it is present. Its spans run from the first to
+    the last of neighbouring ones."""
+    present = actor.present(seconds)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int)))
+    spans = tuple((float(seconds[first]), float(seconds[after - 1])) for first, after in edges.reshape(-1, 2))
+    shown = seconds[present]
+    poses = actor.poses(shown) if len(shown) else np.zeros((0, 4, 4))
+    return InstanceMotion(shown, poses, spans)

@@ -1,0 +1,64 @@
+"""The edits of a scene for programs that play them: samples of every object and of the camera."""
+
+import logging
+from collections.abc import Mapping
+
+import numpy as np
+
+from drivesplat.edited_motion.edited_actors import edited_actors
+from drivesplat.edited_motion.edited_drive import CameraMotion, EditedDrive, Instance, sampled_actor
+from drivesplat.editing.actors import editable_actors
+from drivesplat.editing.ego import edited_camera_path
+from drivesplat.errors import ConfigError
+from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.rendering.trajectory import recorded_frames, sampled_path
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.edit import Edit
+
+log = logging.getLogger(__name__)
+
+
+def edited_drives(
+    checkpoint: TrainedCheckpoint, scene: Scene, camera: str, edits: Mapping[str, Edit], rate: int
+) -> list[EditedDrive]:
+    """The edits of a trained scene, sampled `rate` times a second and at the images of a camera.
+
+    An edit that does not fit the scene or the model is left out with a warning.
+    """
+    if not edits:
+        return []
+    drives, model = [], trained_model(checkpoint)
+    for name, edit in edits.items():
+        where = f"scene {scene.name}, edit {name!r}"
+        try:
+            drives.append(_edited_drive(model, scene, camera, name, edit, rate, where))
+        except ConfigError as error:
+            log.warning("an edit is left out: %s", error)
+    return drives
+
+
+def _edited_drive(
+    model: SplatModel, scene: Scene, camera: str, name: str, edit: Edit, rate: int, where: str
+) -> EditedDrive:
+    actors = editable_actors(model, scene, where)
+    others = {track.id for track in scene.tracks} - {actor.id for actor in actors}
+    ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, camera)])
+    timestamps, _ = sampled_path(scene, camera, rate)
+    seconds = np.array([scene.seconds(timestamp) for timestamp in timestamps])
+    edited = edited_actors(actors, edit, where, others, ego_to_world)
+    instances = tuple(
+        Instance(
+            actor.id, actor.source, actor.category, actor.size, actor.scale,
+            sampled_actor(actor, seconds) if actor.edited else None,
+        )
+        for actor in edited
+    )  # fmt: skip
+    return EditedDrive(name, instances, _edited_camera(scene, camera, edit, rate, where))
+
+
+def _edited_camera(scene: Scene, camera: str, edit: Edit, rate: int, where: str) -> CameraMotion | None:
+    if not any(step.kind == "ego" for step in edit.steps):
+        return None
+    path = edited_camera_path(scene, camera, rate, edit, where)
+    return CameraMotion(np.array([scene.seconds(timestamp) for timestamp in path.timestamps]), path.camera_to_world)

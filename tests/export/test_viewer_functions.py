@@ -1,0 +1,147 @@
+"""Functions of viewer.html's scripts that need no browser, by Node."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivesplat.export import viewer_page
+
+FOLDER = Path(viewer_page.__file__).parent
+NODE = shutil.which("node")
+pytestmark = pytest.mark.skipif(NODE is None, reason="no Node here")
+
+
+def by_node(*files: str, expression: str, **values: object) -> object:
+    """The value of an expression with some of the page's scripts and with `values`."""
+    source = [(FOLDER / f"{name}.js").read_text(encoding="utf-8") for name in files]
+    source += [f"const {name} = {json.dumps(value)};" for name, value in values.items()]
+    source.append(f"Promise.resolve({expression}).then((value) => console.log(JSON.stringify(value)));")
+    done = subprocess.run([str(NODE), "-"], input="\n".join(source), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_rows_are_sorted_far_to_near_instance_by_instance():
+    """Two groups, the second twice, once of double size; Gaussians behind the camera and hidden ones are left out."""
+    rng = np.random.default_rng(0)
+    centers = rng.uniform(-5.0, 5.0, (60, 3)).astype(np.float32)
+    poses = [
+        np.eye(4)[:3],
+        np.hstack([2.0 * np.eye(3), [[1.0], [2.0], [3.0]]]),
+        np.hstack([np.eye(3), [[4.0], [0], [0]]]),
+    ]
+    ranges = [(0, 40, 0, poses[0]), (40, 60, 40, poses[1]), (40, 60, 60, None), (40, 60, 80, poses[2])]
+    axis, position = np.array([0.6, 0.0, 0.8]), np.array([-1.0, 0.5, -2.0])
+    records = [
+        {"begin": begin, "end": end, "row": row, "pose": None if pose is None else pose.ravel().tolist()}
+        for begin, end, row, pose in ranges
+    ]
+    rows = by_node(
+        "camera", "order", axis=axis.tolist(), position=position.tolist(), centers=centers.ravel().tolist(),
+        ranges=records,
+        expression="Array.from(depthOrder(new Float32Array(centers), 0.01)(axis, position, ranges))",
+    )  # fmt: skip
+    depths = {}
+    for begin, end, row, pose in ranges:
+        if pose is not None:
+            depth = (centers[begin:end] @ pose[:, :3].T + pose[:, 3] - position) @ axis
+            depths |= {row + i: value for i, value in enumerate(depth) if value > 0.01}
+    assert 40 < len(depths) < 80
+    assert sorted(rows) == sorted(depths)
+    np.testing.assert_array_equal(np.diff([depths[row] for row in rows]) <= 1e-5, True)
+
+
+def test_while_the_worker_sorts_the_page_keeps_the_last_order_and_asks_for_the_newest():
+    """A worker that answers when it is told to: of three further wishes made meanwhile, the last is sorted."""
+    sequence = """(() => {
+      const [asked, shown] = [[], []];
+      const worker = { postMessage: (data) => asked.push(data) };
+      globalThis.Worker = function () { return worker; };
+      globalThis.URL = { createObjectURL: () => "" };
+      const ranges = [{ begin: 0, end: 1, row: 0, pose: STANDING }];
+      const sorter = sorterOf(new Float32Array(3), 0.01, (rows) => shown.push(rows));
+      const wish = (x) => sorter.later([0, 0, 1], [x, 0, -1], ranges);
+      sorter.now([0, 0, 1], [0, 0, -1], ranges);
+      wish(0); // as it is
+      wish(1); wish(2); wish(3); wish(4);
+      const [before, settled] = [shown.length, [sorter.settled()]];
+      worker.onmessage({ data: { number: 1, rows: "first" } });
+      settled.push(sorter.settled());
+      worker.onmessage({ data: { number: 2, rows: "last" } });
+      settled.push(sorter.settled());
+      return { before, settled, shown, asked: asked.slice(1).map(({ position }) => position[0]) };
+    })()"""
+    found = by_node("camera", "motion", "order", "sorter", expression=sequence)
+    assert found == {"before": 0, "settled": [False, False, True], "shown": ["first", "last"], "asked": [1, 4]}
+
+
+def test_an_address_brings_back_view_time_and_edit_and_ignores_nonsense():
+    view = {"heading": 0.25, "pitch": -0.125, "roll": 0.5, "position": [1.5, -2.25, 1e3]}
+    edits = [{"name": "a & b"}, {"name": "other"}]
+    state = {"view": view, "second": 1.25, "following": True}
+    back = by_node(
+        "link", state=state, edits=edits, expression="stateIn(fragmentOf({ ...state, edit: edits[0] }), edits)"
+    )
+    assert back == {**state, "edit": edits[0]}
+    for fragment in ("", "#", "#second=x&view=1,2&edit=gone", "#view=1,2,3,4,5,NaN"):
+        assert by_node("link", fragment=fragment, expression="stateIn(fragment, [])") == {}
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("/home/results/0061/street/viewer.html", "../gsplat%20d/viewer.html"),
+        ("/C:/results/0061/street/viewer.html", "../gsplat%20d/viewer.html"),
+        ("/report/data/raw/0a1b/viewer.html", None),
+        ("/downloads/viewer.html", None),
+    ],
+)
+def test_pages_beside_are_those_in_the_folders_of_methods(path, expected):
+    assert by_node("link", path=path, expression='pageBeside(path, "street", "gsplat d")') == expected
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [
+        ({"second": 0.5, "image": "over"}, 0.5),
+        ({"second": 0.505, "image": "over"}, 0.5),
+        ({"second": 0.6, "image": "over"}, None),
+        ({"second": 0.5, "image": "over", "playing": True}, None),
+        ({"second": 0.5, "image": "over", "following": False}, None),
+        ({"second": 0.9, "image": "beside", "playing": True}, 0.5),
+        ({"second": 0.5, "image": "none"}, None),
+    ],
+)
+def test_an_image_is_shown_at_its_key_frame_on_the_path_of_the_camera(state, expected):
+    images = [{"second": 0.0}, {"second": 0.5}, {"second": 1.0}]
+    shown = by_node(
+        "images", images=images, state={"playing": False, "following": True, **state},
+        expression="imageAt(images, state)",
+    )  # fmt: skip
+    assert (shown and shown["second"]) == expected
+
+
+def test_ids_are_shortened_as_far_as_they_stay_unique():
+    ids = ["0a8dee9e8b4b", "0a8dee9e8b4c", "f00dee9e8b4b", "twin"]
+    shortened = by_node("drives", ids=ids, expression="ids.map((id) => shortId(id, ids))")
+    assert shortened == ["0a8dee9e8b4b", "0a8dee9e8b4c", "f00dee9e", "twin"]
+
+
+def test_an_edit_keeps_what_is_static_and_replaces_what_moves():
+    groups = [
+        {"name": "background", "gaussians": 5, "samples": None, "present": None},
+        {"name": "car", "gaussians": 3, "samples": [0, 4], "present": [[0, 1]], "category": "vehicle.car"},
+    ]
+    edit = {"instances": [{"id": "car", "group": 1}, {"id": "twin", "group": 1, "scale": 2, "samples": [4, 9]}]}
+    instances = by_node("drives", groups=groups, edit=edit, expression="instancesOf(groups, edit)")
+    assert [(one["id"], one["scale"], one["samples"]) for one in instances] == [
+        ("background", 1, None), ("car", 1, [0, 4]), ("twin", 2, [4, 9]),
+    ]  # fmt: skip
+    ranges = by_node("drives", groups=groups, edit=edit, expression="rowRanges(groups, instancesOf(groups, edit))")
+    assert [(one["begin"], one["end"], one["row"]) for one in ranges] == [(0, 5, 0), (5, 8, 5), (5, 8, 8)]
+    gone = by_node("drives", groups=groups, expression="instancesOf(groups, { instances: [] })")
+    assert [one["id"] for one in gone] == ["background"]
