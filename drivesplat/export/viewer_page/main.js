@@ -43,7 +43,7 @@ async function openPage() {
   const [canvas, over] = [document.getElementById("splat"), document.getElementById("lines")];
   const [paint, drawLines] = [painter(canvas, scene, arrays), linePainter(over, scene.start)];
   const [state, showImage] = [openingState(scene), imageLayer(scene.images, scene.start)];
-  const span = scene.camera.map((row, end) => arrays.camera_seconds[row - end]);
+  const span = [scene.camera[0], scene.camera[1] - 1].map((row) => arrays.camera_seconds[row]);
   let [drive, waiting, before] = [null, false, null];
   const redraw = () => {
     if (waiting) return;
