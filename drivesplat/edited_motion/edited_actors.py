@@ -7,11 +7,12 @@ import numpy as np
 
 from drivesplat.edited_motion.actor_path import ActorPath, recorded_path
 from drivesplat.edited_motion.placed_path import placed_motion
+from drivesplat.edited_motion.recolouring import color_matrix
 from drivesplat.edited_motion.steps import apply_duplicate, apply_reverse, apply_shift, apply_speed, apply_stop
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.tracks import short_ids
-from drivesplat.settings.edit import Duplicate, Edit, Place, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
+from drivesplat.settings.edit import Duplicate, Edit, Place, Recolour, Rescale, Reverse, Shift, Speed, Step, Stop, Swap
 
 MIN_DISTANCE = 0.5
 """Metres; an actor that moves less counts as standing, since annotations are noisy."""
@@ -24,8 +25,8 @@ ORIGIN = np.eye(4)[None]
 @dataclass(frozen=True)
 class EditedActor:
     """An actor of an edited drive: `id` is a track's or the name of a duplicate. It has the Gaussians of the track
-    `source`, scaled by `scale` about the box centre to `size` (3,): length, width, height in metres. Unless
-    `edited` it moves as recorded."""
+    `source`, scaled by `scale` about the box centre to `size` (3,): length, width, height in metres, their
+    RGB colours mapped by `color_matrix` (3, 3; None: as trained). Unless `edited` it is as recorded."""
 
     id: str
     source: str
@@ -34,6 +35,7 @@ class EditedActor:
     size: np.ndarray
     edited: bool
     path: ActorPath = field(repr=False)
+    color_matrix: np.ndarray | None = None
 
     @classmethod
     def recorded(cls, id: str, category: str, size: np.ndarray, motion: Motion) -> "EditedActor":
@@ -129,6 +131,10 @@ def _after_step(state: _EditState, step: Step, number: int) -> _EditState:
         case Rescale():
             scale, size = actor.scale * change.factor, actor.size * change.factor
             return state.with_actors(replace(actor, scale=scale, size=size, edited=True))
+        case Recolour():
+            matrix = color_matrix(change)
+            before = np.eye(3) if actor.color_matrix is None else actor.color_matrix
+            return state.with_actors(replace(actor, color_matrix=matrix @ before, edited=True))
         case Speed() | Stop() | Reverse() | Shift():
             return state.with_actors(replace(actor, path=_changed_path(actor.path, change), edited=True))
         case _:

@@ -96,7 +96,7 @@ def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list
         poses = actor.poses(seconds) if actor.edited else None
         for number in np.flatnonzero(actor.present(seconds)):
             pose = poses[number] if poses is not None else None
-            result[number].append(ActorPlacement(actor.source, pose, actor.scale))
+            result[number].append(ActorPlacement(actor.source, pose, actor.scale, actor.color_matrix))
     return result
 
 
@@ -157,7 +157,8 @@ def track_labels(
     """A record for every actor, then for every other annotated movable object, which stays as recorded: the model has
     it in its static part. `editable`: the ids of all editable tracks, removed ones included; `seconds` (n,) of frames.
 
-    `size` is length, width, height in metres, `scale` included; `object_to_world` (n times (4, 4)) is at the box
+    `size` is length, width, height in metres, `scale` included; `color_matrix` (3, 3) maps its RGB colours in [0, 1]
+    (None: unchanged); `object_to_world` (n times (4, 4)) is at the box
     centre, rounded to 1e-6, None in frames where the object is absent.
     """
     others = (track for track in scene.tracks if track.object_class.is_dynamic and track.id not in editable)
@@ -172,6 +173,7 @@ def track_labels(
                 "size": actor.size.tolist(),
                 "source": actor.source,
                 "scale": actor.scale,
+                "color_matrix": None if actor.color_matrix is None else actor.color_matrix.round(DECIMALS).tolist(),
                 "edited": actor.edited,
                 "editable": i < len(actors),
                 "object_to_world": [pose.tolist() if now else None for now, pose in zip(present, poses, strict=True)],

@@ -19,7 +19,7 @@ from drivesplat.kernels import torch_private
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import Gaussians, concatenate, recolored
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
@@ -124,11 +124,19 @@ class Actors(Part):
         for placement in (placement for placement in placements if placement.source in known):
             repeated = placement.source in {other.source for other in first}
             (copies if repeated else first).append(placement)
-        sets = [self.placed(state, with_placements(poses, known, first))]
+        sets = [self._recolored(self.placed(state, with_placements(poses, known, first)), first)]
         for placement in copies:  # few: transforming all actors for each copy costs little
-            placed = self.placed(state, with_placements(poses, known, [placement]))
+            placed = self._recolored(self.placed(state, with_placements(poses, known, [placement])), [placement])
             sets.append(placed[self.params["owner"] == known.index(placement.source)])
         return concatenate(sets)
+
+    def _recolored(self, gaussians: Gaussians, placements: Sequence[ActorPlacement]) -> Gaussians:
+        """All rows of `gaussians`, those of placements with a colour matrix in its colours."""
+        for placement in placements:
+            if placement.color_matrix is not None:
+                matrix = torch.from_numpy(placement.color_matrix).to(gaussians.sh0)
+                gaussians = recolored(gaussians, matrix, self.of_track(placement.source))
+        return gaussians
 
     def placed(self, state: TimeState, poses: ObjectPoses) -> Gaussians:
         """The Gaussians in world coordinates with their actors placed anywhere, in the colours of a time state."""

@@ -9,6 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from drivesplat.kernels.spherical_harmonics import SH_C0
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -45,6 +47,17 @@ class Gaussians:
     def sh_degree(self) -> int:
         """The degree of the spherical harmonics: k = (degree + 1)² coefficients."""
         return math.isqrt(1 + self.shN.shape[1]) - 1
+
+
+def recolored(gaussians: Gaussians, matrix: Float[Tensor, "3 3"], chosen: Bool[Tensor, " n"]) -> Gaussians:
+    """The same Gaussians with the RGB colours of the `chosen` mapped by a matrix. Does not wait for the device.
+
+    A colour is 0.5 plus the sum of its harmonics: the constant passes through the matrix, too.
+    """
+    constant = 0.5 * (matrix.sum(dim=1) - 1.0) / SH_C0
+    rows = chosen[:, None, None]
+    sh0 = torch.where(rows, gaussians.sh0 @ matrix.T + constant, gaussians.sh0)
+    return replace(gaussians, sh0=sh0, shN=torch.where(rows, gaussians.shN @ matrix.T, gaussians.shN))
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:

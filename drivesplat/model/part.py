@@ -25,11 +25,13 @@ FADED = 1e-4
 @dataclass(frozen=True)
 class ActorPlacement:
     """An edited pose of an object at one time: the Gaussians of the track `source`, scaled by `scale` about the box
-    centre, at `object_to_world` (4, 4) in world metres (None: the recorded pose)."""
+    centre, at `object_to_world` (4, 4) in world metres (None: the recorded pose), their RGB colours mapped by
+    `color_matrix` (3, 3) (None: as trained)."""
 
     source: str
     object_to_world: np.ndarray | None = None
     scale: float = 1.0
+    color_matrix: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Edits of a recorded drive: changed motion of tracks and of the camera.
+"""Edits of a recorded drive: changed motion and colours of tracks, changed motion of the camera.
 
 Units: metres, degrees, m/s. Times are seconds since the scene's first image, which is the start of the film.
 """
@@ -168,6 +168,47 @@ class Rescale(Settings):
     factor: float = Field(ge=0.1, le=10)
 
 
+def _color(value: Any) -> Any:
+    """A CSS name or '#rrggbb' as red, green and blue in [0, 1]; other values unchanged."""
+    if not isinstance(value, str):
+        return value
+    from PIL import ImageColor  # late: planning rarely needs it
+
+    try:
+        return tuple(channel / 255 for channel in ImageColor.getrgb(value)[:3])
+    except ValueError:
+        raise ValueError(
+            "no colour has this name; give a CSS name, '#rrggbb' in quotes, or [red, green, blue] from 0 to 1"
+        ) from None
+
+
+Channel = Annotated[float, Field(ge=0, le=1)]
+Color = Annotated[tuple[Channel, Channel, Channel], BeforeValidator(_color)]
+"""Red, green and blue in [0, 1], as images encode them. Read from these, a CSS name or '#rrggbb'."""
+
+
+class Recolour(Settings):
+    """Changes the colours of the track, all its surfaces alike."""
+
+    track: Id
+    hue: float = Field(0.0, ge=-360, le=360)
+    """Rotation of the hue (degrees): 120 turns red into green, green into blue, blue into red."""
+    saturation: float = Field(1.0, ge=0, le=10)
+    """Factor on the saturation. 0 = grey."""
+    value: float = Field(1.0, ge=0, le=10)
+    """Factor on the brightness."""
+    colour: Color | None = None
+    """The colour that white becomes; darker surfaces become darker shades of it. Also for grey vehicles."""
+
+    @model_validator(mode="after")
+    def _changes(self) -> "Recolour":
+        if self.colour is not None and (self.hue or self.saturation != 1):
+            raise ValueError("'colour' replaces hue and saturation: give it alone, or with 'value'")
+        if self.colour is None and self.hue % 360 == 0 and self.saturation == self.value == 1:
+            raise ValueError("give at least one of 'hue', 'saturation', 'value' and 'colour', other than 0, 1 and 1")
+        return self
+
+
 class Ego(Gradual):
     """Changes the path and the speed of the ego vehicle, which carries the camera."""
 
@@ -185,7 +226,7 @@ class Ego(Gradual):
         return self
 
 
-Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | Rescale | Ego
+Change = Remove | Speed | Stop | Reverse | Shift | Swap | Duplicate | Place | Rescale | Recolour | Ego
 
 
 class Step(Settings):
@@ -200,6 +241,7 @@ class Step(Settings):
     duplicate: Duplicate | None = None
     place: Place | None = None
     rescale: Rescale | None = None
+    recolour: Recolour | None = None
     ego: Ego | None = None
 
     @model_validator(mode="after")

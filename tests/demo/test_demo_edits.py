@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
-from helpers.demo_worlds import LIDAR, edit_of, named, names_of, pose_at, recorder_of
+from helpers.demo_worlds import FRONT, LIDAR, edit_of, named, names_of, pose_at, recorder_of
 
+from drivesplat.demo.optics.imaging import to_bytes
 from drivesplat.demo.placed import require_free_places
 from drivesplat.demo.recorder import Recorder, Viewpoint
 from drivesplat.demo.street.objects import EGO_BODY
+from drivesplat.edited_motion.recolouring import color_matrix
 from drivesplat.errors import ConfigError
+from drivesplat.settings.edit import Recolour
 
 FILM_START = -0.0355
 """Seconds of the first image after the first key frame: the zero of an edit's seconds."""
@@ -24,13 +27,14 @@ EDITS = {
     "placed": edit_of({"place": {"track": ONCOMING, "as": "new", "path": [[0.0, 60.0, 3.5], [10.0, 10.0, 3.5]]}}),
     "stopped": edit_of({"stop": {"track": AHEAD, "at": 4.0, "duration": 0.0}}),
     "larger": edit_of({"rescale": {"track": AHEAD, "factor": 1.4}}),
+    "painted": edit_of({"recolour": {"track": AHEAD, "hue": 120.0, "value": 0.9}}),
     "ego aside": edit_of({"ego": {"lateral": 1.0}}),
     "ego slower": edit_of({"ego": {"speed": 0.5}}),
     "ego later": edit_of({"ego": {"lateral": 2.0, "start": 4.0, "duration": 2.0}}),
 }
 ALTERED = {"removed": {"vehicle 1"}, "aside": {"vehicle 0"}, "further": {"vehicle 0"}, "turned": {"vehicle 1"},
            "copied": {"twin"}, "late": {"twin"}, "placed": {"new"}, "stopped": {"vehicle 0"},
-           "larger": {"vehicle 0"}}  # fmt: skip
+           "larger": {"vehicle 0"}, "painted": {"vehicle 0"}}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +114,20 @@ def test_a_rescaled_vehicle_stays_on_the_ground(recorder):
     np.testing.assert_allclose(after.poses(TIMES), before.poses(TIMES), atol=5e-3)
     lowest = (after.body.pieces[0].vertices @ pose_at(after, 3.0)[:3, :3].T + pose_at(after, 3.0)[:3, 3])[:, 2].min()
     assert lowest == pytest.approx(0.0, abs=5e-3)
+
+
+def test_a_recoloured_vehicle_is_where_it_was_in_other_colours(recorder):
+    """Pixels of dull surfaces change by the matrix of the step; paint and glass mirror the sky as before."""
+    seen, matrix = 4_000_000, color_matrix(Recolour(track=AHEAD, hue=120.0, value=0.9))
+    before, after = (recorder.picture(FRONT, seen, Viewpoint(edit=edit)) for edit in (None, "painted"))
+    np.testing.assert_array_equal(before.depth, after.depth)
+    car = (before.objects == names_of(recorder).index("vehicle 0")) & np.isfinite(before.depth)
+    then, now = (to_bytes(picture.radiance) / 255.0 for picture in (before, after))
+    np.testing.assert_array_equal(then[~car], now[~car])
+    pixels = then[car], now[car]
+    error = np.abs(pixels[0] @ matrix.T - pixels[1]).max(axis=1)
+    assert len(error) > 30 and (error < 0.02).mean() > 0.3 and np.median(error) < 0.1
+    assert np.median(np.abs(pixels[0] - pixels[1]).max(axis=1)) > 0.02
 
 
 def test_ego_steps_move_the_camera_the_lidar_and_the_ego_vehicles_body(recorder):

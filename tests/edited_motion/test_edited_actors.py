@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.recolouring import color_matrix
 from drivesplat.errors import ConfigError
 from drivesplat.scene.motion import Motion
-from drivesplat.settings.edit import Edit
+from drivesplat.settings.edit import Edit, Recolour
 
 IDS = ("6e5c0000aaaa", "6e7d0000bbbb", "91ab0000cccc")
 
@@ -47,6 +48,22 @@ def test_a_prefix_names_a_track_and_removed_tracks_are_absent():
 def test_a_duplicate_outlives_its_original_and_has_its_gaussians():
     actors = edited(TWIN, {"remove": {"track": "91ab"}}, {"duplicate": {"track": "twin", "as": "third"}})
     assert [(actor.id, actor.source) for actor in actors[2:]] == [("twin", IDS[2]), ("third", IDS[2])]
+
+
+def test_recolourings_multiply_and_a_copy_carries_those_made_before_it():
+    first, second = ({"track": "91", "hue": 30.0, "value": 0.5}, {"track": "91", "colour": "red"})
+    alone = {"track": "twin", "saturation": 0.0}
+    actors = edited({"recolour": first}, TWIN, {"recolour": second}, {"recolour": alone})
+    matrices = [color_matrix(Recolour(**change)) for change in (first, second, alone)]
+    assert [actor.color_matrix is None for actor in actors] == [True, True, False, False]
+    np.testing.assert_allclose(actors[2].color_matrix, matrices[1] @ matrices[0])
+    np.testing.assert_allclose(actors[3].color_matrix, matrices[2] @ matrices[0])
+    assert [actor.edited for actor in actors] == [False, False, True, True]
+
+
+def test_swapped_actors_keep_their_colours():
+    actors = edited({"recolour": {"track": "91", "value": 0.5}}, {"swap": {"track": "91", "with": "6e5c"}})
+    assert [actor.color_matrix is None for actor in actors] == [True, True, False]
 
 
 def test_an_exact_id_takes_precedence_over_prefixes():

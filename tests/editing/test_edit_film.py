@@ -51,6 +51,7 @@ BUSY = [
     {"duplicate": {"track": "6e5c", "as": "twin", "longitudinal": -6.0}},
     {"remove": {"track": TURNING}},
     {"rescale": {"track": GONE, "factor": 1.3}},
+    {"recolour": {"track": "twin", "hue": 120.0}},
 ]
 
 
@@ -136,7 +137,12 @@ def test_labels_and_cameras_reproduce_the_frames(scene, model, busy):
     assert seen == {AHEAD, GONE}
     for number, (view, picture) in enumerate(zip(views_of(busy.record, scene), busy.pictures(), strict=True)):
         shown = [
-            ActorPlacement(track["source"], np.array(track["object_to_world"][number]), track["scale"])
+            ActorPlacement(
+                track["source"],
+                np.array(track["object_to_world"][number]),
+                track["scale"],
+                track["color_matrix"] and np.array(track["color_matrix"]),
+            )
             for track in busy.record["tracks"]
             if track["editable"] and track["object_to_world"][number] is not None
         ]
@@ -174,6 +180,8 @@ def test_labels_hold_the_attributes_of_every_object(busy):
     }
     np.testing.assert_allclose(busy.track(GONE)["size"], 1.3 * np.array(DRIVERS[GONE].size))
     np.testing.assert_allclose(busy.track("twin")["size"], DRIVERS[AHEAD].size)
+    assert busy.track("twin")["color_matrix"] == [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    assert busy.track(AHEAD)["color_matrix"] is None
 
 
 def test_objects_that_cannot_be_edited_are_labelled_as_recorded(scene, busy):

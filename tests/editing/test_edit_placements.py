@@ -20,8 +20,10 @@ from helpers.hand_made_street import (
 from helpers.hand_made_traffic import placed
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
+from drivesplat.edited_motion.recolouring import color_matrix
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.film import actor_placements, editable_actors
+from drivesplat.kernels.gsplat_private import sh_basis
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -30,7 +32,7 @@ from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
-from drivesplat.settings.edit import Edit
+from drivesplat.settings.edit import Edit, Recolour
 from drivesplat.settings.render import FilmFormat, TrajectorySettings
 
 LAST = 4.5
@@ -81,6 +83,7 @@ STEPS = {
     "swap": (AHEAD, GONE),
     "duplicate": (),
     "rescale": (TURNING,),
+    "recolour": (TURNING,),
     "ego": (),
 }
 """Kinds of steps, and the actors that the step below changes."""
@@ -94,6 +97,7 @@ STEP = {
     "swap": {"swap": {"track": AHEAD, "with": GONE}},
     "duplicate": {"duplicate": {"track": AHEAD, "as": "twin", "longitudinal": 5.0}},
     "rescale": {"rescale": {"track": TURNING, "factor": 1.5}},
+    "recolour": {"recolour": {"track": TURNING, "hue": 100.0}},
     "ego": {"ego": {"lateral": 1.0}},
 }
 
@@ -151,6 +155,7 @@ NOTHING = {
     "there and back": [{"reverse": {"track": TURNING}}, {"reverse": {"track": TURNING}}],
     "swapped twice": [{"swap": {"track": AHEAD, "with": GONE}}, {"swap": {"track": AHEAD, "with": GONE}}],
     "larger and smaller": [{"rescale": {"track": GONE, "factor": 2.0}}, {"rescale": {"track": GONE, "factor": 0.5}}],
+    "a hue there and back": [{"recolour": {"track": AHEAD, "hue": h, "value": v}} for h, v in ((90, 0.5), (-90, 2.0))],
     "a copy in its place": [{"duplicate": {"track": TURNING, "as": "copy"}}, {"remove": {"track": TURNING}}],
 }
 
@@ -272,6 +277,35 @@ def test_a_duplicate_appears_beside_its_original(model, scene):
         copies = edited[len(model) : len(model) + count], edited[len(model) + count :]
         assert_is(copies[0], model, AHEAD, time, left_of(straight(time - 1.0), 2.0), 1.0)
         assert_is(copies[1], model, AHEAD, time, left_of(straight(time - 1.0), -3.0), 1.0)
+
+
+def test_a_recoloured_actor_has_other_colours_from_all_directions_and_nothing_else_changes(model, scene):
+    """Its copy, recoloured again, has its own. The model's colours vary with time; here with the direction, too."""
+    directed = street_model()
+    with torch.no_grad():
+        (actors,) = (part for part in directed.parts if part.moves)
+        shn = 0.2 * torch.randn(
+            len(actors), actors.params["shN"].shape[1], 3, 3, generator=torch.Generator().manual_seed(0)
+        )
+        actors.params["shN"] = torch.nn.Parameter(shn, requires_grad=False)
+    changes = [{"track": AHEAD, "hue": 70.0, "value": 0.8}, {"track": "twin", "colour": [0.9, 0.2, 0.1]}]
+    steps = [{"recolour": changes[0]}, {"duplicate": {"track": AHEAD, "as": "twin"}}, {"recolour": changes[1]}]
+    first = color_matrix(Recolour(**changes[0]))
+    own, toward = rows_of(directed, AHEAD).nonzero()[:, 0], torch.tensor([0.6, -0.48, 0.64])
+    for time, edited in zip(TIMES, edited_gaussians(directed, scene, *steps), strict=True):
+        recorded = directed.gaussians_at(float(time))
+        for rows, matrix in ((own, first), (slice(len(directed), None), color_matrix(Recolour(**changes[1])) @ first)):
+            for field in ("means", "scales", "opacities"):
+                np.testing.assert_allclose(getattr(edited, field)[rows], getattr(recorded, field)[own], atol=2e-5)
+            then, now = colors_toward(recorded[own], toward), colors_toward(edited[rows], toward)
+            np.testing.assert_allclose(now, then @ matrix.T, atol=1e-4)
+            assert float((then - colors_toward(recorded[own], -toward)).abs().mean()) > 0.05
+
+
+def colors_toward(gaussians: Gaussians, direction: torch.Tensor) -> torch.Tensor:
+    """Colours (n, 3) along a direction, without the bound at 0."""
+    basis = sh_basis(gaussians.sh.shape[1], direction[None].double()).float()[0]
+    return 0.5 + (basis[None, :, None] * gaussians.sh).sum(dim=1)
 
 
 def test_an_actor_is_absent_in_gaps_of_its_track_unless_its_pace_is_edited(model, scene):

@@ -34,6 +34,7 @@ edits:
     - duplicate: {track: 7a, as: twin, longitudinal: -12}
     - place: {track: 7a, as: placed, path: [[0, 10, 3.5], [4.5, -20, 3.5]], yaw: 5}
     - rescale: {track: twin, factor: 1.3}
+    - recolour: {track: twin, colour: firebrick, value: 1.5}
     - ego: {lateral: 2.0, speed: 0.5}
 """
 
@@ -118,7 +119,8 @@ def test_a_file_of_another_form_is_refused(tmp_path, text, expected):
     assert refusal(text, tmp_path).startswith(expected)
 
 
-KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, place, rescale, ego"
+KINDS = "remove, speed, stop, reverse, shift, swap, duplicate, place, rescale, recolour, ego"
+COLOURS = "at least one of 'hue', 'saturation', 'value' and 'colour'"
 NAME = "cannot name a file: use letters, digits, '_', '-' and '.'"
 
 
@@ -183,6 +185,17 @@ def test_what_is_no_step_is_refused_by_its_number(tmp_path, step, expected):
          "'as' 'ego' is a name kept for the camera's car; choose another"),
         ("place", "track: x, as: a/b, path: [[0, 5, 0]]", f"'as' 'a/b' {NAME}"),
         ("rescale", "track: x, factor: 0.01", "'factor' is 0.01: input should be greater than or equal to 0.1"),
+        ("recolour", "track: x", f"give {COLOURS}, other than 0, 1 and 1"),
+        ("recolour", "track: x, hue: 360", f"give {COLOURS}, other than 0, 1 and 1"),
+        ("recolour", "track: x, hue: 400", "'hue' is 400: input should be less than or equal to 360"),
+        ("recolour", "track: x, saturation: -1", "'saturation' is -1: input should be greater than or equal to 0"),
+        ("recolour", "track: x, colour: red, hue: 10",
+         "'colour' replaces hue and saturation: give it alone, or with 'value'"),
+        ("recolour", "track: x, colour: rouge", "'colour' is 'rouge': no colour has this name; give a CSS name, "
+         "'#rrggbb' in quotes, or [red, green, blue] from 0 to 1"),
+        ("recolour", "track: x, colour: [255, 0, 0]", "'colour.0' is 255: input should be less than or equal to 1"),
+        ("recolour", "track: x, color: red",
+         "unknown key 'color'; there are: track, hue, saturation, value, colour"),
         ("ego", "", "give 'lateral', or a 'speed' other than 1"),
         ("ego", "speed: -1", "'speed' is -1: input should be greater than or equal to 0"),
     ],
@@ -194,6 +207,14 @@ def test_a_step_with_other_fields_is_refused_by_its_number_and_kind(tmp_path, ki
 def test_a_decimal_comma_is_distinguished_from_a_point(tmp_path):
     message = refused_step("shift: {track: x, lateral: 3,5}", tmp_path)
     assert message == " (shift): 5 stands where a key should; a decimal has a point: 3.5, not 3,5"
+
+
+@pytest.mark.parametrize(
+    "colour", ["firebrick", "'#b22222'", "[0.6980392156862745, 0.13333333333333333, 0.13333333333333333]"]
+)
+def test_a_colour_is_a_name_a_number_or_three_shares(tmp_path, colour):
+    step = read(f"edits: {{a: [{{recolour: {{track: x, colour: {colour}}}}}]}}", tmp_path)["a"].steps[0]
+    assert step.change.colour == (178 / 255, 34 / 255, 34 / 255)
 
 
 def test_yaml_merges_stay_possible(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivesplat.demo.optics.lighting import Light, shade
 from drivesplat.demo.optics.raycast import NO_HIT, RayHits, Rays, StreetSnapshot
-from drivesplat.demo.shapes.mesh import SurfaceClass
+from drivesplat.demo.shapes.mesh import GAMMA, SurfaceClass
 
 MAX_RAYS = 400_000
 """Rays cast at once, which bounds memory."""
@@ -161,7 +161,7 @@ def _radiance(
 def to_bytes(radiance: np.ndarray, noise: float = 0.0, random: np.random.Generator | None = None) -> np.ndarray:
     """Gamma-encoded bytes (h, w, 3), with sensor noise of standard deviation `noise` (fraction of full scale) if
     `random` is given."""
-    image = np.clip(EXPOSURE * radiance, 0.0, 1.0) ** (1 / 2.2)
+    image = np.clip(EXPOSURE * radiance, 0.0, 1.0) ** (1 / GAMMA)
     if random is not None and noise:
         image = image + random.normal(0.0, noise, image.shape)
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -50,6 +50,8 @@ class SurfaceClass(IntEnum):
     SKY = 13
 
 
+GAMMA = 2.2
+"""Exponent of the encoding of images."""
 Color = tuple[float, float, float]
 """Linear reflectance in [0, 1]."""
 Numbers = Sequence[float | int] | np.ndarray
@@ -96,6 +98,12 @@ class ColoredMesh:
     def scaled(self, factor: float) -> "ColoredMesh":
         """The mesh scaled about the origin; the texture is not."""
         return replace(self, vertices=factor * self.vertices)
+
+    def recolored(self, matrix: np.ndarray) -> "ColoredMesh":
+        """The mesh with all colours mapped by a matrix (3, 3) of colours as images encode them: light scales encoded
+        colours, too, so that images of the mesh are mapped likewise, apart from mirrored sky and lamps."""
+        encoded = (self.color ** (1 / GAMMA)) @ matrix.T
+        return replace(self, color=np.clip(encoded, 0.0, 1.0) ** GAMMA)
 
     def classified(self, surface_class: SurfaceClass) -> "ColoredMesh":
         """The mesh with one class for all faces."""

@@ -78,7 +78,8 @@ def _object_of(actor: EditedActor, originals: Mapping[str, StreetObject], film_s
         return poses
 
     name = originals[actor.id].name if actor.id in originals else actor.id
-    body = RigidBody(original.body.pieces[0].scaled(actor.scale))
+    mesh = original.body.pieces[0].scaled(actor.scale)
+    body = RigidBody(mesh if actor.color_matrix is None else mesh.recolored(actor.color_matrix))
     return replace(original, name=name, body=body, path=GivenPath(poses_at))
 
 
