@@ -11,12 +11,14 @@ import numpy as np
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.actors import editable_actors
 from drivesplat.editing.ego import edited_camera_path
+from drivesplat.editing.unseen_sides import UNSEEN, unseen_sides
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
+from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames
 from drivesplat.scene.images import write_png
 from drivesplat.scene.motion import Motion
@@ -48,12 +50,13 @@ class EditFiles:
 def render_edit(
     scene: Scene, checkpoint: TrainedCheckpoint, job: EditJob, device_settings: DeviceSettings, files: EditFiles
 ) -> dict[str, Any]:
-    """Writes the film and the still, both with the recorded drive on the left and the edited one on the right, and, if
-    `job.frames`, the frames of the edited one.
+    """Writes the film and the still, both with the recorded and the edited drive in panels, and, if `job.frames`, the
+    frames of the edited one.
 
-    Returns the content of the edit's JSON without provenance: cameras of the edited drive at the size of the frames,
-    and the poses of all objects. Raises ConfigError if the edit does not
-    fit the scene or the model has no actors; DatasetError, DeviceError and ResultError as `render_film` does.
+    Returns the content of the edit's JSON without provenance: the cameras of the edited drive at the size of a frame,
+    which is that of a panel, the places of the panels in the `film`, and the poses of all objects. Raises ConfigError
+    if the edit does not fit the scene or the model has no actors; DatasetError, DeviceError and ResultError as
+    `render_film` does.
     """
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {scene.name}, edit {files.film.stem!r}"
@@ -64,24 +67,29 @@ def render_edit(
     edited = edited_actors(actors, job.edit, where, others, ego_to_world)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     recorded = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
-    left, right = (Shot(scene, cameras, job, job.tile(2)) for cameras in (recorded, path))
-    large = Shot(scene, path, job, (job.width, job.height))
-    seconds = np.array([scene.seconds(timestamp) for timestamp in path.timestamps])
+    size = (job.width, job.height)
+    before, after = (Shot(scene, cameras, job, size) for cameras in (recorded, path))
+    seconds = np.array(after.seconds)
     colliding = collisions(edited, path, seconds)
     if colliding.any():
         first, last = seconds[colliding][[0, -1]]
         log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
     placed = actor_placements(edited, seconds)
-    still = Still(avoided=colliding | (seconds > right.trained_until))
-    before = recorded_shot(model, left, device)
-    model.precompute(right.seconds)
-    after = edited_frames(model, right.views(device), placed)
-    write_film(files.film, still.side_by_side(before, after), right, model, ["recorded", files.film.stem])
-    write_png(files.still, still.picture)
+    panels = Panels(("recorded", files.film.stem), size)
+    still = Still(panels, avoided=colliding | (seconds > after.trained_until))
+    shown = recorded_shot(model, before, device)
+    model.precompute(after.seconds)
+    changed = edited_frames(model, after.views(device), placed)
     remove_frames(files.frames)
-    images = write_frames(files.frames, edited_frames(model, large.views(device), placed)) if job.frames else []
+    if job.frames:
+        changed = written_frames(files.frames, changed)
+    notes = [UNSEEN if unseen else "" for unseen in unseen_sides(actors, edited, after)]
+    write_film(files.film, still.pairs(shown, changed), after, model, panels, notes)
+    write_png(files.still, still.picture)
+    images = [frame_name(files.frames, number) for number in range(len(path))] if job.frames else []
     return {
-        **large.record(),
+        **after.record(),
+        "film": panels.record(),
         "edit": job.edit.model_dump(mode="json"),
         "still_frame": still.number,
         "images": images,
@@ -120,35 +128,38 @@ def edited_frames(
 
 
 class Still:
-    """The pair of a recorded and an edited frame that differ most: its `number` from 0 and side-by-side `picture`.
+    """The pair of a recorded and an edited frame that differ most: its `number` from 0 and `picture` of `panels`.
     `avoided` (n,) bool frames are chosen only if there is no other: those inside a vehicle, and those beyond the last
     training image."""
 
     number: int
     picture: np.ndarray
 
-    def __init__(self, avoided: np.ndarray):
-        self._avoided = avoided
+    def __init__(self, panels: Panels, avoided: np.ndarray):
+        self._panels, self._avoided = panels, avoided
 
-    def side_by_side(self, recorded: Iterable[np.ndarray], edited: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    def pairs(self, recorded: Iterable[np.ndarray], edited: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         """Yields each pair as one picture."""
         best = (False, -1.0)
         for number, pair in enumerate(zip(recorded, edited, strict=True)):
-            picture, difference = np.hstack(pair), float(np.abs(np.subtract(*pair, dtype=np.int16)).mean())
+            picture, difference = self._panels.assembled(pair), float(np.abs(np.subtract(*pair, dtype=np.int16)).mean())
             score = (not self._avoided[number], difference)
             if score > best:
                 best, self.number, self.picture = score, number, picture
             yield picture
 
 
-def write_frames(folder: Path, frames: Iterable[np.ndarray]) -> list[str]:
-    """Writes frames (h, w, 3) uint8 as PNGs into `folder`; returns their paths relative to its parent."""
+def written_frames(folder: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """The frames (h, w, 3) uint8, each after it has been written as a PNG into `folder`."""
     folder.mkdir(exist_ok=True)
-    names = []
     for number, frame in enumerate(frames):
-        names.append(f"{folder.name}/{number:06d}.png")
-        write_png(folder.parent / names[-1], frame)
-    return names
+        write_png(folder.parent / frame_name(folder, number), frame)
+        yield frame
+
+
+def frame_name(folder: Path, number: int) -> str:
+    """The path of a frame's PNG in `folder`, relative to its parent."""
+    return f"{folder.name}/{number:06d}.png"
 
 
 def track_labels(

@@ -1,18 +1,20 @@
-"""Captions of films: what each column shows, the seconds of the drive, and where training images end."""
+"""Captions of films: what each panel shows, the seconds of the drive, and where training images end."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from drivesplat.rendering.panels import Panels
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.images import HoldoutSettings
 
 BEYOND = "beyond the last training image"
 HEIGHT_SHARE = 0.04
-"""Height of the letters as a share of the picture's height."""
+"""Height of the letters as a share of a panel's height."""
 MIN_HEIGHT = 9
 """Pixels; smaller letters cannot be read."""
 
@@ -24,27 +26,48 @@ def last_training_second(scene: Scene, camera: str, holdout: HoldoutSettings) ->
     return scene.seconds(max(times)) if times else np.inf
 
 
-def captioned(
-    pictures: Iterable[np.ndarray], seconds: Sequence[float], labels: Sequence[str], trained_until: float
-) -> Iterator[np.ndarray]:
-    """Each picture (h, w, 3) uint8 with captions: at the bottom left of each column its label, at the top right the
-    `seconds` of the frame, and at the top left BEYOND where they are after `trained_until`."""
-    for picture, second in zip(pictures, seconds, strict=True):
-        result = picture.copy()
-        height, width = picture.shape[:2]
-        size = max(MIN_HEIGHT, round(HEIGHT_SHARE * height))
-        margin = size // 2
-        for column, label in enumerate(labels):
-            mask = text_mask(label, size)
-            _write(result, mask, margin + column * width // len(labels), height - margin - mask.shape[0])
-        clock = text_mask(f"{second:.1f} s", size)
-        _write(result, clock, width - margin - clock.shape[1], margin)
+@dataclass(frozen=True)
+class Caption:
+    """The texts in a frame: in each panel its label at the bottom left and a note at the top left (may be empty), and
+    the `clock` at the film's top right."""
+
+    labels: Sequence[str]
+    notes: Sequence[str]
+    clock: str
+
+
+def drive_captions(
+    labels: Sequence[str], seconds: Sequence[float], trained_until: float, notes: Sequence[str] = ()
+) -> list[Caption]:
+    """The captions of a film's frames at these `seconds`: BEYOND in the first panel after `trained_until`, and `notes`,
+    one a frame if given, in the last."""
+    captions = []
+    for second, note in zip(seconds, notes or [""] * len(seconds), strict=True):
+        own = [""] * len(labels)
+        own[-1] = note
         if second > trained_until:
-            _write(result, text_mask(BEYOND, size), margin, margin)
+            own[0] = BEYOND
+        captions.append(Caption(labels, own, f"{second:.1f} s"))
+    return captions
+
+
+def captioned(pictures: Iterable[np.ndarray], panels: Panels, captions: Iterable[Caption]) -> Iterator[np.ndarray]:
+    """Each picture (h, w, 3) uint8 of a film with its caption."""
+    size = max(MIN_HEIGHT, round(HEIGHT_SHARE * panels.size[1]))
+    margin = size // 2
+    for picture, caption in zip(pictures, captions, strict=True):
+        result = picture.copy()
+        for number, (label, note) in enumerate(zip(caption.labels, caption.notes, strict=True)):
+            panel, mask = panels.inside(result, number), text_mask(label, size)
+            _write(panel, mask, margin, panel.shape[0] - margin - mask.shape[0])
+            if note:
+                _write(panel, text_mask(note, size), margin, margin)
+        clock = text_mask(caption.clock, size)
+        _write(result, clock, result.shape[1] - margin - clock.shape[1], margin)
         yield result
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def text_mask(text: str, size: int) -> np.ndarray:
     """The coverage (h, w, 2) in [0, 1] of a text's letters and of their dark outline, in letters `size` pixels high."""
     font, outline = ImageFont.load_default(size), max(1, size // 10)

@@ -20,17 +20,20 @@ from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.captions import captioned, last_training_second
+from drivesplat.rendering.captions import Caption, captioned, drive_captions, last_training_second
 from drivesplat.rendering.frames import film_frame, film_frames, uint8_image
+from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import CameraPath, film_intrinsics, film_path, recorded_frames
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.render import FilmFormat, FilmJob, TrajectorySettings
+from drivesplat.settings.render import FilmFormat, FilmJob, ShownParts, TrajectorySettings
 
 log = logging.getLogger(__name__)
 
 BACKDROP = 0.35
 """Grey level behind dynamic parts that are rendered alone."""
+PARTS_SHOWN: tuple[ShownParts, ...] = ("all", "static", "moving")
+"""The panels of the film of parts."""
 
 
 @dataclass(frozen=True)
@@ -90,44 +93,63 @@ def render_film(
     scene: Scene, checkpoint: TrainedCheckpoint, job: FilmJob, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
     """Writes the MP4 `path`; returns the content of the record of its cameras without provenance: that of the shot, the
-    `offset` from the recorded path in metres and degrees, `render_seconds` and `bytes`.
+    `offset` from the recorded path in metres and degrees, the `parts` shown, `render_seconds` and `bytes`.
 
     Raises DatasetError where the scene lacks the camera, DeviceError,
     and ResultError where the film cannot be written or a rendering contains NaN or Inf.
     """
     shot = Shot(scene, film_path(scene, job.camera, job.fps, job.trajectory), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)
-    figures = write_film(path, recorded_shot(model, shot, device), shot, model, [f"{path.parent.name}: {path.stem}"])
-    return {**shot.record(), "offset": job.trajectory.model_dump(), **figures}
+    panels = Panels((f"{path.parent.name}: {path.stem}",), shot.size)
+    parts = job.trajectory.parts
+    pictures = recorded_shot(model, shot, device) if parts == "all" else _shot_of_parts(model, shot, device, parts)
+    figures = write_film(path, pictures, shot, model, panels)
+    return {**shot.record(), "offset": job.trajectory.model_dump(exclude={"parts"}), "parts": parts, **figures}
 
 
 def render_parts(
     scene: Scene, checkpoint: TrainedCheckpoint, job: FilmFormat, device_settings: DeviceSettings, path: Path
 ) -> dict[str, Any]:
-    """Writes the MP4 `path` of three images side by side along the recorded path: the scene, its static parts, and its
-    dynamic parts on plain grey. Returns the record of its cameras as `render_film` does, with the size of one image.
+    """Writes the MP4 `path` of three panels along the recorded path: the scene, its static parts, and its dynamic parts
+    on plain grey. Returns the record of its cameras as `render_film` does, for one panel, with the `film` of all.
     Raises what `render_film` raises.
     """
-    shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, job.tile(3))
+    shot = Shot(scene, film_path(scene, job.camera, job.fps, TrajectorySettings()), job, (job.width, job.height))
     model, device = open_model(checkpoint, device_settings)
+    panels = Panels(("everything", "static", "moving"), shot.size)
     model.precompute(shot.seconds)
-    pictures = (_static_and_dynamic(model, view) for view in shot.views(device))
-    figures = write_film(path, pictures, shot, model, ["everything", "static", "moving"])
-    return {**shot.record(), "shows": ["all", "still", "moving"], **figures}
+    of_all = (frames_of_parts(model, view, PARTS_SHOWN) for view in shot.views(device))
+    figures = write_film(path, map(panels.assembled, of_all), shot, model, panels)
+    return {**shot.record(), "shows": ["all", "still", "moving"], "film": panels.record(), **figures}
 
 
 def write_film(
-    path: Path, pictures: Iterable[np.ndarray], shot: Shot, model: SplatModel, labels: Sequence[str]
+    path: Path,
+    pictures: Iterable[np.ndarray],
+    shot: Shot,
+    model: SplatModel,
+    panels: Panels,
+    notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Writes an MP4 of one image (h, w, 3) uint8 for each camera of `shot`, with a column as wide as a view of it for
-    each of `labels`, which its captions show; returns `render_seconds` and `bytes`.
+    """Writes an MP4 of one picture of `panels` for each camera of `shot`, with the captions of the drive and `notes`;
+    returns `render_seconds` and `bytes`.
 
     Raises DeviceError, which tells the size of `model`, where memory is exhausted, and ResultError where the film
     cannot be written.
     """
-    began, count = time.perf_counter(), len(shot.cameras)
-    if shot.format.captions:
-        pictures = captioned(pictures, shot.seconds, labels, shot.trained_until)
+    captions = drive_captions(panels.labels, shot.seconds, shot.trained_until, notes)
+    with explain_out_of_memory(lambda: len(model)):
+        return encode_film(path, pictures, panels, captions, shot.format)
+
+
+def encode_film(
+    path: Path, pictures: Iterable[np.ndarray], panels: Panels, captions: Sequence[Caption], form: FilmFormat
+) -> dict[str, Any]:
+    """Writes an MP4 of pictures (h, w, 3) uint8 of `panels`, with `captions`, one a picture, if the format has them;
+    returns `render_seconds` and `bytes`. Raises ResultError where the film cannot be written."""
+    began, count = time.perf_counter(), len(captions)
+    if form.captions:
+        pictures = captioned(pictures, panels, captions)
     frames = tqdm(
         prefetch_items(pictures),
         total=count,
@@ -136,9 +158,7 @@ def write_film(
         disable=not sys.stderr.isatty(),
         mininterval=1.0,
     )
-    size = (len(labels) * shot.size[0], shot.size[1])
-    with explain_out_of_memory(lambda: len(model)):
-        write_video(path, iter(frames), size, shot.format.fps, shot.format.crf, threads=torch.get_num_threads())
+    write_video(path, iter(frames), panels.film_size, form.fps, form.crf, threads=torch.get_num_threads())
     seconds = time.perf_counter() - began
     log.info("%s: %d frames, %.1f s, %.3f s a frame", path.name, count, seconds, seconds / count)
     return {"render_seconds": seconds, "bytes": path.stat().st_size}
@@ -150,11 +170,22 @@ def recorded_shot(model: SplatModel, shot: Shot, device: torch.device) -> Iterat
     return film_frames(model, ((view, None) for view in shot.views(device)))
 
 
+def _shot_of_parts(model: SplatModel, shot: Shot, device: torch.device, parts: ShownParts) -> Iterator[np.ndarray]:
+    """As `recorded_shot`, of the static or the dynamic parts alone."""
+    model.precompute(shot.seconds)
+    return (frames_of_parts(model, view, [parts])[0] for view in shot.views(device))
+
+
 @torch.no_grad()
-def _static_and_dynamic(model: SplatModel, view: View) -> np.ndarray:
-    """The scene, its static parts and its dynamic parts side by side: (h, 3 w, 3) uint8."""
+def frames_of_parts(model: SplatModel, view: View, shown: Sequence[ShownParts]) -> list[np.ndarray]:
+    """A view (h, w, 3) uint8 of everything, of the static or of the moving parts, for each of `shown`. Moving parts are
+    before plain grey."""
     gaussians, dynamic = model.gaussians_at(view.time), model.moving()
-    objects = model.render(view, gaussians=gaussians[dynamic])
-    on_grey = objects.splats + BACKDROP * (1.0 - objects.alpha[..., None])
-    scene, static = (film_frame(model, view, rendered) for rendered in (gaussians, gaussians[~dynamic]))
-    return np.hstack([scene, static, uint8_image(on_grey)])
+
+    def frame(parts: ShownParts) -> np.ndarray:
+        if parts != "moving":
+            return film_frame(model, view, gaussians if parts == "all" else gaussians[~dynamic])
+        objects = model.render(view, gaussians=gaussians[dynamic])
+        return uint8_image(objects.splats + BACKDROP * (1.0 - objects.alpha[..., None]))
+
+    return [frame(parts) for parts in shown]

@@ -19,7 +19,7 @@ DEMO_OVERRIDES = {
         "image_every": 250,
         "psnr_every": 200,
     },
-    "render": {"fps": 15, "width": 800, "height": 450},
+    "render": {"fps": 12, "width": 576, "height": 324},
     "device": {"min_free_gb": 1.0},
 }
 """With these, the demo trains and renders within minutes on a CPU."""

@@ -1,10 +1,14 @@
 """Settings of films."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.images import HoldoutSettings
+
+ShownParts = Literal["all", "moving", "static"]
 
 
 class TrajectorySettings(Settings):
@@ -16,6 +20,9 @@ class TrajectorySettings(Settings):
     """Offset upwards (metres)."""
     yaw: float = Field(0.0, ge=-180, le=180)
     """Rotation of the camera to the left (degrees), about its own centre."""
+    parts: ShownParts = "all"
+    """Parts of the model to show: 'all', 'moving' (objects alone, on grey) or 'static' (the background without them).
+    Methods without moving parts have only films of 'all'."""
 
 
 def _default_trajectories() -> dict[str, TrajectorySettings]:
@@ -54,11 +61,6 @@ class FilmFormat(Settings):
     crf: int
     captions: bool = False
     holdout: HoldoutSettings = Field(default_factory=HoldoutSettings)
-
-    def tile(self, columns: int) -> tuple[int, int]:
-        """Width and height (pixels, even) of each of `columns` images side by side in a film of this width."""
-        width = self.width // columns // 2 * 2
-        return width, max(2, width * self.height // self.width // 2 * 2)
 
 
 class FilmJob(FilmFormat):

@@ -101,8 +101,11 @@ class Outputs(Inputs):
         return [f"{results}/{s}/{m}/{name}" for s in chosen for m in methods for name in names(s, m)]
 
     def _film_names(self, scene: str, method: str) -> list[str]:
-        parts = [PARTS_FILM] if method in self.methods_with_actors else []
-        return [*for_scene(self.config, scene).render.trajectories, *parts]
+        """The films of a method; those of some of its parts only if it has actors."""
+        trajectories = for_scene(self.config, scene).render.trajectories
+        if method in self.methods_with_actors:
+            return [*trajectories, PARTS_FILM]
+        return [name for name, trajectory in trajectories.items() if trajectory.parts == "all"]
 
     def _edit_names(self, scene: str, method: str) -> Iterable[str]:
         return scene_edits(self.config, scene) if method in self.methods_with_actors else ()

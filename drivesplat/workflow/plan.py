@@ -147,7 +147,9 @@ class Plan(Outputs):
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
         edit = Path(path[-1]).stem if len(path) == 2 and path[0] == "edits" else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
-        if (edit is not None or film == PARTS_FILM) and method not in self.methods_with_actors:
+        trajectory = for_scene(self.config, scene).render.trajectories.get(film)
+        of_parts = film == PARTS_FILM or (trajectory is not None and trajectory.parts != "all")
+        if (edit is not None or of_parts) and method not in self.methods_with_actors:
             able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
             raise ConfigError(
                 f"method {method!r} knows no actors that could be edited or shown apart; those do: {able}"

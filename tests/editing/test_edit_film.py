@@ -36,6 +36,7 @@ from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
+from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import CameraPath
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
@@ -109,26 +110,58 @@ def model() -> SplatModel:
 
 @pytest.fixture(scope="module")
 def busy(scene, model, tmp_path_factory) -> Made:
-    """All frames written, at the size of half of the film of `large`."""
+    """All frames written."""
     return make(scene, model, tmp_path_factory.mktemp("busy"), *BUSY, frames=True)
 
 
-@pytest.fixture(scope="module")
-def large(scene, model, tmp_path_factory) -> Made:
-    return make(scene, model, tmp_path_factory.mktemp("large"), *BUSY, width=128, height=72)
-
-
-def test_the_left_half_equals_the_film_of_the_recorded_drive(scene, model, large, tmp_path, monkeypatch):
+def test_the_left_half_equals_the_film_of_the_recorded_drive(scene, model, busy, tmp_path, monkeypatch):
     reels = Reels()
     monkeypatch.setattr("drivesplat.rendering.film.write_video", reels)
     job = FilmJob(**a_format(width=64, height=36).model_dump(), trajectory=TrajectorySettings())
     render_film(scene, checkpoint_of(model), job, CPU, tmp_path / "original.mp4")
-    np.testing.assert_array_equal(large.halves[0], reels["original"])
+    np.testing.assert_array_equal(busy.halves[0], reels["original"])
 
 
-def test_the_right_half_equals_the_frames_of_the_edited_drive(busy, large):
-    np.testing.assert_array_equal(large.halves[1], busy.pictures())
-    assert (large.halves[0] != large.halves[1]).any(axis=(1, 2, 3)).all()
+def test_the_right_half_equals_the_frames_of_the_edited_drive(busy):
+    np.testing.assert_array_equal(busy.halves[1], busy.pictures())
+    assert (busy.halves[0] != busy.halves[1]).any(axis=(1, 2, 3)).all()
+
+
+def test_boxes_of_the_labels_are_around_the_objects_in_the_film_and_in_the_frames(scene, model, busy, tmp_path):
+    """What the film shows of an object, by the difference from one without it, lies where the record alone puts it."""
+    without = make(scene, model, tmp_path, *BUSY, {"remove": {"track": "twin"}}, frames=True)
+    record, track = busy.record, busy.track("twin")
+    (place,) = (panel for panel in record["film"]["panels"] if panel["shows"] == "it")
+    assert busy.reels["it"].shape[1:3] == (record["film"]["height"], record["film"]["width"])
+    seen = 0
+    for number, pose in enumerate(track["object_to_world"]):
+        different = (busy.reels["it"][number] != without.reels["it"][number]).any(axis=-1)
+        in_frame = (busy.pictures()[number] != without.pictures()[number]).any(axis=-1)
+        low, high = pixel_bounds(record, number, np.array(pose), np.array(track["size"]))
+        inside = np.zeros_like(in_frame)
+        inside[max(low[1], 0) : max(high[1], 0), max(low[0], 0) : max(high[0], 0)] = True
+        assert not (in_frame & ~inside).any()
+        filled = in_frame[inside].mean() if inside.any() else 0.0
+        film = np.zeros_like(different)
+        film[place["top"] :, place["left"] :][: inside.shape[0], : inside.shape[1]] = inside
+        assert not (different & ~film).any() and different.sum() == in_frame.sum()
+        seen += filled > 0.3
+    assert seen > 10
+
+
+def pixel_bounds(record: dict[str, Any], number: int, pose: np.ndarray, size: np.ndarray) -> tuple[Any, Any]:
+    """The first and last column and row that a box covers, two pixels wider."""
+    corners = np.array([(x, y, z, 2.0) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.5
+    corners[:, :3] *= size + 2 * MARGIN
+    in_camera = np.linalg.inv(record["camera_to_world"][number]) @ pose @ corners.T
+    if in_camera[2].min() <= 0.1:
+        return np.zeros(2, int), np.array([record["width"], record["height"]])
+    pixels = (np.array(record["K"]) @ (in_camera[:3] / in_camera[2]))[:2]
+    return np.floor(pixels.min(axis=1)).astype(int) - 2, np.ceil(pixels.max(axis=1)).astype(int) + 2
+
+
+MARGIN = 0.6
+"""Metres by which the splats of the model's random Gaussians reach beyond their boxes."""
 
 
 def test_labels_and_cameras_reproduce_the_frames(scene, model, busy):
@@ -208,13 +241,29 @@ def test_the_record_holds_the_edit_and_the_number_of_frames(busy):
     assert Edit.model_validate(record["edit"]) == edit_of(*BUSY)
 
 
-def test_captions_are_in_the_film_and_not_in_the_frames(scene, model, large, tmp_path):
-    plain, captioned = large, make(scene, model, tmp_path, *BUSY, width=128, height=72, captions=True, frames=True)
+def test_captions_are_in_the_film_and_not_in_the_frames(scene, model, tmp_path):
+    large = {"width": 128, "height": 72, "frames": True}
+    plain, captioned = (make(scene, model, tmp_path, *BUSY, captions=it, **large) for it in (False, True))
     different = (plain.reels["it"] != captioned.reels["it"]).any(axis=3)
     assert different.any(axis=(1, 2)).all() and different.mean() < 0.4
     assert captioned.record["still_frame"] == plain.record["still_frame"]
-    bare = make(scene, model, tmp_path, *BUSY, width=128, height=72, frames=True)
-    np.testing.assert_array_equal(captioned.pictures(), bare.pictures())
+    np.testing.assert_array_equal(captioned.pictures(), plain.halves[1])
+
+
+def test_the_caption_says_where_an_object_shows_a_side_that_no_camera_saw(scene, model, tmp_path):
+    """The car ahead was seen from behind only; turned round from second 2 on it faces the camera."""
+    turn = {"shift": {"track": AHEAD, "yaw": 180.0, "start": 2.0, "duration": 0.0}}
+    straight_on = {"shift": {"track": AHEAD, "lateral": 0.1}}
+
+    def noted(step: dict[str, Any]) -> np.ndarray:
+        """The frames whose caption has letters at the top left of the edited drive."""
+        plain, captioned = (
+            make(scene, model, tmp_path, step, width=320, height=180, captions=it).halves[1] for it in (False, True)
+        )
+        return (plain != captioned)[:, :20, :100].any(axis=(1, 2, 3))
+
+    assert not noted(straight_on).any()
+    np.testing.assert_array_equal(noted(turn), 0.25 * np.arange(19) >= 2.0)
 
 
 def test_the_still_is_not_beyond_the_last_training_image(scene, model, tmp_path):
@@ -231,12 +280,12 @@ def test_the_still_is_not_beyond_the_last_training_image(scene, model, tmp_path)
     assert still_second(len(held_out)) < scene.seconds(int(held_out[0])) < still_second(0)
 
 
-def test_the_still_is_the_pair_with_the_largest_difference(large):
-    left, right = (half.astype(float) for half in large.halves)
+def test_the_still_is_the_pair_with_the_largest_difference(busy):
+    left, right = (half.astype(float) for half in busy.halves)
     difference = np.abs(left - right).mean(axis=(1, 2, 3))
     number = int(difference.argmax())
-    assert large.record["still_frame"] == number and 0 < number < len(left) - 1
-    np.testing.assert_array_equal(np.asarray(Image.open(large.folder / "it.png")), large.reels["it"][number])
+    assert busy.record["still_frame"] == number and 0 < number < len(left) - 1
+    np.testing.assert_array_equal(np.asarray(Image.open(busy.folder / "it.png")), busy.reels["it"][number])
 
 
 def test_a_later_run_without_frames_removes_them_and_nothing_else(scene, model, tmp_path):
@@ -275,8 +324,7 @@ def test_a_faster_ego_vehicle_shortens_both_halves(scene, model, tmp_path):
     np.testing.assert_allclose(forward[0] - forward[0][0], 4.0 * 1.5 * 0.25 * np.arange(13), atol=1e-3)
     np.testing.assert_allclose(forward[1] - forward[1][0], 4.0 * 0.5 * 0.25 * np.arange(19), atol=1e-3)
     np.testing.assert_array_equal(made.halves[0], slow.halves[0][:13])
-    frames = make(scene, model, tmp_path, {"ego": {"speed": 1.5}}, width=16, height=8, frames=True).pictures()
-    np.testing.assert_array_equal(made.halves[1], frames)
+    frames = made.halves[1]
     assert (frames[-1] != made.halves[0][-1]).mean() > 0.5
 
 
@@ -303,7 +351,7 @@ def test_an_encoded_film_has_as_many_frames_and_is_twice_as_wide(scene, model, t
     record = render_edit(scene, checkpoint_of(model), job, CPU, files_in(tmp_path))
     footage = read_footage(tmp_path / "it.mp4")
     assert (footage.frames, footage.fps) == (record["frames"], 6.0) == (28, 6.0)
-    assert (footage.width, footage.height) == (36, 10) == Image.open(tmp_path / "it.png").size
+    assert (footage.width, footage.height) == (76, 24) == Image.open(tmp_path / "it.png").size
 
 
 def test_an_edit_does_not_change_the_checkpoint(scene, model, tmp_path, monkeypatch):
@@ -320,7 +368,7 @@ def test_few_frames_are_rendered_ahead_of_the_encoder(scene, model, tmp_path, mo
     def counted(_: SplatModel, shown: Iterable[Any]) -> Iterator[np.ndarray]:
         for _ in shown:
             rendered.append(1)
-            yield np.zeros((18, 32, 3), np.uint8)
+            yield np.zeros((36, 64, 3), np.uint8)
 
     def encoder(path, frames, size, fps, crf, threads):
         for taken, _ in enumerate(frames, start=1):
@@ -377,8 +425,8 @@ def test_a_still_avoids_collision_frames_unless_there_is_no_other():
     recorded = [np.zeros((2, 2, 3), np.uint8)] * 3
     edited = [np.full((2, 2, 3), value, np.uint8) for value in (10, 200, 90)]
     for avoided, number in (([False, True, False], 2), ([True, True, True], 1)):
-        still = Still(np.array(avoided))
-        assert len(list(still.side_by_side(recorded, edited))) == 3
+        still = Still(Panels(("a", "b"), (2, 2)), np.array(avoided))
+        assert len(list(still.pairs(recorded, edited))) == 3
         assert still.number == number
 
 

@@ -1,20 +1,25 @@
 """Captions of films: legible letters at their places, and nothing else changed."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
-from drivesplat.rendering.captions import BEYOND, captioned, last_training_second, text_mask
+from drivesplat.rendering.captions import BEYOND, captioned, drive_captions, last_training_second, text_mask
+from drivesplat.rendering.panels import Panels
 from drivesplat.settings.images import HoldoutSettings
 
 HEIGHT, WIDTH = 180, 640
 
 
-def written(seconds: list[float], labels: list[str], trained_until: float = np.inf) -> list[np.ndarray]:
+def written(
+    seconds: list[float], labels: list[str], trained_until: float = np.inf, notes: Sequence[str] = ()
+) -> list[np.ndarray]:
     """Captions on plain grey."""
     pictures = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8) for _ in seconds]
-    return list(captioned(pictures, seconds, labels, trained_until))
+    panels = Panels(tuple(labels), (WIDTH // len(labels), HEIGHT))
+    return list(captioned(pictures, panels, drive_captions(labels, seconds, trained_until, notes)))
 
 
 def changed(picture: np.ndarray) -> np.ndarray:
@@ -48,14 +53,27 @@ def test_frames_beyond_the_last_training_image_are_marked():
     assert np.flatnonzero(beyond.any(axis=0)).max() == pytest.approx(text_mask(BEYOND, 9).shape[1], abs=12)
 
 
+def test_the_note_of_a_frame_is_in_the_last_panel():
+    without, noted = (changed(p)[: HEIGHT // 2] for p in written([1.0, 1.0], ["a", "b"], np.inf, ["", "unseen"]))
+    new = np.flatnonzero((without != noted).any(axis=0))
+    assert WIDTH // 2 <= new.min() < WIDTH // 2 + 12 and new.max() < WIDTH // 2 + 120
+
+
+def test_a_long_label_ends_with_its_panel():
+    (short,), (long,) = (written([1.0], [label, ""]) for label in ("a", "a label as long as the film " * 4))
+    different = (short != long).any(axis=(0, 2))
+    assert different.any() and not different[WIDTH // 2 :].any()
+
+
 def test_the_given_pictures_stay_as_they_are():
     given = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
-    list(captioned([given], [1.0], ["a"], 0.0))
+    list(captioned([given], Panels(("a",), (WIDTH, HEIGHT)), drive_captions(["a"], [1.0], 0.0)))
     assert (given == 90).all()
 
 
 def test_captions_larger_than_the_picture_are_cut_off():
-    (picture,) = captioned([np.zeros((12, 20, 3), np.uint8)], [1.0], ["a long label"], 0.0)
+    caption = drive_captions(["a long label"], [1.0], 0.0)
+    (picture,) = captioned([np.zeros((12, 20, 3), np.uint8)], Panels(("a",), (20, 12)), caption)
     assert picture.shape == (12, 20, 3) and picture.any()
 
 

@@ -57,29 +57,32 @@ def test_scene_static_and_dynamic_parts_are_side_by_side(scene, tmp_path, reels)
 
 
 def test_the_first_image_equals_the_ordinary_film(scene, tmp_path, reels):
-    checkpoint, size = checkpoint_of(street_model()), {"width": 20, "height": 10}
+    checkpoint, size = checkpoint_of(street_model()), {"width": 64, "height": 36}
     record = parts_film(scene, tmp_path, checkpoint)
     job = FilmJob(**a_format(**size).model_dump(), trajectory=TrajectorySettings())
     ordinary = render_film(scene, checkpoint, job, CPU, tmp_path / "original.mp4")
     np.testing.assert_array_equal(np.split(reels["parts"], 3, axis=2)[0], reels["original"])
-    assert record.keys() - {"shows"} == ordinary.keys() - {"offset"}
+    assert record.keys() - {"shows", "film"} == ordinary.keys() - {"offset", "parts"}
     cameras = ("K", "width", "height", "timestamps", "camera_to_world")
     assert [record[key] for key in cameras] == [ordinary[key] for key in cameras]
 
 
-@pytest.mark.parametrize(
-    ("asked", "tile"), [((64, 36), (20, 10)), ((1920, 1080), (640, 360)), ((100, 50), (32, 16)), ((16, 16), (4, 4))]
-)
-def test_each_image_has_a_third_of_the_width_in_even_pixels(asked, tile):
-    """H.264 wants even sizes; the aspect is kept as far as that goes."""
-    assert a_format(width=asked[0], height=asked[1]).tile(3) == tile
+@pytest.mark.parametrize(("parts", "panel"), [("all", 0), ("static", 1), ("moving", 2)])
+def test_a_film_of_some_parts_is_the_panel_of_the_film_of_parts(scene, tmp_path, reels, parts, panel):
+    checkpoint = checkpoint_of(street_model())
+    parts_film(scene, tmp_path, checkpoint)
+    job = FilmJob(**a_format().model_dump(), trajectory=TrajectorySettings(parts=parts))
+    record = render_film(scene, checkpoint, job, CPU, tmp_path / "some.mp4")
+    np.testing.assert_array_equal(reels["some"], np.split(reels["parts"], 3, axis=2)[panel])
+    assert record["parts"] == parts and "parts" not in record["offset"]
 
 
 def test_a_film_of_parts_has_a_frame_for_each_camera(scene, tmp_path):
     record = parts_film(scene, tmp_path, checkpoint_of(street_model()), width=70, height=38)
     footage = read_footage(tmp_path / "parts.mp4")
     assert (footage.frames, footage.fps) == (record["frames"], 4.0) == (19, 4.0)
-    assert (footage.width, footage.height) == (66, 10) == (3 * record["width"], record["height"])
+    assert (footage.width, footage.height) == (210, 38) == (3 * record["width"], record["height"])
+    assert (footage.width, footage.height) == (record["film"]["width"], record["film"]["height"])
     assert record["bytes"] == (tmp_path / "parts.mp4").stat().st_size
     assert json.loads(json.dumps(record)) == record
 
@@ -96,7 +99,7 @@ def test_the_third_image_is_plain_grey_without_dynamic_parts(scene, tmp_path, re
 def test_rendering_does_not_run_far_ahead_of_the_encoder(scene, tmp_path, monkeypatch):
     rendered = []
     monkeypatch.setattr(
-        "drivesplat.rendering.film.film_frame", lambda *_: rendered.append(1) or np.zeros((10, 20, 3), np.uint8)
+        "drivesplat.rendering.film.film_frame", lambda *_: rendered.append(1) or np.zeros((36, 64, 3), np.uint8)
     )
 
     def encoder(path, frames, size, fps, crf, threads):

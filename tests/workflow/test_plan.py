@@ -197,6 +197,16 @@ def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
     assert made.evaluation_stages("a1", ["mine"]).keys() == {*of_scene, "actors", "mine/train", "mine/evaluate"}
 
 
+def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
+    made = plan(render={"trajectories": {"original": {}, "objects": {"parts": "moving"}}})
+    films = {path.split("/", 2)[2] for path in made.films()}
+    assert {"vanilla/original.mp4", "street/objects.mp4", "street/parts.mp4"} < films
+    assert not {"vanilla/objects.mp4", "vanilla/parts.mp4"} & films
+    made.refuse_unknown(["elsewhere/a1/street/objects.mp4", "elsewhere/a1/street/objects.cameras.json"])
+    with pytest.raises(ConfigError, match=r"method 'vanilla' knows no actors .* those do: street"):
+        made.refuse_unknown(["elsewhere/a1/vanilla/objects.mp4"])
+
+
 # ---- the report across scenes
 
 

@@ -169,8 +169,8 @@ def test_an_edit_becomes_a_film_a_still_and_labels(finished):
     place = [pose[3] for pose in car["object_to_world"][-1][:2]]
     np.testing.assert_allclose(place, [recorded[0][0][3] + 4.2 * (3.0 - 0.035), 1.0], atol=0.3)
     footage = read_footage(folder / "stop.mp4")
-    assert (footage.frames, footage.width, footage.height) == (19, 64, 18)
-    assert Image.open(folder / "stop.png").size == (64, 18)
+    assert (footage.frames, footage.width, footage.height) == (19, 128, 36)
+    assert Image.open(folder / "stop.png").size == (128, 36)
     assert [step.keys() for step in labels["edit"]["steps"]] == [{"shift"}, {"stop"}]
     gone = finished.read("results/0001/street/edits/gone.json")
     assert not any(track["editable"] for track in gone["tracks"])
@@ -181,7 +181,7 @@ def test_the_film_of_parts_is_as_long_as_the_others(finished):
     parts, film = (finished.read(f"results/0001/street/{name}.cameras.json") for name in ("parts", "original"))
     assert parts["timestamps"] == film["timestamps"] and parts["camera_to_world"] == film["camera_to_world"]
     footage = read_footage(finished.folder / "results/0001/street/parts.mp4")
-    assert (footage.frames, footage.width, footage.height) == (film["frames"], 60, 10)
+    assert (footage.frames, footage.width, footage.height) == (film["frames"], 192, 36)
 
 
 def test_every_result_remembers_where_it_came_from(finished):
