@@ -2,7 +2,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz of a method with actors, scene.json; the scene's edits file,
 # named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not.
-# OUTPUTS: <results>/{scene}/{method}/edits/{edit}.mp4, {edit}.png and {edit}.json; {edit}/ with frames, where wanted.
+# OUTPUTS: <results>/{scene}/{method}/edits/{edit}.mp4, {edit}.png and {edit}.json; {edit}/ with frames, where wanted;
+# <results>/{scene}/{method}/quad/{edit}.mp4 and {edit}.json, on request.
 
 
 rule edit:
@@ -48,3 +49,41 @@ rule edit:
         code=plan.code("edit"),
     script:
         "../workflow_scripts/edit.py"
+
+
+rule film_quad:
+    """
+    Renders a drive in four panels of one film: its recorded images, their reconstruction, the smooth drive between
+    them, and an edit of it.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+    output:
+        film=report(
+            "<results>/{scene}/{method}/quad/{edit}.mp4",
+            caption="../report/quad.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "film: recorded, reconstructed, smooth, edited ({edit})"},
+        ),
+        labels="<results>/{scene}/{method}/quad/{edit}.json",
+    log:
+        "<logs>/{scene}/{method}/quad_{edit}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/quad_{edit}.tsv"
+    wildcard_constraints:
+        method=plan.known(plan.methods_with_actors),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("film_quad"),
+        code=plan.code("film_quad"),
+    script:
+        "../workflow_scripts/film_quad.py"

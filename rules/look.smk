@@ -2,7 +2,7 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl, masks/; actors.npz if a method has
 # actors.
-# OUTPUTS: <results>/{scene}/tracks.csv and tracks.png;
+# OUTPUTS: <results>/{scene}/tracks.csv and tracks.png, compare.mp4 and compare.json;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
 # ghost_panel.png and .json;
 # with_car.png, without_car.png, removal.png and removal.json.
@@ -113,6 +113,44 @@ rule film_parts:
         code=plan.code("film_parts"),
     script:
         "../workflow_scripts/film_parts.py"
+
+
+rule compare:
+    """
+    Shows each recorded image of the evaluated camera, the renderings of all methods with their PSNR, and the error of
+    the last one, as a film.
+    """
+    input:
+        checkpoints=expand("<results>/{{scene}}/{method}/checkpoint.npz", method=plan.config.methods),
+        scene=plan.scene,
+        parser="<results>/{scene}/parser.pkl",
+        masks="<results>/{scene}/masks/masks.json",
+    output:
+        film=report(
+            "<results>/{scene}/compare.mp4",
+            caption="../report/compare.rst",
+            category="Scene {scene}",
+            subcategory="figures",
+            labels={"what": "film: all methods beside the recording"},
+        ),
+        figures="<results>/{scene}/compare.json",
+    log:
+        "<logs>/{scene}/compare.log",
+    benchmark:
+        "<benchmarks>/{scene}/compare.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("compare"),
+        code=plan.code("compare"),
+    script:
+        "../workflow_scripts/compare.py"
 
 
 rule ghost_panel:

@@ -39,6 +39,7 @@ from drivesplat.kernels.relocation import relocation
 from drivesplat.machine.device import choose_device
 from drivesplat.model.background import Background
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.part import ActorPlacement
 from drivesplat.model.sky import ConstantSky, CubemapSky
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -379,6 +380,17 @@ def assert_frames(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
     assert max(np.abs(a.astype(int) - b).mean() for a, b in pairwise(expected)) > 1.0, "they differ"
     for frame, alone in zip(found, expected, strict=True):
         np.testing.assert_allclose(frame.astype(int), alone, atol=1)
+
+
+def test_a_recoloured_actor_has_the_colours_of_the_cpu():
+    model = untrained_street(settings_of()).requires_grad_(False)
+    matrix = np.array([[0.2, 0.7, 0.1], [0.0, 0.4, 0.3], [0.9, 0.0, 0.2]])
+    first, *others = (track.id for track in model.parts[1].timeline.tracks)
+    placements = [ActorPlacement(first, color_matrix=matrix), *(ActorPlacement(other) for other in others)]
+    expected, plain = model.gaussians_with_placements(0.7, placements).sh, model.gaussians_at(0.7).sh
+    found = model.to(GPU).gaussians_with_placements(0.7, placements).sh.cpu()
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert bool((expected != plain).any())
 
 
 def test_the_frames_of_a_film_equal_single_frames(street_film, captures, monkeypatch):

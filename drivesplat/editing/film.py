@@ -60,41 +60,59 @@ def render_edit(
     """
     model, device = open_model(checkpoint, device_settings)
     where = f"scene {scene.name}, edit {files.film.stem!r}"
-    actors = editable_actors(model, scene, where)
-    editable = {actor.id for actor in actors}
-    ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, job.camera)])
-    others = {track.id for track in scene.tracks} - editable
-    edited = edited_actors(actors, job.edit, where, others, ego_to_world)
-    path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
-    recorded = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
-    size = (job.width, job.height)
-    before, after = (Shot(scene, cameras, job, size) for cameras in (recorded, path))
-    seconds = np.array(after.seconds)
-    colliding = collisions(edited, path, seconds)
+    drive = edited_drive(scene, model, job, where)
+    after, seconds = drive.after, np.array(drive.after.seconds)
+    colliding = collisions(drive.actors, after.cameras, seconds)
     if colliding.any():
         first, last = seconds[colliding][[0, -1]]
         log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
-    placed = actor_placements(edited, seconds)
-    panels = Panels(("recorded", files.film.stem), size)
+    panels = Panels(("recorded", files.film.stem), after.size)
     still = Still(panels, avoided=colliding | (seconds > after.trained_until))
-    shown = recorded_shot(model, before, device)
-    model.precompute(after.seconds)
-    changed = edited_frames(model, after.views(device), placed)
+    shown = recorded_shot(model, drive.before, device)
+    changed = edited_frames(model, after.views(device), actor_placements(drive.actors, seconds))
     remove_frames(files.frames)
     if job.frames:
         changed = written_frames(files.frames, changed)
-    notes = [UNSEEN if unseen else "" for unseen in unseen_sides(actors, edited, after)]
-    write_film(files.film, still.pairs(shown, changed), after, model, panels, notes)
+    write_film(files.film, still.pairs(shown, changed), after, model, panels, drive.notes)
     write_png(files.still, still.picture)
-    images = [frame_name(files.frames, number) for number in range(len(path))] if job.frames else []
+    images = [frame_name(files.frames, number) for number in range(len(after.cameras))] if job.frames else []
     return {
         **after.record(),
         "film": panels.record(),
         "edit": job.edit.model_dump(mode="json"),
         "still_frame": still.number,
         "images": images,
-        "tracks": track_labels(scene, edited, editable, seconds),
+        "tracks": track_labels(scene, drive.actors, {actor.id for actor in drive.recorded}, seconds),
     }
+
+
+@dataclass(frozen=True)
+class EditedDrive:
+    """A drive with an edit: the actors of the model as `recorded` and as edited (`actors`), and shots of the same times
+    `before` the edit and `after` it."""
+
+    recorded: Sequence[EditedActor]
+    actors: Sequence[EditedActor]
+    before: Shot
+    after: Shot
+
+    @property
+    def notes(self) -> list[str]:
+        """The note in the caption of each edited frame."""
+        return [UNSEEN if unseen else "" for unseen in unseen_sides(self.recorded, self.actors, self.after)]
+
+
+def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> EditedDrive:
+    """The drive with the edit of `job`. Raises ConfigError, starting with `where` (the scene and the edit), if the edit
+    does not fit the scene or the model has no actors, DatasetError if the scene lacks the camera."""
+    recorded = editable_actors(model, scene, where)
+    ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, job.camera)])
+    others = {track.id for track in scene.tracks} - {actor.id for actor in recorded}
+    actors = edited_actors(recorded, job.edit, where, others, ego_to_world)
+    path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
+    unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
+    before, after = (Shot(scene, cameras, job, (job.width, job.height)) for cameras in (unedited, path))
+    return EditedDrive(recorded, actors, before, after)
 
 
 def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list[list[ActorPlacement]]:

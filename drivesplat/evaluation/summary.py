@@ -12,6 +12,7 @@ from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.scene.scene_warnings import DARK
 
 OUTPUTS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
+COMPARE_FILM = "compare.mp4"
 MIN_NOVEL_DISTANCE = 0.1
 """Metres. At nuScenes' focal length a smaller step moves a point 10 m away by less than a dozen pixels."""
 
@@ -41,6 +42,8 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
         lines.append(f"{name}: {method['gaussians']:,} Gaussians, trained in {seconds:.0f} s on {device}")
     folder = Path(path).parent
     lines.append(f"All figures: {path}; training curves and pictures: tensorboard --logdir {folder}")
+    if (folder / COMPARE_FILM).is_file():
+        lines.append(f"All methods beside the recording: {folder / COMPARE_FILM}")
     for name in metrics["methods"]:
         there = [output for output in OUTPUTS if (folder / name / output).is_file()]
         there += ["edits/"] if (folder / name / "edits").is_dir() else []

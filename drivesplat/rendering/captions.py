@@ -51,11 +51,11 @@ def drive_captions(
     return captions
 
 
-def captioned(pictures: Iterable[np.ndarray], panels: Panels, captions: Iterable[Caption]) -> Iterator[np.ndarray]:
+def captioned(frames: Iterable[tuple[np.ndarray, Caption]], panels: Panels) -> Iterator[np.ndarray]:
     """Each picture (h, w, 3) uint8 of a film with its caption."""
     size = max(MIN_HEIGHT, round(HEIGHT_SHARE * panels.size[1]))
     margin = size // 2
-    for picture, caption in zip(pictures, captions, strict=True):
+    for picture, caption in frames:
         result = picture.copy()
         for number, (label, note) in enumerate(zip(caption.labels, caption.notes, strict=True)):
             panel, mask = panels.inside(result, number), text_mask(label, size)

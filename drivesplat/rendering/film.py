@@ -26,7 +26,7 @@ from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import CameraPath, film_intrinsics, film_path, recorded_frames
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.render import FilmFormat, FilmJob, ShownParts, TrajectorySettings
+from drivesplat.settings.render import FilmEncoding, FilmFormat, FilmJob, ShownParts, TrajectorySettings
 
 log = logging.getLogger(__name__)
 
@@ -139,18 +139,18 @@ def write_film(
     """
     captions = drive_captions(panels.labels, shot.seconds, shot.trained_until, notes)
     with explain_out_of_memory(lambda: len(model)):
-        return encode_film(path, pictures, panels, captions, shot.format)
+        frames = zip(pictures, captions, strict=True)
+        return encode_film(path, frames, len(captions), panels, shot.format)
 
 
 def encode_film(
-    path: Path, pictures: Iterable[np.ndarray], panels: Panels, captions: Sequence[Caption], form: FilmFormat
+    path: Path, frames: Iterable[tuple[np.ndarray, Caption]], count: int, panels: Panels, form: FilmEncoding
 ) -> dict[str, Any]:
-    """Writes an MP4 of pictures (h, w, 3) uint8 of `panels`, with `captions`, one a picture, if the format has them;
-    returns `render_seconds` and `bytes`. Raises ResultError where the film cannot be written."""
-    began, count = time.perf_counter(), len(captions)
-    if form.captions:
-        pictures = captioned(pictures, panels, captions)
-    frames = tqdm(
+    """Writes an MP4 of `count` pictures (h, w, 3) uint8 of `panels`, with their captions if `form` has them; returns
+    `render_seconds` and `bytes`. Raises ResultError where the film cannot be written."""
+    began = time.perf_counter()
+    pictures = captioned(frames, panels) if form.captions else (picture for picture, _ in frames)
+    shown = tqdm(
         prefetch_items(pictures),
         total=count,
         desc=path.stem,
@@ -158,7 +158,7 @@ def encode_film(
         disable=not sys.stderr.isatty(),
         mininterval=1.0,
     )
-    write_video(path, iter(frames), panels.film_size, form.fps, form.crf, threads=torch.get_num_threads())
+    write_video(path, iter(shown), panels.film_size, form.fps, form.crf, threads=torch.get_num_threads())
     seconds = time.perf_counter() - began
     log.info("%s: %d frames, %.1f s, %.3f s a frame", path.name, count, seconds, seconds / count)
     return {"render_seconds": seconds, "bytes": path.stat().st_size}

@@ -60,6 +60,7 @@ def report_page(
             _table("Whole images, with the cost of training", WHOLE_IMAGE_FIGURES, COSTS),
         ],
         scenes=scenes,
+        links_of=lambda scene: media.get((scene, ""), MethodMedia()).links,
         media_of=lambda row: _looks(row, media.get((row["scene"], row["method"]), MethodMedia())),
         address=address,
         fixes=PUBLISHED_FIXES,

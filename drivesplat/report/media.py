@@ -29,10 +29,12 @@ class MethodMedia:
 
 
 def collect_media(files: Iterable[str | Path], results: Path) -> dict[tuple[str, str], MethodMedia]:
-    """The media of every scene and method among `files` in {results}/{scene}/{method}/."""
+    """The media of every scene and method among `files` in {results}/{scene}/{method}/, those of the scene itself
+    under the method ''."""
     names, found = {name: key for key, name in PICTURES.items()}, {}
     for file in map(Path, files):
-        scene, method, *inner = file.relative_to(results).parts
+        scene, *inner = file.relative_to(results).parts
+        method, inner = (inner[0], inner[1:]) if len(inner) > 1 else ("", inner)
         own = found.setdefault((scene, method), MethodMedia())
         key = names.get("/".join(inner))
         if key:

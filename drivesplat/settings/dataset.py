@@ -19,7 +19,7 @@ DEMO_OVERRIDES = {
         "image_every": 250,
         "psnr_every": 200,
     },
-    "render": {"fps": 12, "width": 576, "height": 324},
+    "render": {"fps": 12, "width": 576, "height": 324, "compare": False},
     "device": {"min_free_gb": 1.0},
 }
 """With these, the demo trains and renders within minutes on a CPU."""

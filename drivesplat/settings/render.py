@@ -44,22 +44,30 @@ class RenderSettings(Settings):
     """H.264 constant rate factor. Lower values give better quality and larger files; 18 is visually lossless."""
     captions: bool = True
     """Write into films what is shown, the seconds of the drive, and where they go beyond the last training image."""
+    compare: bool = True
+    """Make compare.mp4 with the films of a scene: its recorded images beside the renderings of all methods. It can
+    always be asked for by its name."""
     edited_frames: bool = False
     """Also write the frames of edited drives as PNG, at full size, with labels in the JSON file."""
     trajectories: dict[str, TrajectorySettings] = Field(default_factory=_default_trajectories)
     """Films to render, each under a name of your choice."""
 
 
-class FilmFormat(Settings):
+class FilmEncoding(Settings):
+    """How pictures become a film."""
+
+    fps: int
+    crf: int
+    captions: bool = False
+
+
+class FilmFormat(FilmEncoding):
     """The format of a film. For the film of a method's parts these are all its settings."""
 
     camera: str
-    fps: int
     width: int
     height: int
     horizontal_fov: float | None
-    crf: int
-    captions: bool = False
     holdout: HoldoutSettings = Field(default_factory=HoldoutSettings)
 
 
@@ -70,7 +78,15 @@ class FilmJob(FilmFormat):
 
 
 class EditJob(FilmFormat):
-    """All settings that determine the film of one edit."""
+    """All settings that determine the film of one edit; `frames`: write its frames, too."""
 
     edit: Edit
-    frames: bool
+    frames: bool = False
+
+
+class CompareJob(Settings):
+    """All settings that determine the film of recorded images beside the renderings of methods."""
+
+    eval_camera: str
+    crf: int
+    captions: bool

@@ -32,6 +32,8 @@ EXPORTS: dict[ExportFormat, tuple[str, ...]] = {
 """The files of every format, one or two for each rule that makes them."""
 PARTS_FILM = "parts"
 """The film of a method's parts."""
+COMPARE_FILM = "compare.mp4"
+"""The film of all methods of a scene."""
 
 
 class Outputs(Inputs):
@@ -73,9 +75,12 @@ class Outputs(Inputs):
         return [f"{self.config.results_dir}/{scene}/metrics.json" for scene in self.config.batch_scenes]
 
     def films(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
-        """The films of every method of `scenes`, by default the batch's, and of the parts of methods with moving
-        objects."""
-        return self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], scenes)
+        """The films of every method of `scenes`, by default the batch's, of the parts of methods with moving objects,
+        and of all methods side by side."""
+        chosen = self.config.batch_scenes if scenes is None else list(scenes)
+        compared = [scene for scene in chosen if for_scene(self.config, scene).render.compare]
+        of_methods = self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], chosen)
+        return [*(f"{self.config.results_dir}/{scene}/{COMPARE_FILM}" for scene in compared), *of_methods]
 
     def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
         """The films of every edit of `scenes`, by default the batch's, by every method that can be edited. Raises

@@ -145,7 +145,7 @@ class Plan(Outputs):
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
-        edit = Path(path[-1]).stem if len(path) == 2 and path[0] == "edits" else None
+        edit = Path(path[-1]).stem if len(path) == 2 and path[0] in ("edits", "quad") else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
         of_parts = film == PARTS_FILM or (trajectory is not None and trajectory.parts != "all")

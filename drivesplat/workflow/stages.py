@@ -27,7 +27,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
-from drivesplat.settings.render import EditJob, FilmFormat, FilmJob
+from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
 
@@ -38,7 +38,7 @@ ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
-OF_ONE_SCENE = ("demo_world", "extract", "edit", "ghost_panel", "remove_actor", "export_viewer")
+OF_ONE_SCENE = ("demo_world", "extract", "edit", "film_quad", "ghost_panel", "remove_actor", "export_viewer")
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
@@ -181,11 +181,19 @@ def _film(at: Place) -> dict[str, Any]:
     return {"trajectory": trajectories[at.film], **_format(at)}
 
 
-def _edit(at: Place) -> dict[str, Any]:
+def _quad(at: Place) -> dict[str, Any]:
     edits = scene_edits(at.config, at.scene)
     if at.film not in edits:
         raise ConfigError(no_such_edit(at.scene, at.film, edits))
-    return {"edit": edits[at.film], "frames": at.config.render.edited_frames, **_format(at)}
+    return {"edit": edits[at.film], **_format(at)}
+
+
+def _edit(at: Place) -> dict[str, Any]:
+    return {**_quad(at), "frames": at.config.render.edited_frames}
+
+
+def _compare(at: Place) -> dict[str, Any]:
+    return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
 
 
 def _viewer(at: Place) -> dict[str, Any]:
@@ -263,7 +271,9 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "tracks": (TracksJob, _nothing),
     "film": (FilmJob, _film),
     "film_parts": (FilmFormat, _format),
+    "compare": (CompareJob, _compare),
     "edit": (EditJob, _edit),
+    "film_quad": (EditJob, _quad),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

@@ -97,6 +97,9 @@ def test_existing_films_and_images_are_listed_last_by_method(tmp_path):
         f"To look at, in {tmp_path}/plain: ghost_panel.png, edits/",
     ]
     assert sum("To look at" in line for line in lines) == 2
+    assert not any("compare.mp4" in line for line in lines)
+    (tmp_path / "compare.mp4").touch()
+    assert f"All methods beside the recording: {tmp_path}/compare.mp4" in sentences(metrics, tmp_path / "metrics.json")
 
 
 def test_ground_truth_figures_over_too_few_pixels_are_not_mentioned():

@@ -99,6 +99,8 @@ EDITS = (
         ("vanilla/edits/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
         ("vanilla/parts.mp4", ["'vanilla' knows no actors", "those do: street"]),
         ("street/edits/halt.mp4", ["no edit called 'halt'", "there are: stop, gone", "datasets.<name>.edits"]),
+        ("vanilla/quad/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
+        ("street/quad/halt.mp4", ["no edit called 'halt'", "there are: stop, gone"]),
         ("street/edits/halt.json", ["no edit called 'halt'", "there are: stop, gone"]),
     ],
 )
@@ -324,6 +326,8 @@ def set_to(copy: WorkflowCopy, **config: Any) -> Iterator[None]:
 LOOK_SCRIPTS = {
     "film": "vanilla/original.mp4",
     "film_parts": "street/parts.mp4",
+    "compare": "compare.mp4",
+    "film_quad": "street/quad/gone.mp4",
     "edit": "street/edits/gone.mp4",
     "ghost_panel": "vanilla/ghost_panel.png",
     "remove_actor": "vanilla/with_car.png",

@@ -19,7 +19,8 @@ def written(
     """Captions on plain grey."""
     pictures = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8) for _ in seconds]
     panels = Panels(tuple(labels), (WIDTH // len(labels), HEIGHT))
-    return list(captioned(pictures, panels, drive_captions(labels, seconds, trained_until, notes)))
+    captions = drive_captions(labels, seconds, trained_until, notes)
+    return list(captioned(zip(pictures, captions, strict=True), panels))
 
 
 def changed(picture: np.ndarray) -> np.ndarray:
@@ -67,13 +68,13 @@ def test_a_long_label_ends_with_its_panel():
 
 def test_the_given_pictures_stay_as_they_are():
     given = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
-    list(captioned([given], Panels(("a",), (WIDTH, HEIGHT)), drive_captions(["a"], [1.0], 0.0)))
+    list(captioned([(given, *drive_captions(["a"], [1.0], 0.0))], Panels(("a",), (WIDTH, HEIGHT))))
     assert (given == 90).all()
 
 
 def test_captions_larger_than_the_picture_are_cut_off():
-    caption = drive_captions(["a long label"], [1.0], 0.0)
-    (picture,) = captioned([np.zeros((12, 20, 3), np.uint8)], Panels(("a",), (20, 12)), caption)
+    (caption,) = drive_captions(["a long label"], [1.0], 0.0)
+    (picture,) = captioned([(np.zeros((12, 20, 3), np.uint8), caption)], Panels(("a",), (20, 12)))
     assert picture.shape == (12, 20, 3) and picture.any()
 
 

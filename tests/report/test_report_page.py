@@ -89,6 +89,8 @@ def test_a_page_has_the_images_and_links_of_its_methods(results):
     page = page_of(results)
     assert page.count("data:image/jpeg") == len(GAPS) * len(METHODS) * len(PICTURES)
     assert 'href="0061/vanilla/original.mp4"' in page and "key frame 12, held out between training frames" in page
+    film = report_page(made(results), collect_media([results / "0061/compare.mp4"], results))
+    assert 'href="0061/compare.mp4">compare.mp4<' in film and film.count(".mp4") == 2
     bare = report_page(made(results), {})
     assert "data:image/jpeg" not in bare and ".mp4" not in bare and 'id="scene-0061"' in bare
 
@@ -153,9 +155,12 @@ def test_a_slider_starts_where_its_images_differ(tmp_path):
 
 
 def test_media_are_collected_by_scene_and_method(tmp_path):
-    names = ("0061/street/edits/remove.mp4", "0061/street/ghost_panel.png", "0103/vanilla/viewer.html")
+    names = (
+        "0061/street/edits/remove.mp4", "0061/street/ghost_panel.png", "0103/vanilla/viewer.html", "0103/compare.mp4"
+    )  # fmt: skip
     media = collect_media([tmp_path / name for name in names], tmp_path)
-    assert set(media) == {("0061", "street"), ("0103", "vanilla")}
+    assert set(media) == {("0061", "street"), ("0103", "vanilla"), ("0103", "")}
+    assert media["0103", ""].links == ["0103/compare.mp4"]
     assert media["0061", "street"].images == {"panel": tmp_path / "0061/street/ghost_panel.png"}
     assert media["0061", "street"].links == ["0061/street/edits/remove.mp4"]
     assert media["0103", "vanilla"].links == ["0103/vanilla/viewer.html"]

@@ -15,10 +15,10 @@ from drivesplat.settings.config_document import config_schema, config_yaml
 from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_settings
 
 LOOKS = (
-    "tracks", "film", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd", "export_viewer",
-    "export_colmap", "export_spz", "export_sog",
+    "tracks", "film", "compare", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd",
+    "export_viewer", "export_colmap", "export_spz", "export_sog",
 )  # fmt: skip
-OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "tracks")
+OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "tracks", "compare")
 STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "train", "evaluate", *LOOKS)
 
 
@@ -342,7 +342,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("cameras", ["CAM_FRONT", "CAM_BACK"]), "extract own_car evaluate"),
         (
             {"cameras": ["CAM_FRONT", "CAM_BACK"], "eval_camera": "CAM_BACK"},
-            "extract own_car evaluate tracks film ghost_panel remove_actor export_usd export_viewer",
+            "extract own_car evaluate tracks film compare ghost_panel remove_actor export_usd export_viewer",
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks actors lidar_depth evaluate"),

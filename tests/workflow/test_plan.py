@@ -207,6 +207,12 @@ def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
         made.refuse_unknown(["elsewhere/a1/vanilla/objects.mp4"])
 
 
+def test_the_film_of_all_methods_is_left_out_where_the_settings_say_so_and_can_be_asked_for():
+    made = plan(b={"render": {"compare": False}})
+    assert [path for path in made.films() if "compare" in path] == [f"elsewhere/{s}/compare.mp4" for s in ("a1", "a2")]
+    made.refuse_unknown(["elsewhere/b1/compare.mp4"])
+
+
 # ---- the report across scenes
 
 

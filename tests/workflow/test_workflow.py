@@ -184,6 +184,16 @@ def test_the_film_of_parts_is_as_long_as_the_others(finished):
     assert (footage.frames, footage.width, footage.height) == (film["frames"], 192, 36)
 
 
+def test_all_methods_are_in_one_film_beside_the_recording(finished):
+    record = finished.read("results/0001/compare.json")
+    assert [panel["shows"] for panel in record["film"]["panels"]] == [
+        "ground truth", "vanilla", "street", "error of street"
+    ]  # fmt: skip
+    footage = read_footage(finished.folder / "results/0001/compare.mp4")
+    assert (footage.frames, footage.width, footage.height, footage.fps) == (10, 2 * 96, 2 * 54, 2.0)
+    assert {"vanilla/train", "street/train"} < record["provenance"]["stages"].keys()
+
+
 def test_every_result_remembers_where_it_came_from(finished):
     for name in ("original.cameras.json", "ghost_panel.json", "removal.json", "cameras.json", "eval.json"):
         stages = finished.read(f"results/0001/vanilla/{name}")["provenance"]["stages"]
@@ -221,7 +231,15 @@ def test_every_link_of_the_pages_in_snakemakes_report_is_in_it(archive):
     assert dead == set()
     (page,) = archive.rglob("gap_report.html")
     linked = {Path(address).name for address in addresses(page.read_text(encoding="utf-8"))}
-    assert {"original.mp4", "lateral_2m.mp4", "parts.mp4", "stop.mp4", "gone.mp4", "viewer.html"} < linked
+    assert {
+        "compare.mp4",
+        "original.mp4",
+        "lateral_2m.mp4",
+        "parts.mp4",
+        "stop.mp4",
+        "gone.mp4",
+        "viewer.html",
+    } < linked
     captions = addresses_in_results((archive / "report.html").read_text(encoding="utf-8"))
     assert sum(address.endswith("/ghosts.html") for address in captions) == 1 + 2, "itself, and two ghost panels"
     assert links > 30
@@ -265,7 +283,8 @@ def test_in_a_browser_snakemakes_report_requests_nothing_but_its_files(archive, 
 
 OF_ACTORS = {"film_parts": 1, "edit": 2}
 """What a method with actors has and others have not."""
-FILMS_AND_LOOKS = {"film": 4, "ghost_panel": 2, "remove_actor": 2, **OF_ACTORS}
+FILMS = {"compare": 1, "film": 4, **OF_ACTORS}
+FILMS_AND_LOOKS = {"ghost_panel": 2, "remove_actor": 2, **FILMS}
 EXPORTS = ("far_gaussians", "export", "export_usd", "export_viewer")
 COLMAP = {"export_colmap": 2}
 TRAINING_AND_AFTER = {
@@ -273,8 +292,8 @@ TRAINING_AND_AFTER = {
     **dict.fromkeys(EXPORTS, 2),
 }  # fmt: skip
 ONE_TRAINING_AND_AFTER = {
-    "train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1, "film": 2, "ghost_panel": 1, "remove_actor": 1,
-    **dict.fromkeys(EXPORTS, 1),
+    "train": 1, "evaluate": 1, "scene_metrics": 1, "gap_report": 1, "compare": 1, "film": 2, "ghost_panel": 1,
+    "remove_actor": 1, **dict.fromkeys(EXPORTS, 1),
 }  # fmt: skip
 STREETS_TRAINING_AND_AFTER = ONE_TRAINING_AND_AFTER | OF_ACTORS
 TRAINING_INPUTS = {"actors": 1, "lidar_depth": 1}
@@ -302,6 +321,7 @@ EVERYTHING = {"extract": 1, "own_car": 1, **AFTER_EXTRACTION}
         ({"refine_poses": {"enabled": True}}, {"refine_poses": 1, **AFTER_EXTRACTION}),
         ({"render": {"fps": 5}}, {"film": 4, **OF_ACTORS}),
         ({"render": {"edited_frames": True}}, {"edit": 2}),
+        ({"render": {"compare": False}}, {"gap_report": 1}),
         ({"render": {"trajectories": {"above": {"vertical": 3.0}}}}, {"film": 2, "gap_report": 1}),
         ({"subjects": {"0001": {"key_frame": 3}}}, {"ghost_panel": 2, "remove_actor": 2, "gap_report": 1}),
         ({"export": {"viewer_gaussians": 100}}, {"export_viewer": 2}),
@@ -484,13 +504,13 @@ def test_comments_and_code_of_other_settings_rerun_nothing(finished):
     ("file", "old", "new", "expected"),
     [
         ("drivesplat/evaluation/metrics.py", "MIN_FRAME_PIXELS = 100", "MIN_FRAME_PIXELS = 90",
-         {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "ghost_panel": 2, "remove_actor": 2}),
+         {"evaluate": 2, "scene_metrics": 1, "gap_report": 1, "compare": 1, "ghost_panel": 2, "remove_actor": 2}),
         ("drivesplat/preprocess/masks.py", "BRIGHT = 0.7", "BRIGHT = 0.71",
          {"masks": 1, "tracks": 1, **TRAINING_AND_AFTER}),
         ("drivesplat/training/floaters.py", "LARGEST_STEP = 15.0", "LARGEST_STEP = 14.0", TRAINING_AND_AFTER),
         ("drivesplat/scene/object_class.py", "MOVING_VEHICLE = 1.0", "MOVING_VEHICLE = 2.0", EVERYTHING),
-        ("drivesplat/io/video.py", "bicubic", "bilinear", {"film": 4, **OF_ACTORS}),
-        ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", {"film": 4, **OF_ACTORS}),
+        ("drivesplat/io/video.py", "bicubic", "bilinear", FILMS),
+        ("drivesplat/rendering/film.py", "BACKDROP = 0.35", "BACKDROP = 0.45", FILMS),
         ("drivesplat/edited_motion/lateral_offset.py", "HEADING_SPEED = 1.0", "HEADING_SPEED = 0.5",
          {"edit": 2, "export_viewer": 2}),
         ("drivesplat/export/viewer_page/controls.js", "Drag", "Pull", {"export_viewer": 2}),

@@ -1,0 +1,89 @@
+"""The stage `film_quad`: a drive in four panels of one film: its recorded images, their reconstruction, the smooth
+drive between them, and an edit of it."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+import torch
+
+from drivesplat.editing.film import actor_placements, edited_drive, edited_frames
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
+from drivesplat.model.view import View
+from drivesplat.rendering.film import Shot, write_film
+from drivesplat.rendering.frames import film_frames
+from drivesplat.rendering.panels import Panels
+from drivesplat.rendering.trajectory import recorded_frames
+from drivesplat.scene.images import continuous_intrinsics, read_image
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.settings.device import DeviceSettings
+from drivesplat.settings.render import EditJob
+
+T = TypeVar("T")
+
+
+def render_quad(
+    scene: Scene, checkpoint: TrainedCheckpoint, job: EditJob, device_settings: DeviceSettings, path: Path
+) -> dict[str, Any]:
+    """Writes the MP4 `path`, named like the edit; returns the content of its JSON without provenance.
+
+    The first two panels show the last image of the camera until the next: as recorded, and rendered from its pose at
+    its time. Raises what `render_edit` raises.
+    """
+    model, device = open_model(checkpoint, device_settings)
+    drive = edited_drive(scene, model, job, f"scene {scene.name}, edit {path.stem!r}")
+    smooth, after = drive.before, drive.after
+    frames, last = recorded_frames(scene, job.camera), last_images(scene, smooth)
+    taken = [frames[number] for number in np.unique(last)]
+    model.precompute([*smooth.seconds, *(scene.seconds(frame.timestamp) for frame in taken)])
+    placed = actor_placements(drive.actors, np.array(after.seconds))
+    columns = (
+        repeated(last, (recorded_picture(frame, smooth) for frame in taken)),
+        repeated(last, film_frames(model, ((view_at(frame, smooth, device), None) for frame in taken))),
+        film_frames(model, ((view, None) for view in smooth.views(device))),
+        edited_frames(model, after.views(device), placed),
+    )
+    rate = f"{image_rate(frames):.2g} Hz"
+    labels = (f"recorded, {rate}", f"reconstructed, {rate}", f"smooth, {job.fps} fps", f"edited: {path.stem}")
+    panels = Panels(labels, smooth.size)
+    figures = write_film(path, map(panels.assembled, zip(*columns, strict=True)), after, model, panels, drive.notes)
+    return {**after.record(), "film": panels.record(), "edit": job.edit.model_dump(mode="json"), **figures}
+
+
+def last_images(scene: Scene, shot: Shot) -> np.ndarray:
+    """The index (n,) of the camera's last image up to the time of each frame of a shot."""
+    times = np.array([frame.timestamp for frame in recorded_frames(scene, shot.format.camera)])
+    return np.searchsorted(times, shot.cameras.timestamps, side="right") - 1
+
+
+def repeated(last: np.ndarray, pictures: Iterable[T]) -> Iterator[T]:
+    """A picture for each entry of `last` (n,): the next one wherever the entry changes."""
+    remaining = iter(pictures)
+    for changes in np.diff(last, prepend=-1) != 0:
+        if changes:
+            shown = next(remaining)
+        yield shown
+
+
+def recorded_picture(frame: Frame, shot: Shot) -> np.ndarray:
+    """A recorded image with the intrinsics of a shot, (h, w, 3) uint8; black where it ends."""
+    own = continuous_intrinsics(frame, (frame.width, frame.height))
+    scale = shot.K[0, 0] / own[0, 0]
+    size = max(1, round(scale * frame.width)), max(1, round(scale * frame.height))
+    image = read_image(frame.image_path, size)
+    offset = shot.K[:2, 2] - continuous_intrinsics(frame, size)[:2, 2]
+    return cv2.warpAffine(image, np.column_stack([np.eye(2), offset]), shot.size)
+
+
+def view_at(frame: Frame, shot: Shot, device: torch.device) -> View:
+    """The camera of a recorded image with the intrinsics of a shot."""
+    K, pose = (torch.from_numpy(matrix).float().to(device) for matrix in (shot.K, frame.camera_to_world))
+    return View(K, pose, *shot.size, time=shot.scene.seconds(frame.timestamp))
+
+
+def image_rate(frames: list[Frame]) -> float:
+    """The images a second of a camera."""
+    times = np.array([frame.timestamp for frame in frames])
+    return 1e6 / float(np.median(np.diff(times))) if len(times) > 1 else 0.0

@@ -1,0 +1,20 @@
+"""checkpoint.npz of all methods at the recorded images, into compare.mp4 and the figures of each image."""
+
+from pathlib import Path
+
+from drivesplat.workflow.job import job
+from drivesplat.inspection.compare import render_comparison
+from drivesplat.io.storage import write_json
+from drivesplat.model.checkpoint import read_checkpoint
+from drivesplat.scene.prepared_drive import read_prepared_drive
+from drivesplat.settings.render import CompareJob
+
+with job(snakemake, dataset=("images",)) as current:
+    files = current.input
+    recording, upstream = read_prepared_drive(files.scene, files.parser, files.masks)
+    checkpoints = {Path(file).parent.name: read_checkpoint(file) for file in files.checkpoints}
+    provenance = current.provenance(*upstream, *(one.provenance for one in checkpoints.values()))
+    record = render_comparison(
+        checkpoints, recording, current.settings(CompareJob), current.device(), Path(current.output.film)
+    )
+    write_json(current.output.figures, {**record, "provenance": provenance})
