@@ -16,7 +16,7 @@ say() { echo "setup: $*" >&2; }
 fail() { say "$@"; exit 1; }
 
 # The stamp: a digest of what is required, and the build of torch where it is not PyPI's.
-requirements() { cat requirements.txt constraints.txt | sha256sum | cut -d' ' -f1; }
+requirements() { cat requirements.txt requirements-dev.txt constraints.txt | sha256sum | cut -d' ' -f1; }
 build_made() { local digest build; read -r digest build 2>/dev/null < "$stamp" || true; echo "${build:-cu130}"; }
 stamp_for() { if [ "$1" = cu130 ]; then requirements; else echo "$(requirements) $1"; fi; }
 
@@ -110,7 +110,7 @@ make_venv() {
     # shellcheck disable=SC2046  (two words)
     pip_install $(grep -E '^(torch|torchvision)==' constraints.txt) --index-url "$torch_index/$build"
   fi
-  pip_install -r requirements.txt -c constraints.txt
+  pip_install -r requirements.txt -r requirements-dev.txt -c constraints.txt
   if [ "$build" != cu130 ]; then
     .venv/bin/python -c "from importlib.metadata import version as v; raise SystemExit(not v('torch').endswith('+$build'))" ||
       fail "$torch_index/$build did not give a torch for $build; is TORCH_INDEX a mirror of PyTorch's index?"

@@ -8,6 +8,7 @@ import tomllib
 import pytest
 import yaml
 from helpers import REPOSITORY
+from packaging.requirements import Requirement
 
 from drivesplat.settings.config import load, merged
 
@@ -24,15 +25,23 @@ def test_environments_pin_what_the_constraints_pin():
         amds_own = {"torch", "torchvision", "gsplat"} if path.name == "rocm.yaml" else set()
         same = {name: version for name, version in environment.items() if name not in amds_own}
         assert same and all(constraints[name] == version for name, version in same.items()), path.name
-        tools = {"pytest", "pytest-xdist", "pytest-benchmark", "ruff", "snakefmt", "snakemake-executor-plugin-slurm"}
+        tools = {requirement.name for requirement in requirements("requirements-dev.txt")}
+        tools |= {"snakemake-executor-plugin-slurm"}
         assert constraints.keys() - same.keys() == tools | amds_own, path.name
 
 
-def test_every_requirement_is_pinned():
-    required = {
-        line.strip() for line in (REPOSITORY / "requirements.txt").read_text().splitlines() if line and line[0] != "#"
-    }
-    assert required == pins((REPOSITORY / "constraints.txt").read_text().splitlines()).keys()
+def requirements(name: str) -> list[Requirement]:
+    lines = (REPOSITORY / name).read_text().splitlines()
+    return [Requirement(line) for line in lines if line and not line.startswith("#")]
+
+
+def test_every_requirement_is_pinned_within_its_range():
+    pinned = pins((REPOSITORY / "constraints.txt").read_text().splitlines())
+    required = [*requirements("requirements.txt"), *requirements("requirements-dev.txt")]
+    assert [requirement.name for requirement in required] == list(pinned)
+    assert [one.name for one in required if pinned[one.name] not in one.specifier] == []
+    bounded = {one.name: {part.operator for part in one.specifier} for one in requirements("requirements.txt")}
+    assert {name for name, operators in bounded.items() if operators != {">=", "<"}} == set(), "from, and up to"
 
 
 def test_planning_imports_nothing_heavy():

@@ -93,13 +93,17 @@ def _with_moving_vehicles(static: float, group: dict[str, Any], gap: float | Non
     return f"moving vehicles {moving:.1f} dB, static {static:.1f} dB: a gap of {gap:.1f} dB"
 
 
+def print_summary(path: str | Path) -> None:
+    """Prints the sentences of a metrics.json. Raises ResultError where it is absent or damaged."""
+    metrics = read_json(path, rule="scene_metrics")
+    checked_digest(path, warn=False)
+    print("\n".join(sentences(metrics, path)))
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser("python -m drivesplat.evaluation.summary", description=__doc__)
     parser.add_argument("metrics", help="a scene's metrics.json")
-    path = parser.parse_args().metrics
     try:
-        metrics = read_json(path, rule="scene_metrics")
-        checked_digest(path, warn=False)
-        print("\n".join(sentences(metrics, path)))
+        print_summary(parser.parse_args().metrics)
     except DriveSplatError as error:
         sys.exit(f"drivesplat: {error}")

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from drivesplat.errors import ConfigError
+from drivesplat.io.this_copy import default_config
 from drivesplat.settings import quoted
 from drivesplat.settings.yaml_file import read_yaml
 
-CONFIG = "config.yaml"
 SUFFIXES = (".yaml", ".yml", ".json")
 
 
@@ -24,11 +24,6 @@ def stop_at_bad_config_files(files: Iterable[str | Path] | None, workdir: str | 
         read_config(default_config(Path(workdir or "."), snakefile.parent))
     except ConfigError as error:
         sys.exit(f"drivesplat: {error}")
-
-
-def default_config(workdir: Path, basedir: Path) -> Path:
-    """The config file under all others: that of the working directory, or else the workflow's own."""
-    return workdir / CONFIG if (workdir / CONFIG).is_file() else basedir / CONFIG
 
 
 def check_config_files(files: Sequence[str]) -> None:

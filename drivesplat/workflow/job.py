@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.storage import Provenance, unwritable
+from drivesplat.io.this_copy import in_this_copy
 from drivesplat.provenance.file_digests import (
     check_dataset,
     checked_digest,
@@ -54,9 +55,11 @@ class Job:
 
     @property
     def stage(self) -> str:
-        """The name of this stage in provenance records, prefixed by the method if it has one."""
-        method = getattr(self.wildcards, "method", None)
-        return f"{method}/{self._rule}" if method else self._rule
+        """The name of this stage in provenance records, prefixed by the method if it has one: that of the script, since
+        a workflow that imports this one may rename its rules."""
+        main, method = sys.modules["__main__"], getattr(self.wildcards, "method", None)
+        name = Path(main.__file__).stem if hasattr(main, "snakemake") and hasattr(main, "__file__") else self._rule
+        return f"{method}/{name}" if method else name
 
     @property
     def name(self) -> str:
@@ -135,7 +138,7 @@ def job(snakemake: Any, dataset: Iterable[str] = (), check_inputs: bool = True) 
         current.record_outputs()
         log.info("%s ends", current.name)
     except DriveSplatError as error:
-        log.error("%s: %s", current.name, error)
+        log.error("%s: %s", current.name, in_this_copy(str(error)))
         sys.exit(1)
     except Exception as error:
         if isinstance(error, OSError) and error.errno in REFUSED_BY_DISK:

@@ -5,11 +5,11 @@ A stage is a rule; its record holds everything but the inputs that determines it
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
+from drivesplat.io.this_copy import of_the_workflow
 from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
@@ -42,9 +42,6 @@ OF_ONE_SCENE = ("demo_world", "extract", "edit", "film_quad", "ghost_panel", "re
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
-
-WORKFLOW = Path(__file__).parents[2]
-"""The folder of the Snakefile."""
 
 
 @dataclass(frozen=True)
@@ -232,13 +229,7 @@ def _world(at: Place) -> dict[str, Any]:
 def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
     """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
     path = config.datasets[config.dataset_of(scene)].edits.get(scene)
-    return read_edits(edits_file(path)) if path else {}
-
-
-def edits_file(path: str) -> Path:
-    """The edits file at `path`; one that the workflow brings along is found from any working directory."""
-    given = Path(path).expanduser()
-    return given if given.exists() or not (WORKFLOW / given).is_file() else WORKFLOW / given
+    return read_edits(of_the_workflow(path)) if path else {}
 
 
 def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:

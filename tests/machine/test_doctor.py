@@ -288,12 +288,12 @@ def test_the_backbone_is_hashed_and_the_last_failure_read(tmp_path):
 
 
 def test_a_venv_of_other_requirements_is_noticed(tmp_path, monkeypatch):
-    for name in ("requirements.txt", "constraints.txt"):
+    for name in facts_module.REQUIREMENTS:
         (tmp_path / name).write_text(f"{name}\n")
     (tmp_path / ".venv").mkdir()
     monkeypatch.setattr(sys, "prefix", str(tmp_path / ".venv"))
     stamp = tmp_path / facts_module.STAMP
-    stamp.write_text(sha256(b"requirements.txt\nconstraints.txt\n").hexdigest() + " cu126\n")
+    stamp.write_text(sha256(b"requirements.txt\nrequirements-dev.txt\nconstraints.txt\n").hexdigest() + " cu126\n")
     assert not facts_module._venv_outdated(tmp_path)
     stamp.write_text("0" * 64 + "\n")
     assert facts_module._venv_outdated(tmp_path)

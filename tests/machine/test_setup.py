@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from helpers import REPOSITORY
 
+from drivesplat.machine.doctor.facts import REQUIREMENTS
+
 TOOLS = ("bash", "cat", "cut", "sha256sum", "rm", "grep", "awk", "dirname", "du", "df", "mkdir", "cp", "env")
 
 PYTHON = """#!/usr/bin/env bash
@@ -42,7 +44,7 @@ class Machine:
         self.checkout.mkdir()
         self.bin.mkdir()
         shutil.copytree(REPOSITORY / "scripts", self.checkout / "scripts")
-        for name in ("requirements.txt", "constraints.txt"):
+        for name in REQUIREMENTS:
             shutil.copy(REPOSITORY / name, self.checkout)
         (self.checkout / "drivesplat").symlink_to(REPOSITORY / "drivesplat")
         for tool in TOOLS:
@@ -98,7 +100,7 @@ ADA = "NVIDIA GeForce RTX 4090, 580.65.06, 24564, 24000, 8.9"
 def test_a_good_venv_is_left_alone(machine):
     assert machine.run().returncode == 0
     digest = hashlib.sha256()
-    for name in ("requirements.txt", "constraints.txt"):
+    for name in REQUIREMENTS:
         digest.update((REPOSITORY / name).read_bytes())
     assert machine.stamp.read_text().strip() == digest.hexdigest()
     assert [line.split()[0] for line in machine.done()] == ["pip", "pip", "gsplat_build", "compileall", "warm_up"]
@@ -123,7 +125,7 @@ def test_changed_requirements_remake_it(machine):
     with open(machine.checkout / "constraints.txt", "a") as file:
         file.write("# more\n")
     assert machine.run().returncode == 0
-    assert any("-r requirements.txt -c constraints.txt" in line for line in machine.done())
+    assert any("-r requirements.txt -r requirements-dev.txt -c constraints.txt" in line for line in machine.done())
 
 
 def test_an_interrupted_installation_is_remade_whole(machine):

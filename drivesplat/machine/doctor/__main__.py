@@ -10,27 +10,34 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).parents[3]
+from drivesplat import IS_CHECKOUT, WORKFLOW
+from drivesplat.io.this_copy import in_this_copy
 
 
 def main(arguments: Sequence[str]) -> int:
     """Prints the findings. Returns the exit status."""
-    parser = argparse.ArgumentParser("python -m drivesplat.machine.doctor", description=__doc__)
+    command = "python -m drivesplat.machine.doctor" if IS_CHECKOUT else "drivesplat doctor"
+    parser = argparse.ArgumentParser(command, description=__doc__)
     parser.add_argument("config", nargs="*", type=Path, help="merged over config.yaml in this order (presets)")
     files = parser.parse_args(arguments).config
     try:
+        from drivesplat.io.this_copy import default_config, of_the_workflow
         from drivesplat.machine.doctor.checks import examine
         from drivesplat.machine.doctor.facts import gather
     except ImportError as error:
-        print(f"fix   packages      {error} in {sys.executable}: run make setup, then make doctor")
+        remedy = in_this_copy("run make setup, then make doctor")
+        print(f"fix   packages      {error} in {sys.executable}: {remedy}")
         return 1
-    os.chdir(ROOT)
-    findings = examine(gather(ROOT, [Path("config.yaml"), *files]))
+    if IS_CHECKOUT:
+        os.chdir(WORKFLOW)
+    here = Path.cwd()
+    findings = examine(gather(here, [default_config(here, WORKFLOW), *(of_the_workflow(file) for file in files)]))
     width = max(len(finding.topic) for finding in findings)
     for finding in findings:
-        print(f"{finding.level:4}  {finding.topic:{width}}  {finding.text}")
+        print(f"{finding.level:4}  {finding.topic:{width}}  {in_this_copy(finding.text)}")
     broken = sum(finding.level == "fix" for finding in findings)
-    print(f"\n{broken} to fix" if broken else "\nNothing is broken: make demo runs without GPU and data.")
+    everything = in_this_copy("Nothing is broken: make demo runs without GPU and data.")
+    print(f"\n{broken} to fix" if broken else f"\n{everything}")
     return 1 if broken else 0
 
 

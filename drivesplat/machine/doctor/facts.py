@@ -26,6 +26,8 @@ from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.yaml_file import read_yaml
 
 STAMP = ".venv/.made-from"
+REQUIREMENTS = ("requirements.txt", "requirements-dev.txt", "constraints.txt")
+"""What .venv is made from; scripts/setup.sh reads them in this order, too."""
 
 
 @dataclass(frozen=True)
@@ -203,5 +205,5 @@ def _venv_outdated(root: Path) -> bool:
     stamp = root / STAMP
     if Path(sys.prefix).resolve() != (root / ".venv").resolve() or not stamp.is_file():
         return False
-    present = sha256(b"".join((root / name).read_bytes() for name in ("requirements.txt", "constraints.txt")))
+    present = sha256(b"".join((root / name).read_bytes() for name in REQUIREMENTS))
     return stamp.read_text(encoding="utf-8").split()[:1] != [present.hexdigest()]

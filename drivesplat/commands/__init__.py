@@ -1,0 +1,1 @@
+"""The command `drivesplat` of an installed copy: the workflow without a checkout."""
