@@ -24,7 +24,12 @@ from snakemake.utils import min_version
 min_version("9.27")
 
 
-configfile: "config.yaml" if os.path.isfile("config.yaml") else os.path.join(workflow.basedir, "config.yaml")
+# not workflow.basedir: another workflow may import this one as a module
+here = workflow.current_basedir.get_path_or_uri(secret_free=True)
+main = workflow.modifier.is_main_snakefile()
+
+
+configfile: "config.yaml" if main and os.path.isfile("config.yaml") else os.path.join(here, "config.yaml")
 
 
 report: "report/workflow.rst"
@@ -84,4 +89,6 @@ rule all:
         rules.gap_report.output,
 
 
-include: "rules/hooks.smk"
+if main:
+
+    include: "rules/hooks.smk"

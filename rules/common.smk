@@ -2,31 +2,39 @@
 #
 # A rule's `params` are its settings (canonical JSON of its own subtree, defaults filled in) and the digest of its code.
 # Snakemake compares only these, so key order, comments and settings of other stages rerun nothing.
+#
+# As a module of another workflow this one knows no targets: the command line is the other's.
 import os
 import sys
 
 from snakemake.cli import get_argument_parser
 from snakemake.utils import validate
 
-sys.path.insert(0, workflow.basedir)
+sys.path.insert(0, here)
 
 from drivesplat.workflow.costs.run_costs import COSTS, ESTIMATE, RunCosts
 from drivesplat.errors import DriveSplatError
+from drivesplat.workflow.module_use import module_config, stop_at_absent_data, take_prefix
 from drivesplat.workflow.plan import Plan, let_scripts_import
 
-let_scripts_import(workflow.basedir)
-asked = get_argument_parser().parse_known_args()[0]
+let_scripts_import(here)
+asked = get_argument_parser().parse_known_args(None if main else [])[0]
 wanted = [target for target in asked.targets if target != ESTIMATE]
 
 if ESTIMATE in asked.targets and asked.no_hooks:
     sys.exit(f"drivesplat: --no-hooks leaves out what the target {ESTIMATE!r} is for, and would run everything")
 
 try:
-    plan = Plan(config, workflow.basedir)
+    prefix = "" if main else take_prefix(workflow)
+    if not main:
+        config = module_config(config, os.path.join(here, "config.yaml"), prefix)
+    plan = Plan(config, here, prefix)
+    if not main:
+        stop_at_absent_data(plan)
     run_costs = RunCosts(plan, workflow, asked.targets)
     across_scenes = plan.report(wanted)
     plan.edits()
-    if workflow.is_main_process and not asked.lint:
+    if main and workflow.is_main_process and not asked.lint:
         plan.refuse_unknown(wanted)
         plan.refuse_download(wanted)
         across_scenes.refuse_empty()
@@ -37,13 +45,18 @@ try:
 except DriveSplatError as error:
     sys.exit(f"drivesplat: {error}")
 
-validate(config, os.path.join(workflow.basedir, "config.schema.json"), set_default=False)
+validate(config, os.path.join(here, "config.schema.json"), set_default=False)
 
 
 pathvars:
     results=plan.config.results_dir,
+    resources=os.path.join(prefix, "resources"),
     logs=f"{plan.config.results_dir}/logs",
     benchmarks=f"{plan.config.results_dir}/benchmarks",
+
+
+if workflow.pathvars.get("results") != plan.config.results_dir:
+    sys.exit("drivesplat: pathvars of another workflow move results; use a prefix, or results_dir in the config")
 
 
 wildcard_constraints:

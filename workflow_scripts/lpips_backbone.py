@@ -8,4 +8,5 @@ from drivesplat.io.storage import write_json
 from drivesplat.settings.evaluate import BACKBONE, LpipsSettings
 
 with job(snakemake) as current:
-    write_json(current.output.record, provide_backbone(current.settings(LpipsSettings), Path(BACKBONE)))
+    backbone = Path(current.output.record).with_name(Path(BACKBONE).name)
+    write_json(current.output.record, provide_backbone(current.settings(LpipsSettings), backbone))

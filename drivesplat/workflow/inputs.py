@@ -27,10 +27,11 @@ def unwritable_results(config: Config, error: OSError) -> DriveSplatError:
 
 
 class Inputs:
-    """The inputs of a config's rules."""
+    """The inputs of a config's rules; `prefix` is put before the folder of the downloaded backbone."""
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, prefix: str = ""):
         self.config = config
+        self._prefix = prefix
         self._roots: dict[str, str] = {}
         self._folders: dict[str, Path] = {}
 
@@ -170,8 +171,9 @@ class Inputs:
 
     def lpips_record(self, _: Any) -> list[str]:
         """The record of LPIPS's backbone, if LPIPS is enabled."""
-        return [BACKBONE_RECORD] if self.config.lpips.enabled else []
+        return [str(Path(self._prefix, BACKBONE_RECORD))] if self.config.lpips.enabled else []
 
     def backbone_file(self, _: Any) -> list[str]:
         """The backbone itself if it is present: adding it reruns the measurements that lacked it."""
-        return [BACKBONE] if Path(BACKBONE).is_file() else []
+        file = Path(self._prefix, BACKBONE)
+        return [str(file)] if file.is_file() else []

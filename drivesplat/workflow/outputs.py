@@ -37,10 +37,10 @@ COMPARE_FILM = "compare.mp4"
 
 
 class Outputs(Inputs):
-    """The results of a validated config; `scripts` is the folder of the rules' scripts."""
+    """The results of a validated config; `scripts` is the folder of the rules' scripts, `prefix` as in `Inputs`."""
 
-    def __init__(self, config: Config, scripts: Path):
-        super().__init__(config)
+    def __init__(self, config: Config, scripts: Path, prefix: str = ""):
+        super().__init__(config, prefix)
         self._scripts = scripts
         self._codes: dict[str, str] = {}
         self._settings: dict[tuple[str | None, ...], str] = {}

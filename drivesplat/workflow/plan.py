@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from drivesplat import IS_CHECKOUT
 from drivesplat.demo.marker import refuse_foreign_data
 from drivesplat.errors import ConfigError, DriveSplatError
 from drivesplat.io.file_lock import LockHeldError, locked_file
@@ -34,16 +35,20 @@ ABLATION_FILES = ("ablation.json", "ablation.csv")
 
 
 def let_scripts_import(folder: str) -> None:
-    """Makes the package at `folder` importable for the scripts of all rules, in whatever environment they run."""
+    """Makes the package at `folder`, if it is a checkout, importable for the scripts of all rules, in whatever
+    environment they run. They find an installed package where Snakemake itself lies."""
+    if not IS_CHECKOUT:
+        return
     inherited = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join([folder, *([inherited] if inherited else [])])
 
 
 class Plan(Outputs):
-    """The interface of the rules to the validated config; `basedir` is the Snakefile's folder."""
+    """The interface of the rules to the validated config; `basedir` is the Snakefile's folder, and `prefix` is that of
+    a module of another workflow."""
 
-    def __init__(self, values: Mapping[str, Any], basedir: str):
-        super().__init__(load(values), Path(basedir) / SCRIPTS)
+    def __init__(self, values: Mapping[str, Any], basedir: str, prefix: str = ""):
+        super().__init__(load(values), Path(basedir) / SCRIPTS, prefix)
         self._held_lock: Any = None
         self._devices: dict[str, tuple[str, int]] = {}
 
