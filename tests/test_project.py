@@ -76,3 +76,16 @@ def test_each_test_that_make_test_leaves_out_is_run_by_a_target_of_its_own():
         (files,) = re.findall(r"tests/\S+", command) or ["tests"]
         users = (path for path in REPOSITORY.glob("tests/**/*.py") if f"pytest.mark.{marker}" in path.read_text())
         assert all(path.is_relative_to(REPOSITORY / files) for path in users), marker
+
+
+def test_citation_and_catalog_entry_hold_what_their_readers_require():
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert citation["cff-version"] == "1.2.0" and {"message", "title", "authors"} <= citation.keys()
+    for reference in citation["references"]:
+        assert {"type", "title", "authors", "year"} <= reference.keys() and {"doi", "url"} & reference.keys()
+    usage = yaml.safe_load((REPOSITORY / ".snakemake-workflow-catalog.yml").read_text())["usage"]
+    assert (
+        usage["mandatory-flags"]["flags"].split() == ["--cores", "all"] and usage["software-stack-deployment"]["conda"]
+    )
+    named = re.findall(r"[\w./]+\.(?:yaml|md)\b", usage["mandatory-flags"]["desc"])
+    assert len(named) == 2 and all((REPOSITORY / name).is_file() for name in named)

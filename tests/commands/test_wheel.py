@@ -103,3 +103,14 @@ def test_an_installed_copy_has_its_pages_and_document(site, tmp_path):
     )
     done = python(site, code, cwd=tmp_path)
     assert done.stdout == "made\n", done.stderr
+
+
+def test_the_image_copies_files_that_exist_and_ignores_none_that_the_wheel_needs():
+    lines = (REPOSITORY / "Containerfile").read_text().splitlines()
+    copied = [
+        part for line in lines if line.startswith("COPY ") and "--from" not in line for part in line.split()[1:-1]
+    ]
+    assert {"constraints.txt", "scripts"} < set(copied) and all((REPOSITORY / part).exists() for part in copied)
+    ignored = {line.strip("/") for line in (REPOSITORY / ".containerignore").read_text().splitlines()}
+    needed = {*FOLDERS, *FILES, "drivesplat", "docs", "README.md", "pyproject.toml", "requirements.txt"}
+    assert not ignored & needed and "results" in ignored, "results of a checkout stay out of an image"
