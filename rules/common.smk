@@ -14,6 +14,7 @@ sys.path.insert(0, here)
 
 from drivesplat.workflow.costs.run_costs import COSTS, ESTIMATE, RunCosts
 from drivesplat.errors import DriveSplatError
+from drivesplat.io.this_copy import in_this_copy
 from drivesplat.workflow.module_use import module_config, stop_at_absent_data, take_prefix
 from drivesplat.workflow.plan import Plan, let_scripts_import
 
@@ -43,7 +44,7 @@ try:
         run_costs.report_settings_without_effect()
         run_costs.report_foreign_records()
 except DriveSplatError as error:
-    sys.exit(f"drivesplat: {error}")
+    sys.exit(f"drivesplat: {in_this_copy(str(error))}")
 
 validate(config, os.path.join(here, "config.schema.json"), set_default=False)
 

@@ -21,9 +21,11 @@ def of_the_workflow(path: str | Path) -> Path:
 
 
 def in_this_copy(text: str, is_checkout: bool = IS_CHECKOUT) -> str:
-    """A message with the commands of this copy: one that pip has installed comes without make."""
+    """A message with the commands of this copy: one that pip has installed comes without make, and with a Snakefile
+    that only its own command knows."""
     if is_checkout:
         return text
+    text = text.replace("`snakemake ", "`drivesplat run ")
     text = re.sub(
         r"`?TORCH_CUDA=(\w+) make setup`?",
         r'pip install --force-reinstall "torch==2.11.*" torchvision --index-url https://download.pytorch.org/whl/\1',

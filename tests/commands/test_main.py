@@ -151,6 +151,7 @@ def test_an_installed_copy_names_commands_that_it_has():
     installed = {
         "run `make setup`, `make doctor` says more": "run `drivesplat setup`, `drivesplat doctor` says more",
         'GSPLAT_ARCHS="8.6" make setup': 'GSPLAT_ARCHS="8.6" drivesplat setup',
+        "`snakemake --cores 1 all` makes it": "`drivesplat run --cores 1 all` makes it",
         "rm -r .venv, then make setup": "a new installation by pip",
         "`rm -r .venv; make setup` reinstalls it": "a new installation by pip reinstalls it",
         "what they make; make test": "what they make; make test",
