@@ -23,7 +23,8 @@ class InstanceMotion:
 @dataclass(frozen=True)
 class Instance:
     """An object of an edited drive with the Gaussians of the track `source`, scaled by `scale` about the centre of its
-    box, which then has `size` (3,) metres. It moves by `motion`; None: as recorded."""
+    box, which then has `size` (3,) metres, and with RGB colours mapped by `color_matrix` (3, 3; None: as trained). It
+    moves by `motion`; None: it is as recorded."""
 
     id: str
     source: str
@@ -31,6 +32,7 @@ class Instance:
     size: np.ndarray
     scale: float
     motion: InstanceMotion | None
+    color_matrix: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

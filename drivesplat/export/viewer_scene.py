@@ -148,7 +148,8 @@ def _instance_record(instance: Instance, groups: Sequence[str], rows: PoseRows) 
     record: dict[str, Any] = {"id": instance.id, "group": groups.index(instance.source)}
     if instance.motion is None:
         return record
-    changed = {"category": instance.category, "size": instance.size.tolist(), "scale": instance.scale}
+    colors = None if instance.color_matrix is None else instance.color_matrix.ravel().tolist()
+    changed = {"category": instance.category, "size": instance.size.tolist(), "scale": instance.scale, "colors": colors}
     return {**record, **changed, **motion_record(instance.motion, rows)}
 
 

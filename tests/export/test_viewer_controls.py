@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from helpers.chromium import chromium, in_a_browser
 from helpers.hand_made import recording_of
 from helpers.hand_made_traffic import placed
@@ -37,7 +38,7 @@ from drivesplat.export.trained_parts import SampledGroup
 from drivesplat.export.viewer import viewer_page
 from drivesplat.export.viewer_images import key_frame_images
 from drivesplat.export.viewer_scene import ViewerContent
-from drivesplat.model.gaussians import Gaussians, concatenate
+from drivesplat.model.gaussians import Gaussians, concatenate, recolored
 from drivesplat.scene.images import read_image
 from drivesplat.scene.rigid import rigid
 
@@ -65,7 +66,17 @@ def edits() -> list[EditedDrive]:
         Instance(CAR, CAR, "vehicle.car", SIZE, 1.0, None),
         Instance("twin", CAR, "vehicle.car", SIZE, 0.5, motion),
     )
-    return [EditedDrive("gone", (), None), EditedDrive("twins", copied, camera)]
+    painted = Instance(CAR, CAR, "vehicle.car", SIZE, 1.0, standing(), SWAPPED)
+    return [EditedDrive("gone", (), None), EditedDrive("twins", copied, camera), EditedDrive("paint", (painted,), None)]
+
+
+SWAPPED = np.array([[0.0, 0.8, 0.0], [0.1, 0.0, 0.7], [0.9, 0.0, 0.0]])
+"""A map of colours that no transposed one equals."""
+
+
+def standing() -> InstanceMotion:
+    """The car as it is at the second 1."""
+    return InstanceMotion(np.array([0.0, 2.0]), np.stack([car_pose(1.0), car_pose(1.0)]), ((0.0, 2.0),))
 
 
 def halved(gaussians: Gaussians) -> Gaussians:
@@ -102,6 +113,9 @@ def test_an_edit_plays_with_its_instances_and_its_camera(tmp_path):
         tab.run(f"{set_second(1.0)}; {choose('edit', '')}; document.getElementById('follow').click()")
         tab.key("KeyR", "r")
         assert psnr(settled(tab), expected(own)) > 40.0
+        tab.run(choose("edit", 2))
+        painted = recolored(own, torch.from_numpy(SWAPPED).float(), torch.ones(len(own), dtype=torch.bool))
+        assert psnr(settled(tab), expected(painted)) > 40.0 > 35.0 > psnr(settled(tab), expected(own))
         assert tab.complaints == []
 
 

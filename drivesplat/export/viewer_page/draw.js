@@ -64,7 +64,9 @@ function instanceTexture(gl, unit) {
   };
 }
 
-// The poses of the instances, a line for each: filled anew for every picture.
+const SAME_COLORS = [1, 0, 0, 0, 1, 0, 0, 0, 1];
+
+// The poses and colour matrices of the instances, a line for each: filled anew for every picture.
 function poseTexture(gl, unit) {
   const texture = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0 + unit);
@@ -72,13 +74,14 @@ function poseTexture(gl, unit) {
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   return (ranges) => {
-    const values = new Float32Array(16 * ranges.length);
-    ranges.forEach(({ begin, row, pose }, line) => {
-      if (pose) values.set([...pose, begin - row, 1], 16 * line);
+    const values = new Float32Array(28 * ranges.length);
+    ranges.forEach(({ begin, row, pose, colors }, line) => {
+      const [red, green, blue] = [0, 3, 6].map((i) => (colors || SAME_COLORS).slice(i, i + 3));
+      if (pose) values.set([...pose, begin - row, 1, 0, 0, ...red, 0, ...green, 0, ...blue, 0], 28 * line);
     });
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 4, ranges.length, 0, gl.RGBA, gl.FLOAT, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 7, ranges.length, 0, gl.RGBA, gl.FLOAT, values);
   };
 }
 

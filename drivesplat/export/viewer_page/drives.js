@@ -2,9 +2,9 @@
 
 // The instances of a drive; `edit` is null for the recorded one. An instance has the Gaussians of the group with the
 // number `group`, scaled by `scale`; id, category and size; the intervals `present` and the rows `samples` of its
-// motion, null if it is static. What else an edit's instance has (its looks) is taken as it is.
+// motion, null if it is static; `colors` is the matrix of its colours, row by row, null as trained.
 function instancesOf(groups, edit) {
-  const recorded = groups.map((group, number) => ({ ...group, id: group.name, group: number, scale: 1 }));
+  const recorded = groups.map((group, number) => ({ ...group, id: group.name, group: number, scale: 1, colors: null }));
   if (!edit) return recorded;
   const moving = edit.instances.map((instance) => ({ ...recorded[instance.group], ...instance }));
   return [...recorded.filter((instance) => !instance.samples), ...moving];

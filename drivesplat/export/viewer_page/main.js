@@ -24,7 +24,8 @@ function driveOf(scene, edit) {
 // without scale.
 function posed({ instances, ranges }, arrays, { second, hidden }) {
   const poses = instances.map((one) => (hidden.has(one.id) ? null : instancePose(one, arrays, second)));
-  return [ranges.map((range, i) => ({ ...range, pose: scaledPose(poses[i], instances[i].scale) })), poses];
+  const shown = instances.map(({ scale, colors }, i) => ({ pose: scaledPose(poses[i], scale), colors }));
+  return [ranges.map((range, i) => ({ ...range, ...shown[i] })), poses];
 }
 
 function openingState(scene) {

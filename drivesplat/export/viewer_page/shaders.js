@@ -11,7 +11,8 @@ layout(location = 1) in uint row;
 
 uniform sampler2D means, scales, quats, opacities, sh0, shN;
 uniform usampler2D instance; // the number of each row's instance
-uniform sampler2D poses; // a line for each instance: three rows of [rotation | place], and [first, shown, -, -]
+// a line for each instance: three rows of [rotation | place], [first, shown, -, -], three rows of its colour matrix
+uniform sampler2D poses;
 uniform float shRange;
 uniform int coefficients;
 uniform bool antialiased;
@@ -71,7 +72,7 @@ vec3 radiance(uint i, vec3 d) {
     0.4570457994644658 * (4.0 * zz - xx - yy) * (y * coefficient(i, 11) + x * coefficient(i, 13)) +
     0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(i, 12) +
     1.445305721320277 * z * (xx - yy) * coefficient(i, 14);
-  return max(sum, 0.0);
+  return sum;
 }
 
 void main() {
@@ -105,7 +106,9 @@ void main() {
     sigmas.y * sqrt(max(mid - spread, 0.0)) * vec2(-major.y, major.x);
   vec2 pixel = focal * p.xy / p.z + center + offset;
   gl_Position = vec4((2.0 * pixel / size - 1.0) * vec2(1.0, -1.0), 0.0, 1.0);
-  color = vec4(radiance(index, normalize((mean - position) * toWorld)), alpha);
+  mat3 colors = mat3(texelFetch(poses, ivec2(4, line), 0).xyz, texelFetch(poses, ivec2(5, line), 0).xyz,
+    texelFetch(poses, ivec2(6, line), 0).xyz);
+  color = vec4(max(radiance(index, normalize((mean - position) * toWorld)) * colors, 0.0), alpha);
 }`;
 
 const SPLAT_FRAGMENT = `#version 300 es
