@@ -51,7 +51,7 @@ rule edit:
         "../workflow_scripts/edit.py"
 
 
-rule film_quad:
+rule quad:
     """
     Renders a drive in four panels of one film: its recorded images, their reconstruction, the smooth drive between
     them, and an edit of it.
@@ -83,7 +83,7 @@ rule film_quad:
         mem_mb=8000,
         runtime=60,
     params:
-        settings=plan.settings("film_quad"),
-        code=plan.code("film_quad"),
+        settings=plan.settings("quad"),
+        code=plan.code("quad"),
     script:
-        "../workflow_scripts/film_quad.py"
+        "../workflow_scripts/quad.py"

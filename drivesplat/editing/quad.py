@@ -1,4 +1,4 @@
-"""The stage `film_quad`: a drive in four panels of one film: its recorded images, their reconstruction, the smooth
+"""The stage `quad`: a drive in four panels of one film: its recorded images, their reconstruction, the smooth
 drive between them, and an edit of it."""
 
 from collections.abc import Iterable, Iterator

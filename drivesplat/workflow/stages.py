@@ -38,7 +38,7 @@ ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
-OF_ONE_SCENE = ("demo_world", "extract", "edit", "film_quad", "ghost_panel", "remove_actor", "export_viewer")
+OF_ONE_SCENE = ("demo_world", "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer")
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
@@ -264,7 +264,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "film_parts": (FilmFormat, _format),
     "compare": (CompareJob, _compare),
     "edit": (EditJob, _edit),
-    "film_quad": (EditJob, _quad),
+    "quad": (EditJob, _quad),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

@@ -327,7 +327,7 @@ LOOK_SCRIPTS = {
     "film": "vanilla/original.mp4",
     "film_parts": "street/parts.mp4",
     "compare": "compare.mp4",
-    "film_quad": "street/quad/gone.mp4",
+    "quad": "street/quad/gone.mp4",
     "edit": "street/edits/gone.mp4",
     "ghost_panel": "vanilla/ghost_panel.png",
     "remove_actor": "vanilla/with_car.png",

@@ -538,6 +538,16 @@ def test_a_truncated_result_is_named_with_the_rule_that_rebuilds_it(finished, tm
     assert not (copy.folder / "results/0001/parser.pkl").exists()
 
 
+def test_a_drive_in_four_panels_is_made_on_request(finished):
+    """The last test of this file, since it adds a folder to the results."""
+    done = finished.run("results/0001/street/quad/stop.mp4")
+    assert done.returncode == 0, done.stdout
+    footage = read_footage(finished.folder / "results/0001/street/quad/stop.mp4")
+    assert (footage.frames, footage.width, footage.height) == (19, 128, 72)
+    labels = finished.read("results/0001/street/quad/stop.json")
+    assert {"extract", "street/train"} < labels["provenance"]["stages"].keys() and len(labels["film"]["panels"]) == 4
+
+
 class WorkflowWithConfig(WorkflowCopy):
     """The same folder under another config."""
 

@@ -9,7 +9,7 @@ from typing import Any
 
 BENCHMARKS = "benchmarks"
 """The folder of benchmark files in that of the results."""
-TRAIN, FILM, EDIT, FILM_PARTS, WORLD = "train", "film", "edit", "film_parts", "demo_world"
+TRAIN, FILM, EDIT, QUAD, FILM_PARTS, WORLD = "train", "film", "edit", "quad", "film_parts", "demo_world"
 COLUMNS = {"max_rss_mb": "max_rss", "cpu_seconds": "cpu_time", "mean_load": "mean_load"}
 """Fields of a Cost and the columns of Snakemake's benchmark files that hold them."""
 RENAMED = {"metrics": "scene_metrics"}
@@ -33,7 +33,7 @@ class JobId:
         if place == [WORLD]:
             return cls(WORLD, film=name)
         scene, method = [*place, "", ""][:2]
-        for stage in (FILM, EDIT):
+        for stage in (FILM, EDIT, QUAD):
             if method and name.startswith(f"{stage}_") and name != FILM_PARTS:
                 return cls(stage, scene, method, name.removeprefix(f"{stage}_"))
         return cls(RENAMED.get(name, name), scene, method)
