@@ -339,6 +339,15 @@ def test_a_changed_setting_reruns_its_stage_and_what_depends_on_it(finished, set
     assert WorkflowWithConfig(finished, changed).planned() == {rule: n for rule, n in expected.items() if n}
 
 
+def test_the_page_has_the_edits_of_a_method_with_actors_the_images_and_the_other_method(finished):
+    for method, edits in (("street", ["gone", "stop"]), ("vanilla", [])):
+        page = (finished.folder / f"results/0001/{method}/viewer.html").read_text(encoding="utf-8")
+        scene = json.loads(page.partition('id="scene">')[2].partition("</script>")[0])
+        assert [edit["name"] for edit in scene["edits"]] == edits
+        assert [image["second"] for image in scene["images"]] == scene["key_frames"]
+        assert scene["method"] == method and scene["methods"] == ["street", "vanilla"]
+
+
 def test_what_concerns_actors_reruns_nothing_of_a_method_without_them(finished):
     changed = {**finished.config, "actors": {"humans": True}}
     changed["train"] = {**changed["train"], "actors": {"fourier": 3}}
