@@ -63,7 +63,7 @@ def by_turns(pages: Sequence[Path], rounds: int, frames: int) -> list[list[Speed
     speeds: list[list[Speed]] = [[] for _ in pages]
     for _ in range(rounds):
         for page, found in zip(pages, speeds, strict=True):
-            with tempfile.TemporaryDirectory() as profile, chromium(Path(profile)) as tab:
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile, chromium(Path(profile)) as tab:
                 tab.call("Performance.enable")
                 found.append(measured(tab, page, frames))
     return speeds
