@@ -16,6 +16,7 @@ from drivesplat.workflow.costs.run_costs import COSTS, ESTIMATE, RunCosts
 from drivesplat.errors import DriveSplatError
 from drivesplat.io.this_copy import in_this_copy
 from drivesplat.workflow.module_use import module_config, stop_at_absent_data, take_prefix
+from drivesplat.workflow.named_tracks import run_targets
 from drivesplat.workflow.plan import Plan, let_scripts_import
 
 let_scripts_import(here)
@@ -32,6 +33,7 @@ try:
     plan = Plan(config, here, prefix)
     if not main:
         stop_at_absent_data(plan)
+    plan.targets = run_targets(wanted, workflow.is_main_process) if main else None
     run_costs = RunCosts(plan, workflow, asked.targets)
     across_scenes = plan.report(wanted)
     plan.edits()

@@ -1,6 +1,9 @@
 """The tracks that settings name, and their check before a run deletes results that it would remake."""
 
-from collections.abc import Callable, Iterable
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import PurePosixPath
 from typing import Any
 
 from drivesplat.errors import ResultError
@@ -9,17 +12,51 @@ from drivesplat.settings.edit import Edit
 from drivesplat.settings.track_references import EditReference, TrackReferences
 from drivesplat.workflow.stages import scene_edits
 
+RULES_OF_EDITS = ("edit", "quad")
+"""Rules that render an edit."""
 RULES_OF_SUBJECT = ("ghost_panel", "remove_actor")
 """Rules that show the vehicle that `subjects` names."""
+FILES_OF_SUBJECT = ("ghost_panel", "removal", "with_car", "without_car")
+"""Their files, without suffix."""
+TARGETS = "DRIVESPLAT_TARGETS"
+"""The environment variable with the targets of a run as JSON, for the processes of its jobs."""
 
 
-def track_references(config: Config, scene: str) -> TrackReferences:
-    """The tracks that the settings of a scene name; those of edits where a method can be edited. Raises ConfigError
-    where the edits file is invalid."""
+def run_targets(targets: Sequence[str], is_main: bool) -> list[str] | None:
+    """The targets of the run that this process belongs to: its own in the main process, which hands them to those of
+    jobs. None where they are not known."""
+    if is_main:
+        os.environ[TARGETS] = json.dumps(list(targets))
+    handed = os.environ.get(TARGETS)
+    return None if handed is None else json.loads(handed)
+
+
+def track_references(config: Config, scene: str, targets: Sequence[str] | None = ()) -> TrackReferences:
+    """The tracks that the settings of a scene name and that a run for `targets` (none: everything) uses. Without known
+    targets (None) there are none. Raises ConfigError where the edits file is invalid."""
     subject, editable = config.subjects.get(scene), any(method.moving_parts for method in config.methods.values())
+    used = _Used(scene, targets)
     edits = scene_edits(config, scene) if editable else {}
-    named = [reference for name, edit in edits.items() for reference in _of_edit(name, edit)]
-    return TrackReferences(scene=scene, subject=subject.track if subject else None, edits=tuple(named))
+    named = [reference for name, edit in edits.items() if used.edit(name) for reference in _of_edit(name, edit)]
+    return TrackReferences(scene=scene, subject=subject.track if subject and used.subject else None, edits=tuple(named))
+
+
+class _Used:
+    """What a run for some targets uses of a scene's named tracks."""
+
+    def __init__(self, scene: str, targets: Sequence[str] | None):
+        self._everything = targets is not None and (not targets or "all" in targets)
+        self._targets = set(targets or ())
+        self._files = [path for path in map(PurePosixPath, targets or ()) if scene in path.parts]
+
+    def edit(self, name: str) -> bool:
+        of_edits = (path.stem for path in self._files if {"edits", "quad"} & {*path.parts})
+        return self._everything or "edits" in self._targets or name in of_edits
+
+    @property
+    def subject(self) -> bool:
+        shown = any(path.stem in FILES_OF_SUBJECT for path in self._files)
+        return self._everything or "looks" in self._targets or shown
 
 
 def _of_edit(name: str, edit: Edit) -> Iterable[EditReference]:
@@ -43,11 +80,11 @@ def refuse_wrong_tracks(config: Config, jobs: Iterable[Any], scene_file: Callabl
     extracted = {job.wildcards.scene for job in planned if job.rule.name == "extract"}
     for job in planned:
         rule, scene = job.rule.name, getattr(job.wildcards, "scene", None)
-        if scene in extracted or rule not in (*RULES_OF_SUBJECT, "edit"):
+        if scene in extracted or rule not in (*RULES_OF_SUBJECT, *RULES_OF_EDITS):
             continue
         references = track_references(config, scene)
         subject = references.subject if rule in RULES_OF_SUBJECT else None
-        edits = tuple(one for one in references.edits if rule == "edit" and one.edit == job.wildcards.edit)
+        edits = tuple(one for one in references.edits if rule in RULES_OF_EDITS and one.edit == job.wildcards.edit)
         _refuse(TrackReferences(scene=scene, subject=subject, edits=edits), scene_file(job.wildcards))
 
 

@@ -49,6 +49,8 @@ class Plan(Outputs):
 
     def __init__(self, values: Mapping[str, Any], basedir: str, prefix: str = ""):
         super().__init__(load(values), Path(basedir) / SCRIPTS, prefix)
+        self.targets: list[str] | None = None
+        """The targets of the run; None where they are not known."""
         self._held_lock: Any = None
         self._devices: dict[str, tuple[str, int]] = {}
 
@@ -77,7 +79,8 @@ class Plan(Outputs):
     def track_references(self, wildcards: Any) -> str:
         """The tracks that a scene's settings name as canonical JSON. A resource, not a param: it changes no result of
         the stages that check it."""
-        return canonical_json(track_references(self.config, wildcards.scene).model_dump(mode="json"))
+        references = track_references(self.config, wildcards.scene, self.targets)
+        return canonical_json(references.model_dump(mode="json"))
 
     def refuse_wrong_tracks(self, jobs: Iterable[Any]) -> None:
         """Raises ConfigError where one of Snakemake's planned `jobs` would fail on a track that settings name."""

@@ -114,17 +114,19 @@ GONE = "edits:\n  gone:\n    - remove: {{track: {}}}\n"
 
 
 @pytest.mark.parametrize(
-    ("edits", "subject", "words", "extracted"),
+    ("edits", "subject", "target", "words", "extracted"),
     [
-        (GONE.format("0009"), None, ["edit 'gone', step 1 (remove): no track has an id starting with '0009'"], False),
-        (GONE.format("0001 instance 1"), None, ["edit 'gone'", "no editable track", "editable tracks: 0001"], True),
-        (EDITS, "0001", ["subjects.0001", "no track '0001'", "tracks that move: 0001 instance 0"], False),
+        (GONE.format("0009"), None, "edits/gone.mp4",
+         ["edit 'gone', step 1 (remove): no track has an id starting with '0009'"], False),
+        (GONE.format("0001 instance 1"), None, "edits/gone.mp4",
+         ["edit 'gone'", "no editable track", "editable tracks: 0001"], True),
+        (EDITS, "0001", "removal.png", ["subjects.0001", "no track '0001'", "that move: 0001 instance 0"], False),
     ],
     ids=["an edit of no track", "an edit of a parked car", "a subject"],
-)
-def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, words, extracted):
+)  # fmt: skip
+def test_a_wrong_track_is_refused_before_the_training(copy, edits, subject, target, words, extracted):
     copy.config["subjects"] = {"0001": {"track": subject}}
-    done = with_edits(copy, edits).run("results/0001/street/train.json")
+    done = with_edits(copy, edits).run(f"results/0001/street/{target}")
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
     (line,) = complaints(done.stdout)
     assert all(word in line for word in words), line
