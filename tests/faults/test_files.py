@@ -201,13 +201,17 @@ NO_RESULTS = {
 """The modules that open files for writing by themselves, and what."""
 
 
+NO_FILES = ("Image.open", "tab.open")
+"""Calls that open no file for writing: an image for reading, a page in a browser."""
+
+
 def test_results_are_written_whole_or_not_at_all():
     """Every file that is written goes through `drivesplat.io.storage`, beside its place and into it once it is on
     disk."""
     found = set()
     for path in (path for path in SOURCES if path.name not in NO_RESULTS):
         for name, call in calls(path):
-            place = {"open": 1}.get(name, 0 if name.endswith(".open") and name != "Image.open" else None)
+            place = {"open": 1}.get(name, 0 if name.endswith(".open") and name not in NO_FILES else None)
             named = [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
             modes = [] if place is None else [*call.args[place : place + 1], *named]
             writes = name.endswith(WRITES) and not (name.endswith("to_csv") and not call.args)  # without a path: text

@@ -370,7 +370,7 @@ LEFT_GONE = "results/0001/street/edits/gone.mp4"
          {"edit": 1}),
         ("  stop:", "  also_gone:\n    - remove: {track: 0001 instance 0}\n  stop:",
          {"edit": 1, **PLAYED, "gap_report": 1}, None),
-        ("  gone:\n    - remove: {track: 0001 instance 0}\n", "", PLAYED, None),
+        ("  gone:\n    - remove: {track: 0001 instance 0}\n", "", {**PLAYED, "gap_report": 1}, None),
         (EDITS, """# written otherwise
 edits: {stop: [{shift: {lateral: 1, "track": "0001 instance 0", yaw: 0.0, start: null}},
                {stop: {duration: 2, at: 2.0, track: 0001 instance 0}}],
@@ -400,7 +400,7 @@ def test_a_changed_step_hides_no_change_of_the_report(finished):
     code = report.read_text(encoding="utf-8")
     report.write_text(code + "\nNEW = 1\n", encoding="utf-8")
     try:
-        assert finished.planned() == {"edit": 1, "gap_report": 1}
+        assert finished.planned() == {"edit": 1, "export_viewer": 1, "gap_report": 1}
     finally:
         path.write_text(EDITS)
         report.write_text(code, encoding="utf-8")
