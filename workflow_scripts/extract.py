@@ -13,7 +13,8 @@ from drivesplat.settings.extract import SceneSource
 with job(snakemake) as current:
     tables, rows = current.input.tables, current.input.scene_tables
     root, of_scene = Path(snakemake.params.root), Path(rows[0]) if rows else None
-    scene = extract_scene(current.settings(SceneSource), root, of_scene)
+    resampled = Path(current.output.scene).parent / "undistorted"
+    scene = extract_scene(current.settings(SceneSource), root, of_scene, resampled)
     refuse_unknown_tracks(current.track_references(), scene)
     current.record_dataset(
         images=(frame.image_path for frame in scene.frames), sweeps=(sweep.path for sweep in scene.sweeps)

@@ -2,13 +2,14 @@
 
 import dataclasses
 import logging
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
-
 from drivesplat.errors import DatasetError
+from drivesplat.preprocess.undistort import undistorted
 from drivesplat.readers.datasets import reader
+from drivesplat.readers.image_file import image_fault
 from drivesplat.scene.scene import Frame, Scene, place_of
 from drivesplat.scene.scene_warnings import luminance, scene_warnings
 from drivesplat.settings.extract import SceneSource
@@ -19,12 +20,15 @@ MAX_NAMED = 10
 """Maximum number of skipped images that are logged one by one."""
 
 
-def extract_scene(source: SceneSource, root: Path, scene_tables: Path | None = None) -> Scene:
+def extract_scene(
+    source: SceneSource, root: Path, scene_tables: Path | None = None, undistorted_images: Path | None = None
+) -> Scene:
     """Reads and checks a scene and decodes each of its images once. Logs warnings about properties of the drive that
     affect its metrics.
 
-    `root` holds the folder of tables, `scene_tables` the scene's extract of them (None: the reader finds it). Raises
-    DatasetError naming the token and path of the fault.
+    `root` holds the folder of tables, `scene_tables` the scene's extract of them (None: the reader finds it). Images of
+    distorted cameras are resampled into the folder `undistorted_images`. Raises DatasetError naming the token and path
+    of the fault.
     """
     scene = reader(source.reader).read(root, source, scene_tables)
     with ThreadPoolExecutor() as pool:
@@ -43,28 +47,14 @@ def extract_scene(source: SceneSource, root: Path, scene_tables: Path | None = N
             f"{scene.frames[0].image_path})"
         )
     scene = dataclasses.replace(scene, dataset=source.dataset, frames=kept, missing_images=len(bad))
+    if any(camera.distortion_model != "none" for camera in scene.cameras):
+        if undistorted_images is None:
+            raise DatasetError(f"scene {source.scene}: its images are distorted, and there is no folder for others")
+        shutil.rmtree(undistorted_images, ignore_errors=True)
+        scene = undistorted(scene, undistorted_images)
     for sentence in scene_warnings(scene, luminance(scene)):
         log.warning("scene %s: %s", scene.name, sentence)
     return scene
-
-
-def image_fault(frame: Frame) -> str | None:
-    """The fault of a frame's image file, or None.
-
-    Decodes the image at reduced size: a truncated JPEG opens without error.
-    """
-    path = Path(frame.image_path)
-    if not path.is_file():
-        return f"image {path} is missing"
-    try:
-        with Image.open(path) as image:
-            if image.size != (frame.width, frame.height):
-                return f"image {path} is {image.size[0]}x{image.size[1]}, the tables say {frame.width}x{frame.height}"
-            image.draft("RGB", (frame.width // 8, frame.height // 8))
-            image.load()
-    except (OSError, UnidentifiedImageError, SyntaxError) as error:
-        return f"image {path} is corrupt ({error})"
-    return None
 
 
 def _remedied(frame: Frame, fault: str) -> str:

@@ -10,8 +10,8 @@ from jaxtyping import Float64
 @dataclass(frozen=True)
 class Camera:
     """A camera. `width`, `height` in pixels; `intrinsics`, OpenCV (integer coordinates at pixel centres);
-    `distortion`: OpenCV's coefficients, all 0 for rectified images; `readout_s`: time in seconds from the first line
-    of pixels to the last, read in `readout_direction`. None if unknown."""
+    `distortion`: OpenCV's coefficients by `distortion_model`, all 0 for rectified images; `readout_s`: time in seconds
+    from the first line of pixels to the last, read in `readout_direction`. None if unknown."""
 
     name: str
     width: int
@@ -20,6 +20,7 @@ class Camera:
     distortion: Float64[np.ndarray, " k"] | None = None
     readout_s: float | None = None
     readout_direction: Literal["down", "up", "left", "right"] | None = None
+    distortion_model: Literal["none", "opencv", "fisheye"] = "none"
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ DEMO_OVERRIDES = {
 
 
 class DatasetSettings(Settings):
-    reader: Literal["nuscenes"] = "nuscenes"
-    """Dataset format."""
+    reader: Literal["nuscenes", "drive"] = "nuscenes"
+    """Dataset format: 'nuscenes', or 'drive', a folder that you write (docs/own_data.md)."""
     dataroot: str = "~/data/nuscenes/v1.0-mini"
     """Folder that contains the folder of tables (or that folder itself, or its grandparent)."""
     version: str = "v1.0-mini"

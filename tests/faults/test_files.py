@@ -174,7 +174,9 @@ def test_nothing_loads_a_file_in_a_way_that_could_execute_it():
     for path in SOURCES:
         for name, call in calls(path):
             arguments = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
-            if name in EXECUTES or (name == "torch.load" and arguments.get("weights_only") != "True"):
+            safe = name == "np.load" and arguments.get("allow_pickle") == "False"
+            unsafe = name == "torch.load" and arguments.get("weights_only") != "True"
+            if (name in EXECUTES and not safe) or unsafe:
                 found.add((path.name, name))
             if name == "yaml.load" and arguments.get("Loader") != "_EveryKeyOnce":
                 found.add((path.name, name))

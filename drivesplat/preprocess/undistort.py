@@ -1,0 +1,76 @@
+"""Distorted images, resampled as a pinhole camera would have recorded them: later stages know of no distortion.
+
+The new camera has the centre and the size of the old one, and its focal length, or the smallest longer one with which
+every pixel has a source. No pixel is therefore empty, and no mask is needed; what lies outside the new image is lost.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.scene.images import read_image, write_png
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.sensors import Camera
+
+LONGER = 1.01
+"""Factor between the focal lengths that are tried."""
+LONGEST = 10.0
+"""Largest factor on the focal length."""
+
+
+def undistorted(scene: Scene, folder: Path) -> Scene:
+    """The scene with the images of distorted cameras resampled into `folder`, {camera}/{timestamp}.png, and with the
+    intrinsics of these images.
+
+    Raises DatasetError naming a camera whose distortion cannot be undone at ten times its focal length.
+    """
+    maps = {camera.name: _maps(camera) for camera in scene.cameras if camera.distortion_model != "none"}
+
+    def one(frame: Frame) -> Frame:
+        if frame.camera not in maps:
+            return frame
+        k, x, y = maps[frame.camera]
+        path = folder / frame.camera / f"{frame.timestamp}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, cv2.remap(read_image(frame.image_path), x, y, cv2.INTER_CUBIC))
+        return dataclasses.replace(frame, image_path=str(path), intrinsics=k)
+
+    with ThreadPoolExecutor() as pool:
+        frames = tuple(pool.map(one, scene.frames))
+    cameras = tuple(_pinhole(camera, maps) for camera in scene.cameras)
+    return dataclasses.replace(scene, frames=frames, cameras=cameras)
+
+
+def _pinhole(camera: Camera, maps: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Camera:
+    if camera.name not in maps:
+        return camera
+    k, *_ = maps[camera.name]
+    return dataclasses.replace(camera, intrinsics=k, distortion=np.zeros(5), distortion_model="none")
+
+
+def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The new intrinsics (3, 3), and for each pixel of the new image (h, w) the x and the y of its source."""
+    assert camera.distortion is not None
+    factor, size = 1.0, (camera.width, camera.height)
+    while factor <= LONGEST:
+        k = camera.intrinsics * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]
+        x, y = _sources(camera, k, size)
+        if x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= size[0] - 0.5 and y.max() <= size[1] - 0.5:
+            return k, x, y
+        factor *= LONGER
+    raise DatasetError(
+        f"camera {camera.name}: its distortion leaves no image without empty pixels; check its coefficients"
+    )
+
+
+def _sources(camera: Camera, k: np.ndarray, size: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    if camera.distortion_model == "fisheye":
+        return cv2.fisheye.initUndistortRectifyMap(
+            camera.intrinsics, camera.distortion.reshape(4, 1), np.eye(3), k, size, cv2.CV_32FC1
+        )
+    return cv2.initUndistortRectifyMap(camera.intrinsics, camera.distortion, None, k, size, cv2.CV_32FC1)

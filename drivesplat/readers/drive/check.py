@@ -1,0 +1,111 @@
+"""The check of a drive folder: every fault in a sentence, and a picture with LiDAR and boxes in images."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from drivesplat.readers.drive.faults import faults_of
+from drivesplat.readers.drive.format import FILE, Drive, structure_of
+from drivesplat.readers.drive.reader import scene_of
+from drivesplat.readers.image_file import image_fault
+from drivesplat.readers.sweeps import read_returns, sweep_fault
+from drivesplat.scene.images import continuous_intrinsics, project, read_image
+from drivesplat.scene.regions import hulls_in
+from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.settings.extract import SceneSource
+
+WIDTH = 960
+"""Width of an image in the picture."""
+MAX_DEPTH = 60.0
+"""Metres at which the colour of returns ends."""
+
+
+def check(folder: Path, picture: Path | None) -> list[str]:
+    """The faults of a drive folder, a sentence each. Without faults of drive.json, and with a path for it, writes the
+    picture: the middle key frame of every camera, with the nearest sweep coloured by depth and the boxes."""
+    faults, drive = structure_of(folder / FILE)
+    if drive is None:
+        return faults
+    faults = [f"{folder / FILE}: {fault}" for fault in faults_of(drive)]
+    if faults:
+        return faults
+    scene = whole_scene(drive, folder)
+    if picture is not None:
+        write_picture(scene, picture)
+    return list(_file_faults(scene))
+
+
+def whole_scene(drive: Drive, folder: Path) -> Scene:
+    """All images and sweeps of a drive without faults."""
+    return scene_of(
+        drive, folder,
+        SceneSource(
+            dataset="", reader="drive", version="", scene=folder.name, frames=None, cameras=tuple(drive.cameras),
+            sweeps=True, lidar_sweeps=True, on_missing="stop",
+        ),
+    )  # fmt: skip
+
+
+def summary(scene: Scene) -> str:
+    """What a drive holds, in a sentence."""
+    key_frames = len(scene.key_frame_timestamps)
+    parts = [
+        f"{key_frames} key frames at {scene.key_frame_hz:g} Hz",
+        f"{len(scene.frames)} images of {len(scene.cameras)} cameras",
+        f"{len(scene.sweeps)} LiDAR sweeps" if scene.sweeps else "no LiDAR",
+        f"{len(scene.tracks)} tracks" if scene.tracks else "no boxes: all is treated as static",
+    ]
+    return ", ".join(parts)
+
+
+def _file_faults(scene: Scene) -> Iterator[str]:
+    for frame in scene.frames:
+        if fault := image_fault(frame):
+            yield f"frame {frame.token}: {fault}"
+    for sweep in scene.sweeps:
+        if fault := sweep_fault(sweep):
+            yield fault
+
+
+def write_picture(scene: Scene, path: Path) -> None:
+    """Writes the middle key frames of all cameras, one below the other."""
+    images = []
+    for camera in scene.cameras:
+        indices = scene.key_frames(camera.name)
+        if indices:
+            images.append(_drawn(scene, scene.frames[sorted(indices)[len(indices) // 2]]))
+    if not images:
+        return
+    canvas = Image.new("RGB", (WIDTH, sum(image.height for image in images)))
+    top = 0
+    for image in images:
+        canvas.paste(image, (0, top))
+        top += image.height
+    canvas.save(path)
+
+
+def _drawn(scene: Scene, frame: Frame) -> Image.Image:
+    size = WIDTH, round(WIDTH * frame.height / frame.width)
+    image = Image.new("RGB", size) if image_fault(frame) else Image.fromarray(read_image(frame.image_path, size))
+    draw = ImageDraw.Draw(image)
+    nearest = min(scene.sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp), default=None)
+    if nearest is not None and not sweep_fault(nearest):
+        _draw_returns(draw, apply(nearest.sensor_to_world, read_returns(nearest).points), frame, size)
+    for hull in hulls_in(scene, frame, size):
+        draw.polygon([tuple(corner) for corner in hull.polygon], outline=(255, 90, 0), width=2)
+    draw.text(
+        (8, 8), f"{frame.camera} at {frame.timestamp}", fill=(255, 255, 255), stroke_width=2, stroke_fill=(0, 0, 0)
+    )
+    return image
+
+
+def _draw_returns(draw: ImageDraw.ImageDraw, points: np.ndarray, frame: Frame, size: tuple[int, int]) -> None:
+    pixels, depth = project(points, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
+    inside = (depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+    shares = np.clip(depth[inside] / MAX_DEPTH, 0.0, 1.0)
+    for (x, y), share in zip(pixels[inside], shares, strict=True):
+        color = (int(255 * (1 - share)), int(255 * min(1.0, 2 * share)), int(255 * share))
+        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=color)

@@ -1,0 +1,213 @@
+"""Faults of a drive.json whose structure is right: values that contradict each other or cannot be, a sentence each."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.readers.checks import checked_intrinsics
+from drivesplat.readers.drive.format import Distortion, Drive, DriveCamera, Pose, TimedPose
+from drivesplat.readers.drive.poses import matrix_of
+
+MAX_COORDINATE = 1e7
+"""Metres. Farther positions are a fault, such as longitude and latitude in the wrong unit."""
+MAX_SPEED = 120.0
+"""Metres per second of the ego vehicle and of objects."""
+MAX_POSE_GAP = 1_000_000
+"""Microseconds between ego poses over which poses of images and sweeps are interpolated."""
+COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
+FOCAL_RANGE = (0.1, 20.0)
+"""Focal lengths in image widths."""
+
+
+def faults_of(drive: Drive) -> list[str]:
+    """The faults of a drive."""
+    return [
+        *_camera_faults(drive),
+        *_pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items())),
+        *_path_faults("ego_poses", "the ego vehicle", drive.ego_poses),
+        *_recording_faults(drive),
+        *_track_faults(drive),
+        *_key_frame_faults(drive),
+    ]
+
+
+def _camera_faults(drive: Drive) -> Iterator[str]:
+    yield from _pose_faults("cameras", ((name, camera.sensor_to_ego) for name, camera in drive.cameras.items()))
+    for name, camera in drive.cameras.items():
+        where = f"cameras.{name}"
+        try:
+            k = checked_intrinsics(camera.K, where)
+        except DatasetError as error:
+            yield str(error)
+            continue
+        yield from (f"{where}: {fault}" for fault in _lens_faults(k, camera))
+        wrong = list(_distortion_faults(camera.distortion))
+        if not wrong and camera.distortion.model != "none":
+            wrong = list(_fold_faults(k, camera))
+        yield from (f"{where}: {fault}" for fault in wrong)
+
+
+def _lens_faults(k: np.ndarray, camera: DriveCamera) -> Iterator[str]:
+    lower, upper = (share * camera.width for share in FOCAL_RANGE)
+    for value in (k[0, 0], k[1, 1]):
+        if not lower <= value <= upper:
+            yield (
+                f"the focal length {value:.6g} does not fit images {camera.width} pixels wide: "
+                f"it lies between {lower:.0f} and {upper:.0f} pixels"
+            )
+    if not (-0.5 <= k[0, 2] <= camera.width - 0.5 and -0.5 <= k[1, 2] <= camera.height - 0.5):
+        yield (
+            f"the principal point ({k[0, 2]:.1f}, {k[1, 2]:.1f}) lies outside the image of "
+            f"{camera.width}x{camera.height}; K is of the image as recorded"
+        )
+
+
+def _distortion_faults(distortion: Distortion) -> Iterator[str]:
+    expected, count = COEFFICIENTS[distortion.model], len(distortion.coefficients)
+    if count not in expected:
+        yield f"distortion {distortion.model} has {count} coefficients; it takes {' or '.join(map(str, expected))}"
+
+
+def _fold_faults(k: np.ndarray, camera: DriveCamera) -> Iterator[str]:
+    """The fault of a distortion whose image of a ray moves back towards the centre before the corner of the image."""
+    corner = max(
+        float(np.hypot((x - k[0, 2]) / k[0, 0], (y - k[1, 2]) / k[1, 1]))
+        for x in (0, camera.width - 1)
+        for y in (0, camera.height - 1)
+    )
+    values = camera.distortion.coefficients
+    if camera.distortion.model == "fisheye":
+        angles = np.linspace(0.0, min(corner, np.pi / 2), 400)
+        imaged = angles * (1.0 + sum(c * angles ** (2 * i + 2) for i, c in enumerate(values)))
+    else:
+        radii = np.linspace(0.0, corner, 400)
+        above, below = [values[0], values[1], *values[4:5]], values[5:8]
+        powers = [radii ** (2 * i + 2) for i in range(3)]
+        imaged = radii * (1.0 + sum(c * p for c, p in zip(above, powers, strict=False)))
+        imaged /= 1.0 + sum(c * p for c, p in zip(below, powers, strict=False))
+    if (np.diff(imaged) <= 0).any():
+        yield (
+            f"its distortion folds: two directions within the image have one pixel; check the order of the "
+            f"{camera.distortion.model} coefficients"
+        )
+
+
+def _pose_faults(list_name: str, poses: Iterable[tuple[str | int, Pose]]) -> Iterator[str]:
+    for name, pose in poses:
+        where = f"{list_name}[{name}]" if isinstance(name, int) else f"{list_name}.{name}"
+        try:
+            matrix = matrix_of(pose, where)
+        except DatasetError as error:
+            yield str(error)
+            continue
+        if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
+            yield f"{where}: its position {tuple(pose.translation)} is beyond {MAX_COORDINATE:.0e} m"
+
+
+def _path_faults(list_name: str, who: str, poses: Sequence[TimedPose]) -> Iterator[str]:
+    """Faults of the poses of one body over time."""
+    found = list(_pose_faults(list_name, enumerate(poses)))
+    yield from found
+    times = np.array([pose.timestamp for pose in poses], dtype=np.int64)
+    late = np.flatnonzero(np.diff(times) <= 0)
+    if len(late):
+        yield f"{list_name}[{late[0] + 1}]: its timestamp is not later than that of the one before it"
+    elif not found and len(poses) > 1:
+        steps = np.linalg.norm(np.diff([pose.translation for pose in poses], axis=0), axis=1)
+        speeds = steps / (np.diff(times) * 1e-6)
+        fast = int(np.argmax(speeds))
+        if speeds[fast] > MAX_SPEED:
+            yield (
+                f"{list_name}[{fast + 1}]: {who} moves {steps[fast]:.1f} m in {np.diff(times)[fast] * 1e-6:.6g} s; "
+                "timestamps are microseconds, positions metres"
+            )
+
+
+def _recording_faults(drive: Drive) -> Iterator[str]:
+    """Faults of frames and sweeps."""
+    if not drive.cameras:
+        yield "cameras: there is none; images need their calibration (K and sensor_to_ego)"
+    if not drive.frames:
+        yield "frames: there is none"
+    for list_name, poses in (
+        ("frames", ((i, pose) for i, f in enumerate(drive.frames) for pose in (f.camera_to_world, f.ego_to_world))),
+        ("sweeps", ((i, sweep.lidar_to_world) for i, sweep in enumerate(drive.sweeps))),
+    ):
+        yield from _pose_faults(list_name, ((i, pose) for i, pose in poses if pose is not None))
+    frames = [
+        (f.camera, f.timestamp, f.file, f.camera_to_world is None and f.ego_to_world is None) for f in drive.frames
+    ]
+    sweeps = [(s.lidar, s.timestamp, s.file, s.lidar_to_world is None) for s in drive.sweeps]
+    for list_name, kind, known, records in (
+        ("frames", "camera", drive.cameras, frames),
+        ("sweeps", "lidar", drive.lidars, sweeps),
+    ):
+        seen: dict[tuple[str, int], int] = {}
+        for i, (sensor, time, file, needs_ego) in enumerate(records):
+            where = f"{list_name}[{i}]"
+            if sensor not in known:
+                yield f"{where}: {kind} {sensor!r} is not in {kind}s; there are: {', '.join(known) or 'none'}"
+            if (sensor, time) in seen:
+                yield f"{where}: {list_name}[{seen[sensor, time]}] has the same {kind} and timestamp"
+            seen[sensor, time] = i
+            if not _is_inside(file):
+                yield f"{where}: {file!r} is no path inside the folder"
+            if needs_ego and (fault := _unposed(drive, time)):
+                yield f"{where}: {fault}"
+    yield from _clock_faults([frame.timestamp for frame in drive.frames])
+
+
+def _is_inside(file: str) -> bool:
+    path = PurePosixPath(file)
+    return not path.is_absolute() and ".." not in path.parts and "\0" not in file
+
+
+def _unposed(drive: Drive, time: int) -> str | None:
+    """Why there is no ego pose at a time, or None."""
+    times = [pose.timestamp for pose in drive.ego_poses]
+    if not times:
+        return "there are no ego_poses, and it has no pose of its own"
+    after = int(np.searchsorted(times, time))
+    if after < len(times) and times[after] == time:
+        return None
+    if after in (0, len(times)):
+        return f"its timestamp {time} is outside the ego poses' time, {times[0]} to {times[-1]}"
+    if times[after] - times[after - 1] > MAX_POSE_GAP:
+        return f"the ego poses around its time are {(times[after] - times[after - 1]) * 1e-6:.1f} s apart, at most 1"
+    return None
+
+
+def _clock_faults(times: Sequence[int]) -> Iterator[str]:
+    span = max(times, default=0) - min(times, default=0)
+    if len(set(times)) > 2 and span < 1000 * len(set(times)):
+        yield (
+            f"frames: {len(set(times))} images within {span} microseconds; timestamps are microseconds, not seconds "
+            "or milliseconds"
+        )
+    if span > 3_600_000_000:
+        yield f"frames: they span {span * 1e-6:.0f} s; timestamps are microseconds, and a drive is at most an hour long"
+
+
+def _track_faults(drive: Drive) -> Iterator[str]:
+    ids: set[str] = set()
+    for track in drive.tracks:
+        where = f"track {track.id}"
+        if track.id in ids:
+            yield f"{where}: another track has this id"
+        ids.add(track.id)
+        if min(track.size) <= 0 or max(track.size) > 100:
+            yield f"{where}: its size {tuple(track.size)} is no length, width and height in metres"
+        yield from _path_faults(f"{where}: poses", "it", track.poses)
+
+
+def _key_frame_faults(drive: Drive) -> Iterator[str]:
+    times = drive.key_frames
+    if times is None:
+        return
+    if not times:
+        yield "key_frames: there is none; leave the key out to use all images of the first camera"
+    late = [i for i in range(1, len(times)) if times[i] <= times[i - 1]]
+    if late:
+        yield f"key_frames[{late[0]}]: it is not later than the one before it"

@@ -1,0 +1,194 @@
+"""The content of drive.json. Metres, radians, microseconds.
+
+Frames of reference. World: z up, any origin. Ego: x forward, y left, z up, on the ground under the rear axle. Camera:
+OpenCV (x right, y down, z forward). LiDAR: the sensor's own. Object: x forward, y left, z up, at the centre of the box.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from drivesplat.errors import DatasetError
+from drivesplat.scene.object_class import ObjectClass
+
+FILE = "drive.json"
+MAX_REPORTED = 20
+"""Maximum number of faults of the structure that are reported one by one."""
+
+Timestamp = Annotated[int, Field(ge=0, lt=2**62, strict=True)]
+Vector = tuple[float, float, float]
+Row = Vector
+RelativePath = Annotated[str, Field(min_length=1, max_length=1000)]
+"""The path of a file, relative to the folder of drive.json and inside it."""
+
+
+class DriveRecord(BaseModel):
+    """A record of drive.json: unknown keys are refused, and numbers are finite."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True, populate_by_name=True
+    )
+
+
+class Pose(DriveRecord):
+    """A frame of reference in another one: maps points p of the first to rotation · p + translation."""
+
+    translation: Vector
+    """Metres."""
+    rotation: tuple[float, float, float, float] | tuple[Row, Row, Row]
+    """Unit quaternion w, x, y, z, or rotation matrix, row by row."""
+
+
+class TimedPose(Pose):
+    """A pose at a time."""
+
+    timestamp: Timestamp
+    """Microseconds, on one clock for all sensors."""
+
+
+class Distortion(DriveRecord):
+    """The distortion of a camera's images, as OpenCV defines it."""
+
+    model: Literal["none", "opencv", "fisheye"] = "none"
+    """'opencv': k1, k2, p1, p2[, k3[, k4, k5, k6]]; 'fisheye': the four of cv2.fisheye."""
+    coefficients: tuple[float, ...] = ()
+
+
+class DriveCamera(DriveRecord):
+    """A camera of the vehicle."""
+
+    width: int = Field(ge=1, le=20_000)
+    """Pixels."""
+    height: int = Field(ge=1, le=20_000)
+    """Pixels."""
+    K: tuple[Row, Row, Row]
+    """Pinhole matrix in pixels; the centre of the first pixel is (0, 0), as in OpenCV."""
+    sensor_to_ego: Pose
+    """The camera in the ego frame."""
+    distortion: Distortion = Distortion()
+    readout_s: float | None = Field(None, ge=0, le=1)
+    """Time from the first line of pixels to the last (seconds). null: unknown."""
+    readout_direction: Literal["down", "up", "left", "right"] | None = None
+    """The direction in which lines are read out. null: unknown."""
+
+
+class DriveLidar(DriveRecord):
+    """A spinning LiDAR of the vehicle."""
+
+    sensor_to_ego: Pose
+    """The LiDAR in the ego frame."""
+    beam_elevations: tuple[float, ...] | None = None
+    """Elevation of each beam above the sensor's horizontal plane (radians), in the order of rings. null: unknown."""
+    azimuth_steps: int | None = Field(None, ge=1)
+    """Firings of a beam per revolution. null: unknown."""
+    revolution_s: float | None = Field(None, gt=0)
+    """Time of a revolution (seconds). null: unknown."""
+
+
+class DriveFrame(DriveRecord):
+    """An image."""
+
+    camera: str
+    timestamp: Timestamp
+    file: RelativePath
+    key_frame: bool | None = None
+    """Whether it belongs to a key frame. null: the image nearest to each key frame does."""
+    camera_to_world: Pose | None = None
+    """The camera's own pose. null: ego pose and sensor_to_ego."""
+    ego_to_world: Pose | None = None
+    """The ego vehicle's pose at the image's time. null: by ego_poses, or by camera_to_world where that is given."""
+
+
+class DriveSweep(DriveRecord):
+    """A LiDAR sweep: .npz or .ply (docs/own_data.md)."""
+
+    lidar: str
+    timestamp: Timestamp
+    """The time at which the points are in the sensor's frame."""
+    file: RelativePath
+    lidar_to_world: Pose | None = None
+    """The LiDAR's own pose. null: ego pose and sensor_to_ego."""
+
+
+class TrackPose(TimedPose):
+    """The box of an object at a time, in the world."""
+
+    visibility: float | None = Field(None, ge=0, le=1)
+    """Visible share of the object in the images. null: unknown."""
+
+
+class DriveTrack(DriveRecord):
+    """An annotated object over time."""
+
+    id: str = Field(min_length=1, max_length=200)
+    object_class: ObjectClass = Field(alias="class")
+    category: str | None = None
+    """Your own name of the class, for tables. null: that of the class."""
+    size: Annotated[Vector, Field()]
+    """Length, width, height (metres)."""
+    poses: tuple[TrackPose, ...] = Field(min_length=1)
+
+
+class Drive(DriveRecord):
+    """A drive folder's drive.json."""
+
+    format: Literal["drivesplat drive"]
+    version: Literal[1]
+    description: str = ""
+    licence: str = ""
+    """Who may use the recording, and for what. Exports repeat it."""
+    origin: Vector | None = None
+    """Global coordinates of the world's origin: global = world + origin. null: all poses are global, and the reader
+    takes the first ego position as origin, since single precision holds no global coordinates."""
+    cameras: dict[str, DriveCamera] = {}
+    lidars: dict[str, DriveLidar] = {}
+    ego_poses: tuple[TimedPose, ...] = ()
+    """The ego vehicle in the world, at any rate, in time order. Poses between two of them are interpolated."""
+    key_frames: tuple[Timestamp, ...] | None = None
+    """The times of key frames, in order: the times that are held out or trained on as one, and at which tracks are
+    sampled. null: those of the first camera's key frames, or of all of its images."""
+    frames: tuple[DriveFrame, ...] = ()
+    sweeps: tuple[DriveSweep, ...] = ()
+    tracks: tuple[DriveTrack, ...] = ()
+
+
+def read_drive(folder: Path) -> Drive:
+    """The drive.json of a folder. Raises DatasetError, a line for each fault of its structure."""
+    path = folder / FILE
+    faults, drive = structure_of(path)
+    if drive is None:
+        raise DatasetError("\n".join(faults))
+    return drive
+
+
+def structure_of(path: Path) -> tuple[list[str], Drive | None]:
+    """The faults of a drive.json's structure, a sentence each, and its content where there are none."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return [f"{path} is missing; docs/own_data.md says what a drive folder holds"], None
+    except (OSError, UnicodeDecodeError) as error:
+        return [f"{path} cannot be read ({error})"], None
+    except (ValueError, RecursionError) as error:
+        return [f"{path} is not JSON ({type(error).__name__}: {str(error)[:200]})"], None
+    try:
+        return [], Drive.model_validate(values)
+    except ValidationError as error:
+        found = [f"{path}: {_sentence(item)}" for item in error.errors(include_url=False)]
+    more = [f"{path}: {len(found) - MAX_REPORTED} more faults"] if len(found) > MAX_REPORTED else []
+    return found[:MAX_REPORTED] + more, None
+
+
+def _sentence(item: Any) -> str:
+    """One error of pydantic as a sentence: frames[3].timestamp is …"""
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in item["loc"]).removeprefix(".")
+    if item["type"] == "missing":
+        return f"{key} is missing"
+    if item["type"] == "extra_forbidden":
+        return f"{key} is no key of the format; check its spelling"
+    value = repr(item["input"])
+    shown = value if len(value) <= 80 else f"{value[:80]}…"
+    message = item["msg"].removeprefix("Value error, ")
+    return f"{key or 'the file'} is {shown}: {message[:1].lower()}{message[1:]}"

@@ -1,0 +1,89 @@
+"""Distorted images become those of a pinhole camera, without an empty pixel."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from drivesplat.errors import DatasetError
+from drivesplat.preprocess.undistort import undistorted
+from drivesplat.scene.images import read_image
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.sensors import Camera
+
+SIZE = (320, 180)
+K = np.array([[210.0, 0.0, 158.0], [0.0, 205.0, 91.0], [0.0, 0.0, 1.0]])
+LENSES = {
+    "barrel": ("opencv", [-0.25, 0.06, 0.001, -0.0005]),
+    "pincushion": ("opencv", [0.2, 0.01, 0.0, 0.0, 0.0]),
+    "rational": ("opencv", [0.3, 0.05, 0.0005, 0.0, 0.001, 0.6, 0.1, 0.002]),
+    "fisheye": ("fisheye", [0.05, -0.01, 0.002, -0.0004]),
+}
+
+
+def seen(rays: np.ndarray) -> np.ndarray:
+    """The colours (..., 3) uint8 of directions x/z, y/z (..., 2): waves that a few pixels resolve."""
+    x, y = rays[..., 0], rays[..., 1]
+    waves = [np.sin(21.0 * x + 3.0 * y), np.sin(17.0 * y - 5.0 * x), np.cos(12.0 * x) * np.cos(14.0 * y)]
+    return (127.5 + 110.0 * np.stack(waves, axis=-1)).round().astype(np.uint8)
+
+
+def pixels() -> np.ndarray:
+    return np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), axis=-1).reshape(-1, 1, 2).astype(np.float64)
+
+
+def recorded(model: str, coefficients: np.ndarray) -> np.ndarray:
+    """The image of a camera with distortion: the direction of each of its pixels by OpenCV's own inverse."""
+    if model == "fisheye":
+        rays = cv2.fisheye.undistortPoints(pixels(), K, coefficients.reshape(4, 1))
+    else:
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+        rays = cv2.undistortPointsIter(pixels(), K, coefficients, None, None, criteria)
+    return seen(rays.reshape(SIZE[1], SIZE[0], 2))
+
+
+@pytest.fixture
+def scene(tiny_scene, tmp_path, request) -> Scene:
+    """Two images of a distorted camera."""
+    model, values = LENSES[request.param]
+    coefficients = np.array(values)
+    path = tmp_path / "recorded.png"
+    Image.fromarray(recorded(model, coefficients)).save(path)
+    frames = tuple(
+        dataclasses.replace(frame, image_path=str(path), width=SIZE[0], height=SIZE[1], intrinsics=K)
+        for frame in tiny_scene.frames[:2]
+    )
+    camera = Camera("CAM_FRONT", *SIZE, K, coefficients, distortion_model=model)
+    return dataclasses.replace(tiny_scene, frames=frames, cameras=(camera,))
+
+
+@pytest.mark.parametrize("scene", LENSES, indirect=True)
+def test_resampled_images_are_those_of_a_pinhole_camera(scene, tmp_path):
+    straight = undistorted(scene, tmp_path / "straight")
+    (camera,) = straight.cameras
+    assert camera.distortion_model == "none" and not camera.distortion.any()
+    k = camera.intrinsics
+    assert 1.0 <= k[0, 0] / K[0, 0] < 1.6 and (k[:2, 2] == K[:2, 2]).all()
+    ideal = seen((pixels().reshape(SIZE[1], SIZE[0], 2) - k[:2, 2]) / k.diagonal()[:2])
+    for frame in straight.frames:
+        assert (frame.width, frame.height) == SIZE and (frame.intrinsics == k).all()
+        assert frame.image_path == str(tmp_path / f"straight/CAM_FRONT/{frame.timestamp}.png")
+        inner = np.s_[2:-2, 2:-2]  # at the border a source has no neighbour on one side
+        error = (read_image(frame.image_path)[inner].astype(float) - ideal[inner]) ** 2
+        assert 10.0 * np.log10(255.0**2 / error.mean()) > 38.0
+    bent = 10.0 * np.log10(255.0**2 / ((read_image(scene.frames[0].image_path) - ideal.astype(float)) ** 2).mean())
+    assert bent < 25.0, "the distortion is visible"
+
+
+def test_other_cameras_stay_as_they_are(tiny_scene, tmp_path):
+    assert undistorted(tiny_scene, tmp_path / "none").frames == tiny_scene.frames
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("scene", ["barrel"], indirect=True)
+def test_a_distortion_that_cannot_be_undone_is_named(scene, tmp_path):
+    wild = dataclasses.replace(scene.cameras[0], distortion=np.array([1e7, 0.0, 0.0, 0.0]))
+    with pytest.raises(DatasetError, match="camera CAM_FRONT: its distortion leaves no image"):
+        undistorted(dataclasses.replace(scene, cameras=(wild,)), tmp_path / "straight")

@@ -1,0 +1,327 @@
+"""Drive folders: written from a scene, read back as the same scene, and checked."""
+
+import copy
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import REPOSITORY
+from helpers.small_drives import scene_at
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from drivesplat.errors import DatasetError
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.lidar_seed import seed_points
+from drivesplat.readers.drive.__main__ import main
+from drivesplat.readers.drive.format import Drive
+from drivesplat.readers.drive.layout import camera_names, find_root
+from drivesplat.readers.drive.reader import chosen_recordings
+from drivesplat.readers.drive.write import write_drive
+from drivesplat.readers.sweeps import read_returns, sweep_fault
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
+from drivesplat.settings.lidar_seed import LidarSeedSettings, SeedJob
+
+
+def source(**changes: Any) -> SceneSource:
+    given = {
+        "dataset": "mine", "reader": "drive", "version": "", "scene": "0001", "frames": None, "cameras": ("CAM_FRONT",),
+        "sweeps": True, "lidar_sweeps": True, "on_missing": "stop",
+    }  # fmt: skip
+    return SceneSource(**{**given, **changes})
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory, tiny_root) -> Scene:
+    """The tiny drive by the nuScenes reader, with all recordings between key frames."""
+    return scene_at(tiny_root, lidar_sweeps=True)
+
+
+@pytest.fixture(scope="module")
+def folder(recorded, tmp_path_factory) -> Path:
+    """The same as a drive folder."""
+    root = tmp_path_factory.mktemp("drives")
+    write_drive(recorded, root / "0001", licence="of the tests")
+    return root
+
+
+def test_a_written_scene_is_read_back_to_the_last_bit(recorded, folder):
+    again = extract_scene(source(), folder)
+    assert len(again.frames) == len(recorded.frames) > 10 and len(again.sweeps) == len(recorded.sweeps) >= 10
+    np.testing.assert_array_equal(again.origin, recorded.origin)
+    np.testing.assert_array_equal(again.key_frame_timestamps, recorded.key_frame_timestamps)
+    assert again.key_frame_hz == recorded.key_frame_hz
+    for name in ("camera_to_world", "ego_to_world", "intrinsics"):
+        for one, other in zip(again.frames, recorded.frames, strict=True):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    for one, other in zip([*again.frames, *again.sweeps], [*recorded.frames, *recorded.sweeps], strict=True):
+        assert (one.timestamp, one.is_key_frame, one.sample_index) == (
+            other.timestamp, other.is_key_frame, other.sample_index,
+        )  # fmt: skip
+    for one, other in zip(again.sweeps, recorded.sweeps, strict=True):
+        np.testing.assert_array_equal(one.sensor_to_world, other.sensor_to_world)
+        mine, theirs = read_returns(one), read_returns(other)
+        for field in ("points", "intensity", "rings"):
+            np.testing.assert_array_equal(getattr(mine, field), getattr(theirs, field))
+    for one, other in zip(again.tracks, recorded.tracks, strict=True):
+        assert (one.id, one.object_class, one.category) == (other.id, other.object_class, other.category)
+        for field in ("size", "timestamps", "sample_indices", "object_to_world", "visibility"):
+            np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+
+
+def test_seed_points_are_the_same_to_the_last_bit(recorded, folder):
+    again = extract_scene(source(), folder)
+    job = SeedJob(
+        lidar_seed=LidarSeedSettings(max_points=500, far_points=50), images=ImageSettings(),
+        holdout=HoldoutSettings(), random_seed=0,
+    )  # fmt: skip
+    one, other = seed_points(again, job), seed_points(recorded, job)
+    np.testing.assert_array_equal(one.positions, other.positions)
+    np.testing.assert_array_equal(one.colors, other.colors)
+
+
+def test_a_frame_range_renumbers_key_frames(recorded, folder):
+    again = extract_scene(source(frames=(2, 6), sweeps=False, lidar_sweeps=False), folder)
+    np.testing.assert_array_equal(again.key_frame_timestamps, recorded.key_frame_timestamps[2:6])
+    assert [frame.sample_index for frame in again.frames] == [0, 1, 2, 3]
+    with pytest.raises(DatasetError, match="ends beyond its 10 key frames"):
+        extract_scene(source(frames=(2, 60)), folder)
+
+
+def test_a_folder_is_found_by_itself_and_in_the_one_above(folder):
+    assert find_root(str(folder), "") == folder and find_root(str(folder / "0001"), "") == folder / "0001"
+    assert camera_names(folder, "") == camera_names(folder / "0001", "") == ["CAM_FRONT"]
+    assert len(extract_scene(source(), folder / "0001").frames) > 10
+    with pytest.raises(DatasetError, match=r"scene 0002 is not in .*; there are: 0001"):
+        extract_scene(source(scene="0002"), folder)
+    with pytest.raises(DatasetError, match=r"docs/own_data\.md"):
+        find_root(str(folder / "0001/images"), "")
+
+
+@pytest.fixture(scope="module")
+def content(folder) -> dict[str, Any]:
+    return json.loads((folder / "0001/drive.json").read_text(encoding="utf-8"))
+
+
+def test_what_a_person_writes_by_hand(content, folder, tmp_path):
+    """Ego poses at 20 Hz as quaternions, no marks, no own poses, boxes at the drive's own times, and PLY sweeps."""
+    drive = tmp_path / "mine"
+    (drive / "sweeps").mkdir(parents=True)
+    (drive / "images").symlink_to(folder / "0001/images")
+    first = content["frames"][0]
+    begin, end = first["timestamp"] - 50_000, content["frames"][-1]["timestamp"] + 50_000
+    poses = [
+        {"timestamp": t, "translation": [8.0 * (t - begin) * 1e-6, 100.0, 0.0], "rotation": [1.0, 0.0, 0.0, 0.0]}
+        for t in range(begin, end + 50_000, 50_000)
+    ]
+    points = np.array([(5.0, 1.0, 0.5), (9.0, -2.0, 0.1)], dtype=[(name, "f4") for name in "xyz"])
+    PlyData([PlyElement.describe(points, "vertex")]).write(drive / "sweeps/one.ply")
+    record = {
+        "format": "drivesplat drive",
+        "version": 1,
+        "cameras": content["cameras"],
+        "lidars": {"top": {"sensor_to_ego": {"translation": [0, 0, 1.8], "rotation": [1, 0, 0, 0]}}},
+        "ego_poses": poses,
+        "frames": [{key: frame[key] for key in ("camera", "timestamp", "file")} for frame in content["frames"]],
+        "sweeps": [{"lidar": "top", "timestamp": first["timestamp"], "file": "sweeps/one.ply"}],
+        "tracks": [
+            {
+                "id": "car",
+                "class": "car",
+                "size": [4.0, 2.0, 1.5],
+                "poses": [
+                    {"timestamp": t, "translation": [20.0, 100.0, 0.7], "rotation": [1, 0, 0, 0]}
+                    for t in range(begin, end, 500_000)
+                ],
+            }
+        ],
+    }
+    (drive / "drive.json").write_text(json.dumps(record), encoding="utf-8")
+    scene = extract_scene(source(), drive)
+    assert len(scene.key_frame_timestamps) == len(scene.frames) == len(content["frames"])
+    np.testing.assert_allclose(scene.origin, [8.0 * 0.05, 100.0, 0.0], atol=1e-12)
+    for frame in scene.frames:
+        seconds = (frame.timestamp - first["timestamp"]) * 1e-6
+        np.testing.assert_allclose(frame.ego_to_world[:3, 3], [8.0 * seconds, 0.0, 0.0], atol=1e-9)
+    (sweep,) = scene.sweeps
+    assert sweep.is_key_frame and sweep_fault(sweep) is None
+    np.testing.assert_allclose(read_returns(sweep).points, [(5.0, 1.0, 0.5), (9.0, -2.0, 0.1)], atol=1e-6)
+    (track,) = scene.tracks
+    assert track.category == "car" and set(track.visibility) == {0} and len(track.timestamps) > 5
+
+
+@pytest.mark.parametrize(
+    ("times", "marked", "between", "expected"),
+    [
+        ([0, 100, 205, 300], [None] * 4, False, [(0, 0, True), (2, 1, True)]),
+        ([0, 100, 205, 300], [None] * 4, True, [(0, 0, True), (1, 0, False), (2, 1, True)]),
+        ([0, 100, 205, 300], [True, True, False, False], False, [(0, 0, True), (1, 1, True)]),
+        ([350, 400], [None] * 2, False, []),
+        ([], [], True, []),
+    ],
+)
+def test_the_recording_of_a_key_frame_is_the_nearest_within_half_an_interval(times, marked, between, expected):
+    assert chosen_recordings(times, marked, np.array([0, 200]), between) == expected
+
+
+FAULTS = {
+    "not a drive": (lambda d: d.update(format="nuscenes"), "format is 'nuscenes'"),
+    "another key": (lambda d: d.update(camera={}), "camera is no key of the format"),
+    "a text for a time": (lambda d: d["frames"][3].update(timestamp="now"), "frames[3].timestamp is 'now'"),
+    "seconds": (
+        lambda d: [f.update(timestamp=f["timestamp"] // 10**6) for f in d["frames"]],
+        "same camera and timestamp",
+    ),
+    "milliseconds": (
+        lambda d: [f.update(timestamp=f["timestamp"] // 1000) for f in d["frames"]],
+        "timestamps are microseconds",
+    ),
+    "a mirrored camera": (
+        lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
+        "cameras.CAM_FRONT: its rotation is mirrored",
+    ),
+    "a scaled camera": (
+        lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]),
+        "no rotation matrix",
+    ),
+    "K of another image": (
+        lambda d: d["cameras"]["CAM_FRONT"].update(K=[[1e-300, 0, 40], [0, 60, 27], [0, 0, 1]]),
+        "the focal length 1e-300 does not fit images 96 pixels wide",
+    ),
+    "a principal point outside": (
+        lambda d: d["cameras"]["CAM_FRONT"].update(K=[[60, 0, 800], [0, 60, 450], [0, 0, 1]]),
+        "the principal point (800.0, 450.0) lies outside the image",
+    ),
+    "coefficients": (
+        lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "fisheye", "coefficients": [0.1]}),
+        "distortion fisheye has 1 coefficients; it takes 4",
+    ),
+    "a pose far away": (
+        lambda d: d["frames"][0]["ego_to_world"].update(translation=[1e300, 0, 0]),
+        "frames[0]: its position",
+    ),
+    "another camera": (lambda d: d["frames"][0].update(camera="left"), "camera 'left' is not in cameras"),
+    "a file outside": (lambda d: d["frames"][0].update(file="../x.jpg"), "'../x.jpg' is no path inside the folder"),
+    "no pose": (
+        lambda d: d["frames"][0].update(ego_to_world=None, camera_to_world=None),
+        "frames[0]: there are no ego_poses",
+    ),
+    "two tracks of one id": (lambda d: d["tracks"].append(d["tracks"][0]), "another track has this id"),
+    "a track out of order": (lambda d: d["tracks"][0]["poses"].reverse(), "not later than that of the one before"),
+    "a flat box": (lambda d: d["tracks"][0].update(size=[4.0, 0.0, 1.5]), "no length, width and height"),
+    "an unknown class": (lambda d: d["tracks"][0].update({"class": "lorry"}), "tracks[0].class is 'lorry'"),
+    "no frames": (lambda d: d.update(frames=[], sweeps=[]), "frames: there is none"),
+    "no calibration": (lambda d: d.update(cameras={}), "images need their calibration"),
+    "a jump": (
+        lambda d: d["tracks"][0]["poses"][1].update(translation=[900.0, 0.0, 0.0]),
+        "timestamps are microseconds, positions metres",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_every_fault_is_a_sentence_of_the_checker_and_stops_the_reader(fault, content, folder, tmp_path, capsys):
+    changed = copy.deepcopy(content)
+    change, words = FAULTS[fault]
+    change(changed)
+    mine = tmp_path / "0001"
+    mine.mkdir()
+    (mine / "drive.json").write_text(json.dumps(changed), encoding="utf-8")
+    assert main(["check", str(mine)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert any(words in line for line in lines), lines
+    with pytest.raises(DatasetError) as stopped:
+        extract_scene(source(), tmp_path)
+    assert "drive.json" in str(stopped.value)
+
+
+def test_the_checker_draws_a_picture_of_a_sound_folder(folder, tmp_path, capsys):
+    picture = tmp_path / "check.png"
+    assert main(["check", str(folder / "0001"), "--picture", str(picture)]) == 0
+    said = capsys.readouterr().out
+    assert "10 key frames at 2 Hz" in said and "tracks" in said
+    pixels = np.asarray(Image.open(picture))
+    assert pixels.shape == (540, 960, 3)
+    boxes = (pixels == (255, 90, 0)).all(axis=2)
+    assert 100 < boxes.sum() < 20_000
+
+
+def test_files_that_are_missing_or_no_images_are_faults_too(folder, content, tmp_path, capsys):
+    mine = tmp_path / "0001"
+    mine.mkdir()
+    (mine / "drive.json").write_text(json.dumps(content), encoding="utf-8")
+    for frame in content["frames"][1:]:
+        (mine / frame["file"]).parent.mkdir(parents=True, exist_ok=True)
+        (mine / frame["file"]).write_bytes((folder / "0001" / frame["file"]).read_bytes())
+    deep = np.full((54, 96), 40_000, dtype=np.uint16)
+    Image.fromarray(deep).save(mine / content["frames"][1]["file"], format="PNG")
+    assert main(["check", str(mine)]) == 1
+    said = capsys.readouterr().out
+    assert "is missing" in said and "more than 8 bits per channel (mode I;16)" in said
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"x": [1.0], "y": [2.0]}, "it has no z"),
+        ({"x": [1.0], "y": [2.0], "z": [3.0, 4.0]}, "its columns have 1, 2 rows"),
+        ({"x": [1e11], "y": [0.0], "z": [0.0]}, "a return is 1e+11 m away"),
+        ({"x": [1.0], "y": [0.0], "z": [0.0], "intensity": [200.0]}, "divide them"),
+        ({"x": [np.nan], "y": [0.0], "z": [0.0]}, "no return has finite coordinates"),
+        ({"x": [], "y": [], "z": []}, "is empty"),
+        ({"x": ["a"], "y": ["b"], "z": ["c"]}, "no column of numbers"),
+    ],
+)
+def test_a_sweep_that_cannot_be_is_named(columns, words, recorded, tmp_path):
+    path = tmp_path / "sweep.npz"
+    np.savez(path, **{name: np.array(values) for name, values in columns.items()})
+    sweep = recorded.sweeps[0].__class__(**{**vars(recorded.sweeps[0]), "path": str(path), "reader": "drive"})
+    assert words in (sweep_fault(sweep) or "")
+
+
+def test_a_folder_that_is_not_empty_is_not_written_into(recorded, folder):
+    with pytest.raises(DatasetError, match="is not empty"):
+        write_drive(recorded, folder / "0001")
+
+
+def test_the_converter_of_the_documentation_writes_a_sound_folder(tmp_path, monkeypatch, capsys):
+    page = (REPOSITORY / "docs/own_data.md").read_text(encoding="utf-8")
+    (converter,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for name in ("front", "top"):
+        (tmp_path / "monday" / name).mkdir(parents=True)
+    points = np.array([(5.0, 1.0, 0.5), (9.0, -2.0, 0.1)], dtype=[(name, "f4") for name in "xyz"])
+    rows = ["timestamp,x,y,z,qw,qx,qy,qz"]
+    for i in range(5):
+        time = 1_700_000_000_000_000 + 500_000 * i
+        Image.new("RGB", (1600, 900), (50 * i, 90, 120)).save(tmp_path / f"monday/front/{time}.jpg")
+        PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / f"monday/top/{time}.ply")
+        rows.append(f"{time},{4.0 * i},0.0,0.0,1,0,0,0")
+    (tmp_path / "monday/poses.csv").write_text("\n".join(rows))
+    monkeypatch.chdir(tmp_path)
+    exec(converter, {})
+    assert main(["check", "monday"]) == 0
+    assert "5 key frames at 2 Hz, 5 images of 1 cameras, 5 LiDAR sweeps, no boxes" in capsys.readouterr().out
+    scene = extract_scene(source(scene="monday", cameras=("front",)), tmp_path / "monday")
+    np.testing.assert_allclose(scene.frames[2].camera_to_world[:3, 3], [9.7, 0.0, 1.5], atol=1e-9)
+    np.testing.assert_allclose(scene.frames[2].camera_to_world[:3, 2], [1.0, 0.0, 0.0], atol=1e-9), "it looks ahead"
+
+
+def test_the_schema_is_that_of_the_records(capsys):
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(Drive.model_json_schema(by_alias=True)))
+
+
+def test_the_command_runs_as_documented(folder, tmp_path):
+    arguments = ["check", str(folder / "0001"), "--picture", str(tmp_path / "check.png")]
+    done = subprocess.run(
+        [sys.executable, "-m", "drivesplat.readers.drive", *arguments],
+        cwd=REPOSITORY, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stderr == "", done.stderr
