@@ -9,6 +9,7 @@ from pathlib import Path
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.undistort import undistorted
 from drivesplat.readers.datasets import reader
+from drivesplat.readers.drive_checks import jumps
 from drivesplat.readers.image_file import image_fault
 from drivesplat.scene.scene import Frame, Scene, place_of
 from drivesplat.scene.scene_warnings import luminance, scene_warnings
@@ -52,7 +53,7 @@ def extract_scene(
             raise DatasetError(f"scene {source.scene}: its images are distorted, and there is no folder for others")
         shutil.rmtree(undistorted_images, ignore_errors=True)
         scene = undistorted(scene, undistorted_images)
-    for sentence in scene_warnings(scene, luminance(scene)):
+    for sentence in (*jumps(scene), *scene_warnings(scene, luminance(scene))):
         log.warning("scene %s: %s", scene.name, sentence)
     return scene
 

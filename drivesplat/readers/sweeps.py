@@ -5,6 +5,7 @@ from types import ModuleType
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.by_name import dataset_module
+from drivesplat.readers.drive_checks import returns_fault
 from drivesplat.scene.scene import Sweep, place_of
 from drivesplat.scene.sensors import LidarReturns
 
@@ -15,20 +16,36 @@ SWEEP_FILE = "drivesplat.readers.*.sweep_file"
 def read_returns(sweep: Sweep) -> LidarReturns:
     """The returns of a sweep that have finite coordinates.
 
-    Raises DatasetError naming the sweep's token and path if the file is missing, truncated or empty.
+    Raises DatasetError naming the sweep's token and path if the file is missing, truncated or empty, or its returns are
+    none of a LiDAR on a vehicle.
     """
-    fault = sweep_fault(sweep)
-    if fault:
+    returns = _returns(sweep)
+    if isinstance(returns, str):
         leave_out = "" if sweep.is_key_frame else "lidar_seed.sweeps: false to do without all between key frames, or "
-        raise DatasetError(f"{fault}; restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it")
-    return _files(sweep).read_file(Path(sweep.path))
+        raise DatasetError(
+            f"{_named(sweep, returns)}; restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it"
+        )
+    return returns
 
 
 def sweep_fault(sweep: Sweep) -> str | None:
     """The fault of a sweep's file, with its token and path; None if there is none."""
-    path = Path(sweep.path)
-    fault = _files(sweep).file_fault(path) if path.is_file() else "is missing"
-    return f"{place_of(sweep)}: LiDAR file {path} {fault}" if fault else None
+    returns = _returns(sweep)
+    return _named(sweep, returns) if isinstance(returns, str) else None
+
+
+def _returns(sweep: Sweep) -> LidarReturns | str:
+    """The returns of a sweep, or the fault of its file."""
+    path, files = Path(sweep.path), _files(sweep)
+    fault = files.file_fault(path) if path.is_file() else "is missing"
+    if fault:
+        return fault
+    returns = files.read_file(path)
+    return returns_fault(returns) or returns
+
+
+def _named(sweep: Sweep, fault: str) -> str:
+    return f"{place_of(sweep)}: LiDAR file {sweep.path} {fault}"
 
 
 def _files(sweep: Sweep) -> ModuleType:

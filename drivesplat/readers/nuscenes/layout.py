@@ -57,8 +57,8 @@ def camera_names(root: Path, version: str) -> list[str]:
     table = root / version / "sensor.json"
     try:
         rows = json.loads(table.read_text(encoding="utf-8"))
-        return [row["channel"] for row in rows if row["modality"] == "camera"]
-    except (KeyError, OSError, TypeError, ValueError) as error:
+        return [str(row["channel"]) for row in rows if row["modality"] == "camera"]
+    except (KeyError, OSError, RecursionError, TypeError, ValueError) as error:
         raise DatasetError(f"{table} cannot be read ({type(error).__name__}: {error}); unpack it again") from error
 
 

@@ -14,8 +14,21 @@ from typing import Any
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import checked_intrinsics, checked_pose, checked_size, require_increasing
+from drivesplat.readers.checks import (
+    MAX_MOUNT,
+    checked_beams,
+    checked_box_size,
+    checked_intrinsics,
+    checked_path,
+    checked_pose,
+    checked_readout,
+    checked_size,
+    named,
+    require_increasing,
+)
+from drivesplat.readers.drive_checks import chain, require_microseconds
 from drivesplat.readers.nuscenes.object_classes import object_class
+from drivesplat.readers.nuscenes.row_checks import check_rows
 from drivesplat.readers.nuscenes.scene_tables import damaged, read_scene_tables, scene_file, write_scene_tables
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
@@ -44,6 +57,7 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
     tables = _load(root, source, scene_tables)
     record = tables.scene[0]
     samples = _samples(tables, record)
+    require_microseconds([s["timestamp"] for s in samples], f"scene {name}")
     if frames and frames[1] > len(samples):
         raise DatasetError(f"scene {name}: the frame range {frames} ends beyond its {len(samples)} key frames")
     samples = samples[slice(*(frames or (None, None)))]
@@ -53,7 +67,7 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
         name=name,
         dataset="",
         version=version,
-        description=record.get("description", ""),
+        description=record.get("description") or "",
         origin=origin,
         key_frame_timestamps=times,
         frames=(),
@@ -78,15 +92,20 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
 def _camera(tables: Any, frame: Frame) -> Camera:
     """The camera of a frame. nuScenes' images are rectified; only synthetic worlds state readout times."""
     sensor = _calibration(tables, frame.token)
-    readout = {name: sensor.get(name) for name in ("readout_s", "readout_direction")}
-    return Camera(frame.camera, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5), **readout)
+    record = named("calibrated_sensor", sensor["token"])
+    seconds, direction = checked_readout(sensor.get("readout_s"), sensor.get("readout_direction"), record)
+    return Camera(
+        frame.camera, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5), readout_s=seconds,
+        readout_direction=direction,
+    )  # fmt: skip
 
 
 def _lidar(tables: Any, sweep: Sweep) -> Lidar:
     """The LiDAR of a sweep: nuScenes' own, unless a synthetic world states its beams."""
     sensor = _calibration(tables, sweep.token)
-    elevations = np.array(sensor.get("beam_elevations", BEAM_ELEVATIONS), dtype=np.float64)
-    return Lidar(LIDAR, elevations, sensor.get("azimuth_steps", AZIMUTH_STEPS))
+    record = named("calibrated_sensor", sensor["token"])
+    elevations, steps = sensor.get("beam_elevations", BEAM_ELEVATIONS), sensor.get("azimuth_steps", AZIMUTH_STEPS)
+    return Lidar(LIDAR, *checked_beams(elevations, steps, record))
 
 
 def _calibration(tables: Any, sample_data: str) -> dict:
@@ -95,7 +114,8 @@ def _calibration(tables: Any, sample_data: str) -> dict:
 
 def _key_frame_hz(times: np.ndarray) -> float:
     """The nominal rate of key frames: nuScenes' is 2 Hz within a tenth; synthetic worlds have others."""
-    return float(round(1e6 / np.median(np.diff(times)))) if len(times) > 1 else KEY_FRAME_HZ
+    hz = 1e6 / float(np.median(np.diff(times))) if len(times) > 1 else KEY_FRAME_HZ
+    return float(round(hz)) or hz
 
 
 def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
@@ -113,6 +133,7 @@ def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
             raise DatasetError(
                 f"scene {source.scene} is not in nuScenes {source.version} at {root}; there are: {available}"
             )
+        check_rows(tables)
         try:
             (Path(folder) / source.version).mkdir()
             for row in tables["map"]:
@@ -120,16 +141,13 @@ def _load(root: Path, source: SceneSource, scene_tables: Path | None) -> Any:
             for table, rows in tables.items():
                 (Path(folder) / source.version / f"{table}.json").write_text(json.dumps(rows), encoding="utf-8")
             return NuScenes(source.version, folder, verbose=False)
-        except (AssertionError, IndexError, KeyError, ValueError, OSError) as error:
+        except (AssertionError, RecursionError, ValueError, OSError) as error:
             raise damaged(root, source.version, error) from error
 
 
 def _samples(tables: Any, scene: dict) -> list[dict]:
-    samples, token = [], scene["first_sample_token"]
-    while token:
-        samples.append(_get(tables, "sample", token))
-        token = samples[-1]["next"]
-    return samples
+    tokens = chain(scene["first_sample_token"], lambda token: _get(tables, "sample", token)["next"], "sample")
+    return [_get(tables, "sample", token) for token in tokens]
 
 
 def _get(tables: Any, table: str, token: str) -> dict:
@@ -141,7 +159,7 @@ def _get(tables: Any, table: str, token: str) -> dict:
 
 def _ego_pose(tables: Any, data: dict) -> np.ndarray:
     pose = _get(tables, "ego_pose", data["ego_pose_token"])
-    return checked_pose(pose["translation"], pose["rotation"], f"ego_pose {pose['token']}")
+    return checked_pose(pose.get("translation"), pose.get("rotation"), named("ego_pose", pose["token"]))
 
 
 def _origin(tables: Any, sample: dict, cameras: tuple[str, ...]) -> np.ndarray:
@@ -164,11 +182,16 @@ def _records(tables: Any, samples: list[dict], channel: str, sweeps: bool) -> It
     if not sweeps:
         yield from key
         return
-    data = key[0]
+    key_tokens, data = {d["token"] for d in key}, key[0]
     while True:
+        if data["channel"] != channel or data["is_key_frame"] != (data["token"] in key_tokens):
+            raise DatasetError(
+                f"{named('sample_data', data['token'])}: it stands in the chain of another sensor or scene"
+            )
+        key_tokens.discard(data["token"])
         yield data
         if data["token"] == key[-1]["token"]:
-            return
+            break
         if not data["next"]:
             raise DatasetError(f"sample_data {data['token']}: the chain of {channel} ends before the scene does")
         following = _get(tables, "sample_data", data["next"])
@@ -176,6 +199,8 @@ def _records(tables: Any, samples: list[dict], channel: str, sweeps: bool) -> It
             [data["timestamp"], following["timestamp"]], [data["token"], following["token"]], "sample_data"
         )
         data = following
+    if key_tokens:
+        raise DatasetError(f"{named('sample_data', min(key_tokens))}: the chain of {channel} leaves it out")
 
 
 def _recordings(
@@ -187,23 +212,37 @@ def _recordings(
     for data in _records(tables, samples, channel, sweeps):
         at, of_sample = data["timestamp"], data["sample_token"]
         index = index_of_sample[of_sample] if data["is_key_frame"] else scene.nearest_key_frame(at)
+        _require_near_its_sample(data, int(scene.key_frame_timestamps[index]), scene.key_frame_interval)
         sensor = _get(tables, "calibrated_sensor", data["calibrated_sensor_token"])
         ego_to_world = _ego_pose(tables, data)
         ego_to_world[:3, 3] -= scene.origin
-        sensor_to_ego = checked_pose(sensor["translation"], sensor["rotation"], f"calibrated_sensor {sensor['token']}")
+        mount, turn = sensor.get("translation"), sensor.get("rotation")
+        sensor_to_ego = checked_pose(mount, turn, named("calibrated_sensor", sensor["token"]), MAX_MOUNT)
         yield data, index, ego_to_world, ego_to_world @ sensor_to_ego, sensor
+
+
+def _require_near_its_sample(data: dict, key_frame_us: int, interval: float) -> None:
+    """Raises DatasetError for a recording of a key frame that is farther than a second, and the interval between key
+    frames, from the time of its sample."""
+    apart = abs(data["timestamp"] - key_frame_us)
+    if data["is_key_frame"] and apart > max(1e6, interval):
+        raise DatasetError(
+            f"{named('sample_data', data['token'])}: its timestamp is {apart * 1e-6:g} s from that of its sample; "
+            "both must be microseconds of one clock"
+        )
 
 
 def _frames(tables: Any, root: Path, samples: list[dict], camera: str, sweeps: bool, scene: Scene) -> Iterator[Frame]:
     for data, index, ego_to_world, camera_to_world, sensor in _recordings(tables, samples, camera, sweeps, scene):
-        width, height = checked_size(data["width"], data["height"], f"sample_data {data['token']}")
+        record, calibration = named("sample_data", data["token"]), named("calibrated_sensor", sensor["token"])
+        width, height = checked_size(data.get("width"), data.get("height"), record)
         yield Frame(
             camera=camera,
             timestamp=data["timestamp"],
-            image_path=str(root / data["filename"]),
+            image_path=str(root / checked_path(data.get("filename"), record)),
             width=width,
             height=height,
-            intrinsics=checked_intrinsics(sensor["camera_intrinsic"], f"calibrated_sensor {sensor['token']}"),
+            intrinsics=checked_intrinsics(sensor.get("camera_intrinsic"), calibration, (width, height)),
             camera_to_world=camera_to_world,
             ego_to_world=ego_to_world,
             is_key_frame=data["is_key_frame"],
@@ -216,7 +255,8 @@ def _sweeps(tables: Any, root: Path, samples: list[dict], sweeps: bool, scene: S
     if not any(LIDAR in sample["data"] for sample in samples):
         return
     for data, index, _, sensor_to_world, _ in _recordings(tables, samples, LIDAR, sweeps, scene):
-        path, time, is_key_frame = str(root / data["filename"]), data["timestamp"], data["is_key_frame"]
+        path = str(root / checked_path(data.get("filename"), named("sample_data", data["token"])))
+        time, is_key_frame = data["timestamp"], data["is_key_frame"]
         yield Sweep(path, time, sensor_to_world, is_key_frame, index, data["token"], LIDAR, READER)
 
 
@@ -229,10 +269,10 @@ def _tracks(tables: Any, samples: list[dict], origin: np.ndarray) -> Iterator[Tr
             by_instance.setdefault(annotation["instance_token"], []).append((i, sample["timestamp"], annotation))
     for instance, entries in by_instance.items():
         annotations = [annotation for _, _, annotation in entries]
-        width, length, height = np.median([a["size"] for a in annotations], axis=0)
-        poses = [checked_pose(a["translation"], a["rotation"], f"sample_annotation {a['token']}") for a in annotations]
-        if not (np.isfinite([length, width, height]).all() and min(length, width, height) > 0):
-            raise DatasetError(f"instance {instance}: its boxes have no finite, positive size")
+        names = [f"{named('sample_annotation', a['token'])} (instance {instance})" for a in annotations]
+        checked = list(zip(annotations, names, strict=True))
+        width, length, height = np.median([checked_box_size(a.get("size"), name) for a, name in checked], axis=0)
+        poses = [checked_pose(a.get("translation"), a.get("rotation"), name) for a, name in checked]
         yield Track(
             id=instance,
             object_class=object_class(annotations[0]["category_name"]),

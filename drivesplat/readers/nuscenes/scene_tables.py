@@ -17,6 +17,7 @@ from typing import Any
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import atomic_path, unwritable, write_json
+from drivesplat.readers.checks import named, shown
 from drivesplat.readers.nuscenes.layout import TABLES, all_tables
 
 SCHEMA = 1
@@ -27,6 +28,8 @@ LARGE = 200_000_000
 _CHUNK = 2**22
 _BUFFER = 2**26
 """Number of characters per read, and buffered before a write."""
+_MAX_ROW = 2**24
+"""Maximum number of characters of a row. The rest of a table that is damaged in its middle is not read."""
 _BETWEEN_ROWS = re.compile(r"[\s,]*")
 _REFERENCES = (
     ("sample", "scene_token", "scene", {"sample": "token"}),
@@ -93,7 +96,7 @@ def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: 
     with work as made:
         try:
             _append(_rows_of_scenes(root / version, scenes), Path(made))
-        except (AttributeError, KeyError, TypeError, ValueError, OSError) as error:
+        except (ValueError, OSError) as error:
             raise damaged(root, version, error) from error
         changed = []
         for scene in scenes:
@@ -107,9 +110,8 @@ def write_scene_tables(root: Path, version: str, scenes: Sequence[str], folder: 
 
 def damaged(root: Path, version: str, error: Exception) -> DatasetError:
     """The error for tables that cannot be read."""
-    return DatasetError(
-        f"nuScenes {version} in {root} cannot be read ({type(error).__name__}: {error}); unpack it again"
-    )
+    what = f"{error}" if type(error) is ValueError else f"{type(error).__name__}: {error}"
+    return DatasetError(f"nuScenes {version} in {root} cannot be read ({what}); unpack it again")
 
 
 def read_scene_tables(path: Path) -> dict[str, list[dict[str, Any]]]:
@@ -120,7 +122,7 @@ def read_scene_tables(path: Path) -> dict[str, list[dict[str, Any]]]:
             for line in file:
                 ((table, row),) = json.loads(line).items()
                 tables[table].append(row)
-    except (AttributeError, KeyError, OSError, ValueError) as error:
+    except (AttributeError, KeyError, OSError, RecursionError, ValueError) as error:
         raise DatasetError(f"{path} is damaged ({error}); delete it and rerun to recreate it") from error
     return tables
 
@@ -161,31 +163,49 @@ def _rows_of_scenes(tables: Path, scenes: Sequence[str]) -> Iterator[Found]:
     for table, column, owner, references in _REFERENCES:
         owned_by, referred = owners[owner], [(owners[other], token) for other, token in references.items()]
         for text, row in rows(tables / f"{table}.json"):
-            row_scenes = owned_by.get(row[column], no_scenes)
+            row_scenes = owned_by.get(_token(row, column, table), no_scenes)
             if row_scenes:
                 yield row_scenes, table, text
             for others, token in referred if row_scenes else ():
-                known = others.setdefault(row[token], row_scenes)
+                other = _token(row, token, table)
+                known = others.setdefault(other, row_scenes)
                 if known != row_scenes:
-                    others[row[token]] = tuple(dict.fromkeys((*known, *row_scenes)))
+                    others[other] = tuple(dict.fromkeys((*known, *row_scenes)))
     for table in _SHARED:
         for text, _ in rows(tables / f"{table}.json"):
             yield scenes, table, text
     for _, row in rows(tables / "map.json"):
-        for log in row["log_tokens"]:
+        logs = row.get("log_tokens")
+        if not isinstance(logs, list) or not all(isinstance(log, str) for log in logs):
+            raise ValueError(f"{named('map', row.get('token'))}: its log_tokens must be a list of tokens")
+        for log in dict.fromkeys(logs):
             yield owners["log"].get(log, no_scenes), "map", json.dumps({**row, "log_tokens": [log]})
+
+
+def _token(row: dict[str, Any], column: str, table: str) -> str:
+    """The token in a column. Raises ValueError naming the row if it has none."""
+    token = row.get(column)
+    if not isinstance(token, str):
+        what = f"its {column} is {shown(token)}; it must be text" if column in row else f"it has no {column}"
+        raise ValueError(f"{named(table, row.get('token'))}: {what}")
+    return token
 
 
 def _scene_rows(tables: Path, scenes: Sequence[str], owners: dict[str, dict[str, tuple[str, ...]]]) -> Iterator[Found]:
     """The rows of the table of scenes; adds to `owners`, per table, the scenes to which each token belongs."""
-    known = {row["name"]: (text, row) for text, row in rows(tables / "scene.json")}
+    known: dict[str, tuple[str, dict[str, Any]]] = {}
+    for text, row in rows(tables / "scene.json"):
+        name = _token(row, "name", "scene")
+        if name in known:
+            raise ValueError(f"{named('scene', row.get('token'))}: its name {name} is that of another scene")
+        known[name] = text, row
     for scene in scenes:
         if f"scene-{scene}" not in known:
             yield from (([scene], "scene", json.dumps({"name": name})) for name in known)
             continue
         text, row = known[f"scene-{scene}"]
         yield [scene], "scene", text
-        for table, token in (("scene", row["token"]), ("log", row["log_token"])):
+        for table, token in (("scene", _token(row, "token", "scene")), ("log", _token(row, "log_token", "scene"))):
             owners[table][token] = (*owners[table].get(token, ()), scene)
 
 
@@ -206,11 +226,15 @@ def rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
                 return
             try:
                 row, end = decoder.raw_decode(text, at)
+            except RecursionError as error:
+                raise ValueError(f"{table.name} is nested too deeply") from error
             except json.JSONDecodeError as error:
-                more = file.read(_CHUNK)
+                more = file.read(_CHUNK) if len(text) - at <= _MAX_ROW else ""
                 if not more:
                     raise ValueError(f"{table.name} ends within a row or is not JSON: {error.msg}") from error
                 text, at = text[at:] + more, 0
                 continue
+            if not isinstance(row, dict):
+                raise ValueError(f"{table.name} is not a list of rows: it holds {shown(row)}")
             yield text[at:end].replace("\n", ""), row
             at = end

@@ -1,0 +1,100 @@
+"""Checks of a whole drive that all readers share: chains of records, unique tokens, units of time, tracks and LiDAR
+returns. Errors and warnings name the record."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.readers.checks import named
+from drivesplat.scene.scene import Scene
+from drivesplat.scene.sensors import LidarReturns
+
+MIN_KEY_FRAME_STEP_US = 1000
+"""Minimum median step between key frames in microseconds. Seconds and milliseconds are below it."""
+MAX_SPEED = 120.0
+"""Speed in m/s above which an object or the ego vehicle is taken to jump."""
+MAX_RANGE = 1000.0
+"""Maximum distance in metres of a LiDAR return: no LiDAR on a vehicle measures as far."""
+
+
+def require_unique(tokens: Iterable[str], table: str) -> None:
+    """Raises DatasetError naming a token that two records of a table have."""
+    seen: set[str] = set()
+    for token in tokens:
+        if token in seen:
+            raise DatasetError(f"{named(table, token)}: two records have this token; it must be unique")
+        seen.add(token)
+
+
+def chain(first: str, following: Callable[[str], str], table: str) -> list[str]:
+    """The tokens of a linked list from `first`; `following` gives the next token, "" at the end.
+
+    Raises DatasetError naming the record that leads back to an earlier one.
+    """
+    tokens = {first: None}
+    last = first
+    while token := following(last):
+        if token in tokens:
+            raise DatasetError(
+                f"{named(table, last)}: its next is {token}, which comes before it: the chain is a circle"
+            )
+        tokens[token] = None
+        last = token
+    return list(tokens)
+
+
+def require_microseconds(key_frame_times: Sequence[int] | np.ndarray, record: str) -> None:
+    """Raises DatasetError naming `record` if key frames follow each other so closely that their timestamps must have
+    another unit."""
+    if len(key_frame_times) < 2:
+        return
+    step = float(np.median(np.abs(np.diff(np.array(key_frame_times, dtype=np.int64)))))
+    if step < MIN_KEY_FRAME_STEP_US:
+        raise DatasetError(
+            f"{record}: its key frames are {step:g} microseconds apart, less than a millisecond; timestamps must be "
+            "microseconds, neither seconds nor milliseconds"
+        )
+
+
+def returns_fault(returns: LidarReturns) -> str | None:
+    """The fault of the returns of a sweep's file, as the end of a sentence; None if there is none."""
+    if not len(returns.points):
+        return "is corrupt (it has no return with finite coordinates)"
+    farthest = float(np.abs(returns.points).max())
+    if not farthest <= MAX_RANGE:
+        return f"is corrupt (a return is {farthest:.3g} m away; coordinates must be metres, in the sensor's frame)"
+    if returns.intensity is not None and not np.isfinite(returns.intensity).all():
+        return "is corrupt (an intensity is not finite)"
+    if returns.offsets_s is not None and not np.isfinite(returns.offsets_s).all():
+        return "is corrupt (a time is not finite)"
+    return None
+
+
+def jumps(scene: Scene) -> list[str]:
+    """A sentence for every track with a speed above MAX_SPEED between two annotations, and for the ego vehicle. These
+    are warnings, since annotations and positions have errors."""
+    found = []
+    for camera in dict.fromkeys(frame.camera for frame in scene.frames):
+        frames = sorted((f for f in scene.frames if f.camera == camera), key=lambda frame: frame.timestamp)
+        times = np.array([frame.timestamp for frame in frames])
+        where = _jump(times, np.stack([frame.ego_to_world[:3, 3] for frame in frames]))
+        if where:
+            found.append(f"the ego vehicle jumps, {where}: check its poses")
+            break
+    for track in scene.tracks:
+        where = _jump(track.timestamps, track.object_to_world[:, :3, 3])
+        if where:
+            found.append(f"track {track.id} ({track.category}) jumps, {where}: check its boxes")
+    return found
+
+
+def _jump(timestamps: np.ndarray, positions: np.ndarray) -> str | None:
+    """The step above MAX_SPEED, if any, of positions (n, 3) at times (n,) in microseconds, in words."""
+    seconds = np.diff(timestamps) * 1e-6
+    distances = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    excess = distances - MAX_SPEED * seconds
+    if not len(excess) or excess.max() <= 0:
+        return None
+    at = int(np.argmax(excess))
+    return f"{distances[at]:.0f} m within {seconds[at]:.2f} s (from {timestamps[at]} to {timestamps[at + 1]})"
