@@ -57,8 +57,8 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
     """Writes the masks of every image below `folder`; returns the record for masks.json. The ego vehicle's body is a
     region of its own, neither sky nor of any class. The sky of training images depends on training sweeps only.
 
-    Raises DatasetError naming the file where a user's mask is missing or unreadable, ConfigError where a user's folder
-    is the output.
+    Raises DatasetError naming the file where a user's mask is missing, unreadable, in colours or of another aspect
+    ratio than its image, ConfigError where a user's folder is the output.
     """
     _refuse_own_folder(job, folder)
     groups, training = frame_groups(scene, job.holdout), sweeps_of(scene, job.holdout)
@@ -127,7 +127,7 @@ def _regions(scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) ->
 
 
 def _users_mask(folder: str, frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    return read_mask(users_file(folder, frame), size)
+    return read_mask(users_file(folder, frame), size, (frame.width, frame.height))
 
 
 def users_file(folder: str, frame: Frame) -> Path:
@@ -136,7 +136,7 @@ def users_file(folder: str, frame: Frame) -> Path:
     of_camera, name = Path(folder).expanduser() / frame.camera, Path(frame.image_path).stem
     by_name, by_time = of_camera / f"{name}.png", of_camera / f"{frame.timestamp}.png"
     for path in (by_name, by_time):
-        if path.exists():
+        if path.is_file():
             return path
     raise DatasetError(f"mask {by_name} is missing, and so is {by_time.name} (docs/masks.md)")
 

@@ -2,12 +2,10 @@
 
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
+from drivesplat.scene.images import DECODING_ERRORS
 from drivesplat.scene.scene import Frame
-
-EIGHT_BITS = ("L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "1")
-"""Pillow's modes whose channels have at most 8 bits."""
 
 
 def image_fault(frame: Frame) -> str | None:
@@ -22,10 +20,10 @@ def image_fault(frame: Frame) -> str | None:
         with Image.open(path) as image:
             if image.size != (frame.width, frame.height):
                 return f"image {path} is {image.size[0]}x{image.size[1]}, the tables say {frame.width}x{frame.height}"
-            if image.mode not in EIGHT_BITS:
-                return f"image {path} has more than 8 bits per channel (mode {image.mode}); convert it to 8 bits"
+            if image.mode.startswith(("I", "F")):
+                return f"image {path} has more than 8 bits per channel ({image.mode}): convert it to 8 bits"
             image.draft("RGB", (frame.width // 8, frame.height // 8))
             image.load()
-    except (OSError, UnidentifiedImageError, SyntaxError) as error:
+    except DECODING_ERRORS as error:
         return f"image {path} is corrupt ({error})"
     return None

@@ -5,16 +5,23 @@ continuous convention of COLMAP and gsplat (image corner at (0, 0), centre of th
 resizing scales all coordinates.
 """
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import atomic_write
 from drivesplat.scene.scene import Frame
 from drivesplat.settings.images import ImageSettings
+
+DECODING_ERRORS = (
+    OSError, SyntaxError, ValueError, IndexError, OverflowError, struct.error, zlib.error, Image.DecompressionBombError,
+)  # fmt: skip
+"""What Pillow raises for files that are no image, or a damaged or absurdly large one."""
 
 
 def target_size(frame: Frame, images: ImageSettings) -> tuple[int, int]:
@@ -39,7 +46,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
     try:
         with Image.open(path) as image:
             pixels = np.asarray(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError, SyntaxError) as error:
+    except DECODING_ERRORS as error:
         raise DatasetError(f"image {path} cannot be read ({error})") from error
     if size is None or size == (pixels.shape[1], pixels.shape[0]):
         return pixels
@@ -60,19 +67,46 @@ def write_png(path: str | Path, pixels: np.ndarray) -> None:
         Image.fromarray(pixels).save(file, format="PNG")
 
 
-def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
+def read_mask(path: str | Path, size: tuple[int, int], of_image: tuple[int, int] | None = None) -> np.ndarray:
     """A label image (h, w) uint8, resized to `size` (width, height) by nearest neighbour.
 
-    Raises DatasetError that names the path if the file cannot be read.
+    Raises DatasetError that names the path if the file cannot be read, has more than one channel of 8 bits (other than
+    equal ones), or another aspect ratio than `of_image`, the size of the recorded image, if given.
     """
     try:
         with Image.open(path) as image:
-            labels = np.asarray(image if image.mode in ("L", "P") else image.convert("L"))
-    except (OSError, UnidentifiedImageError, SyntaxError) as error:
+            labels = _labels(image)
+    except DECODING_ERRORS as error:
         raise DatasetError(f"mask {path} cannot be read ({error})") from error
-    if size == (labels.shape[1], labels.shape[0]):
+    if labels is None:
+        raise DatasetError(f"mask {path} has colours or more than 8 bits; save its labels as one channel of 8 bits")
+    found = (labels.shape[1], labels.shape[0])
+    if of_image is not None and not _same_aspect(found, of_image):
+        raise DatasetError(
+            f"mask {path} is {found[0]}x{found[1]}, and its image {of_image[0]}x{of_image[1]}: masks may have another "
+            "size, but must have the image's aspect ratio"
+        )
+    if size == found:
         return labels
     return cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+
+
+def _labels(image: Image.Image) -> np.ndarray | None:
+    """The labels (h, w) uint8 of an image with one channel, or with equal ones; None where they are ambiguous."""
+    if image.mode in ("L", "P"):
+        return np.asarray(image)
+    if image.mode in ("1", "LA"):
+        return np.asarray(image.convert("L"))
+    if image.mode not in ("RGB", "RGBA"):
+        return None
+    red, green, blue = (np.asarray(image)[..., i] for i in range(3))
+    return red.copy() if (red == green).all() and (red == blue).all() else None
+
+
+def _same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one size is the other one, scaled, with its sides rounded to whole pixels."""
+    (small_w, small_h), (large_w, large_h) = sorted((size, other))
+    return abs(small_h - large_h * small_w / large_w) <= 1.0 or abs(small_w - large_w * small_h / large_h) <= 1.0
 
 
 def project(points: np.ndarray, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -264,7 +264,7 @@ def test_files_that_are_missing_or_no_images_are_faults_too(folder, content, tmp
     Image.fromarray(deep).save(mine / content["frames"][1]["file"], format="PNG")
     assert main(["check", str(mine)]) == 1
     said = capsys.readouterr().out
-    assert "is missing" in said and "more than 8 bits per channel (mode I;16)" in said
+    assert "is missing" in said and "more than 8 bits per channel (I;16)" in said
 
 
 @pytest.mark.parametrize(
