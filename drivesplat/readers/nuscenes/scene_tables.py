@@ -234,6 +234,8 @@ def rows(table: Path) -> Iterator[tuple[str, dict[str, Any]]]:
                     raise ValueError(f"{table.name} ends within a row or is not JSON: {error.msg}") from error
                 text, at = text[at:] + more, 0
                 continue
+            except ValueError as error:  # such as a number of 5,000 digits
+                raise ValueError(f"{table.name} cannot be parsed: {error}") from error
             if not isinstance(row, dict):
                 raise ValueError(f"{table.name} is not a list of rows: it holds {shown(row)}")
             yield text[at:end].replace("\n", ""), row
