@@ -17,8 +17,9 @@ def read_file(path: Path) -> LidarReturns:
     """The returns with finite coordinates, of a file without a fault."""
     returns = np.fromfile(path, dtype=np.float32).reshape(-1, _COLUMNS)
     returns = returns[np.isfinite(returns[:, :3]).all(axis=1)]
-    rings = np.nan_to_num(returns[:, 4], nan=-1.0).clip(-1.0, _MAX_RING).astype(np.int64)
-    return LidarReturns(returns[:, :3].astype(np.float64), returns[:, 3] / 255.0, rings)
+    with np.errstate(invalid="ignore", over="ignore"):  # random bytes; `sweeps.read_returns` refuses them
+        rings = np.nan_to_num(returns[:, 4], nan=-1.0).clip(-1.0, _MAX_RING).astype(np.int64)
+        return LidarReturns(returns[:, :3].astype(np.float64), returns[:, 3] / 255.0, rings)
 
 
 def file_fault(path: Path) -> str | None:
