@@ -54,7 +54,7 @@ def text_fault(value: Any) -> str | None:
 
 def _encodes(text: str) -> bool:
     """Whether a text can be printed in a line and written to a file: no lone surrogates, no control characters."""
-    return text.isprintable() or not any(ord(c) < 32 or 0xD800 <= ord(c) < 0xE000 for c in text)
+    return text.isprintable() or not any(ord(c) < 32 or 127 <= ord(c) < 160 or 0xD800 <= ord(c) < 0xE000 for c in text)
 
 
 def checked_text(value: Any, record: str, column: str, empty: bool = False) -> str:

@@ -312,6 +312,46 @@ def test_an_invalid_mask_of_the_user_is_named(two_images, tmp_path, kind, damage
     assert str(path) in str(failure.value)
 
 
+KINDS = ["regions_folder", "sky_folder", "semantic_folder"]
+
+
+@pytest.mark.parametrize("size", [(54, 96), (96, 96), (96, 50), (640, 384), (1, 54)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mask_of_another_aspect_ratio_is_refused_with_both_sizes(two_images, tmp_path, kind, size):
+    folder = users_masks(two_images, tmp_path / "mine", np.zeros(size[::-1], dtype=np.uint8))
+    with pytest.raises(DatasetError) as failure:
+        make_masks(two_images, job(**{kind: str(folder)}), tmp_path / "masks")
+    for part in (str(folder), f"is {size[0]}x{size[1]}", "96x54", "aspect ratio"):
+        assert part in str(failure.value)
+
+
+@pytest.mark.parametrize("size", [(96, 55), (48, 27), (32, 18), (50, 28), (51, 28), (1920, 1080)])
+@pytest.mark.parametrize("width", [None, 40])
+def test_a_mask_whose_sides_are_rounded_is_scaled(two_images, tmp_path, size, width):
+    folder = users_masks(two_images, tmp_path / "mine", np.zeros(size[::-1], dtype=np.uint8))
+    record = make_masks(two_images, job(width, regions_folder=str(folder)), tmp_path / "masks")
+    assert record.regions == "masks"
+
+
+def test_a_mask_in_colours_is_refused_and_one_with_equal_channels_accepted(two_images, tmp_path):
+    labels = np.random.default_rng(0).integers(0, 10, (54, 96)).astype(np.uint8)
+    equal = np.stack([labels] * 3, axis=-1)
+    one_blue = equal.copy()
+    one_blue[3, 4, 2] += 1
+    deep = labels.astype(np.uint16)
+    alpha = np.dstack([equal, np.full_like(labels, 7)])
+    for name, pixels, accepted in (("a", equal, True), ("b", one_blue, False), ("c", deep, False), ("d", alpha, True)):
+        folder = users_masks(two_images, tmp_path / name, pixels)
+        settings = job(regions_folder=str(folder))
+        if accepted:
+            make_masks(two_images, settings, tmp_path / "masks")
+            made = read_labels(tmp_path / "masks", "CAM_FRONT", two_images.frames[0].timestamp, SIZE)
+            np.testing.assert_array_equal(made, labels)
+        else:
+            with pytest.raises(DatasetError, match=f"mask {folder}.* one channel of 8 bits"):
+                make_masks(two_images, settings, tmp_path / "masks")
+
+
 @pytest.mark.parametrize("label", [10, 255])
 def test_an_unknown_label_is_refused_naming_setting_and_file(two_images, tmp_path, label):
     labels = np.zeros((54, 96), dtype=np.uint8)

@@ -317,7 +317,13 @@ def shrink(path: Path) -> None:
     Image.new("RGB", (48, 27)).save(path)
 
 
-FAULTS = [remove, truncate, scramble, empty, shrink]
+def deepen(path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(np.full((54, 96), 40_000, np.uint16)).save(path, format="PNG")
+
+
+FAULTS = [remove, truncate, scramble, empty, shrink, deepen]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -355,6 +361,19 @@ def cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-7])
 
 
+def random_bytes(path: Path) -> None:
+    path.write_bytes(np.random.default_rng(0).bytes(path.stat().st_size))
+
+
+def far(path: Path) -> None:
+    """Coordinates in millimetres."""
+    (np.fromfile(path, np.float32).reshape(-1, 5) * [1000, 1000, 1000, 1, 1]).astype(np.float32).tofile(path)
+
+
+def no_number(path: Path) -> None:
+    np.full((100, 5), np.nan, np.float32).tofile(path)
+
+
 def seed_job(on_missing: str) -> SeedJob:
     return SeedJob.model_validate(
         {
@@ -366,7 +385,7 @@ def seed_job(on_missing: str) -> SeedJob:
     )
 
 
-@pytest.mark.parametrize("fault", [remove, empty, cut_off])
+@pytest.mark.parametrize("fault", [remove, empty, cut_off, random_bytes, far, no_number])
 def test_a_bad_lidar_file_stops_the_seeding_naming_key_frame_token_and_path(root, fault):
     fault(sweep_of(root, 3))
     scene = extract_scene(source(), root)
@@ -376,7 +395,7 @@ def test_a_bad_lidar_file_stops_the_seeding_naming_key_frame_token_and_path(root
         assert part in str(failure.value)
 
 
-@pytest.mark.parametrize("fault", [remove, empty, cut_off])
+@pytest.mark.parametrize("fault", [remove, empty, cut_off, random_bytes, far, no_number])
 def test_a_bad_lidar_file_is_counted_with_on_missing_warn(root, fault, caplog):
     for index in (0, 3):
         fault(sweep_of(root, index))
