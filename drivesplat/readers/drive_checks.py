@@ -1,7 +1,8 @@
 """Checks of a whole drive that all readers share: chains of records, unique tokens, units of time, tracks and LiDAR
 returns. Errors and warnings name the record."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -18,13 +19,11 @@ MAX_RANGE = 1000.0
 """Maximum distance in metres of a LiDAR return: no LiDAR on a vehicle measures as far."""
 
 
-def require_unique(tokens: Iterable[str], table: str) -> None:
+def require_unique(tokens: Sequence[str], table: str) -> None:
     """Raises DatasetError naming a token that two records of a table have."""
-    seen: set[str] = set()
-    for token in tokens:
-        if token in seen:
-            raise DatasetError(f"{named(table, token)}: two records have this token; it must be unique")
-        seen.add(token)
+    if len(set(tokens)) < len(tokens):
+        token, _ = Counter(tokens).most_common(1)[0]
+        raise DatasetError(f"{named(table, token)}: two records have this token; it must be unique")
 
 
 def chain(first: str, following: Callable[[str], str], table: str) -> list[str]:

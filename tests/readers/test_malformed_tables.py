@@ -232,6 +232,17 @@ def without_description(rows: list[dict], value: str | None) -> None:
     rows[0].pop("description") if value else rows[0].update(description=None)
 
 
+@pytest.mark.parametrize("value", [7, ["text"], {}, "lone \ud800"], ids=ascii)
+def test_a_description_that_is_no_text_is_refused_naming_its_scene(root, value):
+    edit(root, "scene", lambda rows: rows[0].update(description=value))
+    assert refusal(root).startswith("scene scene 0001: its description is")
+
+
+def test_a_description_may_be_long_and_have_lines(root):
+    edit(root, "scene", lambda rows: rows[0].update(description="Rain.\nNight. " * 100))
+    assert extracted(root).description == "Rain.\nNight. " * 100
+
+
 COLUMNS = [
     ("scene", "name"), ("scene", "log_token"), ("scene", "first_sample_token"), ("sample", "next"),
     ("sample", "timestamp"), ("sample", "scene_token"), ("sample_data", "next"), ("sample_data", "sample_token"),

@@ -5,45 +5,66 @@ rows of sensors that are not read refuse no drive.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import checked_flag, checked_text, checked_timestamp, named, shown
+from drivesplat.readers.checks import (
+    MAX_TEXT,
+    MAX_TIMESTAMP,
+    checked_flag,
+    checked_text,
+    checked_timestamp,
+    named,
+    shown,
+)
 from drivesplat.readers.drive_checks import chain, require_unique
 
 Rows = dict[str, list[dict[str, Any]]]
 
 
-def _token(value: Any, record: str, column: str) -> None:
-    checked_text(value, record, column)
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of column: the check of a value, and a test of all values of a column at once, which takes a tenth of the
+    time. Values that fail the test are checked one by one."""
+
+    check: Callable[[Any, str, str], Any]
+    all_sound: Callable[[list[Any]], bool]
 
 
-def _text(value: Any, record: str, column: str) -> None:
-    checked_text(value, record, column, empty=True)
+def _sound_texts(values: list[Any]) -> bool:
+    texts = set(map(type, values)) <= {str}
+    return texts and max(map(len, values), default=0) <= MAX_TEXT and "".join(values).isprintable()
 
 
-def _description(value: Any, record: str, column: str) -> None:
-    if value is not None:
-        checked_text(value, record, column, empty=True)
+def _sound_times(values: list[Any]) -> bool:
+    return set(map(type, values)) <= {int} and 0 <= min(values, default=0) <= max(values, default=0) <= MAX_TIMESTAMP
 
 
-def _timestamp(value: Any, record: str, column: str) -> None:
-    checked_timestamp(value, record)
+def _optional_text(value: Any, record: str, column: str) -> None:
+    if value is not None and not (isinstance(value, str) and value.encode(errors="ignore").decode() == value):
+        raise DatasetError(f"{record}: its {column} is {shown(value)}; it must be text, or null")
 
 
-_COLUMNS: dict[str, dict[str, Callable[[Any, str, str], Any]]] = {
-    "scene": {"name": _token, "log_token": _token, "first_sample_token": _token},
-    "sample": {"scene_token": _token, "timestamp": _timestamp, "next": _text},
+_TOKEN = _Kind(checked_text, lambda values: _sound_texts(values) and all(values))
+_TEXT = _Kind(partial(checked_text, empty=True), _sound_texts)
+_OPTIONAL_TEXT = _Kind(_optional_text, _sound_texts)
+_TIMESTAMP = _Kind(lambda value, record, column: checked_timestamp(value, record), _sound_times)
+_FLAG = _Kind(checked_flag, lambda values: set(map(type, values)) <= {bool})
+_COLUMNS: dict[str, dict[str, _Kind]] = {
+    "scene": {"name": _TOKEN, "log_token": _TOKEN, "first_sample_token": _TOKEN},
+    "sample": {"scene_token": _TOKEN, "timestamp": _TIMESTAMP, "next": _TEXT},
     "sample_data": {
-        "sample_token": _token, "ego_pose_token": _token, "calibrated_sensor_token": _token, "timestamp": _timestamp,
-        "is_key_frame": checked_flag, "next": _text,
+        "sample_token": _TOKEN, "ego_pose_token": _TOKEN, "calibrated_sensor_token": _TOKEN, "timestamp": _TIMESTAMP,
+        "is_key_frame": _FLAG, "next": _TEXT,
     },
-    "sample_annotation": {"sample_token": _token, "instance_token": _token},
-    "instance": {"category_token": _token},
-    "calibrated_sensor": {"sensor_token": _token},
-    "sensor": {"channel": _token, "modality": _token},
-    "category": {"name": _token},
-    "map": {"filename": _token},
+    "sample_annotation": {"sample_token": _TOKEN, "instance_token": _TOKEN},
+    "instance": {"category_token": _TOKEN},
+    "calibrated_sensor": {"sensor_token": _TOKEN},
+    "sensor": {"channel": _TOKEN, "modality": _TOKEN},
+    "category": {"name": _TOKEN},
+    "map": {"filename": _TOKEN},
     "ego_pose": {}, "log": {}, "attribute": {}, "visibility": {},
 }  # fmt: skip
 """The required columns of each table, besides `token`."""
@@ -63,16 +84,19 @@ def check_rows(tables: Rows) -> None:
     """Raises DatasetError naming the table and the token of the first row whose columns are absent or of another type,
     whose token is not unique, or that refers to a row that does not exist; and if the scene's samples are no chain."""
     for table, columns in _COLUMNS.items():
-        for row in tables[table]:
-            _check_columns(table, row, columns)
+        rows = tables[table]
+        for column, kind in {"token": _TOKEN, **columns}.items():
+            _check_column(table, rows, column, kind)
+        if table in _OPTIONAL:
+            _check_column(table, [{_OPTIONAL[table]: None, **row} for row in rows], _OPTIONAL[table], _OPTIONAL_TEXT)
         if table != "map":  # its rows are split: one per log
-            require_unique((row["token"] for row in tables[table]), table)
+            require_unique([row["token"] for row in rows], table)
     tokens = {table: {row["token"] for row in tables[table]} for table in _COLUMNS}
     for table, references in _REFERENCES.items():
         for column, other in references.items():
-            for row in tables[table]:
-                if row[column] not in tokens[other]:
-                    raise _missing(other, row[column], named(table, row["token"]))
+            row = next((row for row in tables[table] if row[column] not in tokens[other]), None)
+            if row is not None:
+                raise _missing(other, row[column], named(table, row["token"]))
     for log in tables["log"]:
         if all(log["token"] not in row["log_tokens"] for row in tables["map"]):
             raise DatasetError(f"{named('log', log['token'])}: no row of the table map refers to it")
@@ -80,17 +104,15 @@ def check_rows(tables: Rows) -> None:
     _check_key_frames(tables)
 
 
-def _check_columns(table: str, row: Any, columns: dict[str, Callable[[Any, str, str], Any]]) -> None:
-    token = row.get("token")
-    checked_text(token, f"a row of the table {table} ({shown(row)})", "token")
-    record = f"{table} {token}"
-    for column, check in columns.items():
+def _check_column(table: str, rows: list[dict[str, Any]], column: str, kind: _Kind) -> None:
+    if all(column in row for row in rows) and kind.all_sound([row[column] for row in rows]):
+        return
+    for row in rows:
+        token = row.get("token")
+        record = named(table, token) if isinstance(token, str) and token else f"a row of {table} ({shown(row)})"
         if column not in row:
-            raise DatasetError(f"{named(table, token)}: it has no {column}")
-        check(row[column], record, column)
-    optional = _OPTIONAL.get(table)
-    if optional is not None:
-        _description(row.get(optional), record, optional)
+            raise DatasetError(f"{record}: it has no {column}")
+        kind.check(row[column], record, column)
 
 
 def _missing(table: str, token: str, by: str) -> DatasetError:
