@@ -29,6 +29,8 @@ MAX_TEXT, MAX_NAME, MAX_PATH = 1000, 255, 2000
 MAX_READOUT_S = 1.0
 MAX_STEPS = 1_000_000
 """Maximum readout time of an image, and number of firings of a beam per revolution."""
+EXACT = 1e-9
+"""Deviation from orthogonality that is rounding."""
 
 
 def shown(value: Any) -> str:
@@ -122,7 +124,7 @@ def checked_transform(matrix: Any, record: str, bound: float = MAX_COORDINATE) -
     `bound` along each axis.
 
     Raises DatasetError naming `record` if it is no 4x4 matrix of finite numbers, its last row is not 0, 0, 0, 1, or it
-    mirrors, scales or shears (beyond 1e-3).
+    mirrors, scales or shears (beyond 1e-3). A rotation that is orthogonal to rounding is returned as it is.
     """
     transform = _matrix(matrix, 4)
     if transform is None:
@@ -131,12 +133,14 @@ def checked_transform(matrix: Any, record: str, bound: float = MAX_COORDINATE) -
         hint = "; it seems to be transposed" if np.allclose(transform[:, 3], [0.0, 0.0, 0.0, 1.0]) else ""
         raise DatasetError(f"{record}: the last row of its transform must be 0, 0, 0, 1{hint}")
     rotation = transform[:3, :3]
-    if not (np.abs(rotation) <= 2.0).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 2e-3:
+    deviation = np.abs(rotation @ rotation.T - np.eye(3)).max() if (np.abs(rotation) <= 2.0).all() else np.inf
+    if deviation > 2e-3:
         raise DatasetError(f"{record}: its transform is not rigid: its axes must have unit length and right angles")
     if np.linalg.det(rotation) < 0:
         raise DatasetError(f"{record}: its transform mirrors: its axes must be right-handed (determinant 1, not -1)")
     position = checked_numbers(transform[:3, 3], 3, bound, record, "translation", "metres")
-    return rigid(Rotation.from_matrix(rotation).as_matrix(), position)
+    exact = deviation < EXACT
+    return rigid(rotation if exact else Rotation.from_matrix(rotation).as_matrix(), position)
 
 
 def _matrix(values: Any, size: int) -> np.ndarray | None:

@@ -3,6 +3,7 @@
 import copy
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +22,7 @@ from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.readers.drive.__main__ import main
 from drivesplat.readers.drive.format import Drive
 from drivesplat.readers.drive.layout import camera_names, find_root
-from drivesplat.readers.drive.reader import chosen_recordings
+from drivesplat.readers.drive.reader import chosen_recordings, read
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.scene import Scene
@@ -185,27 +186,27 @@ FAULTS = {
     ),
     "a mirrored camera": (
         lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
-        "cameras.CAM_FRONT: its rotation is mirrored",
+        "cameras.CAM_FRONT: its transform mirrors",
     ),
     "a scaled camera": (
         lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[2, 0, 0], [0, 2, 0], [0, 0, 2]]),
-        "no rotation matrix",
+        "its transform is not rigid",
     ),
     "K of another image": (
         lambda d: d["cameras"]["CAM_FRONT"].update(K=[[1e-300, 0, 40], [0, 60, 27], [0, 0, 1]]),
-        "the focal length 1e-300 does not fit images 96 pixels wide",
+        "its focal length is 1e-300 pixels; images of 96x54",
     ),
     "a principal point outside": (
         lambda d: d["cameras"]["CAM_FRONT"].update(K=[[60, 0, 800], [0, 60, 450], [0, 0, 1]]),
-        "the principal point (800.0, 450.0) lies outside the image",
+        "its principal point (800, 450) is outside its images",
     ),
     "coefficients": (
         lambda d: d["cameras"]["CAM_FRONT"].update(distortion={"model": "fisheye", "coefficients": [0.1]}),
         "distortion fisheye has 1 coefficients; it takes 4",
     ),
     "a pose far away": (
-        lambda d: d["frames"][0]["ego_to_world"].update(translation=[1e300, 0, 0]),
-        "frames[0]: its position",
+        lambda d: d["frames"][0]["ego_to_world"].update(translation=[1e12, 0, 0]),
+        "frames[0]: its translation is",
     ),
     "another camera": (lambda d: d["frames"][0].update(camera="left"), "camera 'left' is not in cameras"),
     "a file outside": (lambda d: d["frames"][0].update(file="../x.jpg"), "'../x.jpg' is no path inside the folder"),
@@ -215,14 +216,13 @@ FAULTS = {
     ),
     "two tracks of one id": (lambda d: d["tracks"].append(d["tracks"][0]), "another track has this id"),
     "a track out of order": (lambda d: d["tracks"][0]["poses"].reverse(), "not later than that of the one before"),
-    "a flat box": (lambda d: d["tracks"][0].update(size=[4.0, 0.0, 1.5]), "no length, width and height"),
+    "a flat box": (
+        lambda d: d["tracks"][0].update(size=[4.0, 0.0, 1.5]),
+        "it must be three positive numbers of metres",
+    ),
     "an unknown class": (lambda d: d["tracks"][0].update({"class": "lorry"}), "tracks[0].class is 'lorry'"),
     "no frames": (lambda d: d.update(frames=[], sweeps=[]), "frames: there is none"),
     "no calibration": (lambda d: d.update(cameras={}), "images need their calibration"),
-    "a jump": (
-        lambda d: d["tracks"][0]["poses"][1].update(translation=[900.0, 0.0, 0.0]),
-        "timestamps are microseconds, positions metres",
-    ),
 }
 
 
@@ -240,6 +240,72 @@ def test_every_fault_is_a_sentence_of_the_checker_and_stops_the_reader(fault, co
     with pytest.raises(DatasetError) as stopped:
         extract_scene(source(), tmp_path)
     assert "drive.json" in str(stopped.value)
+
+
+ODD_VALUES = (
+    None, True, "", "x", -1, 0, 3, 2**80, -(2**80), 1e300, 1e-300, [], {}, [[]], [None], {"a": 1}, "9" * 5000, "\ud800",
+)  # fmt: skip
+
+
+def mutated(content: Any, random: np.random.Generator) -> Any:
+    """A copy with one value at a random place replaced, removed or doubled."""
+    changed = copy.deepcopy(content)
+    holder, key = changed, random.choice(list(changed))
+    while isinstance(holder[key], dict | list) and len(holder[key]) and random.random() < 0.8:
+        holder = holder[key]
+        key = random.choice(list(holder)) if isinstance(holder, dict) else int(random.integers(len(holder)))
+    kind = random.integers(4)
+    if kind == 0:
+        del holder[key]
+    elif kind == 1 and isinstance(holder, list):
+        holder.append(copy.deepcopy(holder[key]))
+    else:
+        holder[key] = copy.deepcopy(ODD_VALUES[int(random.integers(len(ODD_VALUES)))])
+    return changed
+
+
+def test_200_mutated_files_end_with_a_sound_scene_or_sentences(content, tmp_path):
+    """Whatever is accepted is finite, in order, and of the drive's cameras."""
+    random, refused = np.random.default_rng(0), 0
+    path = tmp_path / "drive.json"
+    for _ in range(200):
+        path.write_text(json.dumps(mutated(content, random)), encoding="utf-8")
+        try:
+            scene = read(tmp_path, source())
+        except DatasetError as error:
+            refused += 1
+            assert str(error).startswith((str(path), "scene 0001")) and len(str(error)) < 5000
+            continue
+        for frame in scene.frames:
+            assert np.isfinite(frame.camera_to_world).all() and np.linalg.det(frame.camera_to_world[:3, :3]) > 0.99
+            assert frame.camera == "CAM_FRONT" and Path(frame.image_path).is_relative_to(tmp_path)
+        assert (np.diff(scene.key_frame_timestamps) > 0).all()
+        assert all((track.size > 0).all() and np.isfinite(track.object_to_world).all() for track in scene.tracks)
+    assert 60 < refused < 190
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is not JSON"), ("[1]", "the file is [1]"), ("{" + "\"a\": [" * 200_000, "is not JSON"),
+        ('{"format": NaN}', "format is nan"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_record_is_refused_in_a_sentence(text, words, tmp_path):
+    (tmp_path / "drive.json").write_text(text, encoding="utf-8")
+    with pytest.raises(DatasetError) as stopped:
+        read(tmp_path, source())
+    assert words in str(stopped.value)
+
+
+def test_a_track_that_jumps_is_a_warning_of_the_checker(content, folder, tmp_path, capsys):
+    changed = copy.deepcopy(content)
+    changed["tracks"][0]["poses"][1]["translation"] = [900.0, 0.0, 0.0]
+    shutil.copytree(folder / "0001", tmp_path / "0001")
+    (tmp_path / "0001/drive.json").write_text(json.dumps(changed), encoding="utf-8")
+    assert main(["check", str(tmp_path / "0001")]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: "))
+    assert f"track {changed['tracks'][0]['id']}" in line and "jumps" in line
 
 
 def test_the_checker_draws_a_picture_of_a_sound_folder(folder, tmp_path, capsys):
@@ -274,7 +340,7 @@ def test_files_that_are_missing_or_no_images_are_faults_too(folder, content, tmp
         ({"x": [1.0], "y": [2.0], "z": [3.0, 4.0]}, "its columns have 1, 2 rows"),
         ({"x": [1e11], "y": [0.0], "z": [0.0]}, "a return is 1e+11 m away"),
         ({"x": [1.0], "y": [0.0], "z": [0.0], "intensity": [200.0]}, "divide them"),
-        ({"x": [np.nan], "y": [0.0], "z": [0.0]}, "no return has finite coordinates"),
+        ({"x": [np.nan], "y": [0.0], "z": [0.0]}, "it has no return with finite coordinates"),
         ({"x": [], "y": [], "z": []}, "is empty"),
         ({"x": ["a"], "y": ["b"], "z": ["c"]}, "no column of numbers"),
     ],

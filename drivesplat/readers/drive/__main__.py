@@ -9,6 +9,7 @@ from drivesplat.errors import DriveSplatError
 from drivesplat.readers.drive.check import check, summary, whole_scene
 from drivesplat.readers.drive.format import Drive, read_drive
 from drivesplat.readers.drive.write import write_drive
+from drivesplat.readers.drive_checks import jumps
 from drivesplat.scene.scene import read_scene
 
 
@@ -42,8 +43,14 @@ def _check(asked: argparse.Namespace) -> int:
         print(fault)
     if picture.exists():
         print(f"picture: {picture}: returns must lie on surfaces, and boxes around objects")
-    print(f"{len(faults)} faults" if faults else summary(whole_scene(read_drive(asked.folder), asked.folder)))
-    return 1 if faults else 0
+    if faults:
+        print(f"{len(faults)} faults")
+        return 1
+    scene = whole_scene(read_drive(asked.folder), asked.folder)
+    for sentence in jumps(scene):
+        print(f"warning: {sentence}")
+    print(summary(scene))
+    return 0
 
 
 def _schema(_: argparse.Namespace) -> int:

@@ -6,19 +6,13 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import checked_intrinsics
+from drivesplat.readers.checks import checked_box_size, checked_intrinsics
 from drivesplat.readers.drive.format import Distortion, Drive, DriveCamera, Pose, TimedPose
 from drivesplat.readers.drive.poses import matrix_of
 
-MAX_COORDINATE = 1e7
-"""Metres. Farther positions are a fault, such as longitude and latitude in the wrong unit."""
-MAX_SPEED = 120.0
-"""Metres per second of the ego vehicle and of objects."""
 MAX_POSE_GAP = 1_000_000
 """Microseconds between ego poses over which poses of images and sweeps are interpolated."""
 COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
-FOCAL_RANGE = (0.1, 20.0)
-"""Focal lengths in image widths."""
 
 
 def faults_of(drive: Drive) -> list[str]:
@@ -26,7 +20,7 @@ def faults_of(drive: Drive) -> list[str]:
     return [
         *_camera_faults(drive),
         *_pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items())),
-        *_path_faults("ego_poses", "the ego vehicle", drive.ego_poses),
+        *_order_faults("ego_poses", drive.ego_poses),
         *_recording_faults(drive),
         *_track_faults(drive),
         *_key_frame_faults(drive),
@@ -38,30 +32,14 @@ def _camera_faults(drive: Drive) -> Iterator[str]:
     for name, camera in drive.cameras.items():
         where = f"cameras.{name}"
         try:
-            k = checked_intrinsics(camera.K, where)
+            k = checked_intrinsics(camera.K, where, (camera.width, camera.height))
         except DatasetError as error:
             yield str(error)
             continue
-        yield from (f"{where}: {fault}" for fault in _lens_faults(k, camera))
         wrong = list(_distortion_faults(camera.distortion))
         if not wrong and camera.distortion.model != "none":
             wrong = list(_fold_faults(k, camera))
         yield from (f"{where}: {fault}" for fault in wrong)
-
-
-def _lens_faults(k: np.ndarray, camera: DriveCamera) -> Iterator[str]:
-    lower, upper = (share * camera.width for share in FOCAL_RANGE)
-    for value in (k[0, 0], k[1, 1]):
-        if not lower <= value <= upper:
-            yield (
-                f"the focal length {value:.6g} does not fit images {camera.width} pixels wide: "
-                f"it lies between {lower:.0f} and {upper:.0f} pixels"
-            )
-    if not (-0.5 <= k[0, 2] <= camera.width - 0.5 and -0.5 <= k[1, 2] <= camera.height - 0.5):
-        yield (
-            f"the principal point ({k[0, 2]:.1f}, {k[1, 2]:.1f}) lies outside the image of "
-            f"{camera.width}x{camera.height}; K is of the image as recorded"
-        )
 
 
 def _distortion_faults(distortion: Distortion) -> Iterator[str]:
@@ -98,31 +76,17 @@ def _pose_faults(list_name: str, poses: Iterable[tuple[str | int, Pose]]) -> Ite
     for name, pose in poses:
         where = f"{list_name}[{name}]" if isinstance(name, int) else f"{list_name}.{name}"
         try:
-            matrix = matrix_of(pose, where)
+            matrix_of(pose, where)
         except DatasetError as error:
             yield str(error)
-            continue
-        if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
-            yield f"{where}: its position {tuple(pose.translation)} is beyond {MAX_COORDINATE:.0e} m"
 
 
-def _path_faults(list_name: str, who: str, poses: Sequence[TimedPose]) -> Iterator[str]:
-    """Faults of the poses of one body over time."""
-    found = list(_pose_faults(list_name, enumerate(poses)))
-    yield from found
-    times = np.array([pose.timestamp for pose in poses], dtype=np.int64)
-    late = np.flatnonzero(np.diff(times) <= 0)
-    if len(late):
-        yield f"{list_name}[{late[0] + 1}]: its timestamp is not later than that of the one before it"
-    elif not found and len(poses) > 1:
-        steps = np.linalg.norm(np.diff([pose.translation for pose in poses], axis=0), axis=1)
-        speeds = steps / (np.diff(times) * 1e-6)
-        fast = int(np.argmax(speeds))
-        if speeds[fast] > MAX_SPEED:
-            yield (
-                f"{list_name}[{fast + 1}]: {who} moves {steps[fast]:.1f} m in {np.diff(times)[fast] * 1e-6:.6g} s; "
-                "timestamps are microseconds, positions metres"
-            )
+def _order_faults(list_name: str, poses: Sequence[TimedPose]) -> Iterator[str]:
+    """Faults of the poses of one body over time. Jumps are warnings (`drive_checks.jumps`)."""
+    yield from _pose_faults(list_name, enumerate(poses))
+    late = next((i for i in range(1, len(poses)) if poses[i].timestamp <= poses[i - 1].timestamp), None)
+    if late is not None:
+        yield f"{list_name}[{late}]: its timestamp is not later than that of the one before it"
 
 
 def _recording_faults(drive: Drive) -> Iterator[str]:
@@ -197,9 +161,11 @@ def _track_faults(drive: Drive) -> Iterator[str]:
         if track.id in ids:
             yield f"{where}: another track has this id"
         ids.add(track.id)
-        if min(track.size) <= 0 or max(track.size) > 100:
-            yield f"{where}: its size {tuple(track.size)} is no length, width and height in metres"
-        yield from _path_faults(f"{where}: poses", "it", track.poses)
+        try:
+            checked_box_size(track.size, where)
+        except DatasetError as error:
+            yield str(error)
+        yield from _order_faults(f"{where}: poses", track.poses)
 
 
 def _key_frame_faults(drive: Drive) -> Iterator[str]:

@@ -2,25 +2,17 @@
 
 import numpy as np
 
-from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import checked_pose
+from drivesplat.readers.checks import checked_pose, checked_transform
 from drivesplat.readers.drive.format import Drive, Pose
-from drivesplat.scene.rigid import interpolate, rigid
-
-TOLERANCE = 1e-3
-"""Largest deviation of a rotation matrix times its transpose from the identity."""
+from drivesplat.scene.rigid import interpolate
 
 
 def matrix_of(pose: Pose, record: str = "pose") -> np.ndarray:
     """A pose as a transform (4, 4). Raises DatasetError naming `record` if it is not rigid."""
     if len(pose.rotation) == 4:
         return checked_pose(pose.translation, pose.rotation, record)
-    rotation = np.array(pose.rotation, dtype=np.float64)
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > TOLERANCE:
-        raise DatasetError(f"{record}: its rotation is no rotation matrix; its rows are no orthogonal unit vectors")
-    if np.linalg.det(rotation) < 0:
-        raise DatasetError(f"{record}: its rotation is mirrored (determinant -1); one axis points the wrong way")
-    return rigid(rotation, np.array(pose.translation))
+    rows = [[*row, place] for row, place in zip(pose.rotation, pose.translation, strict=True)]
+    return checked_transform([*rows, [0.0, 0.0, 0.0, 1.0]], record)
 
 
 class EgoPath:

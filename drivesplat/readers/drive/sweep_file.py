@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 
+from drivesplat.readers.drive_checks import returns_fault
 from drivesplat.scene.sensors import LidarReturns
 
 AXES = ("x", "y", "z")
 OPTIONAL = ("intensity", "ring", "time")
-MAX_RANGE = 1000.0
-"""Metres. A farther return is a fault of the file."""
 
 
 def read_file(path: Path) -> LidarReturns:
@@ -44,17 +43,16 @@ def file_fault(path: Path) -> str | None:
         return f"is corrupt (its columns have {', '.join(map(str, sorted(lengths)))} rows)"
     if not lengths.pop():
         return "is empty"
-    points = np.stack([columns[name] for name in AXES], axis=1).astype(np.float64)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.any():
-        return "is corrupt (no return has finite coordinates)"
-    farthest = float(np.abs(points[finite]).max())
-    if farthest > MAX_RANGE:
-        return f"is corrupt (a return is {farthest:.3g} m away; coordinates are metres in the sensor's frame)"
-    intensity = columns.get("intensity")
-    if intensity is not None and not ((intensity >= 0) & (intensity <= 1)).all():
-        return f"has intensities up to {float(np.nanmax(intensity)):.3g}; divide them, so that they lie in [0, 1]"
-    return None
+    returns = read_file(path)
+    fault = returns_fault(returns)
+    if (
+        fault is None
+        and returns.intensity is not None
+        and not 0 <= returns.intensity.min() <= returns.intensity.max() <= 1
+    ):
+        most = float(returns.intensity.max())
+        fault = f"has intensities up to {most:.3g}; divide them, so that they lie in [0, 1]"
+    return fault
 
 
 def _columns(path: Path) -> Mapping[str, np.ndarray]:
