@@ -95,13 +95,14 @@ def checked_numbers(values: Any, count: int, bound: float, record: str, column: 
     Raises DatasetError naming `record` for another number of values, and for values that are no finite numbers or
     beyond the bound.
     """
-    if not (isinstance(values, list | tuple | np.ndarray) and len(values) == count and all(map(is_number, values))):
+    given = isinstance(values, list | tuple | np.ndarray) and len(values) == count
+    if given and all(is_number(value) and abs(value) <= bound for value in values):
+        return np.array(values, dtype=np.float64)
+    if not (given and all(map(is_number, values))):
         raise DatasetError(f"{record}: its {column} is {shown(values)}; it must be {count} numbers ({kind})")
     if not all(abs(value) < np.inf for value in values):
         raise DatasetError(f"{record}: its {column} is {shown(values)}, which is not finite; it must be {kind}")
-    if not all(abs(value) <= bound for value in values):
-        raise DatasetError(f"{record}: its {column} is {shown(values)}; it must be {kind}, at most {bound:g}")
-    return np.array(values, dtype=np.float64)
+    raise DatasetError(f"{record}: its {column} is {shown(values)}; it must be {kind}, at most {bound:g}")
 
 
 def checked_pose(translation: Any, rotation_wxyz: Any, record: str, bound: float = MAX_COORDINATE) -> np.ndarray:
