@@ -1,7 +1,6 @@
 """Checks of a dataset's values that all readers share. Each takes a value as it was read, of any type, and the name of
 its record (a table and a token, or a file and an entry), with which its error begins."""
 
-import reprlib
 from collections.abc import Sequence
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
+from drivesplat.readers.record_names import is_printable, named, shown, text_fault
 from drivesplat.scene.rigid import rigid
 
 MAX_COORDINATE = 1e8
@@ -24,39 +24,13 @@ FOCAL_RANGE = 0.1, 20.0
 """Allowed focal lengths, in image widths: 0.1 is a field of view of 157 degrees, 20 is one of 3 degrees."""
 MAX_IMAGE = 100_000
 """Maximum width and height of an image in pixels."""
-MAX_TEXT, MAX_NAME, MAX_PATH = 1000, 255, 2000
-"""Maximum number of characters of a token or name, of bytes of a file's name, and of bytes of its path."""
+MAX_NAME, MAX_PATH = 255, 2000
+"""Maximum number of bytes of a file's name, and of its path."""
 MAX_READOUT_S = 1.0
 MAX_STEPS = 1_000_000
 """Maximum readout time of an image, and number of firings of a beam per revolution."""
 EXACT = 1e-9
 """Deviation from orthogonality that is rounding."""
-
-
-def shown(value: Any) -> str:
-    """A value for a message, shortened."""
-    short = reprlib.Repr()
-    short.maxstring = short.maxother = 60
-    return short.repr(value)
-
-
-def named(table: str, token: Any) -> str:
-    """The name of a table's record, for messages. Long tokens are shortened."""
-    return f"{table} {token if isinstance(token, str) and token and not text_fault(token) else shown(token)}"
-
-
-def text_fault(value: Any) -> str | None:
-    """What a value should be that is no text of at most MAX_TEXT characters; None if it is."""
-    if not isinstance(value, str):
-        return "must be text"
-    if len(value) > MAX_TEXT:
-        return f"must have at most {MAX_TEXT} characters"
-    return None if _encodes(value) else "must be valid Unicode without control characters"
-
-
-def _encodes(text: str) -> bool:
-    """Whether a text can be printed in a line and written to a file: no lone surrogates, no control characters."""
-    return text.isprintable() or not any(ord(c) < 32 or 127 <= ord(c) < 160 or 0xD800 <= ord(c) < 0xE000 for c in text)
 
 
 def checked_text(value: Any, record: str, column: str, empty: bool = False) -> str:
@@ -208,7 +182,7 @@ def checked_box_size(size: Any, record: str) -> np.ndarray:
 def checked_path(name: Any, record: str, column: str = "filename") -> str:
     """The path of a file below the dataset's root, as it was given. Raises DatasetError naming `record` if it is no
     text, too long for a file system, absolute, or leads out of the root."""
-    if not isinstance(name, str) or not name or not _encodes(name):
+    if not isinstance(name, str) or not name or not is_printable(name):
         raise DatasetError(f"{record}: its {column} is {shown(name)}; it must be the path of a file")
     path = PurePosixPath(name)
     if len(name.encode()) > MAX_PATH or any(len(part.encode()) > MAX_NAME for part in path.parts):

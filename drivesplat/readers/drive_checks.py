@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import named
+from drivesplat.readers.record_names import named
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.sensors import LidarReturns
 
@@ -15,6 +15,8 @@ MIN_KEY_FRAME_STEP_US = 1000
 """Minimum median step between key frames in microseconds. Seconds and milliseconds are below it."""
 MAX_SPEED = 120.0
 """Speed in m/s above which an object or the ego vehicle is taken to jump."""
+MAX_NAMED = 10
+"""Maximum number of tracks that are named."""
 MAX_RANGE = 1000.0
 """Maximum distance in metres of a LiDAR return: no LiDAR on a vehicle measures as far."""
 
@@ -71,9 +73,9 @@ def returns_fault(returns: LidarReturns) -> str | None:
 
 
 def jumps(scene: Scene) -> list[str]:
-    """A sentence for every track with a speed above MAX_SPEED between two annotations, and for the ego vehicle. These
-    are warnings, since annotations and positions have errors."""
-    found = []
+    """A sentence for every track with a speed above MAX_SPEED between two annotations (at most MAX_NAMED), and for the
+    ego vehicle. These are warnings, since annotations and positions have errors."""
+    found, tracks = [], []
     for camera in dict.fromkeys(frame.camera for frame in scene.frames):
         frames = sorted((f for f in scene.frames if f.camera == camera), key=lambda frame: frame.timestamp)
         times = np.array([frame.timestamp for frame in frames])
@@ -84,8 +86,9 @@ def jumps(scene: Scene) -> list[str]:
     for track in scene.tracks:
         where = _jump(track.timestamps, track.object_to_world[:, :3, 3])
         if where:
-            found.append(f"track {track.id} ({track.category}) jumps, {where}: check its boxes")
-    return found
+            tracks.append(f"track {track.id} ({track.category}) jumps, {where}: check its boxes")
+    more = [f"{len(tracks) - MAX_NAMED} more tracks jump"] if len(tracks) > MAX_NAMED else []
+    return [*found, *tracks[:MAX_NAMED], *more]
 
 
 def _jump(timestamps: np.ndarray, positions: np.ndarray) -> str | None:

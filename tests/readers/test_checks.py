@@ -18,10 +18,9 @@ from drivesplat.readers.checks import (
     checked_text,
     checked_timestamp,
     checked_transform,
-    named,
-    shown,
 )
 from drivesplat.readers.drive_checks import chain, require_microseconds, require_unique, returns_fault
+from drivesplat.readers.record_names import named, shown
 from drivesplat.scene.sensors import LidarReturns
 
 TURN = Rotation.from_euler("xyz", [0.3, -0.2, 1.1]).as_matrix()

@@ -1,5 +1,6 @@
 """Every malformed value of the tables ends with one sentence that names its record."""
 
+import dataclasses
 import json
 import logging
 from pathlib import Path
@@ -9,6 +10,7 @@ from helpers.table_files import copy_of, edit, extracted, row
 from helpers.tiny_world import KEY_FRAME_US, START_US, World, write_world
 
 from drivesplat.errors import DatasetError
+from drivesplat.readers.drive_checks import jumps
 from drivesplat.readers.nuscenes.layout import TABLES, camera_names
 
 SAMPLE, IMAGE, SWEEP = "0001 sample 1", "0001 CAM_FRONT 2", "0001 LIDAR_TOP 1"
@@ -404,6 +406,16 @@ def jump(rows: list[dict], apart: float) -> None:
     for it in rows:
         if it["token"] in (BOX, "0001 annotation 1 2"):
             it["translation"][0] += apart
+
+
+def test_of_many_tracks_that_jump_ten_are_named(small_root):
+    scene = extracted(small_root)
+    poses = scene.tracks[0].object_to_world.copy()
+    poses[1, 0, 3] += 1000.0
+    jumping = dataclasses.replace(scene.tracks[0], object_to_world=poses)
+    assert len(jumps(dataclasses.replace(scene, tracks=(jumping,) * 10))) == 10
+    found = jumps(dataclasses.replace(scene, tracks=(jumping,) * 13))
+    assert len(found) == 11 and found[-1] == "3 more tracks jump"
 
 
 def test_an_ego_vehicle_that_jumps_is_warned_of(root, caplog):

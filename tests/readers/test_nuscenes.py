@@ -3,6 +3,8 @@
 import json
 import logging
 import shutil
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -323,7 +325,13 @@ def deepen(path: Path) -> None:
     Image.fromarray(np.full((54, 96), 40_000, np.uint16)).save(path, format="PNG")
 
 
-FAULTS = [remove, truncate, scramble, empty, shrink, deepen]
+def inflate(path: Path) -> None:
+    """A PNG whose header says 60,000 x 60,000 pixels, which Pillow refuses to decode."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\r" + header + struct.pack(">I", zlib.crc32(header)))
+
+
+FAULTS = [remove, truncate, scramble, empty, shrink, deepen, inflate]
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -23,13 +23,13 @@ from drivesplat.readers.checks import (
     checked_pose,
     checked_readout,
     checked_size,
-    named,
     require_increasing,
 )
 from drivesplat.readers.drive_checks import chain, require_microseconds
 from drivesplat.readers.nuscenes.object_classes import object_class
 from drivesplat.readers.nuscenes.row_checks import check_rows
 from drivesplat.readers.nuscenes.scene_tables import damaged, read_scene_tables, scene_file, write_scene_tables
+from drivesplat.readers.record_names import named
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
 from drivesplat.scene.sensors import Camera, Lidar

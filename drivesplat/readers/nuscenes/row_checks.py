@@ -10,16 +10,9 @@ from functools import partial
 from typing import Any
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import (
-    MAX_TEXT,
-    MAX_TIMESTAMP,
-    checked_flag,
-    checked_text,
-    checked_timestamp,
-    named,
-    shown,
-)
+from drivesplat.readers.checks import MAX_TIMESTAMP, checked_flag, checked_text, checked_timestamp
 from drivesplat.readers.drive_checks import chain, require_unique
+from drivesplat.readers.record_names import MAX_TEXT, named, shown
 
 Rows = dict[str, list[dict[str, Any]]]
 

@@ -17,8 +17,8 @@ from typing import Any
 
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import atomic_path, unwritable, write_json
-from drivesplat.readers.checks import named, shown
 from drivesplat.readers.nuscenes.layout import TABLES, all_tables
+from drivesplat.readers.record_names import named, shown
 
 SCHEMA = 1
 INDEX = ".index.json"
