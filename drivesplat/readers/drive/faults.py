@@ -104,6 +104,7 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
         (f.camera, f.timestamp, f.file, f.camera_to_world is None and f.ego_to_world is None) for f in drive.frames
     ]
     sweeps = [(s.lidar, s.timestamp, s.file, s.lidar_to_world is None) for s in drive.sweeps]
+    ego_times = np.array([pose.timestamp for pose in drive.ego_poses], dtype=np.int64)
     for list_name, kind, known, records in (
         ("frames", "camera", drive.cameras, frames),
         ("sweeps", "lidar", drive.lidars, sweeps),
@@ -118,7 +119,7 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
             seen[sensor, time] = i
             if not _is_inside(file):
                 yield f"{where}: {file!r} is no path inside the folder"
-            if needs_ego and (fault := _unposed(drive, time)):
+            if needs_ego and (fault := _unposed(ego_times, time)):
                 yield f"{where}: {fault}"
     yield from _clock_faults([frame.timestamp for frame in drive.frames])
 
@@ -128,10 +129,9 @@ def _is_inside(file: str) -> bool:
     return not path.is_absolute() and ".." not in path.parts and "\0" not in file
 
 
-def _unposed(drive: Drive, time: int) -> str | None:
-    """Why there is no ego pose at a time, or None."""
-    times = [pose.timestamp for pose in drive.ego_poses]
-    if not times:
+def _unposed(times: np.ndarray, time: int) -> str | None:
+    """Why there is no ego pose at a time, or None; `times` (n,) are those of the ego poses."""
+    if not len(times):
         return "there are no ego_poses, and it has no pose of its own"
     after = int(np.searchsorted(times, time))
     if after < len(times) and times[after] == time:

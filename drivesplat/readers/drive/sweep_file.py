@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 
-from drivesplat.readers.drive_checks import returns_fault
 from drivesplat.scene.sensors import LidarReturns
 
 AXES = ("x", "y", "z")
@@ -33,7 +32,7 @@ def read_file(path: Path) -> LidarReturns:
 
 
 def file_fault(path: Path) -> str | None:
-    """The fault of an existing file, or None."""
+    """The fault of an existing file, or None. `drivesplat.readers.sweeps` checks the returns, as for all readers."""
     try:
         columns = _columns(path)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, PlyHeaderParseError, PlyElementParseError) as error:
@@ -43,16 +42,10 @@ def file_fault(path: Path) -> str | None:
         return f"is corrupt (its columns have {', '.join(map(str, sorted(lengths)))} rows)"
     if not lengths.pop():
         return "is empty"
-    returns = read_file(path)
-    fault = returns_fault(returns)
-    if (
-        fault is None
-        and returns.intensity is not None
-        and not 0 <= returns.intensity.min() <= returns.intensity.max() <= 1
-    ):
-        most = float(returns.intensity.max())
-        fault = f"has intensities up to {most:.3g}; divide them, so that they lie in [0, 1]"
-    return fault
+    intensity = columns.get("intensity")
+    if intensity is not None and ((intensity < 0) | (intensity > 1)).any():
+        return f"has intensities up to {float(np.nanmax(intensity)):.3g}; divide them, so that they lie in [0, 1]"
+    return None
 
 
 def _columns(path: Path) -> Mapping[str, np.ndarray]:
