@@ -40,10 +40,10 @@ rule gap_report:
         "<logs>/gap_report.log",
     benchmark:
         "<benchmarks>/gap_report.tsv"
-    conda:
-        "../envs/drivesplat.yaml"
     # after films and edits, whose costs it lists
     priority: -1
+    conda:
+        "../envs/drivesplat.yaml"
     params:
         settings=across_scenes.settings,
         # no inputs: the page names these files and reads none, so that a new film does not change it
