@@ -3,7 +3,8 @@
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz of a method with actors, scene.json; the scene's edits file,
 # named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not.
 # OUTPUTS: <results>/{scene}/{method}/edits/{edit}.mp4, {edit}.png and {edit}.json; {edit}/ with frames, where wanted;
-# <results>/{scene}/{method}/quad/{edit}.mp4 and {edit}.json, on request.
+# <results>/{scene}/{method}/quad/{edit}.mp4 and {edit}.json, on request; likewise
+# <results>/{scene}/{method}/edits/{edit}/drive/ and trajectories/{trajectory}/drive/, with drive.json.
 
 
 rule edit:
@@ -87,3 +88,35 @@ rule quad:
         code=plan.code("quad"),
     script:
         "../workflow_scripts/quad.py"
+
+
+rule drive_folder:
+    """
+    Renders an edited drive, or one beside the recorded path, as a dataset: images of all cameras at their own times,
+    with poses, calibration and boxes, as a drive folder and as nuScenes tables.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+    output:
+        drive="<results>/{scene}/{method}/{kind}/{drive}/drive/drive.json",
+    log:
+        "<logs>/{scene}/{method}/drive_folder_{kind}_{drive}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/drive_folder_{kind}_{drive}.tsv"
+    wildcard_constraints:
+        kind="edits|trajectories",
+        drive="[^/]+",
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("drive_folder"),
+        code=plan.code("drive_folder"),
+    script:
+        "../workflow_scripts/drive_folder.py"

@@ -117,7 +117,7 @@ def _annotate(
             continue
         box = recorder.box_to_global(item, seconds)
         if np.linalg.norm((box - ego)[:2, 3]) <= ANNOTATED_RANGE:
-            tables.add_annotation(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
+            tables.add_box(item.name, item.category, item.attribute, index, box, item.size, fraction, points)
 
 
 def _view(recorder: Recorder, plan: TruthPlan, frames: tuple[TruthFrame, ...]) -> TruthView:

@@ -1,4 +1,7 @@
-"""The camera path of an edited drive: the ego vehicle offset from its recorded path, faster or slower."""
+"""The path of the ego vehicle and its cameras in an edited drive: offset from the recorded path, faster or slower."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,39 +15,66 @@ from drivesplat.settings.edit import Edit, Ego
 from drivesplat.settings.render import TrajectorySettings
 
 
+@dataclass(frozen=True)
+class EgoEdit:
+    """The steps of an edit that change the ego vehicle's path. It is recorded from the second `begin` to `last`, those
+    of the first and the last image of the evaluated camera."""
+
+    scene: Scene
+    steps: tuple[Ego, ...]
+    begin: float
+    last: float
+
+    @classmethod
+    def of(cls, scene: Scene, camera: str, edit: Edit, where: str) -> "EgoEdit | None":
+        """The `ego` steps of an edit; None if it has none.
+
+        Raises ConfigError, starting with `where` (the scene and the edit), for a step that starts after the drive;
+        DatasetError if the scene lacks the camera.
+        """
+        steps = tuple(step.ego for step in edit.steps if step.ego is not None)
+        if not steps:
+            return None
+        frames = recorded_frames(scene, camera)
+        begin, last = (scene.seconds(frames[i].timestamp) for i in (0, -1))
+        for number, step in enumerate(edit.steps, start=1):
+            if step.ego is not None and (step.ego.start or 0.0) >= last:
+                raise ConfigError(
+                    f"{where}, step {number} (ego): 'start' is not before the end of the drive ({last:.2f} s)"
+                )
+        return cls(scene, steps, begin, last)
+
+    def within(self, times: np.ndarray) -> np.ndarray:
+        """Whether the vehicle is still on its recorded path at `times` (n,) in seconds: (n,) bool."""
+        return recorded_time(self.steps, self.begin, times) <= self.last + 1e-9
+
+    def poses(self, frames: Sequence[Frame], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Camera to world and ego to world (n, 4, 4) at `times` (n,) in seconds, of the camera that took `frames`."""
+        first = self.scene.seconds(frames[0].timestamp)
+        recorded = np.array([frame.timestamp - frames[0].timestamp for frame in frames])
+        ego_to_world = np.stack([frame.ego_to_world for frame in frames])
+        camera_to_world = np.stack([frame.camera_to_world for frame in frames])
+
+        def interpolated(poses: np.ndarray) -> PosesAt:
+            return lambda times: smooth_poses(recorded, poses, (times - first) * 1e6)
+
+        clock = recorded_time(self.steps, self.begin, times)
+        ego, camera = interpolated(ego_to_world)(clock), interpolated(camera_to_world)(clock)
+        edited = edited_poses(interpolated(ego_to_world), self.steps, self.begin, times)
+        return edited @ inverse(ego) @ camera, edited
+
+
 def edited_camera_path(scene: Scene, camera: str, fps: int, edit: Edit, where: str) -> CameraPath:
     """The camera poses of an edited film at `fps` frames a second.
 
     `timestamps` are those of the scene, whose time is unaffected. The film of a faster ego vehicle ends where the
-    recorded path ends. Without `ego` steps the result is the recorded path. Raises ConfigError, starting with `where`
-    (the scene and the edit), for a step that starts after the film; DatasetError if the scene lacks the camera.
+    recorded path ends. Without `ego` steps the result is the recorded path. Raises what `EgoEdit.of` raises.
     """
     path = film_path(scene, camera, fps, TrajectorySettings())
-    steps = [step.ego for step in edit.steps if step.ego is not None]
-    if not steps:
+    change = EgoEdit.of(scene, camera, edit, where)
+    if change is None:
         return path
     frames = recorded_frames(scene, camera)
-    first, last = frames[0].timestamp, scene.seconds(frames[-1].timestamp)
-    for number, step in enumerate(edit.steps, start=1):
-        if step.ego is not None and (step.ego.start or 0.0) >= last:
-            raise ConfigError(
-                f"{where}, step {number} (ego): 'start' is not before the end of the drive ({last:.2f} s)"
-            )
-    begin = scene.seconds(first)
-    times = begin + (path.timestamps - first) * 1e-6
-    recorded = recorded_time(steps, begin, times) <= last + 1e-9
-    return CameraPath(path.timestamps[recorded], _camera_poses(frames, begin, steps, times[recorded]))
-
-
-def _camera_poses(frames: list[Frame], begin: float, steps: list[Ego], times: np.ndarray) -> np.ndarray:
-    """Camera to world (n, 4, 4) at `times` (n,) in seconds; `begin` is the time of the first of `frames`."""
-    recorded = np.array([frame.timestamp - frames[0].timestamp for frame in frames])
-    ego_to_world = np.stack([frame.ego_to_world for frame in frames])
-    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
-
-    def interpolated(poses: np.ndarray) -> PosesAt:
-        return lambda times: smooth_poses(recorded, poses, (times - begin) * 1e6)
-
-    clock = recorded_time(steps, begin, times)
-    ego, camera = interpolated(ego_to_world)(clock), interpolated(camera_to_world)(clock)
-    return edited_poses(interpolated(ego_to_world), steps, begin, times) @ inverse(ego) @ camera
+    times = change.begin + (path.timestamps - frames[0].timestamp) * 1e-6
+    within = change.within(times)
+    return CameraPath(path.timestamps[within], change.poses(frames, times[within])[0])

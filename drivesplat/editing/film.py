@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
-from drivesplat.editing.actors import editable_actors
+from drivesplat.editing.actors import editable_actors, other_objects
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.unseen_sides import UNSEEN, unseen_sides
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
@@ -21,7 +21,6 @@ from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames
 from drivesplat.scene.images import write_png
-from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
@@ -82,7 +81,7 @@ def render_edit(
         "edit": job.edit.model_dump(mode="json"),
         "still_frame": still.number,
         "images": images,
-        "tracks": track_labels(scene, drive.actors, {actor.id for actor in drive.recorded}, seconds),
+        "tracks": track_labels(scene, drive, seconds),
     }
 
 
@@ -180,18 +179,16 @@ def frame_name(folder: Path, number: int) -> str:
     return f"{folder.name}/{number:06d}.png"
 
 
-def track_labels(
-    scene: Scene, actors: Sequence[EditedActor], editable: set[str], seconds: np.ndarray
-) -> list[dict[str, Any]]:
-    """A record for every actor, then for every other annotated movable object, which stays as recorded: the model has
-    it in its static part. `editable`: the ids of all editable tracks, removed ones included; `seconds` (n,) of frames.
+def track_labels(scene: Scene, drive: EditedDrive, seconds: np.ndarray) -> list[dict[str, Any]]:
+    """A record for every actor after the edit, then for every other annotated movable object, which stays as recorded;
+    `seconds` (n,) of frames.
 
     `size` is length, width, height in metres, `scale` included; `color_matrix` (3, 3) maps its RGB colours in [0, 1]
     (None: unchanged); `object_to_world` (n times (4, 4)) is at the box
     centre, rounded to 1e-6, None in frames where the object is absent.
     """
-    others = (track for track in scene.tracks if track.object_class.is_dynamic and track.id not in editable)
-    recorded = [EditedActor.recorded(t.id, t.category, t.size, Motion.of_track(scene, t)) for t in others]
+    actors, dynamic = drive.actors, {track.id for track in scene.tracks if track.object_class.is_dynamic}
+    recorded = [item for item in other_objects(scene, drive.recorded) if item.id in dynamic]
     labels = []
     for i, actor in enumerate((*actors, *recorded)):
         present, poses = actor.present(seconds), actor.poses(seconds).round(DECIMALS)

@@ -82,7 +82,7 @@ class Scene:
     Key frame i of `key_frame_timestamps` is `sample_index` i. `origin`: global = world + origin. `poses` names
     where the poses come from (a reader, 'refined', 'images'); `key_frame_hz` is the nominal rate of key frames;
     `key_frame_range` the dataset's key frames [first, last + 1) that were read, None for all. `cameras` and `lidars`
-    are the sensors that frames and sweeps name.
+    are the sensors that frames and sweeps name; `licence` says who may use the recording, where it is known.
     """
 
     name: str
@@ -100,6 +100,7 @@ class Scene:
     missing_images: int = 0
     cameras: tuple[Camera, ...] = ()
     lidars: tuple[Lidar, ...] = ()
+    licence: str = ""
     provenance: Provenance = field(default_factory=dict)
 
     @property

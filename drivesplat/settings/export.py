@@ -6,6 +6,8 @@ from pydantic import Field, field_validator
 
 from drivesplat.settings import Settings
 from drivesplat.settings.edit import Edit
+from drivesplat.settings.images import HoldoutSettings, ImageSettings
+from drivesplat.settings.render import TrajectorySettings
 
 ExportFormat = Literal["ply", "usd", "viewer", "colmap", "spz", "sog"]
 
@@ -28,6 +30,8 @@ class ExportSettings(Settings):
     """Maximum number of Gaussians in scene.usdz. Those with the largest opacity times area are kept."""
     viewer_gaussians: int = Field(300_000, ge=1)
     """Maximum number of Gaussians in viewer.html, which has to fit into a browser's memory."""
+    drive_width: int | None = Field(None, ge=16, le=7680)
+    """Width in pixels of the images in rendered drive folders. null: that of the training images."""
     viewer_images: int = Field(640, ge=0, le=3840)
     """Width in pixels of the recorded images in viewer.html, one JPEG per key frame, about 30 KB each at 640. 0 = none.
     """
@@ -64,3 +68,16 @@ class SplatJob(Settings):
     """All settings that determine one splat.ply with its parts, or one splat.spz."""
 
     sh_degree: int | None = None
+
+
+class DriveJob(Settings):
+    """All settings that determine one rendered drive folder: the `edit` of its drive, or the `trajectory` beside the
+    recorded one. `width` is that of its images in pixels; None: that of the training images."""
+
+    eval_camera: str
+    cameras: tuple[str, ...]
+    images: ImageSettings
+    holdout: HoldoutSettings
+    width: int | None = None
+    edit: Edit | None = None
+    trajectory: TrajectorySettings | None = None

@@ -10,10 +10,10 @@ from drivesplat.errors import ResultError
 from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.track_references import EditReference, TrackReferences
-from drivesplat.workflow.stages import scene_edits
+from drivesplat.workflow.stages import EDITS, scene_edits
 
-RULES_OF_EDITS = ("edit", "quad")
-"""Rules that render an edit."""
+RULES_OF_EDITS = ("edit", "quad", "drive_folder")
+"""Rules that render an edit; the last also renders trajectories, which name no tracks."""
 RULES_OF_SUBJECT = ("ghost_panel", "remove_actor")
 """Rules that show the vehicle that `subjects` names."""
 FILES_OF_SUBJECT = ("ghost_panel", "removal", "with_car", "without_car")
@@ -50,8 +50,9 @@ class _Used:
         self._files = [path for path in map(PurePosixPath, targets or ()) if scene in path.parts]
 
     def edit(self, name: str) -> bool:
-        of_edits = (path.stem for path in self._files if {"edits", "quad"} & {*path.parts})
-        return self._everything or "edits" in self._targets or name in of_edits
+        parts = [path.with_suffix("").parts for path in self._files]
+        of_edits = any(name in names and {"edits", "quad"} & {*names} for names in parts)
+        return self._everything or bool({"edits", "drives"} & self._targets) or of_edits
 
     @property
     def subject(self) -> bool:
@@ -84,8 +85,16 @@ def refuse_wrong_tracks(config: Config, jobs: Iterable[Any], scene_file: Callabl
             continue
         references = track_references(config, scene)
         subject = references.subject if rule in RULES_OF_SUBJECT else None
-        edits = tuple(one for one in references.edits if rule in RULES_OF_EDITS and one.edit == job.wildcards.edit)
+        edit = _edit_of(job.wildcards) if rule in RULES_OF_EDITS else None
+        edits = tuple(one for one in references.edits if one.edit == edit)
         _refuse(TrackReferences(scene=scene, subject=subject, edits=edits), scene_file(job.wildcards))
+
+
+def _edit_of(wildcards: Any) -> str | None:
+    """The edit that a job renders; None for the drive folder of a trajectory."""
+    if getattr(wildcards, "kind", EDITS) != EDITS:
+        return None
+    return wildcards.drive if hasattr(wildcards, "drive") else wildcards.edit
 
 
 def _refuse(references: TrackReferences, scene_file: str) -> None:

@@ -10,9 +10,11 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.stages import (
+    EDITS,
     METHOD_STAGES,
     OF_ONE_SCENE,
     SIDE_BY_SIDE,
+    TRAJECTORIES,
     scene_edits,
     scene_stages,
     stage_settings,
@@ -86,6 +88,18 @@ class Outputs(Inputs):
         """The films of every edit of `scenes`, by default the batch's, by every method that can be edited. Raises
         ConfigError where an edits file is invalid."""
         return self.of_methods(lambda *at: [f"edits/{edit}.mp4" for edit in self._edit_names(*at)], scenes)
+
+    def drives(self, _: Any = None) -> list[str]:
+        """The rendered drive folders of the batch's scenes: of every edit, by every method that can be edited, and of
+        every trajectory that shows all parts."""
+
+        def names(scene: str, method: str) -> list[str]:
+            trajectories = for_scene(self.config, scene).render.trajectories
+            whole = [name for name, trajectory in trajectories.items() if trajectory.parts == "all"]
+            folders = {EDITS: self._edit_names(scene, method), TRAJECTORIES: whole}
+            return [f"{kind}/{name}/drive/drive.json" for kind, names in folders.items() for name in names]
+
+        return self.of_methods(names)
 
     def looks(self, _: Any = None) -> list[str]:
         """The pictures of the batch's scenes and methods."""

@@ -25,6 +25,8 @@ from drivesplat.workflow.named_tracks import refuse_wrong_tracks, track_referenc
 from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import (
+    EDITS,
+    TRAJECTORIES,
     idle_variants,
     no_such_edit,
     no_such_film,
@@ -59,7 +61,8 @@ class Plan(Outputs):
 
         def settings_of(wildcards: Any) -> str:
             method, trajectory, edit = (getattr(wildcards, name, None) for name in ("method", "trajectory", "edit"))
-            return self.stage_settings(stage, wildcards.scene, method, trajectory or edit)
+            folder = f"{wildcards.kind}/{wildcards.drive}" if hasattr(wildcards, "drive") else None
+            return self.stage_settings(stage, wildcards.scene, method, trajectory or edit or folder)
 
         return settings_of
 
@@ -153,19 +156,48 @@ class Plan(Outputs):
 
     def _refuse_unknown_film(self, scene: str, method: str, path: list[str]) -> None:
         """Raises ConfigError if `path` below a method's folder is an unknown film or edit."""
+        if len(path) > 2 and path[0] in (EDITS, TRAJECTORIES):
+            self._refuse_unknown_drive(scene, method, path)
+            return
         edit = Path(path[-1]).stem if len(path) == 2 and path[0] in ("edits", "quad") else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
         of_parts = film == PARTS_FILM or (trajectory is not None and trajectory.parts != "all")
-        if (edit is not None or of_parts) and method not in self.methods_with_actors:
+        if edit is not None or of_parts:
+            self._refuse_without_actors(method)
+        if edit is not None:
+            self._refuse_unknown_edit(scene, edit)
+        if film not in (path[-1], *self._film_names(scene, method)):
+            raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
+
+    def _refuse_unknown_drive(self, scene: str, method: str, path: list[str]) -> None:
+        """Raises ConfigError if `path` below a method's folder is not the drive.json of an edit or a trajectory."""
+        kind, name, *rest = path
+        if rest == ["drive"]:
+            raise ConfigError(f"{'/'.join(path)} is a folder; ask for the file {'/'.join(path)}/drive.json")
+        if kind == EDITS:
+            self._refuse_without_actors(method)
+            self._refuse_unknown_edit(scene, name)
+            return
+        trajectories = for_scene(self.config, scene).render.trajectories
+        if name not in trajectories:
+            raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", name))
+        if trajectories[name].parts != "all":
+            raise ConfigError(
+                f"trajectory {name!r} shows the {trajectories[name].parts} parts alone; a drive folder shows all: "
+                "choose another trajectory"
+            )
+
+    def _refuse_without_actors(self, method: str) -> None:
+        if method not in self.methods_with_actors:
             able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
             raise ConfigError(
                 f"method {method!r} knows no actors that could be edited or shown apart; those do: {able}"
             )
-        if edit is not None and edit not in scene_edits(self.config, scene):
+
+    def _refuse_unknown_edit(self, scene: str, edit: str) -> None:
+        if edit not in scene_edits(self.config, scene):
             raise ConfigError(no_such_edit(scene, edit, scene_edits(self.config, scene)))
-        if film not in (path[-1], *self._film_names(scene, method)):
-            raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
 
     def refuse_download(self, targets: list[str]) -> None:
         """Raises ConfigError if nuScenes mini is a target and may not be downloaded."""

@@ -4,7 +4,7 @@ A stage is a rule; its record holds everything but the inputs that determines it
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from drivesplat.errors import ConfigError
@@ -18,7 +18,7 @@ from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.evaluate import EvaluateJob
-from drivesplat.settings.export import ExportJob, FarJob, SplatJob, ViewerJob
+from drivesplat.settings.export import DriveJob, ExportJob, FarJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.images import ParserJob
@@ -38,16 +38,21 @@ ALL_SCENE_STAGES = (*SCENE_STAGES, "refine_poses")
 """The stages of scenes whose poses are refined."""
 SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
-OF_ONE_SCENE = ("demo_world", "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer")
+OF_ONE_SCENE = (
+    "demo_world", "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
+)  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
+EDITS, TRAJECTORIES = "edits", "trajectories"
+"""Kinds of drive folders, and the folders of a method in which they lie."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
 """Stages of a scene that only some methods train on."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """The dataset, scene, method and film (trajectory or edit) of a job, empty where it has none, and the config that
-    applies to it. `scene` is also empty for stages that are not in OF_ONE_SCENE."""
+    """The dataset, scene, method and film (trajectory or edit; of a drive folder with its kind, 'edits/…') of a job,
+    empty where it has none, and the config that applies to it. `scene` is also empty for stages that are not in
+    OF_ONE_SCENE."""
 
     config: Config
     dataset_name: str
@@ -189,6 +194,13 @@ def _edit(at: Place) -> dict[str, Any]:
     return {**_quad(at), "frames": at.config.render.edited_frames}
 
 
+def _drive(at: Place) -> dict[str, Any]:
+    kind, _, name = at.film.partition("/")
+    of_film = replace(at, film=name)
+    chosen = {"edit": _quad(of_film)["edit"]} if kind == EDITS else {"trajectory": _film(of_film)["trajectory"]}
+    return {**chosen, "width": at.config.export.drive_width}
+
+
 def _compare(at: Place) -> dict[str, Any]:
     return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
 
@@ -265,6 +277,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "compare": (CompareJob, _compare),
     "edit": (EditJob, _edit),
     "quad": (EditJob, _quad),
+    "drive_folder": (DriveJob, _drive),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

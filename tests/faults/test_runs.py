@@ -102,6 +102,8 @@ EDITS = (
         ("vanilla/quad/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
         ("street/quad/halt.mp4", ["no edit called 'halt'", "there are: stop, gone"]),
         ("street/edits/halt.json", ["no edit called 'halt'", "there are: stop, gone"]),
+        ("street/edits/halt/drive/drive.json", ["no edit called 'halt'", "there are: stop, gone"]),
+        ("vanilla/edits/stop/drive/drive.json", ["'vanilla' knows no actors", "those do: street"]),
     ],
 )
 def test_an_edit_that_there_is_none_of_stops_before_any_job(copy, target, words):
@@ -331,6 +333,7 @@ LOOK_SCRIPTS = {
     "compare": "compare.mp4",
     "quad": "street/quad/gone.mp4",
     "edit": "street/edits/gone.mp4",
+    "drive_folder": "street/edits/gone/drive/drive.json",
     "ghost_panel": "vanilla/ghost_panel.png",
     "remove_actor": "vanilla/with_car.png",
     "export": "vanilla/splat.ply",

@@ -50,6 +50,10 @@ def trained(results: Path, scene: str, method: str, seconds: float, **more: Any)
         ("0103/street/film_lateral_2m.tsv", JobId("film", "0103", "street", "lateral_2m")),
         ("0103/street/film_parts.tsv", JobId("film_parts", "0103", "street")),
         ("0103/street/quad_lane_change.tsv", JobId("quad", "0103", "street", "lane_change")),
+        (
+            "0103/street/drive_folder_edits_stop.tsv",
+            JobId("drive_folder", "0103", "street", "edits_stop"),
+        ),
         ("0103/compare.tsv", JobId("compare", "0103")),
         ("0103/street/edit_v1.2_stop.tsv", JobId("edit", "0103", "street", "v1.2_stop")),
     ],

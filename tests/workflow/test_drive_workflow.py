@@ -63,3 +63,55 @@ def test_a_changed_drive_json_reruns_its_scene_and_a_fault_stops_it_in_a_line(co
     assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
     (line,) = complaints(done.stdout)
     assert "drive.json: version is 2" in line, line
+
+
+EDITS = """\
+edits:
+  gone:
+    - remove: {track: 0001 instance 0}
+  shifted:
+    - shift: {track: 0001 instance 0, lateral: 1.0}
+"""
+
+
+@pytest.mark.slow
+def test_this_workflow_trains_on_a_rendered_drive_and_on_its_tables(copy):
+    """The edited drive as a drive folder and as nuScenes tables; both give the same figures, with the edited tracks."""
+    folder = copy.folder
+    (folder / "edits.yaml").write_text(EDITS)
+    copy.config["methods"] = {**VANILLA, "street": {"parts": ["background", "actors"]}}
+    copy.config["datasets"]["nuscenes"]["edits"] = {"0001": "edits.yaml"}
+    for edit in ("gone", "shifted"):
+        drive = f"results/0001/street/edits/{edit}/drive"
+        copy.config["datasets"] |= {
+            edit: {"reader": "drive", "dataroot": drive, "scenes": [edit]},
+            f"{edit}_tables": {
+                "reader": "nuscenes",
+                "dataroot": f"{drive}/nuscenes",
+                "version": "v1.0-rendered",
+                "scenes": [f"0001_{edit}"],
+            },
+        }
+    copy.config["lidar_seed"] = {**copy.config.get("lidar_seed", {}), "on_missing": "warn"}
+    copy.write_config()
+    drives = [f"results/0001/street/edits/{edit}/drive/drive.json" for edit in ("gone", "shifted")]
+    done = copy.run(*drives)
+    assert done.returncode == 0, done.stdout
+    assert copy.planned(*drives) == {}
+    done = copy.run("results/shifted/metrics.json", "results/0001_shifted/metrics.json", "results/gone/tracks.csv")
+    assert done.returncode == 0, done.stdout
+    rendered, tables = (copy.read(f"results/{scene}/metrics.json") for scene in ("shifted", "0001_shifted"))
+    assert rendered["methods"].keys() == {"vanilla", "street"}
+    for method in ("vanilla", "street"):
+        measured = [one["methods"][method]["interpolation"] for one in (rendered, tables)]
+        pixels = [
+            {name: figures["pixels"] for name, figures in groups.items() if isinstance(figures, dict)}
+            for groups in measured
+        ]
+        assert pixels[0] == pixels[1] and pixels[0]["static"] > 0
+        assert measured[0]["static"]["psnr"] == pytest.approx(measured[1]["static"]["psnr"], abs=1.0)
+    recorded = read_scene(folder / "results/0001/scene.json")
+    gone, shifted = (read_scene(folder / f"results/{edit}/scene.json") for edit in ("gone", "shifted"))
+    (moved,) = {track.id for track in recorded.tracks} - {track.id for track in gone.tracks}
+    places = [scene.track(moved).object_to_world for scene in (recorded, shifted)]
+    np.testing.assert_allclose(places[1][:, :3, 3] - places[0][:, :3, 3], places[0][:, :3, 1], atol=0.2)

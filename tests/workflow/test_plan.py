@@ -207,6 +207,27 @@ def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
         made.refuse_unknown(["elsewhere/a1/vanilla/objects.mp4"])
 
 
+def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(tmp_path):
+    edits = tmp_path / "edits.yaml"
+    edits.write_text("edits: {gone: [remove: {track: a}]}")
+    trajectories = {"original": {}, "objects": {"parts": "moving"}}
+    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
+    made = plan(render={"trajectories": trajectories}, datasets={"a": dataset})
+    assert {path.split("/", 1)[1] for path in made.drives() if "/a1/" in path} == {
+        "a1/street/edits/gone/drive/drive.json",
+        "a1/street/trajectories/original/drive/drive.json",
+        "a1/vanilla/trajectories/original/drive/drive.json",
+    }
+    made.refuse_unknown(made.drives())
+    for target, message in {
+        "street/trajectories/objects/drive/drive.json": "shows the moving parts alone",
+        "street/trajectories/nowhere/drive/drive.json": "no film called 'nowhere'",
+        "street/edits/gone/drive": "edits/gone/drive is a folder; ask for the file edits/gone/drive/drive.json",
+    }.items():
+        with pytest.raises(ConfigError, match=message):
+            made.refuse_unknown([f"elsewhere/a1/{target}"])
+
+
 def test_the_film_of_all_methods_is_left_out_where_the_settings_say_so_and_can_be_asked_for():
     made = plan(b={"render": {"compare": False}})
     assert [path for path in made.films() if "compare" in path] == [f"elsewhere/{s}/compare.mp4" for s in ("a1", "a2")]

@@ -10,8 +10,8 @@ from drivesplat.demo.optics.imaging import Picture, to_bytes
 from drivesplat.demo.optics.rig import SENSORS, DemoSensor, image_height, key_frame_time
 from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder, Viewpoint
 from drivesplat.demo.shapes.mesh import SurfaceClass
-from drivesplat.demo.tokens import token
 from drivesplat.io.storage import atomic_write
+from drivesplat.readers.nuscenes.tokens import token
 from drivesplat.readers.truth import (
     DEPTH_LIMIT,
     DEPTH_UNITS_PER_METRE,

@@ -131,6 +131,24 @@ class DriveTrack(DriveRecord):
     poses: tuple[TrackPose, ...] = Field(min_length=1)
 
 
+class Rendered(DriveRecord):
+    """Marks a drive that no camera recorded: what was rendered, and how it was made."""
+
+    scene: str
+    """The recorded scene."""
+    method: str
+    edit: str | None = None
+    """The name of the edit; null: the drive is unedited."""
+    trajectory: str | None = None
+    """The name of the trajectory; null: the recorded one, or that of the edit."""
+    steps: tuple[dict[str, Any], ...] | None = None
+    """The steps of the edit."""
+    trained_until: Timestamp | None = None
+    """Time of the last training image of the evaluated camera: later images are extrapolated."""
+    provenance: dict[str, Any] = {}
+    """Settings, code and inputs of all results behind the drive."""
+
+
 class Drive(DriveRecord):
     """A drive folder's drive.json."""
 
@@ -139,6 +157,8 @@ class Drive(DriveRecord):
     description: str = ""
     licence: str = ""
     """Who may use the recording, and for what. Exports repeat it."""
+    rendered: Rendered | None = None
+    """How the images were rendered. null: they were recorded."""
     origin: Vector | None = None
     """Global coordinates of the world's origin: global = world + origin. null: all poses are global, and the reader
     takes the first ego position as origin, since single precision holds no global coordinates."""

@@ -56,6 +56,7 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
         dataset="",
         version=str(drive.version),
         description=drive.description,
+        licence=drive.licence,
         origin=reading.shift if drive.origin is None else np.array(drive.origin),
         key_frame_timestamps=times,
         frames=tuple(frame for camera in source.cameras for frame in reading.frames(camera, source.sweeps)),

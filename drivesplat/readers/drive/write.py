@@ -1,8 +1,6 @@
 """Writes a scene as a drive folder: images, sweeps and a drive.json that is read back as the same scene."""
 
 import logging
-import os
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.io.storage import write_json
 from drivesplat.readers.drive.format import FILE, Drive
+from drivesplat.readers.files import link_or_copy
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
@@ -51,13 +50,23 @@ def write_drive(scene: Scene, folder: Path, licence: str = "") -> Path:
     if any(missing):
         log.warning("scene %s: %d images and %d sweeps are missing and left out", scene.name, *missing)
     for frame, name in frames:
-        _link(Path(frame.image_path), folder / name)
+        link_or_copy(Path(frame.image_path), folder / name)
     for sweep, name in sweeps:
         _write_sweep(sweep, folder / name)
-    record = drive_record(scene, frames, sweeps, licence)
+    path = folder / FILE
+    _write_checked(path, drive_record(scene, frames, sweeps, licence))
+    return path
+
+
+def write_record(path: Path, scene: Scene, rendered: dict[str, Any]) -> None:
+    """Writes the drive.json of a scene without LiDAR whose images lie in the folder of `path`, marked as `rendered`."""
+    frames = [(frame, Path(frame.image_path).relative_to(path.parent).as_posix()) for frame in scene.frames]
+    _write_checked(path, {**drive_record(scene, frames, (), ""), "rendered": rendered})
+
+
+def _write_checked(path: Path, record: dict[str, Any]) -> None:
     Drive.model_validate(record)
-    write_json(folder / FILE, record)
-    return folder / FILE
+    write_json(path, record)
 
 
 def drive_record(
@@ -69,7 +78,7 @@ def drive_record(
         "format": "drivesplat drive",
         "version": 1,
         "description": scene.description,
-        "licence": licence,
+        "licence": licence or scene.licence,
         "origin": scene.origin.tolist(),
         "cameras": {camera.name: _camera(camera, written) for camera in scene.cameras},
         "lidars": {lidar.name: _lidar(lidar) for lidar in scene.lidars},
@@ -148,12 +157,3 @@ def _write_sweep(sweep: Sweep, path: Path) -> None:
 
 def _image_name(frame: Frame) -> str:
     return f"images/{frame.camera}/{frame.timestamp}{Path(frame.image_path).suffix}"
-
-
-def _link(source: Path, target: Path) -> None:
-    """A hard link where the file system allows it, otherwise a copy."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source.resolve(), target)
-    except OSError:
-        shutil.copyfile(source, target)

@@ -23,3 +23,21 @@ def object_class(category: str) -> ObjectClass:
     while category not in _CLASSES and "." in category:
         category = category.rpartition(".")[0]
     return _CLASSES.get(category, ObjectClass.OTHER_MOVABLE)
+
+
+_CATEGORIES = {
+    ObjectClass.BUS: "vehicle.bus.rigid",
+    ObjectClass.VEHICLE: "vehicle.other",
+    ObjectClass.TRAM: "vehicle.tram",
+    ObjectClass.RIDER: "vehicle.bicycle",
+    ObjectClass.PEDESTRIAN: "human.pedestrian.adult",
+    ObjectClass.OTHER_MOVABLE: "movable_object.other",
+}
+"""Categories of classes that have no name of their own above; nuScenes has none of trams and of unknown vehicles."""
+
+
+def category_of(kind: ObjectClass, name: str) -> str:
+    """The category of an object in nuScenes' tables: `name` where it is a category of nuScenes of that class."""
+    if "." in name and object_class(name) is kind:
+        return name
+    return _CATEGORIES.get(kind) or next(category for category, known in _CLASSES.items() if known is kind)

@@ -1,0 +1,191 @@
+"""A drive that nobody recorded, as a `Scene` of images to render: the recorded one after an edit, or from beside its
+path."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
+from drivesplat.editing.actors import editable_actors, other_objects, trained_actors
+from drivesplat.editing.ego import EgoEdit
+from drivesplat.editing.film import actor_placements, collisions
+from drivesplat.model.part import ActorPlacement
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.model.view import View
+from drivesplat.rendering.trajectory import CameraPath, displaced, recorded_frames
+from drivesplat.scene.images import continuous_intrinsics, target_size
+from drivesplat.scene.scene import Frame, Scene, Track
+from drivesplat.scene.sensors import Camera
+from drivesplat.settings.export import DriveJob
+from drivesplat.settings.images import ImageSettings
+from drivesplat.settings.render import TrajectorySettings
+
+log = logging.getLogger(__name__)
+
+LABEL_INTERVAL = 100_000
+"""Microseconds between the poses of an object in labels, besides those at key frames."""
+IMAGE_SUFFIX = ".jpg"
+RENDERED = "rendered"
+"""The source of the poses of a rendered drive."""
+
+
+@dataclass(frozen=True)
+class RenderedDrive:
+    """A drive to render. `scene` has its images, by their paths to be, which the model shows at `seconds` (n,); its
+    tracks are all annotated objects at key frames, and `tracks` are the same at LABEL_INTERVAL. `actors` are those of
+    an edit; None: all as trained."""
+
+    scene: Scene
+    seconds: np.ndarray
+    tracks: tuple[Track, ...]
+    actors: Sequence[EditedActor] | None
+
+    def views(self, device: torch.device, cameras_differ: bool) -> Iterator[View]:
+        """The cameras of the images in order, on the device. `cameras_differ`: with the exposure of each camera."""
+        for frame, seconds in zip(self.scene.frames, self.seconds.tolist(), strict=True):
+            size = (frame.width, frame.height)
+            yield View(
+                K=torch.from_numpy(continuous_intrinsics(frame, size)).float().to(device),
+                camera_to_world=torch.from_numpy(frame.camera_to_world).float().to(device),
+                width=size[0],
+                height=size[1],
+                time=seconds,
+                camera=frame.camera if cameras_differ else None,
+            )
+
+    def placements(self) -> list[list[ActorPlacement]] | None:
+        """The actors in each image and where they are; None where all are as trained."""
+        return None if self.actors is None else actor_placements(self.actors, self.seconds)
+
+
+def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> RenderedDrive:
+    """The drive of `job`; its images are to lie in `folder`/images.
+
+    All images of the cameras at their own times, as long as the ego vehicle is on its recorded path. Warns where the
+    evaluated camera is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the scene
+    or the model has no actors; DatasetError if the scene lacks a camera.
+    """
+    trained = trained_actors(model, scene, where) if job.edit is None else editable_actors(model, scene, where)
+    others = other_objects(scene, trained)
+    actors = list(trained)
+    if job.edit is not None:
+        ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, job.eval_camera)])
+        actors = edited_actors(trained, job.edit, where, {item.id for item in others}, ego_to_world)
+    frames = [
+        replace(_resized(frame, job), image_path=str(folder / "images" / camera / f"{frame.timestamp}{IMAGE_SUFFIX}"))
+        for camera in job.cameras
+        for frame in _moved_frames(scene, camera, job, where)
+    ]
+    last = max((frame.sample_index for frame in frames if frame.is_key_frame), default=0)
+    frames = [replace(frame, sample_index=min(frame.sample_index, last)) for frame in frames]
+    rendered = _with_frames(scene, frames, scene.key_frame_timestamps[: last + 1])
+    seconds = _seconds(scene, frames)
+    _warn_of_collisions(frames, seconds, actors, job.eval_camera, where)
+    objects, key_times = [*actors, *others], rendered.key_frame_timestamps
+    times = [*key_times.tolist(), *(frame.timestamp for frame in frames)]
+    label_times = np.union1d(key_times, np.arange(min(times), max(times) + 1, LABEL_INTERVAL))
+    return RenderedDrive(
+        replace(rendered, tracks=_tracks(scene, objects, key_times)),
+        seconds,
+        _tracks(scene, objects, label_times),
+        None if job.edit is None else actors,
+    )
+
+
+def _moved_frames(scene: Scene, camera: str, job: DriveJob, where: str) -> list[Frame]:
+    """The images of a camera with the poses after the edit, or beside the recorded path."""
+    frames = recorded_frames(scene, camera)
+    change = None if job.edit is None else EgoEdit.of(scene, job.eval_camera, job.edit, where)
+    if change is not None:
+        seconds = _seconds(scene, frames)
+        within = change.within(seconds)
+        kept = [frame for frame, inside in zip(frames, within, strict=True) if inside]
+        return _posed(kept, *change.poses(frames, seconds[within]))
+    if job.trajectory is None or job.trajectory == TrajectorySettings():
+        return frames
+    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
+    ego_to_world = np.stack([frame.ego_to_world for frame in frames])
+    moved = displaced(camera_to_world, ego_to_world, job.trajectory)
+    aside = TrajectorySettings(lateral=job.trajectory.lateral)
+    return _posed(frames, moved, displaced(ego_to_world, ego_to_world, aside))
+
+
+def _posed(frames: Sequence[Frame], camera_to_world: np.ndarray, ego_to_world: np.ndarray) -> list[Frame]:
+    return [
+        replace(frame, camera_to_world=camera, ego_to_world=ego)
+        for frame, camera, ego in zip(frames, camera_to_world, ego_to_world, strict=True)
+    ]
+
+
+def _resized(frame: Frame, job: DriveJob) -> Frame:
+    """The image at the width of the job, its intrinsics in OpenCV's convention."""
+    size = target_size(frame, job.images if job.width is None else ImageSettings(width=job.width))
+    intrinsics = continuous_intrinsics(frame, size)
+    intrinsics[:2, 2] -= 0.5
+    return replace(frame, width=size[0], height=size[1], intrinsics=intrinsics)
+
+
+def _with_frames(scene: Scene, frames: Sequence[Frame], key_times: np.ndarray) -> Scene:
+    """The scene with other images and no LiDAR. Its cameras record all pixels at once, without distortion."""
+    first = {frame.camera: frame for frame in reversed(frames)}
+    return replace(
+        scene,
+        key_frame_timestamps=key_times,
+        frames=tuple(frames),
+        sweeps=(),
+        tracks=(),
+        poses=RENDERED,
+        key_frame_range=None,
+        missing_images=0,
+        cameras=tuple(
+            Camera(name, frame.width, frame.height, frame.intrinsics, distortion=np.zeros(5), readout_s=0.0)
+            for name, frame in sorted(first.items())
+        ),
+        lidars=(),
+        provenance={},
+    )
+
+
+def _tracks(scene: Scene, objects: Sequence[EditedActor], times: np.ndarray) -> tuple[Track, ...]:
+    """The objects where they are present at `times` (n,) in microseconds. How visible they are is not known."""
+    seconds, tracks = np.array([scene.seconds(time) for time in times]), []
+    for item in objects:
+        present = item.present(seconds)
+        source = scene.track(item.source)
+        if source is None or not present.any():
+            continue
+        tracks.append(
+            Track(
+                id=item.id,
+                object_class=source.object_class,
+                category=item.category,
+                size=item.size,
+                timestamps=times[present],
+                sample_indices=np.flatnonzero(present),
+                object_to_world=item.poses(seconds[present]),
+                visibility=np.zeros(int(present.sum()), dtype=np.int64),
+            )
+        )
+    return tuple(tracks)
+
+
+def _seconds(scene: Scene, frames: Sequence[Frame]) -> np.ndarray:
+    """The times (n,) of images in seconds since the first image of a scene."""
+    return np.array([scene.seconds(frame.timestamp) for frame in frames])
+
+
+def _warn_of_collisions(
+    frames: Sequence[Frame], seconds: np.ndarray, actors: Sequence[EditedActor], camera: str, where: str
+) -> None:
+    shown = [i for i, frame in enumerate(frames) if frame.camera == camera]
+    if not shown:
+        return
+    timestamps = np.array([frames[i].timestamp for i in shown])
+    path = CameraPath(timestamps, np.stack([frames[i].camera_to_world for i in shown]))
+    colliding = seconds[shown][collisions(actors, path, seconds[shown])]
+    if len(colliding):
+        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, *colliding[[0, -1]])

@@ -1,0 +1,112 @@
+"""Writes a scene as nuScenes tables, which nuscenes-devkit and the nuScenes reader load."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.readers.files import link_or_copy
+from drivesplat.readers.nuscenes.object_classes import category_of
+from drivesplat.readers.nuscenes.table_rows import TableRows, pose_columns
+from drivesplat.readers.nuscenes.tokens import token
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.rigid import inverse, rigid
+from drivesplat.scene.scene import Frame, Scene, Track
+from drivesplat.scene.tracks import Box, box_at
+
+MOVING_VEHICLE, MOVING_PERSON, WITH_RIDER = "vehicle.moving", "pedestrian.moving", "cycle.with_rider"
+"""Attributes that are written. Why an object stands, and whether a cycle has a rider, is not known otherwise."""
+CYCLES = (ObjectClass.BICYCLE, ObjectClass.MOTORCYCLE)
+
+
+def write_nuscenes(scene: Scene, root: Path, version: str, log: dict[str, str]) -> None:
+    """Writes the tables of a scene without LiDAR below `root`/`version`, and hard links to its images, or copies, as
+    nuScenes names them. `log` are the columns of its log, which names the vehicle.
+
+    Image and ego poses are those of the scene; the mount of each camera is that of its first image. Boxes are those at
+    key frames; a visibility that is not known is an empty token.
+    """
+    tables = _SceneTables(scene, log)
+    for index, time in enumerate(scene.key_frame_timestamps.tolist()):
+        tables.add_sample(index, time)
+    mounts: dict[str, np.ndarray] = {}
+    for frame in scene.frames:
+        if frame.camera not in mounts:
+            mounts[frame.camera] = inverse(frame.ego_to_world) @ frame.camera_to_world
+            tables.add_camera(frame, mounts[frame.camera])
+        name = tables.add_image(frame, frame.camera_to_world @ inverse(mounts[frame.camera]))
+        link_or_copy(Path(frame.image_path), root / name)
+    for track in scene.tracks:
+        tables.add_track(track)
+    tables.write(root, version)
+
+
+class _SceneTables(TableRows):
+    """The tables of one scene. Poses of the scene become global ones."""
+
+    def __init__(self, scene: Scene, log: dict[str, str]):
+        super().__init__(token(scene.name, "log"), log, (MOVING_VEHICLE, MOVING_PERSON, WITH_RIDER))
+        self._scene, self._origin = scene, rigid(np.eye(3), scene.origin)
+        count = len(scene.key_frame_timestamps)
+        self.add(
+            "scene", token(scene.name), log_token=token(scene.name, "log"), nbr_samples=count,
+            first_sample_token=self._sample(0), last_sample_token=self._sample(count - 1), name=f"scene-{scene.name}",
+            description=scene.description,
+        )  # fmt: skip
+
+    def add_sample(self, index: int, time: int) -> None:
+        """Adds a key frame."""
+        self.add_linked("sample", (), self._sample(index), timestamp=time, scene_token=token(self._scene.name))
+
+    def add_camera(self, frame: Frame, mount: np.ndarray) -> None:
+        """Adds the camera of an image, with its pose (4, 4) on the vehicle."""
+        sensor = token("sensor", frame.camera)
+        self.add("sensor", sensor, channel=frame.camera, modality="camera")
+        self.add(
+            "calibrated_sensor", token(self._scene.name, "calibrated", frame.camera), sensor_token=sensor,
+            camera_intrinsic=frame.intrinsics.tolist(), **pose_columns(mount),
+        )  # fmt: skip
+
+    def add_image(self, frame: Frame, ego_to_world: np.ndarray) -> str:
+        """Adds an image with its ego pose (4, 4); returns the path of its file below the dataset's root."""
+        scene, camera, time = self._scene.name, frame.camera, frame.timestamp
+        name, suffix = token(scene, camera, time), Path(frame.image_path).suffix
+        folder = "samples" if frame.is_key_frame else "sweeps"
+        path = f"{folder}/{camera}/{scene}__{camera}__{time}{suffix}"
+        self.add("ego_pose", name, timestamp=time, **self._global(ego_to_world))
+        self.add_linked(
+            "sample_data", (camera,), name, sample_token=self._sample(frame.sample_index), ego_pose_token=name,
+            calibrated_sensor_token=token(scene, "calibrated", camera), timestamp=time, fileformat=suffix[1:],
+            is_key_frame=frame.is_key_frame, width=frame.width, height=frame.height, filename=path,
+        )  # fmt: skip
+        return path
+
+    def add_track(self, track: Track) -> None:
+        """Adds the boxes of an object."""
+        name, category = self._scene.name, category_of(track.object_class, track.category)
+        for i, index in enumerate(track.sample_indices.tolist()):
+            box = box_at(track, int(track.timestamps[i]), self._scene.key_frame_interval)
+            level = int(track.visibility[i])
+            self.add_annotation(
+                (name, "annotation", track.id, index), token(name, "instance", track.id), category, track.size,
+                sample_token=self._sample(index), visibility_token=str(level) if level else "",
+                attribute_tokens=_attributes(box), num_lidar_pts=0,
+                **self._global(track.object_to_world[i]),
+            )  # fmt: skip
+
+    def _sample(self, index: int) -> str:
+        return token(self._scene.name, "sample", index)
+
+    def _global(self, pose: np.ndarray) -> dict[str, Any]:
+        return pose_columns(self._origin @ pose)
+
+
+def _attributes(box: Box | None) -> list[str]:
+    """The token of the attribute of a box, where it has one."""
+    if box is None:
+        return []
+    if box.object_class is ObjectClass.RIDER:
+        return [token(WITH_RIDER)]
+    if not box.moves or box.object_class in CYCLES:
+        return []
+    return [token(MOVING_PERSON if box.object_class.is_human else MOVING_VEHICLE)]

@@ -1,0 +1,19 @@
+"""checkpoint.npz as a drive that nobody recorded: a drive folder, and nuScenes tables in it."""
+
+from pathlib import Path
+
+from drivesplat.workflow.job import job
+from drivesplat.editing.drive_folder import write_rendered_drive
+from drivesplat.model.checkpoint import read_checkpoint
+from drivesplat.scene.scene import read_scene
+from drivesplat.settings.export import DriveJob
+
+with job(snakemake) as current:
+    scene = read_scene(current.input.scene)
+    checkpoint = read_checkpoint(current.input.checkpoint)
+    provenance = current.provenance(scene.provenance, checkpoint.provenance)
+    wildcards = current.wildcards
+    kind = {"edits": "edit", "trajectories": "trajectory"}[wildcards.kind]
+    source = {"scene": wildcards.scene, "method": wildcards.method, kind: wildcards.drive}
+    settings, path = current.settings(DriveJob), Path(current.output.drive)
+    write_rendered_drive(scene, checkpoint, settings, current.device(), path, source, provenance)
