@@ -138,6 +138,7 @@ def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob
         "train_images": len(record.train_images),
         "poses": record.scene.poses,
         "regions": masks_record.regions,
+        "visibility": masks_record.visibility,
         "own_car": masks_record.own_car.get(job.eval_camera),
         "extra_points": record.seed.extra_points,
         "lidar_missing": record.seed.lidar_missing,

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivesplat.errors import ConfigError
 from drivesplat.scene.prepared_drive import PreparedDrive
-from drivesplat.scene.regions import LABELS, REGIONS, Hull, hulls_in, label_of, owner_image
+from drivesplat.scene.regions import LABELS, REGIONS, Hull, labelled_hulls
 from drivesplat.scene.scene import Frame
 from drivesplat.scene.tracks import Box
 from drivesplat.settings.inspection import SubjectSettings
@@ -54,10 +54,8 @@ def choose_subject(recording: PreparedDrive, camera: str, settings: SubjectSetti
 def visible_subjects(recording: PreparedDrive, index: int) -> list[Subject]:
     """The visible annotated objects of dynamic classes in an image, farthest first."""
     frame, size = recording.frame(index), recording.size(index)
-    hulls = hulls_in(recording.scene, frame, size)
-    owners, covered = owner_image(hulls, size)
+    hulls, owners, labels = labelled_hulls(recording.scene, frame, size)
     owners[recording.ego_mask(index)] = -1
-    labels = (label_of(hull, pixels) for hull, pixels in zip(hulls, covered, strict=True))
     subjects = (
         Subject(index, frame, hull, label, owners == position)
         for position, (hull, label) in enumerate(zip(hulls, labels, strict=True))

@@ -28,7 +28,7 @@ from drivesplat.scene.images import (
     write_png,
 )
 from drivesplat.scene.masks import UNLABELLED, MasksRecord, mask_name
-from drivesplat.scene.regions import LABELS, label_image
+from drivesplat.scene.regions import LABELS, label_image, visibility_source
 from drivesplat.scene.scene import Frame, Scene, Sweep
 from drivesplat.scene.splits import Group, frame_groups
 from drivesplat.settings.masks import MaskJob
@@ -89,6 +89,7 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
         sky_known=sky_known,
         semantic_classes=max(classes),
         own_car={camera: ego_mask.source.get(camera, "masks") for camera in sorted(seeing)},
+        visibility=None if job.masks.regions_folder else visibility_source(scene.tracks),
     )
 
 

@@ -24,7 +24,8 @@ def mask_name(kind: str, camera: str, timestamp: int) -> str:
 class MasksRecord:
     """The content of masks.json: the `labels` of regions, the number of `images`, whether regions come from 'boxes' or
     'masks' and the sky from a 'heuristic' or 'masks', the mean share of sky pixels, whether any sky was found, the
-    number of semantic classes (0: none), and the source of the ego mask by camera that sees the ego vehicle."""
+    number of semantic classes (0: none), the source of the ego mask by camera that sees the ego vehicle, and whether
+    the visibility of boxes is 'annotated' or 'estimated' (None where no box makes a region)."""
 
     labels: dict[str, int]
     images: int
@@ -34,6 +35,7 @@ class MasksRecord:
     sky_known: bool
     semantic_classes: int
     own_car: dict[str, str]
+    visibility: str | None
     provenance: Provenance = field(default_factory=dict)
 
 

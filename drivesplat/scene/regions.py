@@ -3,7 +3,9 @@
 A label image gives each pixel one label; a region is a set of labels. Users may supply label images of their own.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -11,13 +13,17 @@ import numpy as np
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import inverse
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.tracks import Box, boxes_at
 
 NEAR_PLANE = 0.1
 MAX_DISTANCE = 80.0
 MIN_PIXELS = 100
 MIN_VISIBILITY = 2
+UNKNOWN = 0
+"""The level of visibility of boxes without an annotated one."""
+MAX_HIDDEN = 0.6
+"""Maximum share of a hull that nearer boxes hide, for boxes of unknown visibility."""
 
 LABELS = {
     "static": 0,
@@ -83,13 +89,14 @@ def hull_of(box: Box, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np
     return cv2.convexHull(pixels.astype(np.float32))[:, 0, :]
 
 
-def hulls_in(scene: Scene, frame: Frame, size: tuple[int, int]) -> list[Hull]:
-    """The projected boxes of dynamic classes in a frame at `size` (width, height), farthest first."""
+def hulls_in(scene: Scene, frame: Frame, size: tuple[int, int], dynamic: bool = True) -> list[Hull]:
+    """The projected boxes in a frame at `size` (width, height), farthest first: those of `dynamic` classes, or all."""
     world_to_camera = inverse(frame.camera_to_world)
     intrinsics = continuous_intrinsics(frame, size)
     hulls = []
     for box in boxes_at(scene, frame.timestamp):
-        polygon = hull_of(box, world_to_camera, intrinsics) if box.object_class.is_dynamic else None
+        wanted = box.object_class.is_dynamic or not dynamic
+        polygon = hull_of(box, world_to_camera, intrinsics) if wanted else None
         if polygon is not None:
             distance = float(np.linalg.norm(box.object_to_world[:3, 3] - frame.camera_to_world[:3, 3]))
             hulls.append(Hull(box, polygon, distance))
@@ -124,21 +131,53 @@ def owner_image(hulls: list[Hull], size: tuple[int, int]) -> tuple[np.ndarray, l
     return owners, covered
 
 
+def hidden_shares(hulls: list[Hull], size: tuple[int, int]) -> list[float]:
+    """The share of each hull's pixels in the image that nearer ones of `hulls` (farthest first) cover; 0 for a hull
+    outside the image."""
+    owners, covered = owner_image(hulls, size)
+    visible = np.bincount(owners[owners >= 0], minlength=len(hulls)).tolist()
+    return [1.0 - seen / pixels if pixels else 0.0 for seen, pixels in zip(visible, covered, strict=True)]
+
+
 def label_image(scene: Scene, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     """The label (h, w) uint8 of every pixel of a frame at `size` (width, height), from the scene's boxes.
 
     Where hulls overlap, the nearer box wins, even if it is left out of the regions.
     """
+    _, owners, names = labelled_hulls(scene, frame, size)
+    return np.array([LABELS[name] for name in [*names, "static"]], dtype=np.uint8)[owners]
+
+
+def labelled_hulls(scene: Scene, frame: Frame, size: tuple[int, int]) -> tuple[list[Hull], np.ndarray, list[str]]:
+    """The projected boxes of dynamic classes in a frame at `size` (width, height), farthest first; the index (h, w) of
+    the nearest one at every pixel, -1 without one; and their labels."""
     hulls = hulls_in(scene, frame, size)
     owners, covered = owner_image(hulls, size)
-    names = [*(label_of(hull, pixels) for hull, pixels in zip(hulls, covered, strict=True)), "static"]
-    return np.array([LABELS[name] for name in names], dtype=np.uint8)[owners]
+    hidden = _hidden_tracks(scene, frame, size) if any(hull.box.visibility == UNKNOWN for hull in hulls) else set()
+    names = [_label(hull, pixels, hull.box.track_id in hidden) for hull, pixels in zip(hulls, covered, strict=True)]
+    return hulls, owners, names
 
 
-def label_of(hull: Hull, pixels: int) -> str:
-    """The label of a hull that covers `pixels` pixels."""
+def _hidden_tracks(scene: Scene, frame: Frame, size: tuple[int, int]) -> set[str]:
+    """The tracks of unknown visibility of which nearer boxes, of any class, hide more than MAX_HIDDEN."""
+    hulls = hulls_in(scene, frame, size, dynamic=False)
+    shares = zip(hulls, hidden_shares(hulls, size), strict=True)
+    return {hull.box.track_id for hull, share in shares if hull.box.visibility == UNKNOWN and share > MAX_HIDDEN}
+
+
+def visibility_source(tracks: Iterable[Track]) -> Literal["annotated", "estimated"] | None:
+    """Whether the visibility of all boxes of dynamic classes is annotated, or that of at least one is estimated from
+    nearer boxes; None without such boxes."""
+    levels = [track.visibility for track in tracks if track.object_class.is_dynamic]
+    if not levels:
+        return None
+    return "estimated" if any((level == UNKNOWN).any() for level in levels) else "annotated"
+
+
+def _label(hull: Hull, pixels: int, hidden: bool) -> str:
+    """The label of a hull that covers `pixels` pixels; `hidden`: by nearer boxes, with unknown visibility."""
     box = hull.box
-    hidden = 0 < box.visibility < MIN_VISIBILITY
+    hidden |= UNKNOWN < box.visibility < MIN_VISIBILITY
     if hidden or hull.distance > MAX_DISTANCE or pixels < MIN_PIXELS:
         return "left_out"
     if box.object_class.is_vehicle:

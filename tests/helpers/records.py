@@ -16,7 +16,7 @@ EMPTY_CHECKPOINT = TrainedCheckpoint(
 )
 """For functions whose model a test sets."""
 
-EMPTY_MASKS = MasksRecord({}, 0, "boxes", "heuristic", 0.0, False, 0, {})
+EMPTY_MASKS = MasksRecord({}, 0, "boxes", "heuristic", 0.0, False, 0, {}, None)
 
 
 def training_record_of(images: int, **fields: Any) -> TrainingRecord:

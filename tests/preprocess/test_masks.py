@@ -62,7 +62,7 @@ def test_every_image_has_labels_and_a_sky_mask(tiny_scene, made):
     expected = {f"{kind}/CAM_FRONT/{f.timestamp}.png" for kind in ("regions", "sky") for f in tiny_scene.frames}
     assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} == expected
     assert (record.images, record.regions, record.sky) == (19, "boxes", "heuristic")
-    assert record.labels == LABELS
+    assert record.labels == LABELS and record.visibility == "annotated"
 
 
 def test_labels_survive_a_round_trip(tiny_scene, made):
@@ -210,6 +210,13 @@ def two_images(tiny_scene) -> Scene:
     return dataclasses.replace(tiny_scene, frames=tiny_scene.frames[:2])
 
 
+def test_the_record_says_where_visibility_is_estimated(two_images, tmp_path):
+    first, *others = two_images.tracks
+    unknown = dataclasses.replace(first, visibility=np.zeros_like(first.visibility))
+    scene = dataclasses.replace(two_images, tracks=(unknown, *others))
+    assert make_masks(scene, job(), tmp_path).visibility == "estimated"
+
+
 def test_masks_of_the_user_are_used(two_images, tmp_path):
     labels = np.random.default_rng(0).integers(0, 10, (54, 96)).astype(np.uint8)
     sky = np.where(labels > 4, 255, 0).astype(np.uint8)
@@ -218,7 +225,7 @@ def test_masks_of_the_user_are_used(two_images, tmp_path):
         sky_folder=str(users_masks(two_images, tmp_path / "sky", sky)),
     )
     record = make_masks(two_images, settings, tmp_path / "masks")
-    assert (record.regions, record.sky) == ("masks", "masks")
+    assert (record.regions, record.sky, record.visibility) == ("masks", "masks", None)
     sky[labels == LABELS["own_car"]] = 0
     assert record.sky_share == pytest.approx((sky > 0).mean())
     assert record.own_car == {"CAM_FRONT": "masks"}

@@ -34,7 +34,7 @@ def labels() -> np.ndarray:
 def masks(labels, tiny_scene, tmp_path_factory):
     folder = write_labels(tmp_path_factory.mktemp("masks"), tiny_scene, labels)
     known = {"labels": {}, "images": 0, "regions": "boxes", "sky": "heuristic", "sky_share": 0.0}
-    known |= {"own_car": {}, "sky_known": True, "semantic_classes": 0}
+    known |= {"own_car": {}, "sky_known": True, "semantic_classes": 0, "visibility": "annotated"}
     write_json(folder / "masks.json", {**known, "provenance": {"made": "masks"}})
     return folder
 

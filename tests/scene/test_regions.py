@@ -9,7 +9,8 @@ from helpers.tiny_world import CAMERA_AT, CAMERA_TO_EGO, START_US, Thing, World,
 from scipy.spatial import ConvexHull
 
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.scene.regions import LABELS, REGIONS, fill, hull_of, label_image, region_mask
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.regions import LABELS, REGIONS, fill, hull_of, label_image, region_mask, visibility_source
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.tracks import Box
@@ -220,6 +221,69 @@ def test_boxes_under_40_percent_visibility_are_left_out(tmp_path, visibility, ex
 
 def test_boxes_of_unknown_visibility_are_kept(tmp_path):
     assert names(labels_at_start([dataclasses.replace(CAR_AHEAD, visibility="")], tmp_path)) == {"static", "parked_car"}
+
+
+WALL = (1000, 400)
+"""The size of an image whose camera has a focal length of 1000 pixels."""
+
+
+def wall(
+    name: str, columns: tuple[float, float], depth: float, level: int, kind: ObjectClass = ObjectClass.CAR
+) -> Track:
+    """A thin box that faces the camera `depth` metres away and covers these columns and rows 100 to 300 of WALL."""
+    left, right = ((column - 500.0) / 1000.0 * depth for column in columns)
+    size = np.array([right - left, 0.2 * depth, 0.002])
+    pose = rigid(np.eye(3), np.array([(left + right) / 2, 0.0, depth + 0.001]))
+    one = np.zeros(1, dtype=np.int64)
+    return Track(name, kind, kind.value, size, one, one, pose[None], np.array([level]))
+
+
+def labels_of_walls(*tracks: Track) -> np.ndarray:
+    k = np.array([[1000.0, 0.0, 499.5], [0.0, 1000.0, 199.5], [0.0, 0.0, 1.0]])
+    frame = Frame("front", 0, "", *WALL, k, np.eye(4), np.eye(4), True, 0, "")
+    scene = Scene("it", "", "", "", np.zeros(3), np.zeros(1, dtype=np.int64), (frame,), (), tracks, "drive", 2.0)
+    return label_image(scene, frame, WALL)
+
+
+@pytest.mark.parametrize(("hidden", "expected"), [(0.59, "parked_car"), (0.60, "parked_car"), (0.61, "left_out")])
+@pytest.mark.parametrize("by", [ObjectClass.CAR, ObjectClass.OTHER_MOVABLE])
+def test_a_box_of_unknown_visibility_is_left_out_where_nearer_boxes_hide_more_than_60_percent(hidden, expected, by):
+    """Of 200 columns; by two boxes that overlap, whose columns count once. A farther box hides nothing."""
+    edge = 300.0 + 200.0 * hidden
+    nearer = wall("a", (250.0, edge), 10.0, 4, by), wall("b", (280.0, edge - 30.0), 12.0, 4, by)
+    labels = labels_of_walls(wall("far", (300.0, 500.0), 20.0, 0), *nearer, wall("behind", (300.0, 500.0), 30.0, 4))
+    assert labels[200, 450] == LABELS[expected]
+    for level in (2, 4):
+        labels = labels_of_walls(wall("far", (300.0, 500.0), 20.0, level), *nearer)
+        assert labels[200, 450] == LABELS["parked_car"], "an annotated visibility is not estimated"
+
+
+@pytest.mark.parametrize(("hidden", "expected"), [(0.59, "parked_car"), (0.61, "left_out")])
+def test_the_hidden_share_is_that_of_the_hull_within_the_image(hidden, expected):
+    """Half of the box is left of the image, where the nearer box would hide all of it."""
+    edge = 100.0 * hidden
+    labels = labels_of_walls(wall("far", (-100.0, 100.0), 20.0, 0), wall("near", (-400.0, edge), 10.0, 4))
+    assert labels[200, 80] == LABELS[expected]
+
+
+def test_a_hidden_box_of_unknown_visibility_still_hides_others():
+    front, middle = wall("front", (280.0, 430.0), 10.0, 4), wall("middle", (300.0, 500.0), 20.0, 0)
+    labels = labels_of_walls(front, middle, wall("last", (300.0, 520.0), 30.0, 0))
+    assert names(labels) == {"static", "parked_car", "left_out"}
+    assert labels[200, 450] == labels[200, 510] == LABELS["left_out"]
+
+
+@pytest.mark.parametrize(
+    ("tracks", "expected"),
+    [
+        ([wall("a", (0, 9), 9.0, 4), wall("b", (0, 9), 9.0, 1)], "annotated"),
+        ([wall("a", (0, 9), 9.0, 4), wall("b", (0, 9), 9.0, 0)], "estimated"),
+        ([wall("a", (0, 9), 9.0, 4), wall("b", (0, 9), 9.0, 0, ObjectClass.OTHER_MOVABLE)], "annotated"),
+        ([], None),
+    ],
+)
+def test_one_box_without_annotated_visibility_makes_it_estimated(tracks, expected):
+    assert visibility_source(tracks) == expected
 
 
 @pytest.mark.parametrize(("distance", "expected"), [(79.5, "parked_other_vehicle"), (80.5, "left_out")])

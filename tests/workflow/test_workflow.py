@@ -64,7 +64,7 @@ def test_metrics_json_is_what_the_measuring_protocol_promises(finished):
         "version": "v1.0-mini", "cameras": ["CAM_FRONT"], "eval_camera": "CAM_FRONT", "width": 96, "height": 54,
         "sweeps": False, "holdout": {"every_nth": 8, "offset": 4, "last_block": 4}, "train_images": 5,
         "held_out_frames": {"interpolation": [4], "extrapolation": [6, 7, 8, 9]}, "poses": "nuscenes",
-        "regions": "boxes", "extra_points": None, "lidar_missing": 0,
+        "regions": "boxes", "visibility": "annotated", "extra_points": None, "lidar_missing": 0,
     }  # fmt: skip
     assert {key: metrics["protocol"][key] for key in expected} == expected
     assert set(metrics["methods"]) == {"vanilla", "street"}
