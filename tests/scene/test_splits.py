@@ -176,6 +176,16 @@ def test_the_default_neighbourhood_is_that_of_2_hz():
     assert held == [4, 12] and excluded == [2, 3, 5, 6, 10, 11, 13, 14]
 
 
+def test_without_a_neighbourhood_only_the_held_out_frames_themselves_are_excluded():
+    """As in published protocols at 10 Hz."""
+    holdout = HoldoutSettings(last_block=0, neighbourhood_s=0.0)
+    scene = drive(20, cameras=("CAM_FRONT",), between=1, interval=DENSE)
+    for records, groups in ((scene.frames, frame_groups), (scene.sweeps, sweep_groups)):
+        made = zip(records, groups(scene, holdout), strict=True)
+        not_trained = {(record.timestamp, group) for record, group in made if group != "train"}
+        assert not_trained == {(4 * DENSE, "interpolation"), (12 * DENSE, "interpolation")}
+
+
 @pytest.mark.parametrize("seconds", [0.0, 0.6])
 def test_below_5_hz_the_neighbourhood_is_half_an_interval_whatever_the_setting(seconds):
     scene = drive(10)
