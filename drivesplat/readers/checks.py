@@ -1,7 +1,7 @@
 """Checks of a dataset's values that all readers share. Each takes a value as it was read, of any type, and the name of
 its record (a table and a token, or a file and an entry), with which its error begins."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -182,16 +182,20 @@ def checked_box_size(size: Any, record: str) -> np.ndarray:
 def checked_path(name: Any, record: str, column: str = "filename") -> str:
     """The path of a file below the dataset's root, as it was given. Raises DatasetError naming `record` if it is no
     text, too long for a file system, absolute, or leads out of the root."""
+    require_none(path_faults(name, record, column))
+    return name
+
+
+def path_faults(name: Any, record: str, column: str) -> Iterator[str]:
+    """The fault, if any, for which `checked_path` refuses a path."""
     if not isinstance(name, str) or not name or not is_printable(name):
-        raise DatasetError(f"{record}: its {column} is {shown(name)}; it must be the path of a file")
+        yield f"{record}: its {column} is {shown(name)}; it must be the path of a file"
+        return
     path = PurePosixPath(name)
     if len(name.encode()) > MAX_PATH or any(len(part.encode()) > MAX_NAME for part in path.parts):
-        raise DatasetError(f"{record}: its {column} has {len(name)} characters, {shown(name)}; no file can have it")
-    if path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or not path.parts:
-        raise DatasetError(
-            f"{record}: its {column} {shown(name)} must be a path below the dataset's root, without '..'"
-        )
-    return name
+        yield f"{record}: its {column} has {len(name)} characters, {shown(name)}; no file can have it"
+    elif path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or not path.parts:
+        yield f"{record}: its {column} {shown(name)} must be a path below the dataset's root, without '..'"
 
 
 def checked_readout(seconds: Any, direction: Any, record: str) -> tuple[float | None, str | None]:
@@ -217,14 +221,22 @@ def checked_beams(elevations: Any, steps: Any, record: str) -> tuple[np.ndarray 
     return elevations, (None if steps is None else int(steps))
 
 
+def require_none(faults: Iterable[str]) -> None:
+    """Raises DatasetError with the first of `faults`, if there is one."""
+    for fault in faults:
+        raise DatasetError(fault)
+
+
 def require_increasing(timestamps: Sequence[int], tokens: Sequence[str], table: str) -> np.ndarray:
     """The timestamps (n,) int64 in microseconds.
 
     Raises DatasetError naming the first record that is not later than its predecessor.
     """
-    times = np.array(timestamps, dtype=np.int64)
-    wrong = np.flatnonzero(np.diff(times) <= 0)
-    if len(wrong):
-        record = named(table, tokens[wrong[0] + 1])
-        raise DatasetError(f"{record}: its timestamp is not later than that of the one before it")
-    return times
+    require_none(order_faults(timestamps, lambda i: named(table, tokens[i])))
+    return np.array(timestamps, dtype=np.int64)
+
+
+def order_faults(timestamps: Sequence[int], record: Callable[[int], str]) -> Iterator[str]:
+    """A sentence for every timestamp that is not later than its predecessor; `record` names the one at an index."""
+    for index in (np.flatnonzero(np.diff(np.array(timestamps, dtype=np.int64)) <= 0) + 1).tolist():
+        yield f"{record(index)}: its timestamp is not later than that of the one before it"

@@ -2,17 +2,20 @@
 returns. Errors and warnings name the record."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from drivesplat.errors import DatasetError
+from drivesplat.readers.checks import require_none
 from drivesplat.readers.record_names import named
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.sensors import LidarReturns
 
-MIN_KEY_FRAME_STEP_US = 1000
-"""Minimum median step between key frames in microseconds. Seconds and milliseconds are below it."""
+MIN_STEP_US = 1000
+"""Minimum median step between recordings of a sensor in microseconds. Seconds and milliseconds are below it."""
+MAX_SPAN_US = 3_600_000_000
+"""Maximum length of a drive in microseconds."""
 MAX_SPEED = 120.0
 """Speed in m/s above which an object or the ego vehicle is taken to jump."""
 MAX_NAMED = 10
@@ -46,15 +49,27 @@ def chain(first: str, following: Callable[[str], str], table: str) -> list[str]:
 
 
 def require_microseconds(key_frame_times: Sequence[int] | np.ndarray, record: str) -> None:
-    """Raises DatasetError naming `record` if key frames follow each other so closely that their timestamps must have
-    another unit."""
-    if len(key_frame_times) < 2:
+    """Raises DatasetError naming `record` if timestamps of key frames must have another unit."""
+    require_none(clock_faults(key_frame_times, f"{record}: its key frames"))
+
+
+def clock_faults(timestamps: Sequence[int] | np.ndarray, records: str) -> Iterator[str]:
+    """A sentence, which begins with `records` in the plural, if the timestamps of one sensor follow each other so
+    closely, or span so long, that their unit cannot be the microsecond."""
+    times = np.sort(np.array(timestamps, dtype=np.int64))
+    if len(times) < 2:
         return
-    step = float(np.median(np.abs(np.diff(np.array(key_frame_times, dtype=np.int64)))))
-    if step < MIN_KEY_FRAME_STEP_US:
-        raise DatasetError(
-            f"{record}: its key frames are {step:g} microseconds apart, less than a millisecond; timestamps must be "
-            "microseconds, neither seconds nor milliseconds"
+    step = float(np.median(np.diff(times)))
+    span = step * (len(times) - 1)  # without single times that are wrong
+    if step < MIN_STEP_US:
+        yield (
+            f"{records} are {step:g} microseconds apart, less than a millisecond; timestamps must be microseconds, "
+            "neither seconds nor milliseconds"
+        )
+    elif span > MAX_SPAN_US:
+        yield (
+            f"{records} span {span * 1e-6:.0f} s; timestamps must be microseconds, not nanoseconds, and a drive may be "
+            "an hour long"
         )
 
 

@@ -18,6 +18,8 @@ from drivesplat.readers.checks import (
     checked_text,
     checked_timestamp,
     checked_transform,
+    order_faults,
+    require_increasing,
 )
 from drivesplat.readers.drive_checks import chain, require_microseconds, require_unique, returns_fault
 from drivesplat.readers.record_names import named, shown
@@ -137,6 +139,16 @@ def test_long_values_and_tokens_are_shortened_in_messages():
     assert "\n" not in named("sample", "a\nb") and named("sample", None) == "sample None"
 
 
+def test_every_timestamp_out_of_order_is_listed_and_the_first_is_raised():
+    times, tokens = [0, 2, 1, 5, 5], list("abcde")
+    end = ": its timestamp is not later than that of the one before it"
+    assert list(order_faults(times, "poses[{}]".format)) == [f"poses[2]{end}", f"poses[4]{end}"]
+    assert list(order_faults([], str)) == list(order_faults([4, 5], str)) == []
+    with pytest.raises(DatasetError, match=f"^sample c{end}"):
+        require_increasing(times, tokens, "sample")
+    np.testing.assert_array_equal(require_increasing([4, 5], ["a", "b"], "sample"), [4, 5])
+
+
 def test_a_chain_is_followed_to_its_end():
     links = {"a": "b", "b": "c", "c": ""}
     assert chain("a", links.__getitem__, "sample") == ["a", "b", "c"]
@@ -163,9 +175,12 @@ def test_tokens_must_be_unique():
         ([0, 1, 1, 2], True),
         ([0, 500_000, 500_001, 1_000_000], False),
         ([5], False),
+        ([0, 3_600_000_000], False),
+        ([0, 3_600_000_001], True),
+        ([1_532_402_927_000_000_000, 1_532_402_947_000_000_000], True),
     ],
 )
-def test_key_frames_nearer_than_a_millisecond_are_refused(times, refused):
+def test_key_frames_nearer_than_a_millisecond_or_over_an_hour_are_refused(times, refused):
     if refused:
         with pytest.raises(DatasetError, match=r"^scene 1: .*must be microseconds"):
             require_microseconds(times, "scene 1")

@@ -182,7 +182,20 @@ FAULTS = {
     ),
     "milliseconds": (
         lambda d: [f.update(timestamp=f["timestamp"] // 1000) for f in d["frames"]],
-        "timestamps are microseconds",
+        "timestamps must be microseconds",
+    ),
+    "nanoseconds of a camera": (
+        lambda d: [f.update(timestamp=f["timestamp"] * 1000) for f in d["frames"]],
+        "frames of camera CAM_FRONT span",
+    ),
+    "milliseconds of sweeps": (
+        lambda d: [s.update(timestamp=s["timestamp"] // 1000) for s in d["sweeps"]],
+        "sweeps of lidar LIDAR_TOP are",
+    ),
+    "a name that no file can have": (lambda d: d["frames"][0].update(file="a" * 300), "no file can have it"),
+    "key frames out of order": (
+        lambda d: d["key_frames"].__setitem__(slice(3), d["key_frames"][2::-1]),
+        "key_frames[2]: its timestamp is not later",
     ),
     "a mirrored camera": (
         lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
@@ -209,7 +222,10 @@ FAULTS = {
         "frames[0]: its translation is",
     ),
     "another camera": (lambda d: d["frames"][0].update(camera="left"), "camera 'left' is not in cameras"),
-    "a file outside": (lambda d: d["frames"][0].update(file="../x.jpg"), "'../x.jpg' is no path inside the folder"),
+    "a file outside": (
+        lambda d: d["frames"][0].update(file="../x.jpg"),
+        "its file '../x.jpg' must be a path below the dataset's root",
+    ),
     "no pose": (
         lambda d: d["frames"][0].update(ego_to_world=None, camera_to_world=None),
         "frames[0]: there are no ego_poses",

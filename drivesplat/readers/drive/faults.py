@@ -1,14 +1,14 @@
 """Faults of a drive.json whose structure is right: values that contradict each other or cannot be, a sentence each."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import PurePosixPath
 
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import checked_box_size, checked_intrinsics
+from drivesplat.readers.checks import checked_box_size, checked_intrinsics, order_faults, path_faults
 from drivesplat.readers.drive.format import Distortion, Drive, DriveCamera, Pose, TimedPose
 from drivesplat.readers.drive.poses import matrix_of
+from drivesplat.readers.drive_checks import clock_faults
 
 MAX_POSE_GAP = 1_000_000
 """Microseconds between ego poses over which poses of images and sweeps are interpolated."""
@@ -20,7 +20,7 @@ def faults_of(drive: Drive) -> list[str]:
     return [
         *_camera_faults(drive),
         *_pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items())),
-        *_order_faults("ego_poses", drive.ego_poses),
+        *_timed_faults("ego_poses", drive.ego_poses),
         *_recording_faults(drive),
         *_track_faults(drive),
         *_key_frame_faults(drive),
@@ -81,12 +81,10 @@ def _pose_faults(list_name: str, poses: Iterable[tuple[str | int, Pose]]) -> Ite
             yield str(error)
 
 
-def _order_faults(list_name: str, poses: Sequence[TimedPose]) -> Iterator[str]:
+def _timed_faults(list_name: str, poses: Sequence[TimedPose]) -> Iterator[str]:
     """Faults of the poses of one body over time. Jumps are warnings (`drive_checks.jumps`)."""
     yield from _pose_faults(list_name, enumerate(poses))
-    late = next((i for i in range(1, len(poses)) if poses[i].timestamp <= poses[i - 1].timestamp), None)
-    if late is not None:
-        yield f"{list_name}[{late}]: its timestamp is not later than that of the one before it"
+    yield from order_faults([pose.timestamp for pose in poses], lambda i: f"{list_name}[{i}]")
 
 
 def _recording_faults(drive: Drive) -> Iterator[str]:
@@ -117,16 +115,12 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
             if (sensor, time) in seen:
                 yield f"{where}: {list_name}[{seen[sensor, time]}] has the same {kind} and timestamp"
             seen[sensor, time] = i
-            if not _is_inside(file):
-                yield f"{where}: {file!r} is no path inside the folder"
+            yield from path_faults(file, where, "file")
             if needs_ego and (fault := _unposed(ego_times, time)):
                 yield f"{where}: {fault}"
-    yield from _clock_faults([frame.timestamp for frame in drive.frames])
-
-
-def _is_inside(file: str) -> bool:
-    path = PurePosixPath(file)
-    return not path.is_absolute() and ".." not in path.parts and "\0" not in file
+        for sensor in known:
+            times = [time for other, time, *_ in records if other == sensor]
+            yield from clock_faults(times, f"{list_name} of {kind} {sensor}")
 
 
 def _unposed(times: np.ndarray, time: int) -> str | None:
@@ -143,17 +137,6 @@ def _unposed(times: np.ndarray, time: int) -> str | None:
     return None
 
 
-def _clock_faults(times: Sequence[int]) -> Iterator[str]:
-    span = max(times, default=0) - min(times, default=0)
-    if len(set(times)) > 2 and span < 1000 * len(set(times)):
-        yield (
-            f"frames: {len(set(times))} images within {span} microseconds; timestamps are microseconds, not seconds "
-            "or milliseconds"
-        )
-    if span > 3_600_000_000:
-        yield f"frames: they span {span * 1e-6:.0f} s; timestamps are microseconds, and a drive is at most an hour long"
-
-
 def _track_faults(drive: Drive) -> Iterator[str]:
     ids: set[str] = set()
     for track in drive.tracks:
@@ -165,7 +148,7 @@ def _track_faults(drive: Drive) -> Iterator[str]:
             checked_box_size(track.size, where)
         except DatasetError as error:
             yield str(error)
-        yield from _order_faults(f"{where}: poses", track.poses)
+        yield from _timed_faults(f"{where}: poses", track.poses)
 
 
 def _key_frame_faults(drive: Drive) -> Iterator[str]:
@@ -174,6 +157,5 @@ def _key_frame_faults(drive: Drive) -> Iterator[str]:
         return
     if not times:
         yield "key_frames: there is none; leave the key out to use all images of the first camera"
-    late = [i for i in range(1, len(times)) if times[i] <= times[i - 1]]
-    if late:
-        yield f"key_frames[{late[0]}]: it is not later than the one before it"
+    yield from order_faults(times, lambda i: f"key_frames[{i}]")
+    yield from clock_faults(times, "key_frames")
