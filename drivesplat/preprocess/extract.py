@@ -32,6 +32,11 @@ def extract_scene(
     of the fault.
     """
     scene = reader(source.reader).read(root, source, scene_tables)
+    if not scene.frames:
+        raise DatasetError(
+            f"scene {source.scene}: it has no image of {', '.join(source.cameras)}; nothing is trained or measured on "
+            "LiDAR alone yet"
+        )
     with ThreadPoolExecutor() as pool:
         faults = list(pool.map(image_fault, scene.frames))
     bad = [(frame, fault) for frame, fault in zip(scene.frames, faults, strict=True) if fault]

@@ -111,8 +111,9 @@ class Scene:
         return float(np.median(np.diff(self.key_frame_timestamps)))
 
     def seconds(self, timestamp: int | np.integer) -> float:
-        """A timestamp (microseconds) as seconds since the first image, the time unit of models."""
-        return float(timestamp - min(frame.timestamp for frame in self.frames)) * 1e-6
+        """A timestamp (microseconds) as seconds since the first image (the first sweep, without images), the time unit
+        of models."""
+        return float(timestamp - min(recording.timestamp for recording in self.frames or self.sweeps)) * 1e-6
 
     def track(self, track_id: str) -> Track | None:
         """The track with this id; None if there is none."""

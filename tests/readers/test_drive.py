@@ -1,6 +1,7 @@
 """Drive folders: written from a scene, read back as the same scene, and checked."""
 
 import copy
+import dataclasses
 import json
 import re
 import shutil
@@ -21,6 +22,7 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.readers.drive.__main__ import main
 from drivesplat.readers.drive.format import Drive
+from drivesplat.readers.drive.from_above import seen_from_above
 from drivesplat.readers.drive.layout import camera_names, find_root
 from drivesplat.readers.drive.reader import chosen_recordings, read
 from drivesplat.readers.drive.write import write_drive
@@ -393,6 +395,58 @@ def test_the_converter_of_the_documentation_writes_a_sound_folder(tmp_path, monk
     scene = extract_scene(source(scene="monday", cameras=("front",)), tmp_path / "monday")
     np.testing.assert_allclose(scene.frames[2].camera_to_world[:3, 3], [9.7, 0.0, 1.5], atol=1e-9)
     np.testing.assert_allclose(scene.frames[2].camera_to_world[:3, 2], [1.0, 0.0, 0.0], atol=1e-9), "it looks ahead"
+
+
+@pytest.fixture
+def lidar_alone(content, folder, tmp_path) -> Path:
+    """The drive without cameras and images."""
+    mine = tmp_path / "0001"
+    mine.mkdir()
+    (mine / "sweeps").symlink_to(folder / "0001/sweeps")
+    less = {key: value for key, value in content.items() if key not in ("cameras", "frames", "key_frames", "origin")}
+    (mine / "drive.json").write_text(json.dumps(less), encoding="utf-8")
+    return mine
+
+
+def test_lidar_alone_is_read_for_later(lidar_alone, recorded):
+    """Its key frames are the sweeps, and its world begins at the first one."""
+    scene = read(lidar_alone, source())
+    assert scene.frames == scene.cameras == () and [lidar.name for lidar in scene.lidars] == ["LIDAR_TOP"]
+    np.testing.assert_array_equal(scene.key_frame_timestamps, [sweep.timestamp for sweep in recorded.sweeps])
+    assert all(sweep.is_key_frame for sweep in scene.sweeps) and scene.seconds(scene.sweeps[2].timestamp) > 0
+    moved = recorded.sweeps[0].sensor_to_world[:3, 3] - scene.sweeps[0].sensor_to_world[:3, 3]
+    for one, other in zip(scene.sweeps, recorded.sweeps, strict=True):
+        np.testing.assert_allclose(one.sensor_to_world[:3, 3] + moved, other.sensor_to_world[:3, 3], atol=1e-9)
+    assert len(scene.tracks) == len(recorded.tracks)
+
+
+def test_lidar_alone_is_refused_by_the_stages_of_images_and_by_planning(lidar_alone):
+    with pytest.raises(DatasetError, match=r"scene 0001: it has no image of CAM_FRONT; nothing is trained") as stopped:
+        extract_scene(source(), lidar_alone)
+    assert "\n" not in str(stopped.value)
+    with pytest.raises(DatasetError, match="have no cameras: LiDAR alone can be checked and read"):
+        camera_names(lidar_alone.parent, "")
+
+
+def test_lidar_alone_is_checked_and_drawn_from_above(lidar_alone, capsys):
+    assert main(["check", str(lidar_alone)]) == 0
+    said = capsys.readouterr().out
+    assert "no images: such a drive can be read, but nothing is trained or measured on it yet" in said
+    pixels = np.asarray(Image.open(lidar_alone / "check.png"))
+    assert pixels.shape == (960, 960, 3) and (pixels == (255, 90, 0)).all(axis=2).sum() > 100
+    assert (pixels[20:].max(axis=2) > 0).sum() > 1000, "returns"
+
+
+def test_returns_from_above_are_where_the_world_has_them(lidar_alone, recorded):
+    """A return 10 m east and 20 m north of the LiDAR, and nothing else."""
+    sweep = dataclasses.replace(
+        recorded.sweeps[0], path=str(lidar_alone / "one.npz"), reader="drive", sensor_to_world=np.eye(4)
+    )
+    np.savez(sweep.path, x=[10.0], y=[20.0], z=[0.0])
+    scene = dataclasses.replace(recorded, sweeps=(sweep,), tracks=())
+    drawn = np.asarray(seen_from_above(scene, 960))[40:]
+    ((row, column, *_), *_) = np.argwhere(drawn)
+    assert (drawn.max(axis=2) > 0).sum() == 1 and (row + 40, column) == (288, 576)
 
 
 def test_the_schema_is_that_of_the_records(capsys):

@@ -8,6 +8,7 @@ from PIL import Image, ImageDraw
 
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, Drive, structure_of
+from drivesplat.readers.drive.from_above import seen_from_above
 from drivesplat.readers.drive.reader import scene_of
 from drivesplat.readers.image_file import image_fault
 from drivesplat.readers.sweeps import read_returns, sweep_fault
@@ -19,13 +20,15 @@ from drivesplat.settings.extract import SceneSource
 
 WIDTH = 960
 """Width of an image in the picture."""
+NO_IMAGES = "no images: such a drive can be read, but nothing is trained or measured on it yet"
 MAX_DEPTH = 60.0
 """Metres at which the colour of returns ends."""
 
 
 def check(folder: Path, picture: Path | None) -> list[str]:
     """The faults of a drive folder, a sentence each. Without faults of drive.json, and with a path for it, writes the
-    picture: the middle key frame of every camera, with the nearest sweep coloured by depth and the boxes."""
+    picture: the middle key frame of every camera, with the nearest sweep coloured by depth and the boxes; or the
+    middle sweep from above, without images."""
     faults, drive = structure_of(folder / FILE)
     if drive is None:
         return faults
@@ -54,7 +57,7 @@ def summary(scene: Scene) -> str:
     key_frames = len(scene.key_frame_timestamps)
     parts = [
         f"{key_frames} key frames at {scene.key_frame_hz:g} Hz",
-        f"{len(scene.frames)} images of {len(scene.cameras)} cameras",
+        f"{len(scene.frames)} images of {len(scene.cameras)} cameras" if scene.frames else NO_IMAGES,
         f"{len(scene.sweeps)} LiDAR sweeps" if scene.sweeps else "no LiDAR",
         f"{len(scene.tracks)} tracks" if scene.tracks else "no boxes: all is treated as static",
     ]
@@ -71,12 +74,14 @@ def _file_faults(scene: Scene) -> Iterator[str]:
 
 
 def write_picture(scene: Scene, path: Path) -> None:
-    """Writes the middle key frames of all cameras, one below the other."""
+    """Writes the middle key frames of all cameras, one below the other, or without images the middle sweep."""
     images = []
     for camera in scene.cameras:
         indices = scene.key_frames(camera.name)
         if indices:
             images.append(_drawn(scene, scene.frames[sorted(indices)[len(indices) // 2]]))
+    if not scene.frames and scene.sweeps:
+        images.append(seen_from_above(scene, WIDTH))
     if not images:
         return
     canvas = Image.new("RGB", (WIDTH, sum(image.height for image in images)))

@@ -89,10 +89,10 @@ def _timed_faults(list_name: str, poses: Sequence[TimedPose]) -> Iterator[str]:
 
 def _recording_faults(drive: Drive) -> Iterator[str]:
     """Faults of frames and sweeps."""
-    if not drive.cameras:
+    if drive.frames and not drive.cameras:
         yield "cameras: there is none; images need their calibration (K and sensor_to_ego)"
-    if not drive.frames:
-        yield "frames: there is none"
+    if not drive.frames and not drive.sweeps:
+        yield "frames: there is none, and there are no sweeps"
     for list_name, poses in (
         ("frames", ((i, pose) for i, f in enumerate(drive.frames) for pose in (f.camera_to_world, f.ego_to_world))),
         ("sweeps", ((i, sweep.lidar_to_world) for i, sweep in enumerate(drive.sweeps))),

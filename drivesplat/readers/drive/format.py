@@ -168,7 +168,8 @@ class Drive(DriveRecord):
     """The ego vehicle in the world, at any rate, in time order. Poses between two of them are interpolated."""
     key_frames: tuple[Timestamp, ...] | None = None
     """The times of key frames, in order: the times that are held out or trained on as one, and at which tracks are
-    sampled. null: those of the first camera's key frames, or of all of its images."""
+    sampled. null: those of the first camera's key frames, or of all of its images; of the first LiDAR's sweeps where
+    there are no images."""
     frames: tuple[DriveFrame, ...] = ()
     sweeps: tuple[DriveSweep, ...] = ()
     tracks: tuple[DriveTrack, ...] = ()

@@ -41,8 +41,10 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
 
 
 def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
-    """The scene of a drive without faults; paths of files begin with `folder`."""
-    unknown = [camera for camera in source.cameras if camera not in drive.cameras]
+    """The scene of a drive without faults; paths of files begin with `folder`. A drive of LiDAR alone has no frames,
+    whatever the cameras of `source`."""
+    cameras = source.cameras if drive.frames else ()
+    unknown = [camera for camera in cameras if camera not in drive.cameras]
     if unknown:
         raise DatasetError(
             f"scene {source.scene}: the drive has no camera {unknown[0]!r}; there are: {', '.join(drive.cameras)}"
@@ -59,24 +61,29 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
         licence=drive.licence,
         origin=reading.shift if drive.origin is None else np.array(drive.origin),
         key_frame_timestamps=times,
-        frames=tuple(frame for camera in source.cameras for frame in reading.frames(camera, source.sweeps)),
+        frames=tuple(frame for camera in cameras for frame in reading.frames(camera, source.sweeps)),
         sweeps=sweeps,
         tracks=tuple(track for track in tracks if track is not None),
         poses=READER,
         key_frame_hz=nominal_rate(times),
         key_frame_range=list(source.frames) if source.frames else None,
-        cameras=tuple(_camera(drive, name) for name in source.cameras),
+        cameras=tuple(_camera(drive, name) for name in cameras),
         lidars=tuple(_lidar(drive, name) for name in dict.fromkeys(sweep.lidar for sweep in sweeps)),
     )
 
 
 def origin_shift(drive: Drive, ego: EgoPath, time: int) -> np.ndarray:
     """The translation (3,) that is subtracted from all poses: 0 where the drive states its origin, otherwise the ego
-    vehicle's position at the first key frame or, without ego poses, at the first image."""
+    vehicle's position at the first key frame or, without ego poses, at the first image or sweep."""
     if drive.origin is not None:
         return np.zeros(3)
     if len(ego):
         return ego.at(time)[:3, 3].copy()
+    if not drive.frames:
+        sweep = min(drive.sweeps, key=lambda sweep: sweep.timestamp)
+        assert sweep.lidar_to_world is not None
+        mount = matrix_of(drive.lidars[sweep.lidar].sensor_to_ego)
+        return (matrix_of(sweep.lidar_to_world) @ inverse(mount))[:3, 3].copy()
     return _ego_of(drive, min(drive.frames, key=lambda frame: frame.timestamp), ego)[:3, 3].copy()
 
 
@@ -89,7 +96,8 @@ def nominal_rate(times: np.ndarray) -> float:
 
 
 def key_frame_times(drive: Drive, source: SceneSource) -> np.ndarray:
-    """The times (n,) of the key frames that `source` selects."""
+    """The times (n,) of the key frames that `source` selects: those given, those of the first camera's images,
+    or without images those of the first LiDAR's sweeps."""
     times = drive.key_frames
     if times is None:
         for camera in drive.cameras:
@@ -98,6 +106,9 @@ def key_frame_times(drive: Drive, source: SceneSource) -> np.ndarray:
             if marked:
                 times = tuple(sorted(frame.timestamp for frame in marked))
                 break
+    if times is None:
+        first = next(lidar for lidar in drive.lidars if any(sweep.lidar == lidar for sweep in drive.sweeps))
+        times = tuple(sorted(sweep.timestamp for sweep in drive.sweeps if sweep.lidar == first))
     found = np.array(times, dtype=np.int64)
     if source.frames and source.frames[1] > len(found):
         raise DatasetError(
