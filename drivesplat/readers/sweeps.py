@@ -6,6 +6,7 @@ from types import ModuleType
 from drivesplat.errors import DatasetError
 from drivesplat.readers.by_name import dataset_module
 from drivesplat.readers.drive_checks import returns_fault
+from drivesplat.readers.sweep_motion import compensated, motion_fault
 from drivesplat.scene.scene import Sweep, place_of
 from drivesplat.scene.sensors import LidarReturns
 
@@ -14,7 +15,7 @@ SWEEP_FILE = "drivesplat.readers.*.sweep_file"
 
 
 def read_returns(sweep: Sweep) -> LidarReturns:
-    """The returns of a sweep that have finite coordinates.
+    """The returns of a sweep that have finite coordinates, motion-compensated.
 
     Raises DatasetError naming the sweep's token and path if the file is missing, truncated or empty, or its returns are
     none of a LiDAR on a vehicle.
@@ -41,7 +42,11 @@ def _returns(sweep: Sweep) -> LidarReturns | str:
     if fault:
         return fault
     returns = files.read_file(path)
-    return returns_fault(returns) or returns
+    if fault := returns_fault(returns):
+        return fault
+    if sweep.motion is None:
+        return returns
+    return motion_fault(returns, sweep.motion) or compensated(returns, sweep.motion)
 
 
 def _named(sweep: Sweep, fault: str) -> str:

@@ -17,7 +17,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.storage import Provenance, read_json, unreadable, write_json
 from drivesplat.io.typed_record import field_values, typed_record
 from drivesplat.scene.object_class import ObjectClass
-from drivesplat.scene.sensors import Camera, Lidar
+from drivesplat.scene.sensors import Camera, Lidar, SweepMotion
 
 SCHEMA = 1
 REFINED = "scene_refined.json"
@@ -45,7 +45,8 @@ class Frame:
 @dataclass(frozen=True)
 class Sweep:
     """One LiDAR revolution. `sensor_to_world` holds at the sweep's timestamp; `path` may be missing on disk. `lidar` is
-    a name in `Scene.lidars`; `reader` names the package of `drivesplat.readers` that reads it."""
+    a name in `Scene.lidars`; `reader` names the package of `drivesplat.readers` that reads it; `motion` is that of the
+    LiDAR where the file's points are not motion-compensated: reading them compensates it."""
 
     path: str
     timestamp: int
@@ -55,6 +56,7 @@ class Sweep:
     token: str
     lidar: str
     reader: str
+    motion: SweepMotion | None = None
 
 
 @dataclass(frozen=True)

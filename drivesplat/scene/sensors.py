@@ -34,6 +34,17 @@ class Lidar:
 
 
 @dataclass(frozen=True)
+class SweepMotion:
+    """The motion of a LiDAR during a sweep whose points are in the sensor's frame at their own times. `ego_to_sweep`:
+    the ego frame at k increasing `offsets_s`, seconds after the sweep's timestamp, in the sensor's frame at that
+    timestamp; position is linear and rotation slerp in between. `sensor_to_ego` is the mount."""
+
+    offsets_s: Float64[np.ndarray, " k"]
+    ego_to_sweep: Float64[np.ndarray, "k 4 4"]
+    sensor_to_ego: Float64[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
 class LidarReturns:
     """The n returns of a sweep. `points` (n, 3) float64, metres, in the sensor's frame at the sweep's timestamp.
 

@@ -7,11 +7,9 @@ import numpy as np
 from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import checked_box_size, checked_intrinsics, order_faults, path_faults
 from drivesplat.readers.drive.format import Distortion, Drive, DriveCamera, Pose, TimedPose
-from drivesplat.readers.drive.poses import matrix_of
+from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
 
-MAX_POSE_GAP = 1_000_000
-"""Microseconds between ego poses over which poses of images and sweeps are interpolated."""
 COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
 
 
@@ -19,7 +17,7 @@ def faults_of(drive: Drive) -> list[str]:
     """The faults of a drive."""
     return [
         *_camera_faults(drive),
-        *_pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items())),
+        *_lidar_faults(drive),
         *_timed_faults("ego_poses", drive.ego_poses),
         *_recording_faults(drive),
         *_track_faults(drive),
@@ -40,6 +38,13 @@ def _camera_faults(drive: Drive) -> Iterator[str]:
         if not wrong and camera.distortion.model != "none":
             wrong = list(_fold_faults(k, camera))
         yield from (f"{where}: {fault}" for fault in wrong)
+
+
+def _lidar_faults(drive: Drive) -> Iterator[str]:
+    yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()))
+    for name, lidar in drive.lidars.items():
+        if not lidar.motion_compensated and not drive.ego_poses:
+            yield f"lidars.{name}: motion_compensated is false, and there are no ego_poses by which to move its points"
 
 
 def _distortion_faults(distortion: Distortion) -> Iterator[str]:
@@ -101,7 +106,8 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
     frames = [
         (f.camera, f.timestamp, f.file, f.camera_to_world is None and f.ego_to_world is None) for f in drive.frames
     ]
-    sweeps = [(s.lidar, s.timestamp, s.file, s.lidar_to_world is None) for s in drive.sweeps]
+    moving = {name for name, lidar in drive.lidars.items() if drive.ego_poses and not lidar.motion_compensated}
+    sweeps = [(s.lidar, s.timestamp, s.file, s.lidar_to_world is None or s.lidar in moving) for s in drive.sweeps]
     ego_times = np.array([pose.timestamp for pose in drive.ego_poses], dtype=np.int64)
     for list_name, kind, known, records in (
         ("frames", "camera", drive.cameras, frames),

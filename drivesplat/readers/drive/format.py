@@ -85,6 +85,9 @@ class DriveLidar(DriveRecord):
     """Firings of a beam per revolution. null: unknown."""
     revolution_s: float | None = Field(None, gt=0)
     """Time of a revolution (seconds). null: unknown."""
+    motion_compensated: bool = True
+    """Whether all points of a sweep are where they would have been seen at its timestamp. false: each is in the
+    sensor's frame at its own `time`, and the reader moves it by ego_poses."""
 
 
 class DriveFrame(DriveRecord):

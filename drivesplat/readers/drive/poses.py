@@ -4,7 +4,15 @@ import numpy as np
 
 from drivesplat.readers.checks import checked_pose, checked_transform
 from drivesplat.readers.drive.format import Drive, Pose
-from drivesplat.scene.rigid import interpolate
+from drivesplat.scene.rigid import interpolate, inverse
+from drivesplat.scene.sensors import SweepMotion
+
+MAX_POSE_GAP = 1_000_000
+"""Microseconds between ego poses over which poses of images and sweeps are interpolated."""
+KNOT_US = 5_000
+"""Least interval in microseconds between poses of a sweep's motion; over it an acceleration of 1 g moves 0.03 mm."""
+REVOLUTION_US = 200_000
+"""Time of a LiDAR's revolution in microseconds, where it is unknown: the slowest turn five times a second."""
 
 
 def matrix_of(pose: Pose, record: str = "pose") -> np.ndarray:
@@ -35,3 +43,20 @@ class EgoPath:
             return self._poses[min(after, len(self._times) - 1)].copy()
         begin, end = self._times[after - 1 : after + 1]
         return interpolate(self._poses[after - 1], self._poses[after], float((time - begin) / (end - begin)))
+
+    def motion(self, time: int, sensor_to_ego: np.ndarray, revolution_s: float | None) -> SweepMotion:
+        """The motion during a sweep at `time`, a revolution before and after it, as far as there are ego poses at most
+        MAX_POSE_GAP apart. `sensor_to_ego` (4, 4) is the LiDAR's mount."""
+        reach = REVOLUTION_US if revolution_s is None else round(revolution_s * 1e6)
+        gaps = (
+            self._times[:-1][np.diff(self._times) > MAX_POSE_GAP],
+            self._times[1:][np.diff(self._times) > MAX_POSE_GAP],
+        )
+        begin = max(time - reach, self._times[0], *gaps[1][gaps[1] <= time])
+        end = min(time + reach, self._times[-1], *gaps[0][gaps[0] >= time])
+        within = self._times[(self._times > begin) & (self._times < end)]
+        within = within[np.unique(within // KNOT_US, return_index=True)[1]]
+        knots = np.unique([begin, *within, end])
+        to_sweep = inverse(self.at(time) @ sensor_to_ego)
+        poses = np.stack([to_sweep @ self.at(int(knot)) for knot in knots])
+        return SweepMotion((knots - time) * 1e-6, poses, sensor_to_ego)

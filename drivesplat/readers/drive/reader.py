@@ -224,13 +224,17 @@ class _Reading:
     def sweeps(self, name: str, between: bool) -> Iterator[Sweep]:
         """The sweeps of a LiDAR at key frames and, if asked for, between them."""
         records = sorted((s for s in self.drive.sweeps if s.lidar == name), key=lambda sweep: sweep.timestamp)
-        sensor_to_ego, times = matrix_of(self.drive.lidars[name].sensor_to_ego), [s.timestamp for s in records]
+        lidar, times = self.drive.lidars[name], [sweep.timestamp for sweep in records]
+        sensor_to_ego = matrix_of(lidar.sensor_to_ego)
         for number, index, is_key_frame in chosen_recordings(times, [None] * len(times), self.key_times, between):
             sweep = records[number]
             own = sweep.lidar_to_world
             pose = self._shifted(matrix_of(own) if own else self.ego.at(sweep.timestamp) @ sensor_to_ego)
             path, token = str(self.folder / sweep.file), f"{name}/{sweep.timestamp}"
-            yield Sweep(path, sweep.timestamp, pose, is_key_frame, index, token, name, READER)
+            motion = None
+            if not lidar.motion_compensated:
+                motion = self.ego.motion(sweep.timestamp, sensor_to_ego, lidar.revolution_s)
+            yield Sweep(path, sweep.timestamp, pose, is_key_frame, index, token, name, READER, motion)
 
     def _shifted(self, pose: np.ndarray) -> np.ndarray:
         shifted = pose.copy()
