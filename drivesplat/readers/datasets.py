@@ -25,6 +25,11 @@ def index(name: str) -> ModuleType | None:
     return dataset_module(SCENE_TABLES, name) if has_module(SCENE_TABLES, name) else None
 
 
+def reads_unposed(name: str) -> bool:
+    """Whether a reader reads drives without poses, for stages that estimate them (`layout.POSES_OPTIONAL`)."""
+    return getattr(layout(name), "POSES_OPTIONAL", False)
+
+
 def reader(name: str) -> ModuleType:
     """The module that reads a dataset's scenes. Raises DatasetError for an unknown reader."""
     return dataset_module(READER, name)

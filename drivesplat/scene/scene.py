@@ -20,6 +20,8 @@ from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.sensors import Camera, Lidar, SweepMotion
 
 SCHEMA = 1
+UNPOSED = "none"
+"""`Scene.poses` of a drive without any: those of the ego vehicle are the identity."""
 REFINED = "scene_refined.json"
 """File name of the record with refined poses."""
 
@@ -82,9 +84,9 @@ class Scene:
     """A recorded drive.
 
     Key frame i of `key_frame_timestamps` is `sample_index` i. `origin`: global = world + origin. `poses` names
-    where the poses come from (a reader, 'refined', 'images'); `key_frame_hz` is the nominal rate of key frames;
-    `key_frame_range` the dataset's key frames [first, last + 1) that were read, None for all. `cameras` and `lidars`
-    are the sensors that frames and sweeps name; `licence` says who may use the recording, where it is known.
+    where the poses come from (a reader, 'refined', 'images', UNPOSED); `key_frame_hz` is the nominal rate of key
+    frames; `key_frame_range` the dataset's key frames [first, last + 1) that were read, None for all. `cameras` and
+    `lidars` are the sensors that frames and sweeps name; `licence` says who may use the recording, where it is known.
     """
 
     name: str

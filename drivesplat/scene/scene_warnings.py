@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.distance import pdist
 
-from drivesplat.scene.scene import Scene
+from drivesplat.scene.scene import UNPOSED, Scene
 from drivesplat.scene.tracks import moving_tracks
 
 MIN_BASELINE = 1.0
@@ -60,7 +60,9 @@ def scene_warnings(scene: Scene, brightness: float) -> list[str]:
     """The warnings of a scene, one sentence each; `brightness` is its `luminance`."""
     found = []
     distance, seconds, stands = max_displacement(scene), duration(scene), standing_time(scene)
-    if distance < MIN_BASELINE:
+    if scene.poses == UNPOSED:
+        found.append("there are no poses; refine_poses estimates them from the images")
+    elif distance < MIN_BASELINE:
         found.append(
             f"the car hardly moves ({distance:.1f} m in {seconds:.1f} s): nothing can be triangulated, depth is "
             "from LiDAR alone; held-out images repeat training images, so a high PSNR says little, and views from "

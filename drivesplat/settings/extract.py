@@ -17,7 +17,8 @@ class SceneSource(Settings):
 
     A reader reads `scene` of `version`: the images of `cameras` and the LiDAR sweeps at key frames; with `sweeps` also
     the images between them, with `lidar_sweeps` also the LiDAR sweeps between them. `frames` = (first, last + 1) keeps
-    these key frames, renumbered from 0, and the recordings between them. The stage applies `dataset` and `on_missing`.
+    these key frames, renumbered from 0, and the recordings between them. `poses_from_images`: whether the poses of a
+    drive without any are estimated from its images afterwards. The stage applies `dataset` and `on_missing`.
     """
 
     dataset: str
@@ -28,4 +29,5 @@ class SceneSource(Settings):
     cameras: tuple[str, ...]
     sweeps: bool
     lidar_sweeps: bool = False
+    poses_from_images: bool = False
     on_missing: OnMissing

@@ -10,6 +10,7 @@ from typing import Any
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.io.this_copy import of_the_workflow
+from drivesplat.readers.datasets import reads_unposed
 from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
@@ -85,7 +86,11 @@ def _record(stage: str, place: Place) -> Settings:
 
 def refines_poses(config: Config, scene: str) -> bool:
     """Whether a scene's poses are refined before all other stages."""
-    enabled, world = for_scene(config, scene).refine_poses.enabled, config.datasets[config.dataset_of(scene)].world
+    return _refines(Place(for_scene(config, scene), config.dataset_of(scene), scene, "", ""))
+
+
+def _refines(at: Place) -> bool:
+    enabled, world = at.config.refine_poses.enabled, at.dataset.world
     return (world is None or world.pose_noise) if enabled == "auto" else enabled
 
 
@@ -120,6 +125,7 @@ def _nothing(_: Place) -> dict[str, Any]:
 
 
 def _scene_source(at: Place) -> dict[str, Any]:
+    start = at.config.refine_poses.start
     return {
         "dataset": at.dataset_name,
         "reader": at.dataset.reader,
@@ -128,6 +134,7 @@ def _scene_source(at: Place) -> dict[str, Any]:
         "frames": at.dataset.frames.get(at.scene),
         "lidar_sweeps": at.config.lidar_seed.sweeps,
         "on_missing": at.config.extract.on_missing,
+        "poses_from_images": reads_unposed(at.dataset.reader) and _refines(at) and start == "images",
     }
 
 

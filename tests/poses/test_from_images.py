@@ -1,6 +1,7 @@
 """Poses from images alone: synthetic matches with known poses, and drives that do not determine their poses."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,10 @@ from drivesplat.poses.from_images import align_poses
 from drivesplat.poses.refine import estimate_from_matches
 from drivesplat.poses.refinement_record import Refinement
 from drivesplat.poses.rig import RigImages
+from drivesplat.readers.drive.reader import read
 from drivesplat.scene.rigid import apply, inverse, rigid
 from drivesplat.scene.scene import Scene, Sweep
+from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.refine_poses import PriorSettings, RefinePosesJob
 
 pytestmark = pytest.mark.usefixtures("quiet")
@@ -129,6 +132,51 @@ def test_a_drive_without_recorded_poses_is_recovered_in_metres(unlocated, unloca
     assert apart(inverse(truth[0]) @ truth, poses_of(unlocated_made))[1] < 0.005
     assert unlocated_made.scene.poses == "images"
     np.testing.assert_allclose(poses_of(unlocated_made)[0], np.eye(4), atol=0.01)
+
+
+def write_unposed(folder: Path, case: Case) -> Path:
+    """The drive of a case as a drive folder without any pose."""
+    scene = case.drive.scene
+    k = np.array(scene.frames[0].intrinsics)
+    identity = {"translation": [0.0, 0.0, 0.0], "rotation": [1.0, 0.0, 0.0, 0.0]}
+    mount = inverse(scene.frames[0].ego_to_world) @ scene.frames[0].camera_to_world
+    sweeps = []
+    for sweep in scene.sweeps:
+        returns = np.fromfile(sweep.path, dtype=np.float32).reshape(-1, 5)
+        np.savez(folder / f"{sweep.token}.npz", **dict(zip("xyz", returns.T[:3], strict=True)))
+        sweeps.append({"lidar": "top", "timestamp": sweep.timestamp, "file": f"{sweep.token}.npz"})
+    camera = {"width": scene.frames[0].width, "height": scene.frames[0].height, "K": k.tolist()}
+    camera["sensor_to_ego"] = {"translation": mount[:3, 3].tolist(), "rotation": mount[:3, :3].tolist()}
+    record = {
+        "format": "drivesplat drive",
+        "version": 1,
+        "cameras": {"CAM_FRONT": camera},
+        "lidars": {"top": {"sensor_to_ego": {**identity, "translation": LIDAR[:3, 3].tolist()}}},
+        "frames": [{"camera": f.camera, "timestamp": f.timestamp, "file": f"{f.token}.jpg"} for f in scene.frames],
+        "sweeps": sweeps,
+    }
+    (folder / "drive.json").write_text(json.dumps(record), encoding="utf-8")
+    return folder
+
+
+def test_a_drive_folder_without_poses_is_recovered_in_metres(unlocated, tmp_path):
+    """Read with its poses to be estimated, it gets those of a drive whose recorded poses are the identity."""
+    source = SceneSource(
+        dataset="mine", reader="drive", version="", scene="it", frames=None, cameras=("CAM_FRONT",), sweeps=False,
+        on_missing="stop", poses_from_images=True,
+    )  # fmt: skip
+    scene = read(write_unposed(tmp_path, unlocated), source)
+    assert scene.poses == "none"
+    np.testing.assert_array_equal([frame.ego_to_world for frame in scene.frames], [np.eye(4)] * 10)
+    images = RigImages.of(scene, range(10))
+    made = estimate_from_matches(images, unlocated.start, unlocated.database, job_of(), 1)
+    truth = unlocated.drive.truth
+    metres, degrees = apart(inverse(truth[0]) @ truth, poses_of(made))
+    assert metres < 0.02 and degrees < 0.005
+    assert made.scene.poses == "images" and made.record["placement"]["scale_from"] == "LiDAR"
+    for sweep in made.scene.sweeps:
+        expected = inverse(truth[0]) @ curve(sweep.timestamp * 1e-6) @ LIDAR
+        np.testing.assert_allclose(sweep.sensor_to_world, expected, atol=0.03)
 
 
 def test_the_record_describes_the_placement(unlocated_made):

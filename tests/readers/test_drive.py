@@ -449,6 +449,53 @@ def test_returns_from_above_are_where_the_world_has_them(lidar_alone, recorded):
     assert (drawn.max(axis=2) > 0).sum() == 1 and (row + 40, column) == (288, 576)
 
 
+@pytest.fixture
+def unposed(content, folder, tmp_path) -> Path:
+    """The drive without any pose."""
+    mine = tmp_path / "0001"
+    mine.mkdir()
+    for name in ("images", "sweeps"):
+        (mine / name).symlink_to(folder / "0001" / name)
+    less = copy.deepcopy(content)
+    for record in (*less["frames"], *less["sweeps"]):
+        for key in ("camera_to_world", "ego_to_world", "lidar_to_world"):
+            record.pop(key, None)
+    (mine / "drive.json").write_text(json.dumps(less), encoding="utf-8")
+    return mine
+
+
+def test_a_drive_without_poses_is_refused_where_none_are_estimated(unposed):
+    with pytest.raises(
+        DatasetError, match=r"there are no poses; add ego_poses, or set refine_poses: \{enabled: true, st"
+    ):
+        read(unposed, source())
+
+
+def test_a_drive_without_poses_is_read_where_they_are_estimated(unposed, caplog):
+    scene = extract_scene(source(poses_from_images=True), unposed)
+    assert scene.poses == "none" and len(scene.frames) > 10
+    assert all((frame.ego_to_world == np.eye(4)).all() for frame in scene.frames)
+    mount = scene.frames[0].camera_to_world
+    assert (mount[:3, 3] != 0).any() and all((frame.camera_to_world == mount).all() for frame in scene.frames)
+    said = " ".join(record.message for record in caplog.records)
+    assert "there are no poses; refine_poses estimates them" in said and "hardly moves" not in said
+
+
+def test_the_checker_says_what_a_drive_without_poses_needs(unposed, capsys):
+    assert main(["check", str(unposed)]) == 0
+    assert "no poses: set refine_poses: {enabled: true, start: images}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("lacking", ["sweeps", "frames"])
+def test_without_poses_a_drive_needs_images_and_lidar(unposed, lacking, capsys):
+    path = unposed / "drive.json"
+    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), lacking: []}), encoding="utf-8")
+    assert main(["check", str(unposed)]) == 1
+    assert "poses can be estimated only where there are both images and LiDAR sweeps" in capsys.readouterr().out
+    with pytest.raises(DatasetError, match="only where there are both"):
+        read(unposed, source(poses_from_images=True))
+
+
 def test_the_schema_is_that_of_the_records(capsys):
     assert main(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(Drive.model_json_schema(by_alias=True)))

@@ -165,6 +165,21 @@ def test_the_refinement_gets_only_the_settings_that_determine_it():
     assert alone["lidar"] == {"ray_spacing": [0.2, 0.4], "own_car_radius": 3.0}
 
 
+@pytest.mark.parametrize(
+    ("settings", "estimated"),
+    [
+        ({"start": "images"}, True),
+        ({"enabled": True, "start": "images"}, True),
+        ({"enabled": False, "start": "images"}, False),
+        ({}, False),
+    ],
+)
+def test_the_extraction_knows_whether_poses_are_estimated_where_drives_may_lack_them(settings, estimated):
+    mine = {"datasets": {"mine": {"reader": "drive", "dataroot": "d", "scenes": ["it"]}}, "refine_poses": settings}
+    assert json.loads(stage_settings(load(mine), "extract", "it"))["poses_from_images"] is estimated
+    assert stage_record("extract", refine_poses=settings)["poses_from_images"] is False, "nuScenes has poses"
+
+
 def stage_record(stage: str, **values: Any) -> dict[str, Any]:
     return json.loads(stage_settings(load(values), stage, "0061"))
 

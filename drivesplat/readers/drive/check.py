@@ -15,7 +15,7 @@ from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.images import continuous_intrinsics, project, read_image
 from drivesplat.scene.regions import hulls_in
 from drivesplat.scene.rigid import apply, inverse
-from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.scene import UNPOSED, Frame, Scene
 from drivesplat.settings.extract import SceneSource
 
 WIDTH = 960
@@ -59,6 +59,7 @@ def summary(scene: Scene) -> str:
         f"{key_frames} key frames at {scene.key_frame_hz:g} Hz",
         f"{len(scene.frames)} images of {len(scene.cameras)} cameras" if scene.frames else NO_IMAGES,
         f"{len(scene.sweeps)} LiDAR sweeps" if scene.sweeps else "no LiDAR",
+        *(["no poses: set refine_poses: {enabled: true, start: images}"] if scene.poses == UNPOSED else []),
         f"{len(scene.tracks)} tracks" if scene.tracks else "no boxes: all is treated as static",
     ]
     return ", ".join(parts)

@@ -25,6 +25,12 @@ def faults_of(drive: Drive) -> list[str]:
     ]
 
 
+def is_unposed(drive: Drive) -> bool:
+    """Whether a drive has no poses at all: none of the vehicle, of images or of sweeps."""
+    given = (pose for frame in drive.frames for pose in (frame.camera_to_world, frame.ego_to_world))
+    return not drive.ego_poses and not any(given) and not any(sweep.lidar_to_world for sweep in drive.sweeps)
+
+
 def _camera_faults(drive: Drive) -> Iterator[str]:
     yield from _pose_faults("cameras", ((name, camera.sensor_to_ego) for name, camera in drive.cameras.items()))
     for name, camera in drive.cameras.items():
@@ -98,6 +104,12 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
         yield "cameras: there is none; images need their calibration (K and sensor_to_ego)"
     if not drive.frames and not drive.sweeps:
         yield "frames: there is none, and there are no sweeps"
+    unposed = is_unposed(drive)
+    if unposed and not (drive.frames and drive.sweeps):
+        yield (
+            "ego_poses: there is none, and no image or sweep has a pose of its own; poses can be estimated only where "
+            "there are both images and LiDAR sweeps (docs/poses.md)"
+        )
     for list_name, poses in (
         ("frames", ((i, pose) for i, f in enumerate(drive.frames) for pose in (f.camera_to_world, f.ego_to_world))),
         ("sweeps", ((i, sweep.lidar_to_world) for i, sweep in enumerate(drive.sweeps))),
@@ -122,7 +134,7 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
                 yield f"{where}: {list_name}[{seen[sensor, time]}] has the same {kind} and timestamp"
             seen[sensor, time] = i
             yield from path_faults(file, where, "file")
-            if needs_ego and (fault := _unposed(ego_times, time)):
+            if needs_ego and not unposed and (fault := _unposed(ego_times, time)):
                 yield f"{where}: {fault}"
         for sensor in known:
             times = [time for other, time, *_ in records if other == sensor]

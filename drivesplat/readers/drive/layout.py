@@ -6,6 +6,8 @@ from pathlib import Path
 from drivesplat.errors import DatasetError
 
 FILE = "drive.json"
+POSES_OPTIONAL = True
+"""Whether drives may lack poses."""
 HOW = "docs/own_data.md says how to write one; set datasets.<name>.dataroot to its folder, or to the one above"
 
 

@@ -35,7 +35,9 @@ class EgoPath:
 
     def at(self, time: int) -> np.ndarray:
         """Ego to world (4, 4) at a time: the given pose, or linear position and slerp between two. Outside the given
-        times, which faults exclude for all recordings, the nearest pose."""
+        times, which faults exclude for all recordings, the nearest pose; the identity in a drive without poses."""
+        if not len(self._times):
+            return np.eye(4)
         after = int(np.searchsorted(self._times, time))
         if after < len(self._times) and self._times[after] == time:
             return self._poses[after].copy()

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.drive.faults import faults_of
+from drivesplat.readers.drive.faults import faults_of, is_unposed
 from drivesplat.readers.drive.format import FILE, Drive, DriveFrame, DriveTrack, read_drive
 from drivesplat.readers.drive.layout import scene_folder
 from drivesplat.readers.drive.poses import EgoPath, matrix_of
 from drivesplat.scene.rigid import interpolate, inverse, rigid
-from drivesplat.scene.scene import Frame, Scene, Sweep, Track
+from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track
 from drivesplat.scene.sensors import Camera, Lidar
 from drivesplat.settings.extract import SceneSource
 
@@ -37,12 +37,17 @@ def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> S
     if faults:
         more = f" ({len(faults) - 1} more: `{CHECK} {folder}` lists them)" if len(faults) > 1 else ""
         raise DatasetError(f"{folder / FILE}: {faults[0]}{more}")
+    if is_unposed(drive) and not source.poses_from_images:
+        raise DatasetError(
+            f"{folder / FILE}: there are no poses; add ego_poses, or set "
+            "refine_poses: {enabled: true, start: images} to estimate them from the images (docs/poses.md)"
+        )
     return scene_of(drive, folder, source)
 
 
 def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
     """The scene of a drive without faults; paths of files begin with `folder`. A drive of LiDAR alone has no frames,
-    whatever the cameras of `source`."""
+    whatever the cameras of `source`; in one without poses the ego vehicle's pose is the identity at all times."""
     cameras = source.cameras if drive.frames else ()
     unknown = [camera for camera in cameras if camera not in drive.cameras]
     if unknown:
@@ -64,7 +69,7 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
         frames=tuple(frame for camera in cameras for frame in reading.frames(camera, source.sweeps)),
         sweeps=sweeps,
         tracks=tuple(track for track in tracks if track is not None),
-        poses=READER,
+        poses=UNPOSED if is_unposed(drive) else READER,
         key_frame_hz=nominal_rate(times),
         key_frame_range=list(source.frames) if source.frames else None,
         cameras=tuple(_camera(drive, name) for name in cameras),
@@ -77,7 +82,7 @@ def origin_shift(drive: Drive, ego: EgoPath, time: int) -> np.ndarray:
     vehicle's position at the first key frame or, without ego poses, at the first image or sweep."""
     if drive.origin is not None:
         return np.zeros(3)
-    if len(ego):
+    if len(ego) or is_unposed(drive):
         return ego.at(time)[:3, 3].copy()
     if not drive.frames:
         sweep = min(drive.sweeps, key=lambda sweep: sweep.timestamp)
