@@ -16,7 +16,7 @@ from helpers.syntax_trees import source_of, tree_of
 LINES = (REPOSITORY / "tests/forbidden_terms.txt").read_text(encoding="utf-8").splitlines()
 NAMES = [line.removeprefix("name ") for line in LINES if line.startswith("name ")]
 PHRASES = [line.removeprefix("phrase ") for line in LINES if line.startswith("phrase ")]
-PYTHON = ("drivesplat", "benchmarks", "workflow_scripts", "scripts")
+PYTHON = ("drivesplat", "benchmarks", "examples", "workflow_scripts", "scripts")
 TEXTS = (
     "README.md",
     "Makefile",

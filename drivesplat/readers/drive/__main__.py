@@ -8,6 +8,7 @@ from pathlib import Path
 from drivesplat.errors import DriveSplatError
 from drivesplat.readers.drive.check import check, summary, whole_scene
 from drivesplat.readers.drive.format import Drive, read_drive
+from drivesplat.readers.drive.nerfstudio import add_command
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.drive_checks import jumps
 from drivesplat.scene.scene import read_scene
@@ -28,6 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     writing.add_argument("folder", type=Path)
     writing.add_argument("--licence", default="", help="who may use the recording, and for what")
     writing.set_defaults(run=_write)
+    add_command(commands)
     asked = parser.parse_args(arguments)
     try:
         return asked.run(asked)

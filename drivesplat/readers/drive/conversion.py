@@ -1,0 +1,83 @@
+"""What converters to drive folders share: poses over time, messages about damaged files, and writing the folder."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.io.storage import write_json
+from drivesplat.readers.drive.faults import faults_of
+from drivesplat.readers.drive.format import FILE, structure_of
+from drivesplat.readers.files import link_or_copy, pose_record
+from drivesplat.scene.rigid import interpolate
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turns what goes wrong with a file into a DatasetError that names it."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise DatasetError(f"{error.filename or path} is missing") from error
+    except (OSError, ValueError, LookupError, TypeError, SyntaxError) as error:
+        raise DatasetError(f"{path} cannot be read ({type(error).__name__}: {str(error)[:200]})") from error
+
+
+def pose_at(times: np.ndarray, poses: np.ndarray, time: int | np.integer) -> np.ndarray:
+    """The pose (4, 4) at a time, of poses (n, 4, 4) at increasing times (n,): between two of them linear position and
+    slerp, outside them the motion of the nearest two."""
+    if len(times) == 1:
+        return poses[0]
+    after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1))
+    begin, end = times[after - 1], times[after]
+    return interpolate(poses[after - 1], poses[after], float((time - begin) / (end - begin)))
+
+
+def timed_poses(times: np.ndarray, poses: np.ndarray) -> list[dict[str, Any]]:
+    """Poses (n, 4, 4) at times (n,) in microseconds as `ego_poses`, or those of a track."""
+    return [{"timestamp": int(time), **pose_record(pose)} for time, pose in zip(times, poses, strict=True)]
+
+
+def write_folder(
+    folder: Path,
+    record: Mapping[str, Any],
+    images: Mapping[str, Path],
+    sweeps: Iterable[tuple[str, Mapping[str, np.ndarray]]] = (),
+) -> Path:
+    """Writes an empty drive folder: `record` as drive.json, hard links to `images`, or copies, by their paths in the
+    folder, and the columns of `sweeps`, one after the other, as .npz files. Returns the path of drive.json.
+
+    Raises DatasetError where the folder holds anything, an image is missing, or `record` has a fault (`check`).
+
+    >>> write_folder(Path("mine/0001"), record, {"front/1.jpg": Path("camera0/0001.jpg")})
+    PosixPath('mine/0001/drive.json')
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DatasetError(f"{folder} is not empty; name a new folder")
+    missing = [path for path in images.values() if not path.is_file()]
+    if missing:
+        raise DatasetError(f"{len(missing)} of {len(images)} images are missing (first: {missing[0]})")
+    _write_record(folder / FILE, record)
+    for name, source in images.items():
+        link_or_copy(source, folder / name)
+    for name, columns in sweeps:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(folder / name, **columns)
+    return folder / FILE
+
+
+def _write_record(path: Path, record: Mapping[str, Any]) -> None:
+    try:
+        write_json(path, record)
+    except ValueError as error:
+        raise DatasetError(f"{path}: a number is not finite ({error})") from error
+    faults, drive = structure_of(path)
+    if drive is not None:
+        faults = [f"{path}: {fault}" for fault in faults_of(drive)]
+    if faults:
+        path.unlink()
+        more = f" ({len(faults) - 1} more faults)" if len(faults) > 1 else ""
+        raise DatasetError(f"{faults[0]}{more}")

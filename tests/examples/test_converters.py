@@ -1,0 +1,416 @@
+"""The worked converters: each test writes a small drive in a dataset's own layout, by the formulas of that dataset's
+documentation, and compares what the converter makes of it with the world that it shows."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import REPOSITORY
+from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from drivesplat.readers.drive.check import check, whole_scene
+from drivesplat.readers.drive.format import read_drive
+from drivesplat.readers.sweeps import read_returns
+from drivesplat.scene.images import read_image
+from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.scene.scene import Scene
+from examples import argoverse2, kitti_raw
+
+TILT = Rotation.from_euler("ZYX", [0.65, 0.05, -0.03]).as_matrix()
+ELEVATIONS = np.radians(np.linspace(-25.0, 3.0, 8))
+AZIMUTHS = np.radians(np.arange(-179.0, 180.0, 6.0))
+"""Of a scan, in the order in which it turns counter-clockwise from behind the vehicle."""
+
+
+def origin_of(scene: Scene, drive: TurningDrive) -> np.ndarray:
+    """The scene's origin in the drive's world, by the first image."""
+    first = scene.frames[0]
+    return drive.ego(first.timestamp)[:3, 3] - first.ego_to_world[:3, 3]
+
+
+def assert_shows(scene: Scene, drive: TurningDrive, delay: int, lidars: dict[str, np.ndarray], atol: float) -> None:
+    """Poses, calibration, images and boxes of a scene are those of a drive whose images are `delay` microseconds after
+    its key frames, up to the origin, which is near the first ego position."""
+    origin = origin_of(scene, drive)
+    assert np.linalg.norm(scene.frames[0].ego_to_world[:3, 3]) < 0.1
+
+    def here(pose: np.ndarray) -> np.ndarray:
+        return rigid(pose[:3, :3], pose[:3, 3] - origin)
+
+    assert [frame.timestamp for frame in scene.frames] == (TIMES + delay).tolist()
+    for frame in scene.frames:
+        np.testing.assert_allclose(frame.intrinsics, drive.world.intrinsics, atol=1e-9)
+        np.testing.assert_allclose(frame.ego_to_world, here(drive.ego(frame.timestamp)), atol=atol)
+        np.testing.assert_allclose(frame.camera_to_world, here(drive.ego(frame.timestamp) @ CAMERA), atol=atol)
+        expected = drive.image(frame.timestamp)
+        assert np.abs(read_image(frame.image_path).astype(int) - expected).mean() < 3.0
+    for sweep in scene.sweeps:
+        np.testing.assert_allclose(
+            sweep.sensor_to_world, here(drive.ego(sweep.timestamp) @ lidars[sweep.lidar]), atol=atol
+        )
+    assert len(scene.tracks) == len(drive.world.things)
+    for track, thing in zip(scene.tracks, drive.world.things, strict=True):
+        np.testing.assert_allclose(track.size, thing.size, atol=1e-6)
+        assert len(track.timestamps) >= 5
+        for time, box in zip(track.timestamps, track.object_to_world, strict=True):
+            np.testing.assert_allclose(box, here(drive.box(thing, time)), atol=atol)
+
+
+def world_points(scene: Scene, number: int, drive: TurningDrive) -> np.ndarray:
+    """The returns of a sweep in the drive's world."""
+    sweep = scene.sweeps[number]
+    return apply(sweep.sensor_to_world, read_returns(sweep).points) + origin_of(scene, drive)
+
+
+# KITTI raw
+
+DELAY, SPIN = 4_000, 50_000
+"""Microseconds between a key frame and what the GPS/IMU unit says; half a turn of the scanner."""
+LATITUDE, LONGITUDE, RADIUS = 49.01, 8.43, 6378137.0
+IMU = rigid(np.eye(3), np.array([0.0, 0.0, 0.93]))
+VELODYNE = rigid(Rotation.from_euler("z", 0.02).as_matrix(), np.array([0.81, -0.32, 1.73]))
+"""Mounts in the ego frame. Tracklets have a heading only: the scanner is level."""
+KITTI_NAMES = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}
+
+
+def lines_of(times: np.ndarray) -> str:
+    """Times in KITTI's form, to the nanosecond."""
+    return "".join(str(np.datetime64(int(t) * 1000, "ns")).replace("T", " ") + "\n" for t in times)
+
+
+def oxts(pose: np.ndarray) -> str:
+    """The record of the GPS/IMU unit at a pose (x east, y north, z up, near LATITUDE and LONGITUDE), on a spherical
+    earth. Angles as KITTI's dataformat.txt says: roll is positive with the left side up, pitch with the front down,
+    yaw is 0 towards the east and positive counter-clockwise."""
+    (east, north, up), (forward, left, upward) = pose[:3, 3], pose[:3, :3].T
+    latitude = LATITUDE + np.degrees(north / RADIUS)
+    longitude = LONGITUDE + np.degrees(east / (RADIUS * np.cos(np.radians(LATITUDE))))
+    roll = np.arctan2(left[2], upward[2])
+    pitch, yaw = -np.arcsin(forward[2]), np.arctan2(forward[1], forward[0])
+    return " ".join(f"{v:.15g}" for v in (latitude, longitude, up, roll, pitch, yaw, *np.zeros(19), 4, 8, 4, 4, 0))
+
+
+def numbers(values: np.ndarray) -> str:
+    return " ".join(f"{value:.12e}" for value in np.ravel(values))
+
+
+def write_calibration(day: Path, drive: TurningDrive) -> dict[str, np.ndarray]:
+    """The three files, such that camera 2 is mounted as CAMERA; returns the matrices of KITTI's readme."""
+    K = drive.world.intrinsics
+    shift = np.array([0.06, -0.001, 0.003])
+    rectifying = Rotation.from_euler("xyz", [0.01, -0.015, 0.02]).as_matrix()
+    rectified_to_ego = CAMERA @ rigid(np.eye(3), shift)
+    velo_to_cam = rigid(rectifying.T, np.zeros(3)) @ inverse(rectified_to_ego) @ VELODYNE
+    imu_to_velo = inverse(VELODYNE) @ IMU
+    projection = K @ np.column_stack([np.eye(3), shift])
+    (day / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\n"
+        f"S_rect_02: {numbers([drive.world.width, drive.world.height])}\n"
+        f"R_rect_00: {numbers(rectifying)}\nP_rect_02: {numbers(projection)}\n"
+    )
+    for name, matrix in (("velo_to_cam", velo_to_cam), ("imu_to_velo", imu_to_velo)):
+        text = f"calib_time: 15-Mar-2012 11:37:16\nR: {numbers(matrix[:3, :3])}\nT: {numbers(matrix[:3, 3])}\n"
+        (day / f"calib_{name}.txt").write_text(text)
+    return {"P": projection, "R": rigid(rectifying, np.zeros(3)), "velo_to_cam": velo_to_cam}
+
+
+def tracklets_xml(drive: TurningDrive) -> str:
+    """Boxes as boost serializes them: relative to the scanner, standing on their bottom, with a heading."""
+    items = []
+    for thing in drive.world.things:
+        poses = []
+        for time in TIMES:
+            box = inverse(drive.ego(time) @ VELODYNE) @ drive.box(thing, time)
+            x, y, z = box[:3, 3] - [0.0, 0.0, thing.size[2] / 2]
+            heading = np.arctan2(box[1, 0], box[0, 0])
+            poses.append(
+                f"<item><tx>{x:.9g}</tx><ty>{y:.9g}</ty><tz>{z:.9g}</tz><rx>0</rx><ry>0</ry><rz>{heading:.9g}</rz>"
+                "<state>2</state><occlusion>1</occlusion><occlusion_kf>0</occlusion_kf><truncation>0</truncation></item>"
+            )
+        length, width, height = thing.size
+        items.append(
+            f"<item><objectType>{KITTI_NAMES[thing.category]}</objectType><h>{height}</h><w>{width}</w><l>{length}</l>"
+            f"<first_frame>0</first_frame><poses><count>{len(poses)}</count>{''.join(poses)}</poses></item>"
+        )
+    return (
+        '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?><!DOCTYPE boost_serialization>'
+        '<boost_serialization signature="serialization::archive" version="9"><tracklets class_id="0">'
+        f"<count>{len(items)}</count><item_version>1</item_version>{''.join(items)}</tracklets></boost_serialization>"
+    )
+
+
+def scan(drive: TurningDrive, time: int) -> tuple[np.ndarray, np.ndarray]:
+    """A turn of the scanner that looks forward at `time`, counter-clockwise from behind: what it writes, each point as
+    seen at its own time, and where the points are in the world; (n, 3) each."""
+    raw, true = [], []
+    for azimuth in AZIMUTHS:
+        now = time + SPIN * azimuth / np.pi
+        hits = drive.hits(VELODYNE, rays_at(azimuth, ELEVATIONS), now)
+        true.append(hits)
+        raw.append(seen_from(drive.ego(now) @ VELODYNE, hits))
+    return np.concatenate(raw), np.concatenate(true)
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory) -> tuple[Path, TurningDrive, dict[str, np.ndarray]]:
+    """A day of KITTI raw with the drive 0005, of which one scan is missing, as in some of KITTI's."""
+    day = tmp_path_factory.mktemp("kitti") / "2011_09_26"
+    drive = TurningDrive(rigid(TILT, np.array([3.0, -7.0, 120.0])))
+    folder = day / "2011_09_26_drive_0005_sync"
+    for name in ("image_02/data", "oxts/data", "velodyne_points/data"):
+        (folder / name).mkdir(parents=True)
+    matrices = write_calibration(day, drive)
+    velodyne = folder / "velodyne_points"
+    for name, offset in (("_start", -SPIN), ("", 0), ("_end", SPIN)):
+        (velodyne / f"timestamps{name}.txt").write_text(lines_of(TIMES + offset))
+    (folder / "image_02/timestamps.txt").write_text(lines_of(TIMES - 1_000))
+    (folder / "oxts/timestamps.txt").write_text(lines_of(TIMES + DELAY))
+    (folder / "tracklet_labels.xml").write_text(tracklets_xml(drive))
+    for i, time in enumerate(TIMES):
+        Image.fromarray(drive.image(time - 1_000)).save(folder / f"image_02/data/{i:010}.png")
+        (folder / f"oxts/data/{i:010}.txt").write_text(oxts(drive.ego(time + DELAY) @ IMU) + "\n")
+        points, _ = scan(drive, int(time))
+        if i != 4:
+            reflectance = np.full((len(points), 1), 0.25)
+            np.hstack([points, reflectance]).astype(np.float32).tofile(velodyne / f"data/{i:010}.bin")
+    return day, drive, matrices
+
+
+@pytest.fixture(scope="module")
+def kitti_scene(kitti, tmp_path_factory) -> Scene:
+    out = tmp_path_factory.mktemp("drives") / "kitti"
+    assert kitti_raw.main([str(kitti[0]), "5", str(out), "--cameras", "02"]) == 0
+    assert check(out, None) == []
+    return whole_scene(read_drive(out), out)
+
+
+def test_kitti_raw_shows_the_world_that_it_recorded(kitti, kitti_scene):
+    _, drive, _ = kitti
+    assert_shows(kitti_scene, drive, -1_000, {"velodyne": VELODYNE}, atol=5e-3)
+    assert [sweep.timestamp for sweep in kitti_scene.sweeps] == np.delete(TIMES, 4).tolist()
+    assert [track.category for track in kitti_scene.tracks] == ["Car", "Truck", "Pedestrian"]
+    assert [track.object_class for track in kitti_scene.tracks] == ["car", "truck", "pedestrian"]
+    assert all(set(track.visibility) == {2} for track in kitti_scene.tracks), "partly occluded"
+
+
+def test_scans_of_kitti_raw_are_untwisted(kitti, kitti_scene):
+    _, drive, _ = kitti
+    points, true = scan(drive, int(TIMES[2]))
+    np.testing.assert_allclose(world_points(kitti_scene, 2, drive), true, atol=5e-3)
+    twisted = apply(drive.ego(TIMES[2]) @ VELODYNE, points)
+    assert np.linalg.norm(twisted - true, axis=1).max() > 0.5, "the test would not see a difference"
+    assert (read_returns(kitti_scene.sweeps[2]).intensity == 0.25).all()
+
+
+def test_points_fall_on_the_pixels_of_kittis_readme(kitti, kitti_scene):
+    """Y = P_rect_02 · R_rect_00 · (R|T)_velo_to_cam · X, for a point that the scanner sees at the image's time."""
+    _, drive, matrices = kitti
+    frame = kitti_scene.frames[3]
+    point = np.array([12.0, 1.5, -0.4, 1.0])
+    x, y, z = matrices["P"] @ matrices["R"] @ matrices["velo_to_cam"] @ point
+    in_world = (drive.ego(frame.timestamp) @ VELODYNE @ point)[:3] - origin_of(kitti_scene, drive)
+    found = frame.intrinsics @ seen_from(frame.camera_to_world, in_world[None])[0]
+    np.testing.assert_allclose(found[:2] / found[2], [x / z, y / z], atol=0.05)
+
+
+def test_scans_that_are_compensated_already_are_left_as_they_are(kitti, tmp_path):
+    day, drive, _ = kitti
+    points, _ = scan(drive, int(TIMES[2]))
+    assert kitti_raw.main([str(day), "0005", str(tmp_path / "c"), "--cameras", "02", "--scans", "compensated"]) == 0
+    scene = whole_scene(read_drive(tmp_path / "c"), tmp_path / "c")
+    np.testing.assert_allclose(read_returns(scene.sweeps[2]).points, points, atol=1e-5)
+    mirrored = points * [1.0, -1.0, 1.0]
+    start, end = drive.ego(TIMES[2] - SPIN) @ VELODYNE, drive.ego(TIMES[2] + SPIN) @ VELODYNE
+    turned = [kitti_raw.untwisted(mirrored, scans, start, end, start) for scans in ("clockwise", "counter-clockwise")]
+    assert np.linalg.norm(turned[0] - turned[1], axis=1).max() > 0.3
+
+
+# Argoverse 2
+
+EGO_HEIGHT = rigid(np.eye(3), np.array([0.0, 0.0, 0.33]))
+"""The origin of Argoverse's ego frame is above the ground."""
+AV2_LIDARS = {
+    "up_lidar": rigid(np.eye(3), np.array([1.35, 0.0, 1.97])),
+    "down_lidar": rigid(Rotation.from_euler("zx", [0.2, np.pi]).as_matrix(), np.array([1.355, 0.0, 1.9])),
+}
+AV2_DELAY = 17_000
+AV2_NAMES = {"car": "REGULAR_VEHICLE", "truck": "BOX_TRUCK", "pedestrian": "PEDESTRIAN"}
+
+
+def se3_columns(poses: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """Poses as Argoverse's tables have them."""
+    rotations = Rotation.from_matrix([pose[:3, :3] for pose in poses]).as_quat()
+    columns = dict(zip(("qx", "qy", "qz", "qw"), rotations.T, strict=True))
+    return columns | dict(zip(("tx_m", "ty_m", "tz_m"), np.array([pose[:3, 3] for pose in poses]).T, strict=True))
+
+
+def av2_hits(drive: TurningDrive, name: str, time: float) -> np.ndarray:
+    rays = np.concatenate([rays_at(azimuth, ELEVATIONS) for azimuth in AZIMUTHS])
+    return drive.hits(AV2_LIDARS[name], rays, time)
+
+
+@pytest.fixture(scope="module")
+def argoverse(tmp_path_factory) -> tuple[Path, TurningDrive]:
+    """A log of Argoverse 2; returns of both LiDARs are in one table, in the ego frame of the sweep's time."""
+    pytest.importorskip("pyarrow")
+    log = tmp_path_factory.mktemp("av2") / "01bb304d-7bd8-35f8-bbef-7086b688e35e"
+    drive = TurningDrive(rigid(TILT, np.array([747.4, 1275.3, -24.3])))
+
+    def vehicle(time: float) -> np.ndarray:
+        """city_SE3_egovehicle"""
+        return drive.ego(time) @ EGO_HEIGHT
+
+    times = [int(t) * 1000 for t in np.sort(np.concatenate([TIMES, TIMES + AV2_DELAY, TIMES - 5_000]))]
+    times = sorted([*times, times[3] + 1])  # two within a nanosecond, as in the documentation
+    write_table(
+        log / "city_SE3_egovehicle.feather",
+        {"timestamp_ns": np.array(times), **se3_columns([vehicle(t / 1000) for t in times])},
+    )
+    mounts = {"ring_front_center": CAMERA, **AV2_LIDARS}
+    write_table(
+        log / "calibration/egovehicle_SE3_sensor.feather",
+        {"sensor_name": list(mounts), **se3_columns([inverse(EGO_HEIGHT) @ mount for mount in mounts.values()])},
+    )
+    K, columns = drive.world.intrinsics, {"fx_px": (0, 0), "fy_px": (1, 1), "cx_px": (0, 2), "cy_px": (1, 2)}
+    write_table(
+        log / "calibration/intrinsics.feather",
+        {
+            "sensor_name": ["ring_front_center", "ring_rear_left"],
+            **{name: [K[at], 50.0] for name, at in columns.items()},
+            "k1": [-0.27, -0.2], "k2": [-0.21, -0.1], "k3": [0.33, 0.2],
+            "height_px": [drive.world.height, 60], "width_px": [drive.world.width, 80],
+        },
+    )  # fmt: skip
+    (log / "sensors/cameras/ring_front_center").mkdir(parents=True)
+    for time in TIMES:
+        image = Image.fromarray(drive.image(time + AV2_DELAY))
+        image.save(log / f"sensors/cameras/ring_front_center/{(time + AV2_DELAY) * 1000}.jpg", quality=97)
+        write_table(log / f"sensors/lidar/{time * 1000}.feather", sweep_table(drive, vehicle(time), time))
+    rows = [(time, thing) for time in TIMES for thing in drive.world.things]
+    boxes = [inverse(vehicle(time)) @ drive.box(thing, time) for time, thing in rows]
+    write_table(
+        log / "annotations.feather",
+        {
+            "timestamp_ns": [int(time) * 1000 for time, _ in rows],
+            "track_uuid": [f"uuid {thing.category}" for _, thing in rows],
+            "category": [AV2_NAMES[thing.category] for _, thing in rows],
+            "length_m": [thing.size[0] for _, thing in rows],
+            "width_m": [thing.size[1] for _, thing in rows],
+            "height_m": [thing.size[2] for _, thing in rows],
+            **se3_columns(boxes),
+            "num_interior_pts": [7] * len(rows),
+        },
+    )
+    return log, drive
+
+
+def sweep_table(drive: TurningDrive, vehicle: np.ndarray, time: float) -> dict[str, np.ndarray]:
+    """Returns of both LiDARs, mixed: lasers 0 to 31 are those of the upper one."""
+    parts = []
+    for first, name in ((0, "up_lidar"), (32, "down_lidar")):
+        points = seen_from(vehicle, av2_hits(drive, name, time))
+        parts.append(np.column_stack([points, first + np.arange(len(points)) % 32]))
+    rows = np.random.default_rng(0).permutation(np.concatenate(parts))
+    return {
+        **dict(zip("xyz", rows[:, :3].T.astype(np.float32), strict=True)),
+        "intensity": np.full(len(rows), 51, dtype=np.uint8),
+        "laser_number": rows[:, 3].astype(np.uint8),
+        "offset_ns": np.full(len(rows), 3_318_000, dtype=np.int32),
+    }
+
+
+def write_table(path: Path, columns: dict) -> None:
+    import pyarrow
+    from pyarrow import feather
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    feather.write_feather(pyarrow.table(columns), path)
+
+
+@pytest.fixture(scope="module")
+def argoverse_scene(argoverse, tmp_path_factory) -> Scene:
+    out = tmp_path_factory.mktemp("drives") / "argoverse"
+    assert argoverse2.main([str(argoverse[0]), str(out)]) == 0
+    assert check(out, None) == []
+    return whole_scene(read_drive(out), out)
+
+
+def test_argoverse2_shows_the_world_that_it_recorded(argoverse, argoverse_scene):
+    _, drive = argoverse
+    assert argoverse_scene.key_frame_timestamps.tolist() == TIMES.tolist()
+    assert_shows(argoverse_scene, drive, AV2_DELAY, AV2_LIDARS, atol=2e-3)
+    assert [track.category for track in argoverse_scene.tracks] == list(AV2_NAMES.values())
+    assert [track.object_class for track in argoverse_scene.tracks] == ["car", "truck", "pedestrian"]
+
+
+def test_returns_of_argoverse2_belong_to_the_lidar_that_recorded_them(argoverse, argoverse_scene):
+    _, drive = argoverse
+    assert [sweep.lidar for sweep in argoverse_scene.sweeps] == ["up_lidar"] * 6 + ["down_lidar"] * 6
+    for number, name in ((2, "up_lidar"), (8, "down_lidar")):
+        found, true = world_points(argoverse_scene, number, drive), av2_hits(drive, name, TIMES[2])
+        nearest = np.linalg.norm(found[:, None] - true[None], axis=2).min(axis=1)
+        assert len(found) == len(true) > 100 and nearest.max() < 2e-3
+        returns = read_returns(argoverse_scene.sweeps[number])
+        elevations = np.arcsin(returns.points[:, 2] / np.linalg.norm(returns.points, axis=1))
+        assert np.abs(elevations[:, None] - ELEVATIONS).min(axis=1).max() < 1e-3, "in the LiDAR's own frame"
+        np.testing.assert_allclose(returns.intensity, 0.2, atol=1e-6)
+        np.testing.assert_allclose(returns.offsets_s, 0.003318)
+        assert set(returns.rings) == set(range(32))
+
+
+# Both
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "words"),
+    [
+        ("calib_velo_to_cam.txt", Path.unlink, "calib_velo_to_cam.txt is missing"),
+        ("calib_cam_to_cam.txt", lambda p: p.write_text("P_rect_02: x\n"), "calib_cam_to_cam.txt cannot be read"),
+        ("{drive}/image_02/timestamps.txt", lambda p: p.write_text("yesterday\n"), "timestamps.txt cannot be read"),
+        (
+            "{drive}/image_02/timestamps.txt",
+            lambda p: p.write_text(p.read_text()[:40]),
+            "timestamps.txt cannot be read",
+        ),
+        ("{drive}/tracklet_labels.xml", lambda p: p.write_text("<a>"), "tracklet_labels.xml cannot be read"),
+        ("{drive}/velodyne_points/data/0000000000.bin", lambda p: p.write_bytes(b"123"), "0000000000.bin cannot be"),
+        ("{drive}", lambda p: p.rename(p.with_name("x")), "there is no folder"),
+    ],
+)
+def test_a_damaged_day_of_kitti_ends_with_a_sentence(path, change: Callable, words, kitti, tmp_path, capsys):
+    day = tmp_path / "2011_09_26"
+    name = "2011_09_26_drive_0005_sync"
+    for file in kitti[0].rglob("*"):
+        if file.is_file():
+            target = day / file.relative_to(kitti[0])
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(file.read_bytes())
+    change(day / path.format(drive=name))
+    assert kitti_raw.main([str(day), "0005", str(tmp_path / "out"), "--cameras", "02"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("kitti_raw: ") and said.count("\n") == 1 and words in said
+
+
+def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, capsys):
+    assert argoverse2.main([str(tmp_path), str(tmp_path / "out")]) == 1
+    assert "egovehicle_SE3_sensor.feather is missing" in capsys.readouterr().err
+    assert argoverse2.main([str(argoverse[0]), str(tmp_path / "out"), "--cameras", "ring_rear_left"]) == 1
+    assert "no images or no intrinsics of ring_rear_left" in capsys.readouterr().err
+    (tmp_path / "calibration").mkdir()
+    (tmp_path / "calibration/egovehicle_SE3_sensor.feather").write_bytes(b"no table")
+    assert argoverse2.main([str(tmp_path), str(tmp_path / "out")]) == 1
+    assert "egovehicle_SE3_sensor.feather cannot be read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["kitti_raw", "argoverse2"])
+def test_converters_run_as_documented(name, tmp_path):
+    done = subprocess.run(
+        [sys.executable, str(REPOSITORY / f"examples/{name}.py"), "--help"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and "drive folder" in done.stdout and "--cameras" in done.stdout, done.stderr

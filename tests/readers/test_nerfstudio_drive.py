@@ -1,0 +1,355 @@
+"""A transforms.json of nerfstudio as a drive folder: cameras, units, times, and values that cannot be."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.hand_made import recording_of
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from drivesplat.export.nerfstudio import transforms_record
+from drivesplat.readers.drive.__main__ import main
+from drivesplat.readers.drive.check import check, whole_scene
+from drivesplat.readers.drive.format import read_drive
+from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.rigid import inverse, rigid
+
+STATED = ["--metres-per-unit", "1", "--seconds-per-time", "1e-6", "--camera-height", "1.5"]
+
+
+def converted(values: Any, folder: Path, arguments: list[str] | None = None) -> int:
+    """Writes the file beside images and runs the command on it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "transforms.json").write_text(json.dumps(values), encoding="utf-8")
+    command = ["from-nerfstudio", str(folder / "transforms.json"), str(folder / "out")]
+    return main([*command, *(STATED if arguments is None else arguments)])
+
+
+def scene_in(folder: Path):
+    assert check(folder / "out", None) == []
+    return whole_scene(read_drive(folder / "out"), folder / "out")
+
+
+def test_an_exported_scene_is_read_back(tiny_scene, tiny_root, tmp_path):
+    values = json.loads(json.dumps(transforms_record(tiny_scene, recording_of(tiny_scene).record)))
+    (tmp_path / "images").symlink_to(tiny_root)
+    assert converted(values, tmp_path) == 0
+    scene = scene_in(tmp_path)
+    recorded = sorted(tiny_scene.frames, key=lambda frame: frame.timestamp)
+    assert [frame.timestamp for frame in scene.frames] == [frame.timestamp for frame in recorded]
+    assert [camera.name for camera in scene.cameras] == ["CAM_FRONT"]
+    for frame, other in zip(scene.frames, recorded, strict=True):
+        np.testing.assert_allclose(frame.intrinsics, other.intrinsics, atol=1e-9)
+        pose = rigid(frame.camera_to_world[:3, :3], frame.camera_to_world[:3, 3] + scene.origin)
+        np.testing.assert_allclose(pose, other.camera_to_world, atol=1e-9)
+        assert Path(frame.image_path).read_bytes() == Path(other.image_path).read_bytes()
+        np.testing.assert_allclose(frame.ego_to_world[:3, :3], other.ego_to_world[:3, :3], atol=1e-9)
+        assert frame.ego_to_world[2, 3] + scene.origin[2] == pytest.approx(0.0, abs=1e-9), "on the ground"
+
+
+SIZE = (80, 60)
+UPRIGHT = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""An OpenGL camera that looks along x, with z up: its columns are right, up, back."""
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Four images of two folders, with a turning rig, at 10 Hz."""
+    for camera in ("left", "right"):
+        (tmp_path / "images" / camera).mkdir(parents=True)
+        for number in range(4):
+            Image.new("RGB", SIZE, (60 * number, 90, 120)).save(tmp_path / f"images/{camera}/{number}.png")
+    return tmp_path
+
+
+def rig(number: int) -> np.ndarray:
+    """Rig to world (4, 4), in metres."""
+    return rigid(Rotation.from_euler("z", 0.05 * number + 0.7).as_matrix(), np.array([3.0 + number, 2.0, 4.0]))
+
+
+MOUNTS = {
+    "left": rigid(Rotation.from_euler("zy", [0.0, 0.04]).as_matrix() @ UPRIGHT, np.array([0.0, 0.3, 1.5])),
+    "right": rigid(Rotation.from_euler("zy", [-0.8, 0.0]).as_matrix() @ UPRIGHT, np.array([0.2, -0.3, 1.6])),
+}
+
+
+@pytest.fixture
+def values() -> dict[str, Any]:
+    """A file in half metres, with times in seconds."""
+    frames = []
+    for number in range(4):
+        for camera, mount in MOUNTS.items():
+            pose = rig(number) @ mount
+            pose[:3, 3] *= 2.0
+            frames.append(
+                {
+                    "file_path": f"./images/{camera}/{number}.png",
+                    "transform_matrix": pose.tolist(),
+                    "time": 100.0 + 0.1 * number,
+                }
+            )
+    intrinsics = {"fl_x": 70.0, "fl_y": 72.0, "cx": 41.0, "cy": 29.5, "w": 80, "h": 60}
+    return {"camera_model": "OPENCV", **intrinsics, "frames": frames}
+
+
+HALF_METRES = ["--metres-per-unit", "0.5", "--seconds-per-time", "1", "--camera-height", "1.5"]
+
+
+def by_nerfstudio(values: dict[str, Any], frame: dict[str, Any], point: np.ndarray) -> np.ndarray:
+    """The pixel of a world point in metres, from the image's corner, as nerfstudio's documentation says: the camera
+    looks along -z, y is up."""
+    pose = np.array(frame["transform_matrix"])
+    x, y, z = pose[:3, :3].T @ (2.0 * point - pose[:3, 3])
+    return np.array([values["cx"] + values["fl_x"] * x / -z, values["cy"] - values["fl_y"] * y / -z])
+
+
+def test_units_times_and_folders(folder, values):
+    assert converted(values, folder, HALF_METRES) == 0
+    scene = scene_in(folder)
+    assert [camera.name for camera in scene.cameras] == ["left", "right"]
+    assert [frame.timestamp for frame in scene.frames] == [100_000_000 + 100_000 * i for i in range(4)] * 2
+    for entry, (camera, number) in zip(values["frames"], [(c, n) for n in range(4) for c in MOUNTS], strict=True):
+        frame = next(f for f in scene.frames if f.camera == camera and f.timestamp % 10**6 == 10**5 * number)
+        point = frame.camera_to_world[:3, 3] + scene.origin + frame.camera_to_world[:3, :3] @ [1.0, 0.5, 8.0]
+        pixels, _ = project(
+            point[None] - scene.origin, inverse(frame.camera_to_world), continuous_intrinsics(frame, SIZE)
+        )
+        np.testing.assert_allclose(pixels[0], by_nerfstudio(values, entry, point), atol=1e-6)
+        np.testing.assert_allclose(
+            frame.camera_to_world[:3, 3] + scene.origin, (rig(number) @ MOUNTS[camera])[:3, 3], atol=1e-9
+        )
+    assert scene.frames[0].intrinsics[0, 2] == 40.5 and scene.frames[0].intrinsics[1, 2] == 29.0
+
+
+def test_the_ego_frame_is_level_below_the_camera_that_looks_ahead(folder, values):
+    assert converted(values, folder, HALF_METRES) == 0
+    scene = scene_in(folder)
+    for number, frame in enumerate(scene.frames[:4]):
+        expected = rig(number) @ rigid(np.eye(3), np.array([0.0, 0.3, 0.0]))
+        expected[:3, 3] -= scene.origin
+        np.testing.assert_allclose(frame.ego_to_world, expected, atol=1e-9)
+    for frame, other in zip(scene.frames[:4], scene.frames[4:], strict=True):
+        np.testing.assert_allclose(other.ego_to_world, frame.ego_to_world, atol=1e-9)
+
+
+def test_another_camera_can_be_the_one_that_looks_ahead(folder, values):
+    assert converted(values, folder, [*HALF_METRES, "--ego-camera", "right"]) == 0
+    frame = scene_in(folder).frames[0]
+    ahead = rig(0)[:3, :3] @ Rotation.from_euler("z", -0.8).as_matrix() @ [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(frame.ego_to_world[:3, 0], ahead, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "coefficients"),
+    [
+        ("OPENCV", {"k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.002}, [-0.1, 0.02, 0.001, -0.002, 0.0]),
+        ("OPENCV", {"k1": -0.1, "k3": 0.003}, [-0.1, 0.0, 0.0, 0.0, 0.003]),
+        ("OPENCV_FISHEYE", {"k1": 0.03, "k2": 0.005, "k3": 6e-4, "k4": 1e-4}, [0.03, 0.005, 6e-4, 1e-4]),
+        ("OPENCV_FISHEYE", {}, [0.0, 0.0, 0.0, 0.0]),
+        ("PINHOLE", {}, []),
+    ],
+)
+@pytest.mark.parametrize("at_the_top", [True, False])
+def test_distortion_is_that_of_opencv(model, given, coefficients, at_the_top, folder, values):
+    values["camera_model"] = model
+    for holder in [values] if at_the_top else values["frames"]:
+        holder.update(given)
+    assert converted(values, folder, HALF_METRES) == 0
+    camera = read_drive(folder / "out").cameras["left"]
+    expected = {"OPENCV": "opencv", "OPENCV_FISHEYE": "fisheye", "PINHOLE": "none"}[model]
+    assert (camera.distortion.model, list(camera.distortion.coefficients)) == (expected, coefficients)
+    if model == "OPENCV":
+        k1, k2, p1, p2, k3 = coefficients
+        x, y = 0.3, -0.2
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        by_formula = [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        ]
+        found, _ = cv2.projectPoints(
+            np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), np.eye(3), np.array(coefficients)
+        )
+        np.testing.assert_allclose(found.ravel(), by_formula, atol=1e-12)
+
+
+def test_images_of_a_folder_with_other_intrinsics_are_another_camera(folder, values):
+    for frame in values["frames"]:
+        frame["fl_x"] = 70.0 if "/left/" in frame["file_path"] or frame["time"] < 100.15 else 75.0
+    del values["fl_x"]
+    assert converted(values, folder, HALF_METRES) == 0
+    scene = scene_in(folder)
+    assert {camera.name: camera.intrinsics[0, 0] for camera in scene.cameras} == {
+        "left": 70.0, "right_0": 70.0, "right_1": 75.0,
+    }  # fmt: skip
+
+
+def test_frames_name_their_camera_by_a_number(folder, values):
+    for frame in values["frames"]:
+        frame["camera_id"] = 1 if "/left/" in frame["file_path"] else 2
+    assert converted(values, folder, HALF_METRES) == 0
+    assert [camera.name for camera in scene_in(folder).cameras] == ["camera_1", "camera_2"]
+
+
+def test_an_applied_transform_is_undone_where_asked_for(folder, values, capsys):
+    """The world before it has y down, as COLMAP's."""
+    applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
+    values["applied_transform"] = applied.tolist()
+    for frame in values["frames"]:
+        frame["file_path"] = "../" + frame["file_path"]
+    assert converted(values, folder / "as_it_is", HALF_METRES) == 0
+    assert converted(values, folder / "undone", [*HALF_METRES, "--undo-applied-transform"]) == 1
+    assert "z must be up: rotate transform_matrix, or leave out --undo-applied-transform" in capsys.readouterr().err
+    for frame in values["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        frame["transform_matrix"] = (np.vstack([applied, [0, 0, 0, 1]]) @ pose).tolist()
+    assert converted(values, folder / "lying", HALF_METRES) == 1
+    assert "or try --undo-applied-transform" in capsys.readouterr().err
+    assert converted(values, folder / "undone_again", [*HALF_METRES, "--undo-applied-transform"]) == 0
+    values["applied_transform"] = "x"
+    assert converted(values, folder / "text", [*HALF_METRES, "--undo-applied-transform"]) == 1
+    assert "applied_transform: its transform is 'x'" in capsys.readouterr().err
+    for one, other in zip(scene_in(folder / "undone_again").frames, scene_in(folder / "as_it_is").frames, strict=True):
+        np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=1e-9)
+
+
+def test_what_is_left_out_is_said(folder, values, capsys):
+    values |= {"ply_file_path": "points.ply", "train_filenames": [], "camera_model": "OPENCV_FISHEYE", "p1": -6e-5}
+    values["frames"][0]["mask_path"] = "masks/0.png"
+    assert converted(values, folder, HALF_METRES) == 0
+    said = capsys.readouterr().out
+    for words in ("no LiDAR sweeps", "mask_path of 1 frames", "train_filenames", "p1 and p2 are not used"):
+        assert words in said
+    assert "no LiDAR" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (HALF_METRES[2:], "state --metres-per-unit"),
+        ([*HALF_METRES[:2], *HALF_METRES[4:]], "state --seconds-per-time"),
+        (HALF_METRES[:4], "state --camera-height"),
+        (["--metres-per-unit", "0", *HALF_METRES[2:]], "it must be a positive number, not 0"),
+        (["--metres-per-unit", "nan", *HALF_METRES[2:]], "it must be a positive number, not nan"),
+        ([*HALF_METRES[:2], "--seconds-per-time", "1e300", *HALF_METRES[4:]], "check --seconds-per-time"),
+        ([*HALF_METRES[:2], "--seconds-per-time", "1e-6", *HALF_METRES[4:]], "it has the time of frames[0]"),
+        ([*HALF_METRES, "--ego-camera", "front"], "no camera 'front'; there are: left, right"),
+    ],
+)
+def test_what_the_file_does_not_say_must_be_stated(arguments, words, folder, values, capsys):
+    assert converted(values, folder, arguments) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("drivesplat: ") and said.count("\n") == 1 and words in said
+    assert not (folder / "out").exists()
+
+
+def test_the_scale_that_was_applied_is_a_hint(folder, values, capsys):
+    values["applied_scale"] = 0.25
+    assert converted(values, folder, HALF_METRES[2:]) == 1
+    assert "were multiplied by 0.25" in capsys.readouterr().err
+
+
+LOOKS_DOWN = rigid(UPRIGHT @ Rotation.from_euler("x", np.radians(-80.0)).as_matrix(), np.zeros(3)).tolist()
+
+
+def every(change: dict[str, Any]):
+    return lambda v: [frame.update(copy.deepcopy(change)) for frame in v["frames"]]
+
+
+FAULTS = {
+    "a list": (lambda v: [1], "has no frames"),
+    "no frames": (lambda v: v.update(frames=[]), "has no frames"),
+    "a frame that is a text": (lambda v: v["frames"].append("x"), "has no frames"),
+    "no time": (lambda v: v["frames"][3].pop("time"), "frames[0] has no timestamp and not all frames have a time"),
+    "a time that is a text": (lambda v: v["frames"][3].update(time="now"), "frames[3]: its time is 'now'"),
+    "a time before 0": (lambda v: v["frames"][3].update(time=-1.0), "frames[3]: its time is -1.0"),
+    "NaN": (lambda v: v["frames"][3].update(time=float("nan")), "frames[3]: its time is nan"),
+    "no focal length": (lambda v: v.pop("fl_y"), "frames[0] has no fl_y, and neither has the top"),
+    "a focal length that is a text": (lambda v: v.update(fl_x="70"), "its fl_x is '70'"),
+    "a focal length of another image": (lambda v: v.update(fl_x=1e-3), "its focal length is 0.001 pixels"),
+    "another size": (lambda v: v.update(w=160), "is 80x60, its w and h say 160x60"),
+    "no size": (lambda v: v.update(w=None), "its image size is None"),
+    "no image": (lambda v: v["frames"][1].update(file_path="images/none.png"), "none.png is missing"),
+    "no file": (lambda v: v["frames"][1].pop("file_path"), "frames[1]: its file_path is None"),
+    "a long file": (lambda v: v["frames"][1].update(file_path="a" * 5000), "no file can have it"),
+    "an image that is a folder": (lambda v: v["frames"][1].update(file_path="images"), "cannot be read"),
+    "no pose": (lambda v: v["frames"][2].pop("transform_matrix"), "frames[2]: its transform is None"),
+    "a pose that mirrors": (
+        lambda v: v["frames"][2].update(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), "transform mirrors",
+    ),
+    "a scaled pose": (
+        lambda v: v["frames"][2].update(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "is not rigid",
+    ),
+    "y up": (every({"transform_matrix": np.eye(4).tolist()}), "z must be up"),
+    "looks down": (
+        lambda v: [f.update(transform_matrix=LOOKS_DOWN) for f in v["frames"] if "/left/" in f["file_path"]],
+        "camera left looks up or down; name one that looks ahead with --ego-camera",
+    ),
+    "an odd model": (lambda v: v.update(camera_model="EQUIRECTANGULAR"), "its camera_model is 'EQUIRECTANGULAR'"),
+    "k4": (lambda v: v.update(k4=0.1), "nerfstudio's k4 is no coefficient of OpenCV's model"),
+    "distortion that folds": (lambda v: v.update(k1=-3.0), "its distortion folds"),
+    "two lenses of a camera": (
+        lambda v: (v.pop("cx"), [f.update(camera="x", cx=40.0 + i) for i, f in enumerate(v["frames"])]),
+        "frames[1]: its intrinsics are not those of frames[0], of the same camera x",
+    ),
+    "equal times": (every({"camera": "x"}), "it has the time of frames[0], of the same camera x"),
+    "a camera that is a list": (every({"camera": []}), "its camera is []"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_values_that_cannot_be_are_a_sentence(fault, folder, values, capsys):
+    change, words = FAULTS[fault]
+    changed = change(values) if fault == "a list" else (change(values), values)[1]
+    status = converted(changed, folder, HALF_METRES)
+    assert status == 1
+    said = capsys.readouterr().err
+    assert said.startswith("drivesplat: ") and said.count("\n") == 1 and words in said
+    assert not list((folder / "out").rglob("*.json"))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 200_000, "\ud800"])
+def test_what_is_no_json_is_a_sentence(text, tmp_path, capsys):
+    path = tmp_path / "transforms.json"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    assert main(["from-nerfstudio", str(path), str(tmp_path / "out"), *STATED]) == 1
+    assert "is not JSON" in capsys.readouterr().err
+    assert main(["from-nerfstudio", str(tmp_path / "none.json"), str(tmp_path / "out"), *STATED]) == 1
+    assert "none.json is missing" in capsys.readouterr().err
+
+
+ODD_VALUES = (
+    None, True, "", "x", -1, 0, 3, 2**80, -(2**80), 1e300, 1e-300, [], {}, [[]], [None], {"a": 1}, "9" * 5000, "\ud800",
+)  # fmt: skip
+
+
+def test_200_mutated_files_end_with_a_drive_or_a_sentence(folder, values, capsys):
+    random, refused = np.random.default_rng(0), 0
+    values |= {"k1": 0.01, "applied_transform": np.eye(4)[:3].tolist()}
+    every({"camera_id": 1})({"frames": values["frames"][::2]})
+    for i in range(200):
+        changed = copy.deepcopy(values)
+        holder, key = changed, random.choice(list(changed))
+        while isinstance(holder[key], dict | list) and len(holder[key]) and random.random() < 0.9:
+            holder = holder[key]
+            key = random.choice(list(holder)) if isinstance(holder, dict) else int(random.integers(len(holder)))
+        if random.random() < 0.2:
+            del holder[key]
+        else:
+            holder[key] = copy.deepcopy(ODD_VALUES[int(random.integers(len(ODD_VALUES)))])
+        path, out = folder / "transforms.json", folder / f"out{i}"
+        path.write_text(json.dumps(changed), encoding="utf-8")
+        undo = ["--undo-applied-transform"] if i % 2 else []
+        if main(["from-nerfstudio", str(path), str(out), *HALF_METRES, *undo]):
+            refused += 1
+            said = capsys.readouterr().err
+            assert said.startswith("drivesplat: ") and said.count("\n") == 1 and len(said) < 3000
+        else:
+            scene = whole_scene(read_drive(out), out)
+            assert all(np.isfinite(frame.camera_to_world).all() for frame in scene.frames)
+    assert 60 < refused < 190
