@@ -26,7 +26,7 @@ from drivesplat.scene.rigid import apply, inverse, rigid
 
 LICENCE = "Argoverse 2: CC BY-NC-SA 4.0, Wilson et al., Argoverse 2: Next Generation Datasets"
 TO_GROUND = rigid(np.eye(3), np.array([0.0, 0.0, 0.33]))
-"""Argoverse's ego frame in that of a drive folder."""
+"""Argoverse's ego frame in that of a drive folder (https://github.com/argoverse/argoverse-api/issues/286)."""
 LIDARS = {"up_lidar": range(32), "down_lidar": range(32, 64)}
 """The lasers of each LiDAR (https://github.com/argoverse/av2-api/issues/77)."""
 CLASSES = {

@@ -67,7 +67,7 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-def rig(number: int) -> np.ndarray:
+def rig(number: float) -> np.ndarray:
     """Rig to world (4, 4), in metres."""
     return rigid(Rotation.from_euler("z", 0.05 * number + 0.7).as_matrix(), np.array([3.0 + number, 2.0, 4.0]))
 
@@ -135,6 +135,24 @@ def test_the_ego_frame_is_level_below_the_camera_that_looks_ahead(folder, values
         np.testing.assert_allclose(frame.ego_to_world, expected, atol=1e-9)
     for frame, other in zip(scene.frames[:4], scene.frames[4:], strict=True):
         np.testing.assert_allclose(other.ego_to_world, frame.ego_to_world, atol=1e-9)
+
+
+def test_cameras_that_fire_at_other_times_are_mounted_where_they_are(folder, values):
+    """The right camera begins 0.24 s later; the left one's motion says where the vehicle is then."""
+    values["frames"] = [f for f in values["frames"] if "/left/" in f["file_path"] or f["time"] > 100.15]
+    for frame in values["frames"]:
+        if "/right/" in frame["file_path"]:
+            number = round((frame["time"] - 100.0) * 10)
+            pose = rig(number + 0.4) @ MOUNTS["right"]
+            pose[:3, 3] *= 2.0
+            frame |= {"time": frame["time"] + 0.04, "transform_matrix": pose.tolist()}
+    assert converted(values, folder, HALF_METRES) == 0
+    scene = scene_in(folder)
+    for frame in [frame for frame in scene.frames if frame.camera == "right"]:
+        number = (frame.timestamp - 100_000_000) / 1e5
+        expected = rig(number) @ rigid(np.eye(3), np.array([0.0, 0.3, 0.0]))
+        np.testing.assert_allclose(frame.ego_to_world[:3, :3], expected[:3, :3], atol=1e-9)
+        np.testing.assert_allclose(frame.ego_to_world[:3, 3] + scene.origin, expected[:3, 3], atol=1e-4)
 
 
 def test_another_camera_can_be_the_one_that_looks_ahead(folder, values):

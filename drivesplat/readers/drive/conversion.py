@@ -11,7 +11,8 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.storage import write_json
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, structure_of
-from drivesplat.readers.files import link_or_copy, pose_record
+from drivesplat.readers.drive.write import pose_record
+from drivesplat.readers.files import link_or_copy
 from drivesplat.scene.rigid import interpolate
 
 
