@@ -21,10 +21,10 @@ from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.lidar_seed import seed_points
 from drivesplat.readers.drive.__main__ import main
-from drivesplat.readers.drive.format import Drive
+from drivesplat.readers.drive.format import Drive, DriveTrack
 from drivesplat.readers.drive.from_above import seen_from_above
 from drivesplat.readers.drive.layout import camera_names, find_root
-from drivesplat.readers.drive.reader import chosen_recordings, read
+from drivesplat.readers.drive.reader import chosen_recordings, max_track_gap, read
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.scene import Scene
@@ -77,6 +77,36 @@ def test_a_written_scene_is_read_back_to_the_last_bit(recorded, folder):
         assert (one.id, one.object_class, one.category) == (other.id, other.object_class, other.category)
         for field in ("size", "timestamps", "sample_indices", "object_to_world", "visibility"):
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+
+
+def test_a_track_that_is_absent_at_one_key_frame_stays_absent(recorded, tmp_path):
+    track = max(recorded.tracks, key=lambda track: len(track.timestamps))
+    kept = [i for i in range(len(track.timestamps)) if i != 2]
+    columns = ("timestamps", "sample_indices", "object_to_world", "visibility")
+    broken = dataclasses.replace(track, **{name: getattr(track, name)[kept] for name in columns})
+    scene = dataclasses.replace(recorded, tracks=(broken,))
+    write_drive(scene, tmp_path / "again")
+    (again,) = read(tmp_path / "again", source()).tracks
+    np.testing.assert_array_equal(again.sample_indices, broken.sample_indices)
+    np.testing.assert_array_equal(again.object_to_world, broken.object_to_world)
+
+
+@pytest.mark.parametrize(
+    ("intervals", "expected"),
+    [
+        ([[500_000] * 4, [500_000, 1_000_000]], 750_000),
+        ([[100_000] * 9], 150_000),
+        ([[900_000] * 2], 1_000_000),
+        ([[]], 0),
+    ],
+)
+def test_tracks_are_interpolated_over_little_more_than_their_usual_interval(intervals, expected):
+    def track(steps: list[int]) -> DriveTrack:
+        times = np.cumsum([0, *steps]).tolist()
+        poses = [{"timestamp": t, "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]} for t in times]
+        return DriveTrack.model_validate({"id": "a", "class": "car", "size": [4, 2, 1.5], "poses": poses})
+
+    assert max_track_gap([track(steps) for steps in intervals]) == expected
 
 
 def test_seed_points_are_the_same_to_the_last_bit(recorded, folder):

@@ -20,8 +20,8 @@ READER = "drive"
 CHECK = "python -m drivesplat.readers.drive check"
 VISIBILITY_LEVELS = (0.4, 0.6, 0.8)
 """Visible shares at which nuScenes' levels 2, 3 and 4 begin."""
-MAX_TRACK_GAP = 1_000_000
-"""Microseconds between poses of a track over which it is interpolated. Over longer ones the object is absent."""
+MAX_TRACK_GAP, MAX_INTERVALS = 1e6, 1.5
+"""Limits of `max_track_gap`: microseconds, and usual intervals between poses."""
 
 
 def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> Scene:
@@ -56,7 +56,8 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
         )
     times, ego = key_frame_times(drive, source), EgoPath(drive)
     reading = _Reading(drive, folder, times, ego, origin_shift(drive, ego, int(times[0])))
-    tracks = (sampled_track(track, times, reading.shift) for track in drive.tracks)
+    gap = max_track_gap(drive.tracks)
+    tracks = (sampled_track(track, times, reading.shift, gap) for track in drive.tracks)
     sweeps = tuple(sweep for lidar in drive.lidars for sweep in reading.sweeps(lidar, source.lidar_sweeps))
     return Scene(
         name=source.scene,
@@ -146,8 +147,16 @@ def chosen_recordings(
     return [(i, own.get(i, near), i in own) for i, near in zip(kept, nearest, strict=True)]
 
 
-def sampled_track(track: DriveTrack, key_times: np.ndarray, origin: np.ndarray) -> Track | None:
-    """A track at the key frames during which it is annotated; None where there are none."""
+def max_track_gap(tracks: Sequence[DriveTrack]) -> float:
+    """The time in microseconds between two poses of a track over which it is interpolated: MAX_INTERVALS of the usual
+    intervals between poses, at most MAX_TRACK_GAP. Over a longer one the object is absent."""
+    intervals = [np.diff([pose.timestamp for pose in track.poses]) for track in tracks if len(track.poses) > 1]
+    return min(MAX_TRACK_GAP, MAX_INTERVALS * float(np.median(np.concatenate(intervals)))) if intervals else 0.0
+
+
+def sampled_track(track: DriveTrack, key_times: np.ndarray, origin: np.ndarray, max_gap: float) -> Track | None:
+    """A track at the key frames during which it is annotated; None where there are none. It is interpolated between
+    poses at most `max_gap` microseconds apart."""
     times = np.array([pose.timestamp for pose in track.poses], dtype=np.int64)
     poses = [matrix_of(pose) for pose in track.poses]
     indices, matrices, levels = [], [], []
@@ -155,7 +164,7 @@ def sampled_track(track: DriveTrack, key_times: np.ndarray, origin: np.ndarray) 
         after = int(np.searchsorted(times, key))
         if after < len(times) and times[after] == key:
             matrix, nearest = poses[after], after
-        elif 0 < after < len(times) and times[after] - times[after - 1] <= MAX_TRACK_GAP:
+        elif 0 < after < len(times) and times[after] - times[after - 1] <= max_gap:
             share = float((key - times[after - 1]) / (times[after] - times[after - 1]))
             matrix, nearest = interpolate(poses[after - 1], poses[after], share), after - (share < 0.5)
         else:
