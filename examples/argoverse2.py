@@ -1,6 +1,6 @@
 """Converts a log of the Argoverse 2 sensor dataset (https://argoverse.github.io/user-guide/datasets/sensor.html) to a
 drive folder. LOG is the folder of a log, with calibration/, sensors/, city_SE3_egovehicle.feather and, but in the test
-split, annotations.feather. Needs pyarrow: pip install pyarrow.
+split, annotations.feather. Needs pyarrow: pip install 'pyarrow<26' (later versions want numpy 2).
 
 Argoverse's ego frame has its origin at the centre of the rear axle, 0.33 m above the ground; that of a drive folder is
 on the ground. Images are undistorted: k1, k2 and k3 describe the lens before that, and are not used. Sweeps hold the
@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # a checkout that is not installed
 
-from drivesplat.errors import DatasetError, DriveSplatError
-from drivesplat.readers.drive.conversion import pose_at, reading, timed_poses, write_folder
+from drivesplat.errors import DatasetError
+from drivesplat.readers.drive.conversion import pose_at, reading, reported, timed_poses, write_folder
 from drivesplat.readers.drive.write import pose_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 
@@ -51,7 +51,7 @@ def table(path: Path) -> dict[str, np.ndarray]:
     try:
         from pyarrow import feather
     except ImportError as error:
-        raise DatasetError("feather files are read with pyarrow: pip install pyarrow") from error
+        raise DatasetError(f"feather files are read with pyarrow ({error}): pip install 'pyarrow<26'") from error
     with reading(path):
         content = feather.read_table(path)
         return {name: content[name].to_numpy() for name in content.column_names}
@@ -181,12 +181,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("out", type=Path, help="the drive folder, new or empty")
     parser.add_argument("--cameras", nargs="+", help="names of cameras; by default the seven ring cameras")
     asked = parser.parse_args(arguments)
-    try:
-        print(convert(asked.log, asked.out, asked.cameras))
-    except DriveSplatError as error:
-        print(f"argoverse2: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return reported("argoverse2", lambda: convert(asked.log, asked.out, asked.cameras))
 
 
 if __name__ == "__main__":

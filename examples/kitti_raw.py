@@ -24,12 +24,13 @@ from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # a checkout that is not installed
 
-from drivesplat.errors import DatasetError, DriveSplatError
-from drivesplat.readers.drive.conversion import pose_at, reading, timed_poses, write_folder
+from drivesplat.errors import DatasetError
+from drivesplat.readers.drive.conversion import pose_at, reading, reported, timed_poses, write_folder
 from drivesplat.readers.drive.write import pose_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 
 LICENCE = "KITTI: CC BY-NC-SA 3.0, Geiger et al., Vision meets Robotics: The KITTI Dataset"
+COLOUR = ("02", "03")
 EARTH_RADIUS = 6378137.0
 IMU_TO_EGO = rigid(np.eye(3), np.array([0.0, 0.0, 0.93]))
 """The GPS/IMU unit is 0.93 m above the ground (sensor setup, https://www.cvlibs.net/datasets/kitti/setup.php)."""
@@ -109,6 +110,14 @@ def untwisted(points: np.ndarray, scans: str, start: np.ndarray, end: np.ndarray
     return apply(inverse(forward) @ start, turns.apply(points) + shares * motion[:3, 3])
 
 
+def sweep_columns(path: Path, scans: str, start: np.ndarray, end: np.ndarray, forward: np.ndarray) -> dict[str, Any]:
+    """The untwisted returns of a scan's file: x, y, z, reflectance."""
+    with reading(path):
+        *points, reflectance = np.frombuffer(path.read_bytes(), dtype=np.float32).reshape(-1, 4).T
+    still = untwisted(np.stack(points, axis=1).astype(float), scans, start, end, forward)
+    return dict(zip("xyz", still.T.astype(np.float32), strict=True)) | {"intensity": reflectance.clip(0.0, 1.0)}
+
+
 def tracks(path: Path, scanner_poses: np.ndarray, times: np.ndarray) -> Iterator[dict[str, Any]]:
     """The tracklets of a drive; `scanner_poses` (n, 4, 4) and `times` (n,) are those of its scans. Tracklets stand on
     the bottom of their boxes."""
@@ -127,7 +136,7 @@ def tracks(path: Path, scanner_poses: np.ndarray, times: np.ndarray) -> Iterator
             yield {"id": f"tracklet_{number}", **shape, "poses": poses}
 
 
-def convert(date: Path, drive: str, out: Path, cameras: list[str], scans: str) -> Path:
+def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans: str) -> Path:
     """Writes the drive folder; returns the path of its drive.json."""
     folder = date / f"{date.resolve().name}_drive_{drive.zfill(4)}_sync"
     if not folder.is_dir():
@@ -137,7 +146,7 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str], scans: str) -
     imu_times, imu_to_world = imu_poses(folder / "oxts")
 
     frames, images, mounted = [], {}, {}
-    for number in cameras:
+    for number in cameras or [number for number in COLOUR if (folder / f"image_{number}").is_dir()]:
         with reading(date / "calib_cam_to_cam.txt"):
             mounted[f"image_{number}"] = camera(values, number, imu_to_velo, velo_to_cam)
         for _, time, path in recordings(folder / f"image_{number}", ".png"):
@@ -146,7 +155,7 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str], scans: str) -
             frames.append({"camera": f"image_{number}", "timestamp": time, "file": name, "ego_to_world": ego})
             images[name] = path
 
-    def scanner_at(time: int) -> np.ndarray:
+    def scanner_at(time: np.integer) -> np.ndarray:
         return pose_at(imu_times, imu_to_world, time) @ inverse(imu_to_velo)
 
     velodyne = folder / "velodyne_points"
@@ -154,15 +163,10 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str], scans: str) -
     scanner_poses = np.stack([scanner_at(time) for time in forwards])
     scan_files = recordings(velodyne, ".bin")
 
-    def sweeps() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-        for i, _, path in scan_files:
-            with reading(path):
-                *points, reflectance = np.frombuffer(path.read_bytes(), dtype=np.float32).reshape(-1, 4).T
-            begin, end = scanner_at(starts[i]), scanner_at(ends[i])
-            still = untwisted(np.stack(points, axis=1).astype(float), scans, begin, end, scanner_poses[i])
-            columns = dict(zip("xyz", still.T.astype(np.float32), strict=True))
-            yield f"velodyne/{path.stem}.npz", columns | {"intensity": reflectance.clip(0.0, 1.0)}
-
+    sweeps = (
+        (f"velodyne/{path.stem}.npz", sweep_columns(path, scans, scanner_at(starts[i]), scanner_at(ends[i]), forward))
+        for (i, _, path), forward in zip(scan_files, scanner_poses[[i for i, *_ in scan_files]], strict=True)
+    )
     labels = folder / "tracklet_labels.xml"
     record = {
         "format": "drivesplat drive",
@@ -184,7 +188,7 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str], scans: str) -
         ],
         "tracks": list(tracks(labels, scanner_poses, forwards)) if labels.is_file() else [],
     }
-    return write_folder(out, record, images, sweeps())
+    return write_folder(out, record, images, sweeps)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -193,16 +197,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("date", type=Path, help="folder of a day, such as ~/kitti/2011_09_26")
     parser.add_argument("drive", help="number of a drive, such as 0001")
     parser.add_argument("out", type=Path, help="the drive folder, new or empty")
-    parser.add_argument("--cameras", nargs="+", default=["02", "03"], choices=["02", "03"], help="colour cameras")
+    parser.add_argument("--cameras", nargs="+", choices=COLOUR, help="colour cameras; by default those there are")
     directions = ["counter-clockwise", "clockwise", "compensated"]
     parser.add_argument("--scans", default=directions[0], choices=directions, help="direction in which scans turn")
     asked = parser.parse_args(arguments)
-    try:
-        print(convert(asked.date, asked.drive, asked.out, asked.cameras, asked.scans))
-    except DriveSplatError as error:
-        print(f"kitti_raw: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return reported("kitti_raw", lambda: convert(asked.date, asked.drive, asked.out, asked.cameras, asked.scans))
 
 
 if __name__ == "__main__":

@@ -184,7 +184,7 @@ def kitti(tmp_path_factory) -> tuple[Path, TurningDrive, dict[str, np.ndarray]]:
 @pytest.fixture(scope="module")
 def kitti_scene(kitti, tmp_path_factory) -> Scene:
     out = tmp_path_factory.mktemp("drives") / "kitti"
-    assert kitti_raw.main([str(kitti[0]), "5", str(out), "--cameras", "02"]) == 0
+    assert kitti_raw.main([str(kitti[0]), "5", str(out)]) == 0
     assert check(out, None) == []
     return whole_scene(read_drive(out), out)
 
@@ -257,7 +257,7 @@ def av2_hits(drive: TurningDrive, name: str, time: float) -> np.ndarray:
 @pytest.fixture(scope="module")
 def argoverse(tmp_path_factory) -> tuple[Path, TurningDrive]:
     """A log of Argoverse 2; returns of both LiDARs are in one table, in the ego frame of the sweep's time."""
-    pytest.importorskip("pyarrow")
+    pytest.importorskip("pyarrow", exc_type=ImportError)
     log = tmp_path_factory.mktemp("av2") / "01bb304d-7bd8-35f8-bbef-7086b688e35e"
     drive = TurningDrive(rigid(TILT, np.array([747.4, 1275.3, -24.3])))
 
@@ -394,6 +394,13 @@ def test_a_damaged_day_of_kitti_ends_with_a_sentence(path, change: Callable, wor
     assert kitti_raw.main([str(day), "0005", str(tmp_path / "out"), "--cameras", "02"]) == 1
     said = capsys.readouterr().err
     assert said.startswith("kitti_raw: ") and said.count("\n") == 1 and words in said
+
+
+def test_without_pyarrow_the_converter_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert argoverse2.main([str(tmp_path), str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("argoverse2: feather files are read with pyarrow") and "pip install 'pyarrow<26'" in said
 
 
 def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, capsys):

@@ -1,13 +1,14 @@
 """What converters to drive folders share: poses over time, messages about damaged files, and writing the folder."""
 
-from collections.abc import Iterable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivesplat.errors import DatasetError
+from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.io.storage import write_json
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, structure_of
@@ -25,6 +26,17 @@ def reading(path: Path) -> Iterator[None]:
         raise DatasetError(f"{error.filename or path} is missing") from error
     except (OSError, ValueError, LookupError, TypeError, SyntaxError) as error:
         raise DatasetError(f"{path} cannot be read ({type(error).__name__}: {str(error)[:200]})") from error
+
+
+def reported(program: str, convert: Callable[[], Path]) -> int:
+    """Runs a converter and prints the path of its drive.json, or what is wrong with its data; returns the exit status
+    of the program."""
+    try:
+        print(convert())
+    except DriveSplatError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 1
+    return 0
 
 
 def pose_at(times: np.ndarray, poses: np.ndarray, time: int | np.integer) -> np.ndarray:

@@ -211,7 +211,10 @@ def unused(values: Mapping[str, Any]) -> list[str]:
     frames: Sequence[Mapping[str, Any]] = values["frames"]
     found = []
     if "ply_file_path" in values:
-        found.append("ply_file_path is not used: its points are no LiDAR sweeps; images give the seed points")
+        found.append(
+            "ply_file_path is not used: its points are no LiDAR sweeps, and seed points come from images; to add these "
+            "points, bring them to metres and set lidar_seed.points_file"
+        )
     for key, page in (("mask_path", "docs/masks.md"), ("depth_file_path", "docs/geometry.md")):
         count = sum(key in frame for frame in frames)
         if count:
