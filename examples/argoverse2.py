@@ -1,6 +1,6 @@
 """Converts a log of the Argoverse 2 sensor dataset (https://argoverse.github.io/user-guide/datasets/sensor.html) to a
 drive folder. LOG is the folder of a log, with calibration/, sensors/, city_SE3_egovehicle.feather and, but in the test
-split, annotations.feather. Needs pyarrow: pip install 'pyarrow<26' (later versions want numpy 2).
+split, annotations.feather.
 
 Argoverse's ego frame has its origin at the centre of the rear axle, 0.33 m above the ground; that of a drive folder is
 on the ground. Images are undistorted: k1, k2 and k3 describe the lens before that, and are not used. Sweeps hold the
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pyarrow import feather
 from scipy.spatial.transform import Rotation
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # a checkout that is not installed
@@ -48,10 +49,6 @@ CLASS_OF = {category: name for name, categories in CLASSES.items() for category 
 
 def table(path: Path) -> dict[str, np.ndarray]:
     """The columns of a feather file."""
-    try:
-        from pyarrow import feather
-    except ImportError as error:
-        raise DatasetError(f"feather files are read with pyarrow ({error}): pip install 'pyarrow<26'") from error
     with reading(path):
         content = feather.read_table(path)
         return {name: content[name].to_numpy() for name in content.column_names}

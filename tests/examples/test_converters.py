@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow
 import pytest
 from helpers import REPOSITORY
 from helpers.turning_drive import CAMERA, TIMES, TurningDrive, rays_at, seen_from
 from PIL import Image
+from pyarrow import feather
 from scipy.spatial.transform import Rotation
 
 from drivesplat.readers.drive.check import check, whole_scene
@@ -257,7 +259,6 @@ def av2_hits(drive: TurningDrive, name: str, time: float) -> np.ndarray:
 @pytest.fixture(scope="module")
 def argoverse(tmp_path_factory) -> tuple[Path, TurningDrive]:
     """A log of Argoverse 2; returns of both LiDARs are in one table, in the ego frame of the sweep's time."""
-    pytest.importorskip("pyarrow", exc_type=ImportError)
     log = tmp_path_factory.mktemp("av2") / "01bb304d-7bd8-35f8-bbef-7086b688e35e"
     drive = TurningDrive(rigid(TILT, np.array([747.4, 1275.3, -24.3])))
 
@@ -325,9 +326,6 @@ def sweep_table(drive: TurningDrive, vehicle: np.ndarray, time: float) -> dict[s
 
 
 def write_table(path: Path, columns: dict) -> None:
-    import pyarrow
-    from pyarrow import feather
-
     path.parent.mkdir(parents=True, exist_ok=True)
     feather.write_feather(pyarrow.table(columns), path)
 
@@ -394,13 +392,6 @@ def test_a_damaged_day_of_kitti_ends_with_a_sentence(path, change: Callable, wor
     assert kitti_raw.main([str(day), "0005", str(tmp_path / "out"), "--cameras", "02"]) == 1
     said = capsys.readouterr().err
     assert said.startswith("kitti_raw: ") and said.count("\n") == 1 and words in said
-
-
-def test_without_pyarrow_the_converter_says_what_to_install(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert argoverse2.main([str(tmp_path), str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
-    assert said.startswith("argoverse2: feather files are read with pyarrow") and "pip install 'pyarrow<26'" in said
 
 
 def test_a_damaged_log_of_argoverse2_ends_with_a_sentence(argoverse, tmp_path, capsys):
