@@ -55,7 +55,7 @@ def test_nothing_is_written_over(image, tmp_path):
     [
         ({"version": 2}, "drive.json: version is 2"),
         ({"frames": [], "sweeps": [{}]}, "more faults"),
-        ({"ego_poses": timed_poses(np.array([100_000]), np.eye(4)[None])}, "ego_poses"),
+        ({"ego_poses": timed_poses(np.array([100_000]), np.eye(4)[None])}, "outside the ego poses' time"),
         ({"origin": [float("nan"), 0.0, 0.0]}, "a number is not finite"),
     ],
 )
