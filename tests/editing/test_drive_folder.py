@@ -18,7 +18,6 @@ from helpers.hand_made_street import (
     checkpoint_of,
     straight,
     street_model,
-    street_scene,
 )
 from nuscenes.nuscenes import NuScenes
 from nuscenes.utils.geometry_utils import view_points
@@ -100,16 +99,6 @@ def tables_as_read(folder: Path, name: str) -> Scene:
         lidar_sweeps=False, on_missing="stop",
     )  # fmt: skip
     return read(folder / TABLES, source)
-
-
-@pytest.fixture(scope="module")
-def scene(tiny_scene) -> Scene:
-    return street_scene(tiny_scene)
-
-
-@pytest.fixture(scope="module")
-def model() -> SplatModel:
-    return street_model()
 
 
 @pytest.fixture(scope="module")

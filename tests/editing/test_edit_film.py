@@ -20,7 +20,6 @@ from helpers.hand_made_street import (
     checkpoint_of,
     straight,
     street_model,
-    street_scene,
     views_of,
 )
 from helpers.hand_made_traffic import placed
@@ -96,16 +95,6 @@ def make(scene: Scene, model: SplatModel, folder: Path, *steps: dict[str, Any], 
         patch.setattr("drivesplat.rendering.film.write_video", reels)
         record = render_edit(scene, checkpoint_of(model), a_job(*steps, **changes), CPU, files_in(folder))
     return Made(json.loads(json.dumps(record, allow_nan=False)), reels, folder)
-
-
-@pytest.fixture(scope="module")
-def scene(tiny_scene) -> Scene:
-    return street_scene(tiny_scene)
-
-
-@pytest.fixture(scope="module")
-def model() -> SplatModel:
-    return street_model()
 
 
 @pytest.fixture(scope="module")

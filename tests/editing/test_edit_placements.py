@@ -15,7 +15,6 @@ from helpers.hand_made_street import (
     TURNING,
     straight,
     street_model,
-    street_scene,
 )
 from helpers.hand_made_traffic import placed
 
@@ -43,16 +42,6 @@ TIMES = np.array([0.0, 1.3, 2.2, 3.1, LAST])
 
 def an_edit(*steps: dict[str, Any]) -> Edit:
     return Edit.model_validate({"steps": steps})
-
-
-@pytest.fixture(scope="module")
-def scene(tiny_scene) -> Scene:
-    return street_scene(tiny_scene)
-
-
-@pytest.fixture(scope="module")
-def model() -> SplatModel:
-    return street_model()
 
 
 def edited(model: SplatModel, scene: Scene, *steps: dict[str, Any]) -> list[EditedActor]:
