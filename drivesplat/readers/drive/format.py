@@ -83,7 +83,7 @@ class DriveLidar(DriveRecord):
     """Elevation of each beam above the sensor's horizontal plane (radians), in the order of rings. null: unknown."""
     azimuth_steps: int | None = Field(None, ge=1)
     """Firings of a beam per revolution. null: unknown."""
-    revolution_s: float | None = Field(None, gt=0)
+    revolution_s: float | None = Field(None, gt=0, le=10)
     """Time of a revolution (seconds). null: unknown."""
     motion_compensated: bool = True
     """Whether all points of a sweep are where they would have been seen at its timestamp. false: each is in the
