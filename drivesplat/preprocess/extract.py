@@ -34,8 +34,8 @@ def extract_scene(
     scene = reader(source.reader).read(root, source, scene_tables)
     if not scene.frames:
         raise DatasetError(
-            f"scene {source.scene}: it has no image of {', '.join(source.cameras)}; nothing is trained or measured on "
-            "LiDAR alone yet"
+            f"scene {source.scene}: it has no image of {', '.join(source.cameras)}; name cameras that have some "
+            "(cameras); nothing is trained or measured on LiDAR alone yet"
         )
     with ThreadPoolExecutor() as pool:
         faults = list(pool.map(image_fault, scene.frames))

@@ -451,7 +451,7 @@ def test_lidar_alone_is_read_for_later(lidar_alone, recorded):
 
 
 def test_lidar_alone_is_refused_by_the_stages_of_images_and_by_planning(lidar_alone):
-    with pytest.raises(DatasetError, match=r"scene 0001: it has no image of CAM_FRONT; nothing is trained") as stopped:
+    with pytest.raises(DatasetError, match=r"scene 0001: it has no image of CAM_FRONT; name cameras that") as stopped:
         extract_scene(source(), lidar_alone)
     assert "\n" not in str(stopped.value)
     with pytest.raises(DatasetError, match="have no cameras: LiDAR alone can be checked and read"):
