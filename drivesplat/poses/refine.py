@@ -159,7 +159,7 @@ def rejection_reason(
     if trial is None or constrained.mean() < limits.min_images:
         return (
             f"{int(constrained.sum())} of {len(images)} images see {limits.min_points} triangulated points or more "
-            "(by night, or where the vehicle stands, there are few)"
+            "(there are few by night, where the vehicle stands, or with wrong poses or calibration)"
         )
     shift, turn = _magnitudes(changes)
     for largest, limit, unit in ((shift.max(), limits.max_shift, "m"), (turn.max(), limits.max_turn, "degrees")):

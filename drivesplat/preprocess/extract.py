@@ -11,6 +11,7 @@ from drivesplat.preprocess.undistort import undistorted
 from drivesplat.readers.datasets import reader
 from drivesplat.readers.drive_checks import jumps
 from drivesplat.readers.image_file import image_fault
+from drivesplat.readers.plausibility import pose_warnings
 from drivesplat.scene.scene import Frame, Scene, place_of
 from drivesplat.scene.scene_warnings import luminance, scene_warnings
 from drivesplat.settings.extract import SceneSource
@@ -58,7 +59,7 @@ def extract_scene(
             raise DatasetError(f"scene {source.scene}: its images are distorted, and there is no folder for others")
         shutil.rmtree(undistorted_images, ignore_errors=True)
         scene = undistorted(scene, undistorted_images)
-    for sentence in (*jumps(scene), *scene_warnings(scene, luminance(scene))):
+    for sentence in (*jumps(scene), *pose_warnings(scene), *scene_warnings(scene, luminance(scene))):
         log.warning("scene %s: %s", scene.name, sentence)
     return scene
 

@@ -96,7 +96,7 @@ def jumps(scene: Scene) -> list[str]:
         times = np.array([frame.timestamp for frame in frames])
         where = _jump(times, np.stack([frame.ego_to_world[:3, 3] for frame in frames]))
         if where:
-            found.append(f"the ego vehicle jumps, {where}: check its poses")
+            found.append(f"the ego vehicle jumps, {where}: check its poses, that they are metres, and their times")
             break
     for track in scene.tracks:
         where = _jump(track.timestamps, track.object_to_world[:, :3, 3])

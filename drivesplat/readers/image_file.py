@@ -26,7 +26,9 @@ def image_fault(frame: Frame) -> str | None:
     try:
         with Image.open(path) as image:
             if image.size != (frame.width, frame.height):
-                return f"image {path} is {image.size[0]}x{image.size[1]}, the tables say {frame.width}x{frame.height}"
+                return (
+                    f"image {path} is {image.size[0]}x{image.size[1]}, but was recorded as {frame.width}x{frame.height}"
+                )
             if deep := _deep_mode(image):
                 peak = "1.0" if deep.startswith("F") else "65535"
                 return f"image {path} has more than 8 bits per channel ({deep}): {HOW.format(peak=peak)}"

@@ -104,8 +104,8 @@ class Scene:
     missing_images: int = 0
     cameras: tuple[Camera, ...] = ()
     lidars: tuple[Lidar, ...] = ()
-    licence: str = ""
     provenance: Provenance = field(default_factory=dict)
+    licence: str = ""
 
     @property
     def key_frame_interval(self) -> float:

@@ -80,7 +80,8 @@ def scene_warnings(scene: Scene, brightness: float) -> list[str]:
         )
     if not scene.tracks:
         found.append(
-            "nothing is annotated (the test split of nuScenes has no boxes): moving objects count as static and smear"
+            "nothing is annotated: moving objects count as static and smear, figures of vehicles are null, and no "
+            "method has actors"
         )
     elif not any(track.object_class.is_vehicle for track in moving_tracks(scene)):
         found.append(

@@ -68,4 +68,6 @@ def _sentence(item: Mapping[str, Any], document: str, keys: str) -> str:
         return f"unknown key '{key}' (value {value}): check its spelling against {document}"
     if item["type"] == "missing":
         return f"'{key}' is missing; there are: {keys}" if keys else f"'{key}' is missing: {document} says what it is"
+    if item["type"] in ("dict_type", "model_type", "model_attributes_type"):
+        return f"'{key}' is {value}: it must be a mapping, a key and a value for each entry; see {document}"
     return f"'{key}' is {value}: {message[:1].lower()}{message[1:]}"

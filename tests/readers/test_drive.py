@@ -210,7 +210,7 @@ FAULTS = {
     "a text for a time": (lambda d: d["frames"][3].update(timestamp="now"), "frames[3].timestamp is 'now'"),
     "seconds": (
         lambda d: [f.update(timestamp=f["timestamp"] // 10**6) for f in d["frames"]],
-        "same camera and timestamp",
+        "timestamps must be microseconds",
     ),
     "milliseconds": (
         lambda d: [f.update(timestamp=f["timestamp"] // 1000) for f in d["frames"]],
@@ -362,7 +362,7 @@ def test_the_checker_draws_a_picture_of_a_sound_folder(folder, tmp_path, capsys)
     said = capsys.readouterr().out
     assert "10 key frames at 2 Hz" in said and "tracks" in said
     pixels = np.asarray(Image.open(picture))
-    assert pixels.shape == (540, 960, 3)
+    assert pixels.shape == (2 * 540, 960, 3), "the sweep of the image's time, and sweeps of other times"
     boxes = (pixels == (255, 90, 0)).all(axis=2)
     assert 100 < boxes.sum() < 20_000
 
@@ -507,6 +507,8 @@ def test_a_drive_without_poses_is_read_where_they_are_estimated(unposed, caplog)
     assert all((frame.ego_to_world == np.eye(4)).all() for frame in scene.frames)
     mount = scene.frames[0].camera_to_world
     assert (mount[:3, 3] != 0).any() and all((frame.camera_to_world == mount).all() for frame in scene.frames)
+    with pytest.raises(DatasetError, match="scene 0001 has no poses"):
+        write_drive(scene, unposed / "again")
     said = " ".join(record.message for record in caplog.records)
     assert "there are no poses; refine_poses estimates them" in said and "hardly moves" not in said
 

@@ -71,10 +71,10 @@ def test_a_job_that_says_nothing_is_taken_to_be_as_far_as_expected(tmp_path):
 def test_jobs_that_nobody_measured_are_counted_and_not_guessed(tmp_path):
     """A running training says how long it still takes."""
     alone = progress(tmp_path, {MASKS}, costs=COSTS[:1])
-    assert alone.line(0.0) == "1 of 3 jobs, about 0 s and 2 jobs not measured yet left"
+    assert alone.line(0.0) == "1 of 3 jobs, 2 jobs not measured yet left"
     (tmp_path / "train.log").write_text(BEGINS + LOGGED.format("50 %, 18.8 it/s, 400 s left"))
     line = alone.line(0.0)
-    assert line == "1 of 3 jobs, about 7 min and 1 jobs not measured yet left; at work: 0103 street train (50 %)"
+    assert line == "1 of 3 jobs, about 7 min and 1 job not measured yet left; at work: 0103 street train (50 %)"
 
 
 def test_a_job_that_has_ended_is_done_before_it_is_counted(tmp_path):

@@ -7,10 +7,11 @@ from pathlib import Path
 
 from drivesplat.errors import DriveSplatError
 from drivesplat.readers.drive.check import check, summary, whole_scene
-from drivesplat.readers.drive.format import Drive, read_drive
+from drivesplat.readers.drive.format import Drive, grouped, read_drive
 from drivesplat.readers.drive.nerfstudio import add_command
 from drivesplat.readers.drive.write import write_drive
 from drivesplat.readers.drive_checks import jumps
+from drivesplat.readers.plausibility import lidar_warnings, pose_warnings
 from drivesplat.scene.scene import read_scene
 
 
@@ -41,15 +42,15 @@ def main(arguments: list[str] | None = None) -> int:
 def _check(asked: argparse.Namespace) -> int:
     picture = asked.picture or asked.folder / "check.png"
     faults = check(asked.folder, picture)
-    for fault in faults:
-        print(fault)
+    for line in grouped(faults):
+        print(line)
     if picture.exists():
-        print(f"picture: {picture}: returns must lie on surfaces, and boxes around objects")
+        print(f"picture: {picture}: returns must lie on surfaces, also those of other times, and boxes around objects")
     if faults:
-        print(f"{len(faults)} faults")
+        print(f"{len(faults)} fault{'s' if len(faults) > 1 else ''}")
         return 1
     scene = whole_scene(read_drive(asked.folder), asked.folder)
-    for sentence in jumps(scene):
+    for sentence in (*jumps(scene), *pose_warnings(scene), *lidar_warnings(scene)):
         print(f"warning: {sentence}")
     print(summary(scene))
     return 0

@@ -1,6 +1,6 @@
 """The check of a drive folder: every fault in a sentence, and a picture with LiDAR and boxes in images."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +23,16 @@ WIDTH = 960
 NO_IMAGES = "no images: such a drive can be read, but nothing is trained or measured on it yet"
 MAX_DEPTH = 60.0
 """Metres at which the colour of returns ends."""
+OTHER_TIMES = (-1_500_000, 1_500_000)
+"""Microseconds from an image to the sweeps that test the poses."""
+SCALE_STEPS = 6
+"""Colours in the legend of distances."""
 
 
 def check(folder: Path, picture: Path | None) -> list[str]:
     """The faults of a drive folder, a sentence each. Without faults of drive.json, and with a path for it, writes the
-    picture: the middle key frame of every camera, with the nearest sweep coloured by depth and the boxes; or the
-    middle sweep from above, without images."""
+    picture: the middle key frame of every camera, with the nearest sweep coloured by depth and the boxes, and the same
+    with sweeps of other times, which the ego poses bring there; or the middle sweep from above, without images."""
     faults, drive = structure_of(folder / FILE)
     if drive is None:
         return faults
@@ -80,7 +84,8 @@ def write_picture(scene: Scene, path: Path) -> None:
     for camera in scene.cameras:
         indices = scene.key_frames(camera.name)
         if indices:
-            images.append(_drawn(scene, scene.frames[sorted(indices)[len(indices) // 2]]))
+            frame = scene.frames[sorted(indices)[len(indices) // 2]]
+            images += [_drawn(scene, frame, offsets) for offsets in ((0,), OTHER_TIMES)[: 2 if scene.sweeps else 1]]
     if not scene.frames and scene.sweeps:
         images.append(seen_from_above(scene, WIDTH))
     if not images:
@@ -93,18 +98,25 @@ def write_picture(scene: Scene, path: Path) -> None:
     canvas.save(path)
 
 
-def _drawn(scene: Scene, frame: Frame) -> Image.Image:
+def _drawn(scene: Scene, frame: Frame, offsets: Sequence[int]) -> Image.Image:
+    """An image with boxes, and with the returns of the sweeps nearest to its time plus `offsets` (microseconds)."""
     size = WIDTH, round(WIDTH * frame.height / frame.width)
     image = Image.new("RGB", size) if image_fault(frame) else Image.fromarray(read_image(frame.image_path, size))
-    draw = ImageDraw.Draw(image)
-    nearest = min(scene.sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp), default=None)
-    if nearest is not None and not sweep_fault(nearest):
-        _draw_returns(draw, apply(nearest.sensor_to_world, read_returns(nearest).points), frame, size)
+    draw, shown = ImageDraw.Draw(image), []
+    sound = [sweep for sweep in scene.sweeps if not sweep_fault(sweep)]
+    for offset in offsets if sound else ():
+        sweep = min(sound, key=lambda sweep: abs(sweep.timestamp - frame.timestamp - offset))
+        _draw_returns(draw, apply(sweep.sensor_to_world, read_returns(sweep).points), frame, size)
+        shown.append(f"{(sweep.timestamp - frame.timestamp) * 1e-6:+.2f} s")
     for hull in hulls_in(scene, frame, size):
         draw.polygon([tuple(corner) for corner in hull.polygon], outline=(255, 90, 0), width=2)
-    draw.text(
-        (8, 8), f"{frame.camera} at {frame.timestamp}", fill=(255, 255, 255), stroke_width=2, stroke_fill=(0, 0, 0)
-    )
+    text = [f"{frame.camera} at {frame.timestamp}", *([f"returns at {' and '.join(shown)}"] if shown else [])]
+    outlined = {"fill": (255, 255, 255), "stroke_width": 2, "stroke_fill": (0, 0, 0)}
+    draw.text((8, 8), ", ".join(text), **outlined)
+    for step in range(SCALE_STEPS + 1 if shown else 0):
+        share = step / SCALE_STEPS
+        draw.rectangle((8 + 60 * step, 26, 20 + 60 * step, 38), fill=_color(share))
+        draw.text((24 + 60 * step, 26), f"{share * MAX_DEPTH:.0f} m", **outlined)
     return image
 
 
@@ -113,5 +125,9 @@ def _draw_returns(draw: ImageDraw.ImageDraw, points: np.ndarray, frame: Frame, s
     inside = (depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
     shares = np.clip(depth[inside] / MAX_DEPTH, 0.0, 1.0)
     for (x, y), share in zip(pixels[inside], shares, strict=True):
-        color = (int(255 * (1 - share)), int(255 * min(1.0, 2 * share)), int(255 * share))
-        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=color)
+        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_color(share))
+
+
+def _color(share: float) -> tuple[int, int, int]:
+    """The colour of a distance, as a share of MAX_DEPTH."""
+    return int(255 * (1 - share)), int(255 * min(1.0, 2 * share)), int(255 * share)

@@ -5,17 +5,26 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.checks import checked_box_size, checked_intrinsics, order_faults, path_faults
+from drivesplat.readers.checks import (
+    MAX_COORDINATE,
+    MAX_MOUNT,
+    checked_box_size,
+    checked_intrinsics,
+    order_faults,
+    path_faults,
+)
 from drivesplat.readers.drive.format import Distortion, Drive, DriveCamera, Pose, TimedPose
 from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
 
+UNITS = {"seconds": 1e6, "milliseconds": 1e3}
+"""Units that are taken for microseconds by mistake, and the microseconds in one."""
 COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
 
 
 def faults_of(drive: Drive) -> list[str]:
-    """The faults of a drive."""
-    return [
+    """The faults of a drive; if times have another unit than microseconds, only those, which cause others."""
+    return list(_unit_faults(drive)) or [
         *_camera_faults(drive),
         *_lidar_faults(drive),
         *_timed_faults("ego_poses", drive.ego_poses),
@@ -25,6 +34,23 @@ def faults_of(drive: Drive) -> list[str]:
     ]
 
 
+def _unit_faults(drive: Drive) -> Iterator[str]:
+    """Faults of the unit of timestamps: of each sensor by itself, and of ego poses beside the others."""
+    for name in drive.cameras:
+        yield from clock_faults([f.timestamp for f in drive.frames if f.camera == name], f"frames of camera {name}")
+    for name in drive.lidars:
+        yield from clock_faults([s.timestamp for s in drive.sweeps if s.lidar == name], f"sweeps of lidar {name}")
+    yield from clock_faults(drive.key_frames or (), "key_frames")
+    recorded = [one.timestamp for one in (*drive.frames, *drive.sweeps)]
+    if not recorded or not drive.ego_poses:
+        return
+    ratio = float(np.median(recorded)) / max(1.0, float(np.median([pose.timestamp for pose in drive.ego_poses])))
+    for unit, factor in UNITS.items():
+        for which, held in (("ego_poses", ratio), ("frames and sweeps", 1.0 / max(ratio, 1e-12))):
+            if 0.5 < held / factor < 2.0:
+                yield f"{which}: timestamps are {unit}, the others microseconds; from seconds: round(t * 1e6)"
+
+
 def is_unposed(drive: Drive) -> bool:
     """Whether a drive has no poses at all: none of the vehicle, of images or of sweeps."""
     given = (pose for frame in drive.frames for pose in (frame.camera_to_world, frame.ego_to_world))
@@ -32,7 +58,8 @@ def is_unposed(drive: Drive) -> bool:
 
 
 def _camera_faults(drive: Drive) -> Iterator[str]:
-    yield from _pose_faults("cameras", ((name, camera.sensor_to_ego) for name, camera in drive.cameras.items()))
+    mounts = ((name, camera.sensor_to_ego) for name, camera in drive.cameras.items())
+    yield from _pose_faults("cameras", mounts, MAX_MOUNT)
     for name, camera in drive.cameras.items():
         where = f"cameras.{name}"
         try:
@@ -47,7 +74,7 @@ def _camera_faults(drive: Drive) -> Iterator[str]:
 
 
 def _lidar_faults(drive: Drive) -> Iterator[str]:
-    yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()))
+    yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()), MAX_MOUNT)
     for name, lidar in drive.lidars.items():
         if not lidar.motion_compensated and not drive.ego_poses:
             yield f"lidars.{name}: motion_compensated is false, and there are no ego_poses by which to move its points"
@@ -83,11 +110,13 @@ def _fold_faults(k: np.ndarray, camera: DriveCamera) -> Iterator[str]:
         )
 
 
-def _pose_faults(list_name: str, poses: Iterable[tuple[str | int, Pose]]) -> Iterator[str]:
+def _pose_faults(
+    list_name: str, poses: Iterable[tuple[str | int, Pose]], bound: float = MAX_COORDINATE
+) -> Iterator[str]:
     for name, pose in poses:
         where = f"{list_name}[{name}]" if isinstance(name, int) else f"{list_name}.{name}"
         try:
-            matrix_of(pose, where)
+            matrix_of(pose, where, bound)
         except DatasetError as error:
             yield str(error)
 
@@ -136,9 +165,6 @@ def _recording_faults(drive: Drive) -> Iterator[str]:
             yield from path_faults(file, where, "file")
             if needs_ego and not unposed and (fault := _unposed(ego_times, time)):
                 yield f"{where}: {fault}"
-        for sensor in known:
-            times = [time for other, time, *_ in records if other == sensor]
-            yield from clock_faults(times, f"{list_name} of {kind} {sensor}")
 
 
 def _unposed(times: np.ndarray, time: int) -> str | None:
@@ -176,4 +202,3 @@ def _key_frame_faults(drive: Drive) -> Iterator[str]:
     if not times:
         yield "key_frames: there is none; leave the key out to use all images of the first camera"
     yield from order_faults(times, lambda i: f"key_frames[{i}]")
-    yield from clock_faults(times, "key_frames")

@@ -5,6 +5,8 @@ OpenCV (x right, y down, z forward). LiDAR: the sensor's own. Object: x forward,
 """
 
 import json
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,8 +16,8 @@ from drivesplat.errors import DatasetError
 from drivesplat.scene.object_class import ObjectClass
 
 FILE = "drive.json"
-MAX_REPORTED = 20
-"""Maximum number of faults of the structure that are reported one by one."""
+MAX_ALIKE = 3
+"""Maximum number of faults that are reported one by one if they differ in numbers only."""
 
 Timestamp = Annotated[int, Field(ge=0, lt=2**62, strict=True)]
 Vector = tuple[float, float, float]
@@ -183,8 +185,21 @@ def read_drive(folder: Path) -> Drive:
     path = folder / FILE
     faults, drive = structure_of(path)
     if drive is None:
-        raise DatasetError("\n".join(faults))
+        raise DatasetError("\n".join(grouped(faults)))
     return drive
+
+
+def grouped(faults: Iterable[str]) -> list[str]:
+    """The first MAX_ALIKE of the faults that differ in numbers only, with how many more there are, in their order."""
+    alike: dict[str, list[str]] = {}
+    for fault in faults:
+        alike.setdefault(re.sub(r"\d+", "#", fault), []).append(fault)
+    lines: list[str] = []
+    for same in alike.values():
+        lines += same[:MAX_ALIKE]
+        if len(same) > MAX_ALIKE:
+            lines.append(f"… and {len(same) - MAX_ALIKE} more like this")
+    return lines
 
 
 def structure_of(path: Path) -> tuple[list[str], Drive | None]:
@@ -200,9 +215,7 @@ def structure_of(path: Path) -> tuple[list[str], Drive | None]:
     try:
         return [], Drive.model_validate(values)
     except ValidationError as error:
-        found = [f"{path}: {_sentence(item)}" for item in error.errors(include_url=False)]
-    more = [f"{path}: {len(found) - MAX_REPORTED} more faults"] if len(found) > MAX_REPORTED else []
-    return found[:MAX_REPORTED] + more, None
+        return [f"{path}: {_sentence(item)}" for item in error.errors(include_url=False)], None
 
 
 def _sentence(item: Any) -> str:
@@ -214,5 +227,7 @@ def _sentence(item: Any) -> str:
         return f"{key} is no key of the format; check its spelling"
     value = repr(item["input"])
     shown = value if len(value) <= 80 else f"{value[:80]}…"
+    if item["loc"][-1:] == ("timestamp",):
+        return f"{key} is {shown}: timestamps are whole microseconds; from seconds: round(t * 1e6)"
     message = item["msg"].removeprefix("Value error, ")
     return f"{key or 'the file'} is {shown}: {message[:1].lower()}{message[1:]}"

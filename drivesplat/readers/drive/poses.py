@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drivesplat.readers.checks import checked_pose, checked_transform
+from drivesplat.readers.checks import MAX_COORDINATE, checked_pose, checked_transform
 from drivesplat.readers.drive.format import Drive, Pose
 from drivesplat.scene.rigid import interpolate, inverse
 from drivesplat.scene.sensors import SweepMotion
@@ -15,12 +15,13 @@ REVOLUTION_US = 200_000
 """Time of a LiDAR's revolution in microseconds, where it is unknown: the slowest turn five times a second."""
 
 
-def matrix_of(pose: Pose, record: str = "pose") -> np.ndarray:
-    """A pose as a transform (4, 4). Raises DatasetError naming `record` if it is not rigid."""
+def matrix_of(pose: Pose, record: str = "pose", bound: float = MAX_COORDINATE) -> np.ndarray:
+    """A pose as a transform (4, 4). Raises DatasetError naming `record` if it is not rigid, or its translation beyond
+    `bound` metres along an axis."""
     if len(pose.rotation) == 4:
-        return checked_pose(pose.translation, pose.rotation, record)
+        return checked_pose(pose.translation, pose.rotation, record, bound)
     rows = [[*row, place] for row, place in zip(pose.rotation, pose.translation, strict=True)]
-    return checked_transform([*rows, [0.0, 0.0, 0.0, 1.0]], record)
+    return checked_transform([*rows, [0.0, 0.0, 0.0, 1.0]], record, bound)
 
 
 class EgoPath:

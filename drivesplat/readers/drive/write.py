@@ -13,7 +13,7 @@ from drivesplat.readers.drive.format import FILE, Drive
 from drivesplat.readers.files import link_or_copy
 from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.rigid import inverse
-from drivesplat.scene.scene import Frame, Scene, Sweep, Track
+from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track
 from drivesplat.scene.sensors import Camera, Lidar
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ def write_drive(scene: Scene, folder: Path, licence: str = "") -> Path:
     """Writes a scene into an empty `folder`: hard links to its images, or copies, its sweeps as .npz, and drive.json.
     Missing images and sweeps are left out with a warning. Returns the path of drive.json.
 
-    Raises DatasetError where the folder holds anything, or where the scene has none of its images.
+    Raises DatasetError where the folder holds anything, or where the scene has none of its images or no poses.
 
     >>> from drivesplat.scene.scene import read_scene
     >>> write_drive(read_scene("results/0001/scene.json"), Path("mine/0001"))
@@ -36,6 +36,10 @@ def write_drive(scene: Scene, folder: Path, licence: str = "") -> Path:
     """
     if folder.exists() and any(folder.iterdir()):
         raise DatasetError(f"{folder} is not empty; name a new folder")
+    if scene.poses == UNPOSED:
+        raise DatasetError(
+            f"scene {scene.name} has no poses; write scene_refined.json, where they are estimated from the images"
+        )
     frames = [(frame, _image_name(frame)) for frame in scene.frames if Path(frame.image_path).is_file()]
     if not frames and scene.frames:
         raise DatasetError(

@@ -59,8 +59,9 @@ class RunProgress:
         time_left = spelled(wall_seconds(left, self.machine))
         more = f" and {len(at_work) - MAX_NAMED} more" if len(at_work) > MAX_NAMED else ""
         named = f"; at work: {', '.join(at_work[:MAX_NAMED])}{more}" if at_work else ""
-        missing = f" and {unknown} jobs {NOT_MEASURED}" if unknown else ""
-        return f"{share}{len(finished)} of {len(self.planned)} jobs, about {time_left}{missing} left{named}"
+        known = [f"about {time_left}"] if whole > done or not unknown else []
+        missing = [f"{unknown} job{'s' * (unknown > 1)} {NOT_MEASURED}"] if unknown else []
+        return f"{share}{len(finished)} of {len(self.planned)} jobs, {' and '.join([*known, *missing])} left{named}"
 
     def _is_at_work(self, job: JobId) -> bool | None:
         """Whether a job is running, by its log of this run, since Snakemake counts a finished job seconds later; None

@@ -1,0 +1,145 @@
+"""What a drive's own geometry says against its poses and mounts, in sentences. These are warnings: a camera may be
+mounted on its side, and a vehicle may reverse all the time."""
+
+from collections.abc import Iterator
+from typing import TypeVar
+
+import numpy as np
+
+from drivesplat.readers.sweeps import read_returns, sweep_fault
+from drivesplat.scene.images import continuous_intrinsics, project
+from drivesplat.scene.rigid import apply, inverse
+from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep
+
+T = TypeVar("T")
+MIN_STEP = 0.3
+"""Distance in metres between two images from which on the direction of travel is compared with the heading."""
+MAX_TURN = 30.0
+"""Degrees between heading and direction of travel, or between the vertical axes of the ego frame and the world."""
+REVERSING = 150.0
+"""Degrees from which on an upright vehicle may be one that reverses."""
+MAX_ROLL = 45.0
+"""Degrees between a camera's y axis and the downward direction of the vehicle."""
+GROUND_RING, GROUND_HEIGHT, MIN_GROUND = (3.0, 12.0), 0.5, 0.1
+"""Between these horizontal distances (metres) from the vehicle, at least this share of returns lies within this height
+(metres) of the ground."""
+SAMPLED_SWEEPS = 5
+"""Sweeps of each LiDAR, and images of each camera, from which this is computed."""
+
+
+def pose_warnings(scene: Scene) -> list[str]:
+    """Sentences about ego poses that contradict the vehicle's motion, and about cameras that are not upright."""
+    if scene.poses == UNPOSED or not scene.frames:
+        return []
+    return [*_heading_warnings(scene), *_camera_warnings(scene)]
+
+
+def lidar_warnings(scene: Scene) -> list[str]:
+    """Sentences about LiDARs with hardly any return near the ground, and cameras whose images no return falls into.
+    Reads a few sweeps; those with faults are left out."""
+    if scene.poses == UNPOSED:
+        return []
+    found = []
+    for lidar in scene.lidars:
+        chosen = _spread([sweep for sweep in scene.sweeps if sweep.lidar == lidar.name and not sweep_fault(sweep)])
+        if chosen and _ground_share(scene, chosen) < MIN_GROUND:
+            found.append(
+                f"LiDAR {lidar.name}: hardly any return lies near the ground (z = 0 of the ego frame): check its "
+                "sensor_to_ego, and the rotations of ego_poses"
+            )
+    return [*found, *_unseen_warnings(scene)]
+
+
+def _heading_warnings(scene: Scene) -> Iterator[str]:
+    """The vehicle must move along its x axis, and stand on the ground."""
+    frames = _frames_of(scene, scene.frames[0].camera)
+    poses = np.stack([frame.ego_to_world for frame in frames])
+    tilt = float(np.median(_degrees(poses[:, 2, 2])))
+    if tilt > MAX_TURN:
+        yield (
+            f"the ego vehicle is tilted by {tilt:.0f} degrees (median): its z axis must point up, as the world's does; "
+            "check that rotations of poses are w, x, y, z and map the ego frame to the world"
+        )
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    moving = lengths > MIN_STEP
+    if not moving.any():
+        return
+    along = np.einsum("ni,ni->n", steps[moving], poses[:-1][moving, :3, 0]) / lengths[moving]
+    angle = float(np.median(_degrees(along)))
+    if angle > MAX_TURN and not (angle > REVERSING and tilt <= MAX_TURN):
+        yield (
+            f"the ego vehicle moves at {angle:.0f} degrees to its x axis (median of {int(moving.sum())} steps): x must "
+            "point forward; check that rotations of poses are w, x, y, z and map the ego frame to the world, not the "
+            "reverse"
+        )
+    elif angle > REVERSING:
+        yield (
+            f"the ego vehicle moves backwards (median of {int(moving.sum())} steps): its x axis must point forward; "
+            "unless it reverses, check that rotations of poses are w, x, y, z"
+        )
+
+
+def _camera_warnings(scene: Scene) -> Iterator[str]:
+    for camera in dict.fromkeys(frame.camera for frame in scene.frames):
+        frame = _frames_of(scene, camera)[0]
+        mount = inverse(frame.ego_to_world) @ frame.camera_to_world
+        roll = float(_degrees(-mount[2:3, 1])[0])
+        if roll > MAX_ROLL:
+            yield (
+                f"camera {camera}: its y axis, which points down in the image, is {roll:.0f} degrees from the "
+                "vehicle's downward direction: check that the axes of sensor_to_ego are x right, y down, z forward"
+            )
+
+
+def _ground_share(scene: Scene, sweeps: list[Sweep]) -> float:
+    """The share of the returns around the vehicle that lie near the ground under it."""
+    near = total = 0
+    for sweep in sweeps:
+        points = apply(inverse(_ego_at(scene, sweep.timestamp)) @ sweep.sensor_to_world, read_returns(sweep).points)
+        distances = np.linalg.norm(points[:, :2], axis=1)
+        around = (distances > GROUND_RING[0]) & (distances < GROUND_RING[1])
+        near += int((np.abs(points[around, 2]) < GROUND_HEIGHT).sum())
+        total += int(around.sum())
+    return near / total if total else 1.0
+
+
+def _unseen_warnings(scene: Scene) -> Iterator[str]:
+    sweeps = [sweep for sweep in scene.sweeps if not sweep_fault(sweep)]
+    if not sweeps:
+        return
+    for camera in dict.fromkeys(frame.camera for frame in scene.frames):
+        if not any(_seen(frame, sweeps) for frame in _spread(_frames_of(scene, camera))):
+            yield (
+                f"camera {camera}: no return of the LiDAR falls into its images: check its sensor_to_ego (x right, y "
+                "down, z forward, in metres) and that of the LiDAR"
+            )
+
+
+def _seen(frame: Frame, sweeps: list[Sweep]) -> bool:
+    """Whether a return of the sweep nearest in time falls into an image."""
+    sweep = min(sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp))
+    points = apply(sweep.sensor_to_world, read_returns(sweep).points)
+    size = (frame.width, frame.height)
+    pixels, depth = project(points, inverse(frame.camera_to_world), continuous_intrinsics(frame, size))
+    return bool(((depth > 0.5) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)).any())
+
+
+def _ego_at(scene: Scene, timestamp: int) -> np.ndarray:
+    """The ego pose (4, 4) of the image nearest in time; the identity without images."""
+    nearest = min(scene.frames, key=lambda frame: abs(frame.timestamp - timestamp), default=None)
+    return np.eye(4) if nearest is None else nearest.ego_to_world
+
+
+def _frames_of(scene: Scene, camera: str) -> list[Frame]:
+    return sorted((frame for frame in scene.frames if frame.camera == camera), key=lambda frame: frame.timestamp)
+
+
+def _spread(items: list[T]) -> list[T]:
+    """At most SAMPLED_SWEEPS of some items, from the first to the last."""
+    chosen = np.unique(np.linspace(0, len(items) - 1, SAMPLED_SWEEPS).round().astype(int)) if items else []
+    return [items[i] for i in chosen]
+
+
+def _degrees(cosines: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(cosines.clip(-1.0, 1.0)))
