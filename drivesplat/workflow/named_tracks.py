@@ -10,7 +10,8 @@ from drivesplat.errors import ResultError
 from drivesplat.settings.config import Config
 from drivesplat.settings.edit import Edit
 from drivesplat.settings.track_references import EditReference, TrackReferences
-from drivesplat.workflow.stages import EDITS, scene_edits
+from drivesplat.workflow.film_names import scene_edits
+from drivesplat.workflow.stages import EDITS
 
 RULES_OF_EDITS = ("edit", "quad", "drive_folder")
 """Rules that render an edit; the last also renders trajectories, which name no tracks."""

@@ -8,6 +8,7 @@ from typing import Any
 from drivesplat.provenance.code_digest import code_digest
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.export import ExportFormat
+from drivesplat.workflow.film_names import scene_edits
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.stages import (
     EDITS,
@@ -15,7 +16,6 @@ from drivesplat.workflow.stages import (
     OF_ONE_SCENE,
     SIDE_BY_SIDE,
     TRAJECTORIES,
-    scene_edits,
     scene_stages,
     stage_settings,
     training_inputs,

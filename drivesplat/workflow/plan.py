@@ -19,6 +19,7 @@ from drivesplat.readers.nuscenes.download.destination import RULE as DOWNLOAD
 from drivesplat.readers.nuscenes.download.destination import download_job, require_permission
 from drivesplat.settings.config import for_scene, load
 from drivesplat.settings.names import suggestion
+from drivesplat.workflow.film_names import no_such_edit, no_such_film, scene_edits
 from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.named_tracks import refuse_wrong_tracks, track_references
@@ -28,9 +29,6 @@ from drivesplat.workflow.stages import (
     EDITS,
     TRAJECTORIES,
     idle_variants,
-    no_such_edit,
-    no_such_film,
-    scene_edits,
 )
 
 ABLATION_FILES = ("ablation.json", "ablation.csv")

@@ -3,21 +3,18 @@
 A stage is a rule; its record holds everything but the inputs that determines its result.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
-from drivesplat.io.this_copy import of_the_workflow
 from drivesplat.readers.datasets import reads_unposed
 from drivesplat.settings import Settings
 from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
-from drivesplat.settings.edit import Edit
-from drivesplat.settings.edits_file import read_edits
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.export import DriveJob, ExportJob, FarJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
@@ -31,6 +28,7 @@ from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
+from drivesplat.workflow.film_names import no_such_edit, no_such_film, scene_edits
 
 SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
@@ -243,24 +241,6 @@ def _world(at: Place) -> dict[str, Any]:
         "world": world.model_copy(update={"cameras": cameras}),
         "edits": {name: edits[name] for name in wanted},
     }
-
-
-def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
-    """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
-    path = config.datasets[config.dataset_of(scene)].edits.get(scene)
-    return read_edits(of_the_workflow(path)) if path else {}
-
-
-def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:
-    """The message about an unknown edit of a scene."""
-    known = ", ".join(edits) or "none"
-    return f"scene {scene} has no edit called {name!r}; there are: {known} (datasets.<name>.edits names its edits file)"
-
-
-def no_such_film(config: Config, whose: str, name: str) -> str:
-    """The message about an unknown film of a scene or dataset; `config` as it holds there."""
-    known = ", ".join(config.render.trajectories)
-    return f"{whose} has no film called {name!r}; there are: {known} (add it to render.trajectories)"
 
 
 _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {

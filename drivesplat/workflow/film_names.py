@@ -1,0 +1,26 @@
+"""The names of edits and films of a scene, and the messages about unknown ones."""
+
+from collections.abc import Iterable
+
+from drivesplat.io.this_copy import of_the_workflow
+from drivesplat.settings.config import Config
+from drivesplat.settings.edit import Edit
+from drivesplat.settings.edits_file import read_edits
+
+
+def scene_edits(config: Config, scene: str) -> dict[str, Edit]:
+    """The edits of a scene by name; empty without an edits file. Raises ConfigError if the file is invalid."""
+    path = config.datasets[config.dataset_of(scene)].edits.get(scene)
+    return read_edits(of_the_workflow(path)) if path else {}
+
+
+def no_such_edit(scene: str, name: str, edits: Iterable[str]) -> str:
+    """The message about an unknown edit of a scene."""
+    known = ", ".join(edits) or "none"
+    return f"scene {scene} has no edit called {name!r}; there are: {known} (datasets.<name>.edits names its edits file)"
+
+
+def no_such_film(config: Config, whose: str, name: str) -> str:
+    """The message about an unknown film of a scene or dataset; `config` as it holds there."""
+    known = ", ".join(config.render.trajectories)
+    return f"{whose} has no film called {name!r}; there are: {known} (add it to render.trajectories)"
