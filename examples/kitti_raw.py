@@ -30,6 +30,8 @@ from drivesplat.readers.drive.write import pose_record
 from drivesplat.scene.rigid import apply, inverse, rigid
 
 LICENCE = "KITTI: CC BY-NC-SA 3.0, Geiger et al., Vision meets Robotics: The KITTI Dataset"
+MISSING = -1
+"""The time of a lost recording."""
 COLOUR = ("02", "03")
 EARTH_RADIUS = 6378137.0
 IMU_TO_EGO = rigid(np.eye(3), np.array([0.0, 0.0, 0.93]))
@@ -58,9 +60,11 @@ def transform(path: Path) -> np.ndarray:
 
 
 def timestamps(path: Path) -> np.ndarray:
-    """The times (n,) in microseconds of a file with a time per line, such as 2011-09-26 13:02:25.964389445."""
+    """The times (n,) in microseconds of a file with a time per line, such as 2011-09-26 13:02:25.964389445; MISSING for
+    an empty line, which stands for a lost recording."""
     with reading(path):
-        return np.array(path.read_text().splitlines(), dtype="datetime64[ns]").astype(np.int64) // 1000
+        times = np.array([line.strip() or "NaT" for line in path.read_text().splitlines()], dtype="datetime64[ns]")
+    return np.where(np.isnat(times), MISSING, times.astype(np.int64) // 1000)
 
 
 def recordings(folder: Path, suffix: str) -> list[tuple[int, int, Path]]:
@@ -114,8 +118,8 @@ def sweep_columns(path: Path, scans: str, start: np.ndarray, end: np.ndarray, fo
     """The untwisted returns of a scan's file: x, y, z, reflectance."""
     with reading(path):
         *points, reflectance = np.frombuffer(path.read_bytes(), dtype=np.float32).reshape(-1, 4).T
-    still = untwisted(np.stack(points, axis=1).astype(float), scans, start, end, forward)
-    return dict(zip("xyz", still.T.astype(np.float32), strict=True)) | {"intensity": reflectance.clip(0.0, 1.0)}
+    at_forward = untwisted(np.stack(points, axis=1).astype(float), scans, start, end, forward)
+    return dict(zip("xyz", at_forward.T.astype(np.float32), strict=True)) | {"intensity": reflectance.clip(0.0, 1.0)}
 
 
 def tracks(path: Path, scanner_poses: np.ndarray, times: np.ndarray) -> Iterator[dict[str, Any]]:
@@ -127,13 +131,16 @@ def tracks(path: Path, scanner_poses: np.ndarray, times: np.ndarray) -> Iterator
             height, width, length = (float(item.findtext(name, "")) for name in ("h", "w", "l"))
             poses = []
             for index, pose in enumerate(item.findall("poses/item"), first):
+                if times[index] == MISSING:
+                    continue
                 x, y, z, *angles = (float(pose.findtext(name, "")) for name in ("tx", "ty", "tz", "rx", "ry", "rz"))
                 box = rigid(Rotation.from_euler("xyz", angles).as_matrix(), np.array([x, y, z + height / 2]))
                 share = VISIBLE_SHARE.get(int(pose.findtext("occlusion", "-1")))
-                moment = {"timestamp": int(times[index]), "visibility": share}
-                poses.append(moment | pose_record(scanner_poses[index] @ box))
+                seen = {"timestamp": int(times[index]), "visibility": share}
+                poses.append(seen | pose_record(scanner_poses[index] @ box))
             shape = {"class": CLASSES[kind], "category": kind, "size": [length, width, height]}
-            yield {"id": f"tracklet_{number}", **shape, "poses": poses}
+            if poses:
+                yield {"id": f"tracklet_{number}", **shape, "poses": poses}
 
 
 def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans: str) -> Path:
@@ -145,22 +152,22 @@ def convert(date: Path, drive: str, out: Path, cameras: list[str] | None, scans:
     values = calibration(date / "calib_cam_to_cam.txt")
     imu_times, imu_to_world = imu_poses(folder / "oxts")
 
-    frames, images, mounted = [], {}, {}
-    for number in cameras or [number for number in COLOUR if (folder / f"image_{number}").is_dir()]:
-        with reading(date / "calib_cam_to_cam.txt"):
-            mounted[f"image_{number}"] = camera(values, number, imu_to_velo, velo_to_cam)
-        for _, time, path in recordings(folder / f"image_{number}", ".png"):
-            name = f"image_{number}/{path.name}"
+    numbers = cameras or [number for number in COLOUR if (folder / f"image_{number}").is_dir()]
+    with reading(date / "calib_cam_to_cam.txt"):
+        mounted = {f"image_{number}": camera(values, number, imu_to_velo, velo_to_cam) for number in numbers}
+    frames, images = [], {}
+    for name in mounted:
+        for _, time, path in recordings(folder / name, ".png"):
             ego = pose_record(pose_at(imu_times, imu_to_world, time) @ inverse(IMU_TO_EGO))
-            frames.append({"camera": f"image_{number}", "timestamp": time, "file": name, "ego_to_world": ego})
-            images[name] = path
+            frames.append({"camera": name, "timestamp": time, "file": f"{name}/{path.name}", "ego_to_world": ego})
+            images[f"{name}/{path.name}"] = path
 
     def scanner_at(time: np.integer) -> np.ndarray:
         return pose_at(imu_times, imu_to_world, time) @ inverse(imu_to_velo)
 
     velodyne = folder / "velodyne_points"
     starts, forwards, ends = (timestamps(velodyne / f"timestamps{name}.txt") for name in ("_start", "", "_end"))
-    scanner_poses = np.stack([scanner_at(time) for time in forwards])
+    scanner_poses = np.stack([np.eye(4) if time == MISSING else scanner_at(time) for time in forwards])
     scan_files = recordings(velodyne, ".bin")
 
     sweeps = (

@@ -1,4 +1,4 @@
-"""checkpoint.npz as a drive that nobody recorded: a drive folder, and nuScenes tables in it."""
+"""checkpoint.npz, after an edit or along a trajectory, as a drive folder with nuScenes tables."""
 
 from pathlib import Path
 

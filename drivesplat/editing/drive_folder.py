@@ -1,4 +1,4 @@
-"""The stage `drive_folder`: a drive that nobody recorded as a dataset: images, poses, calibration and boxes."""
+"""The stage `drive_folder`: writes a rendered drive as a dataset: images, poses, calibration and boxes."""
 
 import shutil
 from collections.abc import Iterator
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from drivesplat.editing.film import edited_frames
 from drivesplat.editing.rendered_drive import RenderedDrive, rendered_drive
 from drivesplat.io.prefetch import prefetch_items
 from drivesplat.io.storage import Provenance, atomic_write, write_json
@@ -18,10 +19,9 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.readers.drive.write import write_record
 from drivesplat.readers.nuscenes.write import write_nuscenes
-from drivesplat.rendering.captured_frames import FrameInput
 from drivesplat.rendering.frames import film_frames
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.splits import training_images
+from drivesplat.scene.splits import last_training_timestamp
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.export import DriveJob
 
@@ -47,13 +47,14 @@ def write_rendered_drive(
     DeviceError; ResultError where a rendering contains NaN or Inf, or the disk is full.
     """
     folder, what = path.parent, " ".join(f"{key} {value}" for key, value in source.items())
-    for earlier in ("images", TABLES):
-        shutil.rmtree(folder / earlier, ignore_errors=True)
+    for earlier in (folder / "images", folder / TABLES):
+        if earlier.exists():
+            shutil.rmtree(earlier)
     model, device = open_model(checkpoint, device_settings)
     drive = rendered_drive(scene, model, job, folder, what)
-    inputs = _inputs(model, drive, drive.views(device, model.exposure is not None))
+    pictures = _pictures(model, drive, drive.views(device))
     with explain_out_of_memory(lambda: len(model)):
-        for frame, pixels in zip(drive.scene.frames, prefetch_items(film_frames(model, inputs)), strict=True):
+        for frame, pixels in zip(drive.scene.frames, prefetch_items(pictures), strict=True):
             _write_jpeg(Path(frame.image_path), pixels)
     marked = replace(
         drive.scene,
@@ -62,28 +63,21 @@ def write_rendered_drive(
         provenance=provenance,
     )
     steps = None if job.edit is None else job.edit.model_dump(mode="json", exclude_none=True)["steps"]
-    rendered: dict[str, Any] = {**source, "steps": steps, "trained_until": _trained_until(scene, job)}
+    trained_until = last_training_timestamp(scene, job.eval_camera, job.holdout)
+    rendered: dict[str, Any] = {**source, "steps": steps, "trained_until": trained_until}
     log = {"logfile": "rendered-by-drivesplat", "vehicle": "rendered", "date_captured": "", "location": what}
     write_nuscenes(marked, folder / TABLES, VERSION, log)
     write_json(folder / TABLES / "provenance.json", {"rendered": rendered, "provenance": provenance})
     write_record(path, replace(marked, tracks=drive.tracks), {**rendered, "provenance": provenance})
 
 
-def _inputs(model: SplatModel, drive: RenderedDrive, views: Iterator[View]) -> Iterator[FrameInput]:
-    """Each view with the Gaussians that it shows: None for those of the model at its time."""
+def _pictures(model: SplatModel, drive: RenderedDrive, views: Iterator[View]) -> Iterator[np.ndarray]:
+    """The rendering of each view, (h, w, 3) uint8."""
     placements = drive.placements()
-    if placements is None:
-        model.precompute(drive.seconds.tolist())
-        yield from ((view, None) for view in views)
-        return
-    for view, actors in zip(views, placements, strict=True):
-        yield view, model.gaussians_with_placements(view.time, actors)
-
-
-def _trained_until(scene: Scene, job: DriveJob) -> int | None:
-    """The time of the last training image of the evaluated camera in microseconds; None if there is none."""
-    frames = (scene.frames[i] for i in training_images(scene, job.holdout))
-    return max((frame.timestamp for frame in frames if frame.camera == job.eval_camera), default=None)
+    if placements is not None:
+        return edited_frames(model, views, placements)
+    model.precompute(drive.seconds.tolist())
+    return film_frames(model, ((view, None) for view in views))
 
 
 def _write_jpeg(path: Path, pixels: np.ndarray) -> None:

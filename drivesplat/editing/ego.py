@@ -14,16 +14,19 @@ from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.edit import Edit, Ego
 from drivesplat.settings.render import TrajectorySettings
 
+MAX_LEAD = 0.1
+"""Seconds by which the path of a camera is extrapolated before its first image: the cameras of a rig fire at different
+times."""
+
 
 @dataclass(frozen=True)
 class EgoEdit:
-    """The steps of an edit that change the ego vehicle's path. It is recorded from the second `begin` to `last`, those
-    of the first and the last image of the evaluated camera."""
+    """The steps of an edit that change the ego vehicle's path. Its clock is that of the recording at the second
+    `begin`, that of the first image of the evaluated camera."""
 
     scene: Scene
     steps: tuple[Ego, ...]
     begin: float
-    last: float
 
     @classmethod
     def of(cls, scene: Scene, camera: str, edit: Edit, where: str) -> "EgoEdit | None":
@@ -42,11 +45,14 @@ class EgoEdit:
                 raise ConfigError(
                     f"{where}, step {number} (ego): 'start' is not before the end of the drive ({last:.2f} s)"
                 )
-        return cls(scene, steps, begin, last)
+        return cls(scene, steps, begin)
 
-    def within(self, times: np.ndarray) -> np.ndarray:
-        """Whether the vehicle is still on its recorded path at `times` (n,) in seconds: (n,) bool."""
-        return recorded_time(self.steps, self.begin, times) <= self.last + 1e-9
+    def within(self, frames: Sequence[Frame], times: np.ndarray) -> np.ndarray:
+        """Whether the vehicle at `times` (n,) in seconds is on the part of its path in which the camera that took
+        `frames` recorded: (n,) bool."""
+        clock = recorded_time(self.steps, self.begin, times)
+        first, last = (self.scene.seconds(frames[i].timestamp) for i in (0, -1))
+        return (clock >= first - MAX_LEAD) & (clock <= last + 1e-9)
 
     def poses(self, frames: Sequence[Frame], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Camera to world and ego to world (n, 4, 4) at `times` (n,) in seconds, of the camera that took `frames`."""
@@ -76,5 +82,5 @@ def edited_camera_path(scene: Scene, camera: str, fps: int, edit: Edit, where: s
         return path
     frames = recorded_frames(scene, camera)
     times = change.begin + (path.timestamps - frames[0].timestamp) * 1e-6
-    within = change.within(times)
+    within = change.within(frames, times)
     return CameraPath(path.timestamps[within], change.poses(frames, times[within])[0])

@@ -19,7 +19,7 @@ from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
-from drivesplat.rendering.trajectory import CameraPath, film_path, recorded_frames
+from drivesplat.rendering.trajectory import film_path, recorded_frames
 from drivesplat.scene.images import write_png
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
@@ -61,10 +61,7 @@ def render_edit(
     where = f"scene {scene.name}, edit {files.film.stem!r}"
     drive = edited_drive(scene, model, job, where)
     after, seconds = drive.after, np.array(drive.after.seconds)
-    colliding = collisions(drive.actors, after.cameras, seconds)
-    if colliding.any():
-        first, last = seconds[colliding][[0, -1]]
-        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
+    colliding = warn_of_collisions(drive.actors, after.cameras.camera_to_world, seconds, where)
     panels = Panels(("recorded", files.film.stem), after.size)
     still = Still(panels, avoided=colliding | (seconds > after.trained_until))
     shown = recorded_shot(model, drive.before, device)
@@ -125,13 +122,24 @@ def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list
     return result
 
 
-def collisions(actors: Sequence[EditedActor], path: CameraPath, seconds: np.ndarray) -> np.ndarray:
+def warn_of_collisions(
+    actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray, where: str
+) -> np.ndarray:
+    """The `collisions` of a camera, after a warning that begins with `where` if there are any."""
+    colliding = collisions(actors, camera_to_world, seconds)
+    if colliding.any():
+        first, last = seconds[colliding][[0, -1]]
+        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, first, last)
+    return colliding
+
+
+def collisions(actors: Sequence[EditedActor], camera_to_world: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """The frames (n,) bool in which the camera is inside a box enlarged by COLLISION_MARGIN, and so shows the inside of
     an object."""
     inside = np.zeros(len(seconds), dtype=bool)
     for actor in actors:
         to_object = inverse(actor.poses(seconds))
-        camera = (to_object[:, :3, :3] @ path.camera_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
+        camera = (to_object[:, :3, :3] @ camera_to_world[:, :3, 3:])[..., 0] + to_object[:, :3, 3]
         inside |= actor.present(seconds) & (np.abs(camera) < actor.size / 2 + COLLISION_MARGIN).all(axis=1)
     return inside
 

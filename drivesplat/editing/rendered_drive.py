@@ -1,7 +1,5 @@
-"""A drive that nobody recorded, as a `Scene` of images to render: the recorded one after an edit, or from beside its
-path."""
+"""A rendered drive as a `Scene` of images to render: the recorded drive after an edit, or seen from beside its path."""
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,19 +10,17 @@ import torch
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.editing.actors import editable_actors, other_objects, trained_actors
 from drivesplat.editing.ego import EgoEdit
-from drivesplat.editing.film import actor_placements, collisions
+from drivesplat.editing.film import actor_placements, warn_of_collisions
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
-from drivesplat.rendering.trajectory import CameraPath, displaced, recorded_frames
+from drivesplat.rendering.trajectory import displaced, recorded_frames
 from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.scene import Frame, Scene, Track
 from drivesplat.scene.sensors import Camera
 from drivesplat.settings.export import DriveJob
 from drivesplat.settings.images import ImageSettings
 from drivesplat.settings.render import TrajectorySettings
-
-log = logging.getLogger(__name__)
 
 LABEL_INTERVAL = 100_000
 """Microseconds between the poses of an object in labels, besides those at key frames."""
@@ -44,8 +40,9 @@ class RenderedDrive:
     tracks: tuple[Track, ...]
     actors: Sequence[EditedActor] | None
 
-    def views(self, device: torch.device, cameras_differ: bool) -> Iterator[View]:
-        """The cameras of the images in order, on the device. `cameras_differ`: with the exposure of each camera."""
+    def views(self, device: torch.device) -> Iterator[View]:
+        """The cameras of the images in order, on the device, as films have them: with the colours and the poses of the
+        model itself, without corrections of cameras of the rig."""
         for frame, seconds in zip(self.scene.frames, self.seconds.tolist(), strict=True):
             size = (frame.width, frame.height)
             yield View(
@@ -54,7 +51,6 @@ class RenderedDrive:
                 width=size[0],
                 height=size[1],
                 time=seconds,
-                camera=frame.camera if cameras_differ else None,
             )
 
     def placements(self) -> list[list[ActorPlacement]] | None:
@@ -65,8 +61,8 @@ class RenderedDrive:
 def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path, where: str) -> RenderedDrive:
     """The drive of `job`; its images are to lie in `folder`/images.
 
-    All images of the cameras at their own times, as long as the ego vehicle is on its recorded path. Warns where the
-    evaluated camera is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the scene
+    All images of the cameras at their own times, as long as the ego vehicle is on its recorded path. Warns where a
+    camera is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the scene
     or the model has no actors; DatasetError if the scene lacks a camera.
     """
     trained = trained_actors(model, scene, where) if job.edit is None else editable_actors(model, scene, where)
@@ -84,7 +80,8 @@ def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path,
     frames = [replace(frame, sample_index=min(frame.sample_index, last)) for frame in frames]
     rendered = _with_frames(scene, frames, scene.key_frame_timestamps[: last + 1])
     seconds = _seconds(scene, frames)
-    _warn_of_collisions(frames, seconds, actors, job.eval_camera, where)
+    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
+    warn_of_collisions(actors, camera_to_world, seconds, where)
     objects, key_times = [*actors, *others], rendered.key_frame_timestamps
     times = [*key_times.tolist(), *(frame.timestamp for frame in frames)]
     label_times = np.union1d(key_times, np.arange(min(times), max(times) + 1, LABEL_INTERVAL))
@@ -102,7 +99,7 @@ def _moved_frames(scene: Scene, camera: str, job: DriveJob, where: str) -> list[
     change = None if job.edit is None else EgoEdit.of(scene, job.eval_camera, job.edit, where)
     if change is not None:
         seconds = _seconds(scene, frames)
-        within = change.within(seconds)
+        within = change.within(frames, seconds)
         kept = [frame for frame, inside in zip(frames, within, strict=True) if inside]
         return _posed(kept, *change.poses(frames, seconds[within]))
     if job.trajectory is None or job.trajectory == TrajectorySettings():
@@ -176,16 +173,3 @@ def _tracks(scene: Scene, objects: Sequence[EditedActor], times: np.ndarray) -> 
 def _seconds(scene: Scene, frames: Sequence[Frame]) -> np.ndarray:
     """The times (n,) of images in seconds since the first image of a scene."""
     return np.array([scene.seconds(frame.timestamp) for frame in frames])
-
-
-def _warn_of_collisions(
-    frames: Sequence[Frame], seconds: np.ndarray, actors: Sequence[EditedActor], camera: str, where: str
-) -> None:
-    shown = [i for i, frame in enumerate(frames) if frame.camera == camera]
-    if not shown:
-        return
-    timestamps = np.array([frames[i].timestamp for i in shown])
-    path = CameraPath(timestamps, np.stack([frames[i].camera_to_world for i in shown]))
-    colliding = seconds[shown][collisions(actors, path, seconds[shown])]
-    if len(colliding):
-        log.warning("%s: the camera is inside a vehicle between %.1f and %.1f s", where, *colliding[[0, -1]])

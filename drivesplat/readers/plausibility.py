@@ -6,14 +6,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from drivesplat.readers.sweeps import read_returns, sweep_fault
+from drivesplat.readers.sweeps import read_returns
 from drivesplat.scene.images import continuous_intrinsics, project
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep
 
 T = TypeVar("T")
 MIN_STEP = 0.3
-"""Distance in metres between two images from which on the direction of travel is compared with the heading."""
+"""Minimum distance in metres between two positions that give the direction of travel."""
 MAX_TURN = 30.0
 """Degrees between heading and direction of travel, or between the vertical axes of the ego frame and the world."""
 REVERSING = 150.0
@@ -36,12 +36,13 @@ def pose_warnings(scene: Scene) -> list[str]:
 
 def lidar_warnings(scene: Scene) -> list[str]:
     """Sentences about LiDARs with hardly any return near the ground, and cameras whose images no return falls into.
-    Reads a few sweeps; those with faults are left out."""
-    if scene.poses == UNPOSED:
+    Reads a few sweeps, which have no faults. Without images nothing is known of the vehicle's path, and there are none.
+    """
+    if scene.poses == UNPOSED or not scene.frames:
         return []
     found = []
     for lidar in scene.lidars:
-        chosen = _spread([sweep for sweep in scene.sweeps if sweep.lidar == lidar.name and not sweep_fault(sweep)])
+        chosen = _spread([sweep for sweep in scene.sweeps if sweep.lidar == lidar.name])
         if chosen and _ground_share(scene, chosen) < MIN_GROUND:
             found.append(
                 f"LiDAR {lidar.name}: hardly any return lies near the ground (z = 0 of the ego frame): check its "
@@ -60,30 +61,28 @@ def _heading_warnings(scene: Scene) -> Iterator[str]:
             f"the ego vehicle is tilted by {tilt:.0f} degrees (median): its z axis must point up, as the world's does; "
             "check that rotations of poses are w, x, y, z and map the ego frame to the world"
         )
-    steps = np.diff(poses[:, :3, 3], axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    moving = lengths > MIN_STEP
-    if not moving.any():
+    poses = _apart(poses)
+    if len(poses) < 2:
         return
-    along = np.einsum("ni,ni->n", steps[moving], poses[:-1][moving, :3, 0]) / lengths[moving]
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    along = np.einsum("ni,ni->n", steps, poses[:-1, :3, 0]) / np.linalg.norm(steps, axis=1)
     angle = float(np.median(_degrees(along)))
     if angle > MAX_TURN and not (angle > REVERSING and tilt <= MAX_TURN):
         yield (
-            f"the ego vehicle moves at {angle:.0f} degrees to its x axis (median of {int(moving.sum())} steps): x must "
+            f"the ego vehicle moves at {angle:.0f} degrees to its x axis (median of {len(steps)} steps): x must "
             "point forward; check that rotations of poses are w, x, y, z and map the ego frame to the world, not the "
             "reverse"
         )
     elif angle > REVERSING:
         yield (
-            f"the ego vehicle moves backwards (median of {int(moving.sum())} steps): its x axis must point forward; "
+            f"the ego vehicle moves backwards (median of {len(steps)} steps): its x axis must point forward; "
             "unless it reverses, check that rotations of poses are w, x, y, z"
         )
 
 
 def _camera_warnings(scene: Scene) -> Iterator[str]:
     for camera in dict.fromkeys(frame.camera for frame in scene.frames):
-        frame = _frames_of(scene, camera)[0]
-        mount = inverse(frame.ego_to_world) @ frame.camera_to_world
+        mount = _frames_of(scene, camera)[0].camera_to_ego
         roll = float(_degrees(-mount[2:3, 1])[0])
         if roll > MAX_ROLL:
             yield (
@@ -105,13 +104,14 @@ def _ground_share(scene: Scene, sweeps: list[Sweep]) -> float:
 
 
 def _unseen_warnings(scene: Scene) -> Iterator[str]:
-    sweeps = [sweep for sweep in scene.sweeps if not sweep_fault(sweep)]
-    if not sweeps:
+    by_lidar = [[sweep for sweep in scene.sweeps if sweep.lidar == lidar.name] for lidar in scene.lidars]
+    if not any(by_lidar):
         return
     for camera in dict.fromkeys(frame.camera for frame in scene.frames):
-        if not any(_seen(frame, sweeps) for frame in _spread(_frames_of(scene, camera))):
+        frames = _spread(_frames_of(scene, camera))
+        if not any(_seen(frame, sweeps) for frame in frames for sweeps in by_lidar if sweeps):
             yield (
-                f"camera {camera}: no return of the LiDAR falls into its images: check its sensor_to_ego (x right, y "
+                f"camera {camera}: no return of a LiDAR falls into its images: check its sensor_to_ego (x right, y "
                 "down, z forward, in metres) and that of the LiDAR"
             )
 
@@ -126,9 +126,17 @@ def _seen(frame: Frame, sweeps: list[Sweep]) -> bool:
 
 
 def _ego_at(scene: Scene, timestamp: int) -> np.ndarray:
-    """The ego pose (4, 4) of the image nearest in time; the identity without images."""
-    nearest = min(scene.frames, key=lambda frame: abs(frame.timestamp - timestamp), default=None)
-    return np.eye(4) if nearest is None else nearest.ego_to_world
+    """The ego pose (4, 4) of the image nearest in time."""
+    return min(scene.frames, key=lambda frame: abs(frame.timestamp - timestamp)).ego_to_world
+
+
+def _apart(poses: np.ndarray) -> np.ndarray:
+    """Those of the poses (n, 4, 4) that are more than MIN_STEP apart, one after the other."""
+    chosen = [0]
+    for i in range(1, len(poses)):
+        if np.linalg.norm(poses[i, :3, 3] - poses[chosen[-1], :3, 3]) > MIN_STEP:
+            chosen.append(i)
+    return poses[chosen]
 
 
 def _frames_of(scene: Scene, camera: str) -> list[Frame]:

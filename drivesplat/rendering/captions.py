@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from drivesplat.rendering.panels import Panels
 from drivesplat.scene.scene import Scene
-from drivesplat.scene.splits import training_images
+from drivesplat.scene.splits import last_training_timestamp
 from drivesplat.settings.images import HoldoutSettings
 
 BEYOND = "beyond the last training image"
@@ -21,9 +21,8 @@ MIN_HEIGHT = 9
 
 def last_training_second(scene: Scene, camera: str, holdout: HoldoutSettings) -> float:
     """The second of a camera's last training image, since the scene's first image; infinite if there is none."""
-    frames = [scene.frames[i] for i in training_images(scene, holdout)]
-    times = [frame.timestamp for frame in frames if frame.camera == camera]
-    return scene.seconds(max(times)) if times else np.inf
+    last = last_training_timestamp(scene, camera, holdout)
+    return np.inf if last is None else scene.seconds(last)
 
 
 @dataclass(frozen=True)

@@ -89,13 +89,14 @@ def hull_of(box: Box, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np
     return cv2.convexHull(pixels.astype(np.float32))[:, 0, :]
 
 
-def hulls_in(scene: Scene, frame: Frame, size: tuple[int, int], dynamic: bool = True) -> list[Hull]:
-    """The projected boxes in a frame at `size` (width, height), farthest first: those of `dynamic` classes, or all."""
+def hulls_in(scene: Scene, frame: Frame, size: tuple[int, int], all_classes: bool = False) -> list[Hull]:
+    """The projected boxes in a frame at `size` (width, height), farthest first: those of dynamic classes, or of
+    `all_classes`."""
     world_to_camera = inverse(frame.camera_to_world)
     intrinsics = continuous_intrinsics(frame, size)
     hulls = []
     for box in boxes_at(scene, frame.timestamp):
-        wanted = box.object_class.is_dynamic or not dynamic
+        wanted = box.object_class.is_dynamic or all_classes
         polygon = hull_of(box, world_to_camera, intrinsics) if wanted else None
         if polygon is not None:
             distance = float(np.linalg.norm(box.object_to_world[:3, 3] - frame.camera_to_world[:3, 3]))
@@ -160,7 +161,7 @@ def labelled_hulls(scene: Scene, frame: Frame, size: tuple[int, int]) -> tuple[l
 
 def _hidden_tracks(scene: Scene, frame: Frame, size: tuple[int, int]) -> set[str]:
     """The tracks of unknown visibility of which nearer boxes, of any class, hide more than MAX_HIDDEN."""
-    hulls = hulls_in(scene, frame, size, dynamic=False)
+    hulls = hulls_in(scene, frame, size, all_classes=True)
     shares = zip(hulls, hidden_shares(hulls, size), strict=True)
     return {hull.box.track_id for hull, share in shares if hull.box.visibility == UNKNOWN and share > MAX_HIDDEN}
 

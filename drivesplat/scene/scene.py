@@ -17,6 +17,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.storage import Provenance, read_json, unreadable, write_json
 from drivesplat.io.typed_record import field_values, typed_record
 from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.rigid import inverse
 from drivesplat.scene.sensors import Camera, Lidar, SweepMotion
 
 SCHEMA = 1
@@ -42,6 +43,11 @@ class Frame:
     is_key_frame: bool
     sample_index: int
     token: str
+
+    @property
+    def camera_to_ego(self) -> np.ndarray:
+        """The mount of the camera (4, 4), by the poses of this image."""
+        return inverse(self.ego_to_world) @ self.camera_to_world
 
 
 @dataclass(frozen=True)

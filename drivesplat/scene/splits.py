@@ -31,6 +31,12 @@ def training_images(scene: Scene, holdout: HoldoutSettings) -> np.ndarray:
     return np.flatnonzero([group == "train" for group in frame_groups(scene, holdout)])
 
 
+def last_training_timestamp(scene: Scene, camera: str, holdout: HoldoutSettings) -> int | None:
+    """The timestamp in microseconds of a camera's last training image; None if there is none."""
+    frames = (scene.frames[i] for i in training_images(scene, holdout))
+    return max((frame.timestamp for frame in frames if frame.camera == camera), default=None)
+
+
 def sweep_groups(scene: Scene, holdout: HoldoutSettings) -> list[Group]:
     """The group of every LiDAR sweep of the scene, in the order of `scene.sweeps`."""
     return _groups(scene, scene.sweeps, holdout)

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -52,7 +53,8 @@ class _Used:
 
     def edit(self, name: str) -> bool:
         parts = [path.with_suffix("").parts for path in self._files]
-        of_edits = any(name in names and {"edits", "quad"} & {*names} for names in parts)
+        folders = (pair for names in parts for pair in pairwise(names))
+        of_edits = any(folder in ("edits", "quad") and edit == name for folder, edit in folders)
         return self._everything or bool({"edits", "drives"} & self._targets) or of_edits
 
     @property

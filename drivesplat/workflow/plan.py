@@ -172,7 +172,8 @@ class Plan(Outputs):
         """Raises ConfigError if `path` below a method's folder is not the drive.json of an edit or a trajectory."""
         kind, name, *rest = path
         if rest == ["drive"]:
-            raise ConfigError(f"{'/'.join(path)} is a folder; ask for the file {'/'.join(path)}/drive.json")
+            folder = "/".join([self.config.results_dir, scene, method, *path])
+            raise ConfigError(f"{folder} is a folder; ask for the file {folder}/drive.json")
         if kind == EDITS:
             self._refuse_without_actors(method)
             self._refuse_unknown_edit(scene, name)

@@ -1,5 +1,6 @@
 """Drives that nobody recorded, as drive folders and as nuScenes tables: what other programs read of them."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial import ConvexHull
 
 from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_drive
+from drivesplat.editing.rendered_drive import rendered_drive
 from drivesplat.errors import ConfigError
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
@@ -220,6 +222,32 @@ def test_a_slower_ego_vehicle_takes_its_cameras_along(scene, model, tmp_path):
         along = (frame.ego_to_world[:3, 3] - begin)[0]
         assert along == pytest.approx(0.5 * (origin.ego_to_world[:3, 3] - begin)[0], abs=0.05)
         assert (frame.ego_to_world[:3, 3] - begin)[1] == pytest.approx(1.5, abs=0.05)
+
+
+def with_side_camera(scene: Scene, ends: float) -> Scene:
+    """A second camera that fires 40 ms after the first, until a second of the drive."""
+    late = [
+        dataclasses.replace(frame, camera="SIDE", timestamp=frame.timestamp + 40_000, token=f"side {frame.token}")
+        for frame in scene.frames
+        if scene.seconds(frame.timestamp) + 0.04 <= ends
+    ]
+    return dataclasses.replace(scene, frames=(*scene.frames, *late))
+
+
+@pytest.mark.parametrize(
+    ("ego", "ends", "counts"),
+    [({"lateral": 1.0}, 9.0, (19, 19)), ({"speed": 2.0}, 9.0, (10, 9)), ({"speed": 2.0}, 2.1, (10, 4))],
+    ids=["beside the path", "to the end of the path", "to the end of a camera's path"],
+)
+def test_every_camera_has_its_images_as_far_as_its_own_path_goes(ego, ends, counts, scene, model):
+    rig = with_side_camera(scene, ends)
+    job = a_job({"ego": ego}).model_copy(update={"cameras": ("CAM_FRONT", "SIDE")})
+    drive = rendered_drive(rig, model, job, Path("here"), "it")
+    found = [frame.camera for frame in drive.scene.frames]
+    assert (found.count("CAM_FRONT"), found.count("SIDE")) == counts
+    along = {(f.camera, f.timestamp): f.ego_to_world[0, 3] for f in drive.scene.frames}
+    recorded = [frame.ego_to_world[0, 3] for frame in rig.frames]
+    assert max(along.values()) < max(recorded) + 0.5, "no pose beyond the recorded path"
 
 
 def test_a_faster_ego_vehicle_ends_the_drive_with_its_path(scene, model, tmp_path):

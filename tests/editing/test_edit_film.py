@@ -36,7 +36,6 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.rendering.film import render_film
 from drivesplat.rendering.frames import film_frame
 from drivesplat.rendering.panels import Panels
-from drivesplat.rendering.trajectory import CameraPath
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Scene
@@ -439,5 +438,5 @@ def test_a_camera_collides_inside_the_box_of_a_present_actor():
     across = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     motion = Motion(seconds[1:], np.tile(across, (5, 1, 1)), ((0, 4),), 0.0)
     car = EditedActor.recorded("a", "vehicle.car", np.array([4.0, 2.0, 1.5]), motion)
-    found = collisions(edited_actors([car], BESIDE, ""), CameraPath(np.arange(6), cameras), seconds)
+    found = collisions(edited_actors([car], BESIDE, ""), cameras, seconds)
     assert found.tolist() == [False, True, True, False, True, False]

@@ -158,9 +158,12 @@ def scan(drive: TurningDrive, time: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(raw), np.concatenate(true)
 
 
+LOST = 4
+
+
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory) -> tuple[Path, TurningDrive, dict[str, np.ndarray]]:
-    """A day of KITTI raw with the drive 0005, of which one scan is missing, as in some of KITTI's."""
+    """A day of KITTI raw with the drive 0005, of which one scan is lost, with an empty line as its time."""
     day = tmp_path_factory.mktemp("kitti") / "2011_09_26"
     drive = TurningDrive(rigid(TILT, np.array([3.0, -7.0, 120.0])))
     folder = day / "2011_09_26_drive_0005_sync"
@@ -169,7 +172,9 @@ def kitti(tmp_path_factory) -> tuple[Path, TurningDrive, dict[str, np.ndarray]]:
     matrices = write_calibration(day, drive)
     velodyne = folder / "velodyne_points"
     for name, offset in (("_start", -SPIN), ("", 0), ("_end", SPIN)):
-        (velodyne / f"timestamps{name}.txt").write_text(lines_of(TIMES + offset))
+        lines = lines_of(TIMES + offset).splitlines()
+        lines[LOST] = ""
+        (velodyne / f"timestamps{name}.txt").write_text("\n".join(lines) + "\n")
     (folder / "image_02/timestamps.txt").write_text(lines_of(TIMES - 1_000))
     (folder / "oxts/timestamps.txt").write_text(lines_of(TIMES + DELAY))
     (folder / "tracklet_labels.xml").write_text(tracklets_xml(drive))
@@ -177,7 +182,7 @@ def kitti(tmp_path_factory) -> tuple[Path, TurningDrive, dict[str, np.ndarray]]:
         Image.fromarray(drive.image(time - 1_000)).save(folder / f"image_02/data/{i:010}.png")
         (folder / f"oxts/data/{i:010}.txt").write_text(oxts(drive.ego(time + DELAY) @ IMU) + "\n")
         points, _ = scan(drive, int(time))
-        if i != 4:
+        if i != LOST:
             reflectance = np.full((len(points), 1), 0.25)
             np.hstack([points, reflectance]).astype(np.float32).tofile(velodyne / f"data/{i:010}.bin")
     return day, drive, matrices

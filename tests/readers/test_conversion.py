@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive.check import check
 from drivesplat.readers.drive.conversion import pose_at, reading, timed_poses, write_folder
+from drivesplat.readers.files import link_or_copy
 from drivesplat.scene.rigid import rigid
 
 
@@ -39,6 +40,26 @@ def test_a_folder_holds_the_record_the_images_and_the_sweeps(image, tmp_path):
     assert path == tmp_path / "out/drive.json" and json.loads(path.read_text())["frames"][0]["file"] == "front/1.png"
     assert (tmp_path / "out/front/1.png").samefile(image), "linked where the file system allows it"
     assert check(tmp_path / "out", None) == []
+
+
+def test_a_file_that_is_a_link_is_replaced_and_not_written_into(image, tmp_path):
+    other, target = tmp_path / "other.png", tmp_path / "target.png"
+    other.write_bytes(b"other")
+    for _ in range(2):
+        link_or_copy(image, target)
+    assert target.samefile(image)
+    link_or_copy(other, target)
+    assert target.read_bytes() == b"other" and image.stat().st_size > 5
+
+
+def test_a_scan_that_cannot_be_read_leaves_no_drive(image, tmp_path):
+    def sweeps():
+        raise DatasetError("a corrupt scan")
+        yield
+
+    with pytest.raises(DatasetError, match="a corrupt scan"):
+        write_folder(tmp_path / "out", record(), {"front/1.png": image}, sweeps())
+    assert not (tmp_path / "out/drive.json").exists()
 
 
 def test_nothing_is_written_over(image, tmp_path):

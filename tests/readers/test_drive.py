@@ -92,21 +92,22 @@ def test_a_track_that_is_absent_at_one_key_frame_stays_absent(recorded, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("intervals", "expected"),
+    ("steps", "usual", "expected"),
     [
-        ([[500_000] * 4, [500_000, 1_000_000]], 750_000),
-        ([[100_000] * 9], 150_000),
-        ([[900_000] * 2], 1_000_000),
-        ([[]], 0),
+        ([500_000, 1_000_000], 500_000, 1_000_000),
+        ([500_000, 500_000, 1_000_000], 500_000, 750_000),
+        ([100_000] * 9, 100_000, 300_000),
+        ([500_000] * 4, 100_000, 750_000),
+        ([2_000_000], 100_000, 300_000),
+        ([900_000] * 2, 900_000, 1_000_000),
+        ([], 0, 300_000),
     ],
 )
-def test_tracks_are_interpolated_over_little_more_than_their_usual_interval(intervals, expected):
-    def track(steps: list[int]) -> DriveTrack:
-        times = np.cumsum([0, *steps]).tolist()
-        poses = [{"timestamp": t, "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]} for t in times]
-        return DriveTrack.model_validate({"id": "a", "class": "car", "size": [4, 2, 1.5], "poses": poses})
-
-    assert max_track_gap([track(steps) for steps in intervals]) == expected
+def test_tracks_are_interpolated_over_little_more_than_the_usual_interval(steps, usual, expected):
+    times = np.cumsum([0, *steps]).tolist()
+    poses = [{"timestamp": t, "translation": [0, 0, 0], "rotation": [1, 0, 0, 0]} for t in times]
+    track = DriveTrack.model_validate({"id": "a", "class": "car", "size": [4, 2, 1.5], "poses": poses})
+    assert max_track_gap(track, float(usual)) == expected
 
 
 def test_seed_points_are_the_same_to_the_last_bit(recorded, folder):

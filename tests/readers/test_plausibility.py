@@ -119,7 +119,7 @@ def test_a_drive_without_mistakes_has_no_warnings(content, folder, capsys):
         ),
         (
             lambda d: d["cameras"]["CAM_FRONT"]["sensor_to_ego"].update(translation=[90.0, 60.0, 90.0]),
-            "no return of the LiDAR falls into its images",
+            "no return of a LiDAR falls into its images",
         ),
     ],
     ids=[
@@ -138,11 +138,15 @@ def test_a_mistake_is_a_warning_that_says_what_to_check(change, words, content, 
     [
         (
             lambda d: [pose.update(timestamp=pose["timestamp"] // 10**6) for pose in d["ego_poses"]],
-            "ego_poses: timestamps are seconds, the others microseconds",
+            "ego_poses: timestamps are seconds, those of frames and sweeps microseconds; multiply them by 1e+06",
         ),
         (
             lambda d: [pose.update(timestamp=pose["timestamp"] // 10**3) for pose in d["ego_poses"]],
-            "ego_poses: timestamps are milliseconds, the others microseconds",
+            "ego_poses: timestamps are milliseconds, those of frames and sweeps microseconds; multiply them by 1000",
+        ),
+        (
+            lambda d: [pose.update(timestamp=pose["timestamp"] * 1000) for pose in d["ego_poses"]],
+            "ego_poses: timestamps are nanoseconds, those of frames and sweeps microseconds",
         ),
         (
             lambda d: [pose.update(timestamp=pose["timestamp"] * 1e-6) for pose in d["ego_poses"]],
@@ -153,7 +157,10 @@ def test_a_mistake_is_a_warning_that_says_what_to_check(change, words, content, 
             "cameras.CAM_FRONT: its translation is",
         ),
     ],
-    ids=["poses in seconds", "poses in milliseconds", "seconds as decimals", "a mount in millimetres"],
+    ids=[
+        "poses in seconds", "poses in milliseconds", "poses in nanoseconds", "seconds as decimals",
+        "a mount in millimetres",
+    ],
 )  # fmt: skip
 def test_a_wrong_unit_is_a_fault_that_names_the_cause_in_few_lines(change, words, content, folder, capsys):
     status, said = said_of(content, change, folder, capsys)

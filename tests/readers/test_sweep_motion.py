@@ -152,4 +152,4 @@ def test_without_ego_poses_it_is_refused(tmp_path):
         {"lidar": "top", "timestamp": t, "file": f"{t}.npz", "lidar_to_world": pose_record(np.eye(4))} for t in SWEEPS
     ]
     (fault,) = faults_of(read_drive(write(tmp_path, ego_poses=[], sweeps=sweeps)))
-    assert fault.startswith("lidars.top: motion_compensated is false, and there are no ego_poses")
+    assert fault.startswith("lidars.top: motion_compensated is false, but there are no ego_poses")

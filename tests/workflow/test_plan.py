@@ -237,7 +237,7 @@ def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(tmp
     for target, message in {
         "street/trajectories/objects/drive/drive.json": "shows the moving parts alone",
         "street/trajectories/nowhere/drive/drive.json": "no film called 'nowhere'",
-        "street/edits/gone/drive": "edits/gone/drive is a folder; ask for the file edits/gone/drive/drive.json",
+        "street/edits/gone/drive": "ask for the file elsewhere/a1/street/edits/gone/drive/drive.json",
     }.items():
         with pytest.raises(ConfigError, match=message):
             made.refuse_unknown([f"elsewhere/a1/{target}"])

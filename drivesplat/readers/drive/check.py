@@ -15,7 +15,7 @@ from drivesplat.readers.sweeps import read_returns, sweep_fault
 from drivesplat.scene.images import continuous_intrinsics, project, read_image
 from drivesplat.scene.regions import hulls_in
 from drivesplat.scene.rigid import apply, inverse
-from drivesplat.scene.scene import UNPOSED, Frame, Scene
+from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep
 from drivesplat.settings.extract import SceneSource
 
 WIDTH = 960
@@ -30,9 +30,11 @@ SCALE_STEPS = 6
 
 
 def check(folder: Path, picture: Path | None) -> list[str]:
-    """The faults of a drive folder, a sentence each. Without faults of drive.json, and with a path for it, writes the
-    picture: the middle key frame of every camera, with the nearest sweep coloured by depth and the boxes, and the same
-    with sweeps of other times, which the ego poses bring there; or the middle sweep from above, without images."""
+    """The faults of a drive folder, a sentence each. Without faults of drive.json, and with a path for it, writes a
+    picture: for every camera its middle key frame with boxes and the nearest sweep, and again with sweeps 1.5 s earlier
+    and later. Without images: the middle sweep from above."""
+    if picture is not None:
+        picture.unlink(missing_ok=True)
     faults, drive = structure_of(folder / FILE)
     if drive is None:
         return faults
@@ -40,9 +42,11 @@ def check(folder: Path, picture: Path | None) -> list[str]:
     if faults:
         return faults
     scene = whole_scene(drive, folder)
+    of_sweeps = [sweep_fault(sweep) for sweep in scene.sweeps]
     if picture is not None:
-        write_picture(scene, picture)
-    return list(_file_faults(scene))
+        sound = [sweep for sweep, fault in zip(scene.sweeps, of_sweeps, strict=True) if not fault]
+        write_picture(scene, sound, picture)
+    return [*_image_faults(scene), *filter(None, of_sweeps)]
 
 
 def whole_scene(drive: Drive, folder: Path) -> Scene:
@@ -69,23 +73,23 @@ def summary(scene: Scene) -> str:
     return ", ".join(parts)
 
 
-def _file_faults(scene: Scene) -> Iterator[str]:
+def _image_faults(scene: Scene) -> Iterator[str]:
     for frame in scene.frames:
         if fault := image_fault(frame):
             yield f"frame {frame.token}: {fault}"
-    for sweep in scene.sweeps:
-        if fault := sweep_fault(sweep):
-            yield fault
 
 
-def write_picture(scene: Scene, path: Path) -> None:
-    """Writes the middle key frames of all cameras, one below the other, or without images the middle sweep."""
+def write_picture(scene: Scene, sweeps: Sequence[Sweep], path: Path) -> None:
+    """Writes the middle key frames of all cameras, one below the other, or without images the middle sweep. `sweeps`
+    are those without faults."""
     images = []
     for camera in scene.cameras:
         indices = scene.key_frames(camera.name)
         if indices:
             frame = scene.frames[sorted(indices)[len(indices) // 2]]
-            images += [_drawn(scene, frame, offsets) for offsets in ((0,), OTHER_TIMES)[: 2 if scene.sweeps else 1]]
+            images += [
+                _drawn(scene, sweeps, frame, offsets) for offsets in ((0,), OTHER_TIMES)[: 2 if scene.sweeps else 1]
+            ]
     if not scene.frames and scene.sweeps:
         images.append(seen_from_above(scene, WIDTH))
     if not images:
@@ -98,22 +102,21 @@ def write_picture(scene: Scene, path: Path) -> None:
     canvas.save(path)
 
 
-def _drawn(scene: Scene, frame: Frame, offsets: Sequence[int]) -> Image.Image:
+def _drawn(scene: Scene, sweeps: Sequence[Sweep], frame: Frame, offsets: Sequence[int]) -> Image.Image:
     """An image with boxes, and with the returns of the sweeps nearest to its time plus `offsets` (microseconds)."""
     size = WIDTH, round(WIDTH * frame.height / frame.width)
     image = Image.new("RGB", size) if image_fault(frame) else Image.fromarray(read_image(frame.image_path, size))
-    draw, shown = ImageDraw.Draw(image), []
-    sound = [sweep for sweep in scene.sweeps if not sweep_fault(sweep)]
-    for offset in offsets if sound else ():
-        sweep = min(sound, key=lambda sweep: abs(sweep.timestamp - frame.timestamp - offset))
+    draw, seconds = ImageDraw.Draw(image), []
+    for offset in offsets if sweeps else ():
+        sweep = min(sweeps, key=lambda sweep: abs(sweep.timestamp - frame.timestamp - offset))
         _draw_returns(draw, apply(sweep.sensor_to_world, read_returns(sweep).points), frame, size)
-        shown.append(f"{(sweep.timestamp - frame.timestamp) * 1e-6:+.2f} s")
+        seconds.append(f"{(sweep.timestamp - frame.timestamp) * 1e-6:+.2f} s")
     for hull in hulls_in(scene, frame, size):
         draw.polygon([tuple(corner) for corner in hull.polygon], outline=(255, 90, 0), width=2)
-    text = [f"{frame.camera} at {frame.timestamp}", *([f"returns at {' and '.join(shown)}"] if shown else [])]
+    text = [f"{frame.camera} at {frame.timestamp}", *([f"returns at {' and '.join(seconds)}"] if seconds else [])]
     outlined = {"fill": (255, 255, 255), "stroke_width": 2, "stroke_fill": (0, 0, 0)}
     draw.text((8, 8), ", ".join(text), **outlined)
-    for step in range(SCALE_STEPS + 1 if shown else 0):
+    for step in range(SCALE_STEPS + 1 if seconds else 0):
         share = step / SCALE_STEPS
         draw.rectangle((8 + 60 * step, 26, 20 + 60 * step, 38), fill=_color(share))
         draw.text((24 + 60 * step, 26), f"{share * MAX_DEPTH:.0f} m", **outlined)

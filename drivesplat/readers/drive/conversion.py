@@ -12,7 +12,7 @@ from drivesplat.errors import DatasetError, DriveSplatError
 from drivesplat.io.storage import write_json
 from drivesplat.readers.drive.faults import faults_of
 from drivesplat.readers.drive.format import FILE, structure_of
-from drivesplat.readers.drive.write import pose_record
+from drivesplat.readers.drive.write import pose_record, require_empty
 from drivesplat.readers.files import link_or_copy
 from drivesplat.scene.rigid import interpolate
 
@@ -68,21 +68,22 @@ def write_folder(
     >>> write_folder(Path("mine/0001"), record, {"front/1.jpg": Path("camera0/0001.jpg")})
     PosixPath('mine/0001/drive.json')
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DatasetError(f"{folder} is not empty; name a new folder")
+    require_empty(folder)
     missing = [path for path in images.values() if not path.is_file()]
     if missing:
         raise DatasetError(f"{len(missing)} of {len(images)} images are missing (first: {missing[0]})")
-    _write_record(folder / FILE, record)
+    _check_record(folder / FILE, record)
     for name, source in images.items():
         link_or_copy(source, folder / name)
     for name, columns in sweeps:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(folder / name, **columns)
+    write_json(folder / FILE, record)
     return folder / FILE
 
 
-def _write_record(path: Path, record: Mapping[str, Any]) -> None:
+def _check_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Raises DatasetError, naming the file that is to hold it, if a record has faults. Leaves no file."""
     try:
         write_json(path, record)
     except ValueError as error:
@@ -90,7 +91,7 @@ def _write_record(path: Path, record: Mapping[str, Any]) -> None:
     faults, drive = structure_of(path)
     if drive is not None:
         faults = [f"{path}: {fault}" for fault in faults_of(drive)]
+    path.unlink()
     if faults:
-        path.unlink()
         more = f" ({len(faults) - 1} more faults)" if len(faults) > 1 else ""
         raise DatasetError(f"{faults[0]}{more}")

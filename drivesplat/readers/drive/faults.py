@@ -17,7 +17,7 @@ from drivesplat.readers.drive.format import Distortion, Drive, DriveCamera, Pose
 from drivesplat.readers.drive.poses import MAX_POSE_GAP, matrix_of
 from drivesplat.readers.drive_checks import clock_faults
 
-UNITS = {"seconds": 1e6, "milliseconds": 1e3}
+UNITS = {"seconds": 1e6, "milliseconds": 1e3, "nanoseconds": 1e-3}
 """Units that are taken for microseconds by mistake, and the microseconds in one."""
 COEFFICIENTS = {"none": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
 
@@ -46,9 +46,11 @@ def _unit_faults(drive: Drive) -> Iterator[str]:
         return
     ratio = float(np.median(recorded)) / max(1.0, float(np.median([pose.timestamp for pose in drive.ego_poses])))
     for unit, factor in UNITS.items():
-        for which, held in (("ego_poses", ratio), ("frames and sweeps", 1.0 / max(ratio, 1e-12))):
-            if 0.5 < held / factor < 2.0:
-                yield f"{which}: timestamps are {unit}, the others microseconds; from seconds: round(t * 1e6)"
+        if 0.5 < ratio / factor < 2.0:
+            yield (
+                f"ego_poses: timestamps are {unit}, those of frames and sweeps microseconds; multiply them by "
+                f"{factor:g}, before they are rounded"
+            )
 
 
 def is_unposed(drive: Drive) -> bool:
@@ -77,7 +79,7 @@ def _lidar_faults(drive: Drive) -> Iterator[str]:
     yield from _pose_faults("lidars", ((name, lidar.sensor_to_ego) for name, lidar in drive.lidars.items()), MAX_MOUNT)
     for name, lidar in drive.lidars.items():
         if not lidar.motion_compensated and not drive.ego_poses:
-            yield f"lidars.{name}: motion_compensated is false, and there are no ego_poses by which to move its points"
+            yield f"lidars.{name}: motion_compensated is false, but there are no ego_poses for motion compensation"
 
 
 def _distortion_faults(distortion: Distortion) -> Iterator[str]:

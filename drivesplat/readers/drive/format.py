@@ -111,7 +111,7 @@ class DriveSweep(DriveRecord):
 
     lidar: str
     timestamp: Timestamp
-    """The time at which the points are in the sensor's frame."""
+    """The time to which the points are motion-compensated, or to which their `time` refers."""
     file: RelativePath
     lidar_to_world: Pose | None = None
     """The LiDAR's own pose. null: ego pose and sensor_to_ego."""
@@ -137,7 +137,7 @@ class DriveTrack(DriveRecord):
 
 
 class Rendered(DriveRecord):
-    """Marks a drive that no camera recorded: what was rendered, and how it was made."""
+    """Marks a rendered drive: its source, and how it was made."""
 
     scene: str
     """The recorded scene."""

@@ -20,7 +20,7 @@ def seen_from_above(scene: Scene, width: int) -> Image.Image:
     """The middle sweep in a square picture of `width` pixels, x of the world to the right and y up: returns coloured by
     height, boxes outlined."""
     image = Image.new("RGB", (width, width))
-    draw, sweep = ImageDraw.Draw(image), scene.sweeps[len(scene.sweeps) // 2]
+    draw, sweep = ImageDraw.Draw(image), sorted(scene.sweeps, key=lambda sweep: sweep.timestamp)[len(scene.sweeps) // 2]
     center = sweep.sensor_to_world[:3, 3]
 
     def pixels(points: np.ndarray) -> np.ndarray:

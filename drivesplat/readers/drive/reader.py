@@ -20,8 +20,10 @@ READER = "drive"
 CHECK = "python -m drivesplat.readers.drive check"
 VISIBILITY_LEVELS = (0.4, 0.6, 0.8)
 """Visible shares at which nuScenes' levels 2, 3 and 4 begin."""
-MAX_TRACK_GAP, MAX_INTERVALS = 1e6, 1.5
-"""Limits of `max_track_gap`: microseconds, and usual intervals between poses."""
+MIN_TRACK_GAP, MAX_TRACK_GAP, MAX_INTERVALS = 3e5, 1e6, 1.5
+"""Bounds of `max_track_gap` in microseconds, and its usual intervals between poses."""
+MIN_POSES = 3
+"""Poses from which on a track has a usual interval of its own."""
 
 
 def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> Scene:
@@ -56,8 +58,8 @@ def scene_of(drive: Drive, folder: Path, source: SceneSource) -> Scene:
         )
     times, ego = key_frame_times(drive, source), EgoPath(drive)
     reading = _Reading(drive, folder, times, ego, origin_shift(drive, ego, int(times[0])))
-    gap = max_track_gap(drive.tracks)
-    tracks = (sampled_track(track, times, reading.shift, gap) for track in drive.tracks)
+    usual = usual_interval(drive.tracks)
+    tracks = (sampled_track(track, times, reading.shift, max_track_gap(track, usual)) for track in drive.tracks)
     sweeps = tuple(sweep for lidar in drive.lidars for sweep in reading.sweeps(lidar, source.lidar_sweeps))
     return Scene(
         name=source.scene,
@@ -147,11 +149,18 @@ def chosen_recordings(
     return [(i, own.get(i, near), i in own) for i, near in zip(kept, nearest, strict=True)]
 
 
-def max_track_gap(tracks: Sequence[DriveTrack]) -> float:
-    """The time in microseconds between two poses of a track over which it is interpolated: MAX_INTERVALS of the usual
-    intervals between poses, at most MAX_TRACK_GAP. Over a longer one the object is absent."""
+def usual_interval(tracks: Sequence[DriveTrack]) -> float:
+    """The median time in microseconds between poses of a drive's tracks; 0 if there are none."""
     intervals = [np.diff([pose.timestamp for pose in track.poses]) for track in tracks if len(track.poses) > 1]
-    return min(MAX_TRACK_GAP, MAX_INTERVALS * float(np.median(np.concatenate(intervals)))) if intervals else 0.0
+    return float(np.median(np.concatenate(intervals))) if intervals else 0.0
+
+
+def max_track_gap(track: DriveTrack, usual: float) -> float:
+    """The time in microseconds between two poses of a track over which it is interpolated: MAX_INTERVALS of the `usual`
+    interval between poses of the drive or of this track, whichever is longer, from MIN_TRACK_GAP to MAX_TRACK_GAP. Over
+    a longer one the object is absent."""
+    own = usual_interval([track]) if len(track.poses) >= MIN_POSES else 0.0
+    return float(np.clip(MAX_INTERVALS * max(usual, own), MIN_TRACK_GAP, MAX_TRACK_GAP))
 
 
 def sampled_track(track: DriveTrack, key_times: np.ndarray, origin: np.ndarray, max_gap: float) -> Track | None:

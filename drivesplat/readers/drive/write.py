@@ -12,7 +12,6 @@ from drivesplat.io.storage import write_json
 from drivesplat.readers.drive.format import FILE, Drive
 from drivesplat.readers.files import link_or_copy
 from drivesplat.readers.sweeps import read_returns, sweep_fault
-from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import UNPOSED, Frame, Scene, Sweep, Track
 from drivesplat.scene.sensors import Camera, Lidar
 
@@ -34,8 +33,7 @@ def write_drive(scene: Scene, folder: Path, licence: str = "") -> Path:
     >>> write_drive(read_scene("results/0001/scene.json"), Path("mine/0001"))
     PosixPath('mine/0001/drive.json')
     """
-    if folder.exists() and any(folder.iterdir()):
-        raise DatasetError(f"{folder} is not empty; name a new folder")
+    require_empty(folder)
     if scene.poses == UNPOSED:
         raise DatasetError(
             f"scene {scene.name} has no poses; write scene_refined.json, where they are estimated from the images"
@@ -71,6 +69,12 @@ def write_record(path: Path, scene: Scene, rendered: dict[str, Any]) -> None:
 def _write_checked(path: Path, record: dict[str, Any]) -> None:
     Drive.model_validate(record)
     write_json(path, record)
+
+
+def require_empty(folder: Path) -> None:
+    """Raises DatasetError if `folder` is a file, or holds anything."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DatasetError(f"{folder} is not empty; name a new folder")
 
 
 def drive_record(
@@ -118,7 +122,7 @@ def pose_record(matrix: np.ndarray) -> dict[str, Any]:
 
 def _camera(camera: Camera, frames: Iterable[tuple[Frame, str]]) -> dict[str, Any]:
     first = next((frame for frame, _ in frames if frame.camera == camera.name), None)
-    mount = np.eye(4) if first is None else inverse(first.ego_to_world) @ first.camera_to_world
+    mount = np.eye(4) if first is None else first.camera_to_ego
     return {
         "width": camera.width,
         "height": camera.height,

@@ -37,7 +37,7 @@ _CATEGORIES = {
 
 
 def category_of(kind: ObjectClass, name: str) -> str:
-    """The category of an object in nuScenes' tables: `name` where it is a category of nuScenes of that class."""
+    """The category of an object in nuScenes' tables: `name` where it reads as one of that class."""
     if "." in name and object_class(name) is kind:
         return name
     return _CATEGORIES.get(kind) or next(category for category, known in _CLASSES.items() if known is kind)

@@ -32,7 +32,7 @@ def write_nuscenes(scene: Scene, root: Path, version: str, log: dict[str, str]) 
     mounts: dict[str, np.ndarray] = {}
     for frame in scene.frames:
         if frame.camera not in mounts:
-            mounts[frame.camera] = inverse(frame.ego_to_world) @ frame.camera_to_world
+            mounts[frame.camera] = frame.camera_to_ego
             tables.add_camera(frame, mounts[frame.camera])
         name = tables.add_image(frame, frame.camera_to_world @ inverse(mounts[frame.camera]))
         link_or_copy(Path(frame.image_path), root / name)

@@ -101,7 +101,8 @@ def _size(files: Iterable[str | Path]) -> float:
         found.add(path)
         if path.name in MEMBER_FOLDERS:
             found |= {file for file in (path.parent / MEMBER_FOLDERS[path.name]).rglob("*") if file.is_file()}
-    return float(sum(file.stat().st_size for file in found))
+    states = [file.stat() for file in found]
+    return float(sum({(state.st_dev, state.st_ino): state.st_size for state in states}.values()))  # hard links once
 
 
 def wall_seconds(planned: Iterable[PlannedJob], machine: Machine) -> float:
