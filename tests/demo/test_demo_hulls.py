@@ -13,6 +13,8 @@ from drivesplat.preprocess.extract import extract_scene
 from drivesplat.scene.regions import LABELS, MIN_PIXELS, fill, hulls_in, label_image
 from drivesplat.settings.extract import SceneSource
 
+pytestmark = pytest.mark.slow
+
 SIZE = (400, 225)
 """The demo's own size."""
 

@@ -79,6 +79,7 @@ def steps_of(recorder: Recorder, found: Scan) -> np.ndarray:
     return np.array(sorted(steps))
 
 
+@pytest.mark.slow
 def test_ranges_are_those_of_meshes_posed_at_each_rays_own_time(recorder, found):
     static = np.concatenate([meshes_at(item, 0.0) for item in recorder.objects if not item.moves])
     standing = RayMeshIntersector(

@@ -11,6 +11,8 @@ from helpers.world_digests import digest
 from drivesplat.demo.recorder import Recorder
 from drivesplat.settings.world import WorldSettings
 
+pytestmark = pytest.mark.slow
+
 EVERYTHING = {"pedestrians": 20, "bystanders": 6, "cyclists": 3, "dogs": 3}
 WORLDS = {
     "default": {},

@@ -71,6 +71,7 @@ def png(path) -> np.ndarray:
     return np.asarray(Image.open(path))
 
 
+@pytest.mark.slow
 def test_key_frames_come_at_10_hz_and_images_at_20(root, scene):
     assert set(np.diff([row["timestamp"] for row in table(root, "sample")])) == {100_000}
     images = [frame.timestamp for frame in scene.frames]

@@ -10,6 +10,8 @@ from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import held_out_key_frames
 from drivesplat.settings.images import HoldoutSettings
 
+pytestmark = pytest.mark.slow
+
 WIDTH = 400
 """The width of the default world."""
 SIZE = (WIDTH, WIDTH * 9 // 16)

@@ -16,6 +16,8 @@ from drivesplat.demo.world import make_world
 from drivesplat.readers.truth import read_truth
 from drivesplat.settings.edits_file import read_edits
 
+pytestmark = pytest.mark.slow
+
 NAMES = {"day", "dense", "night", "slope", "six_cameras"}
 
 

@@ -149,8 +149,14 @@ DELETE = re.compile(r"(results/\S+): .*; delete (\S+) and rerun: the rule '(\w+)
     ("path", "rule", "lost", "target"),
     [
         ("results/0001/masks/regions/CAM_FRONT/*.png", "masks", True, "results/0001/street/checkpoint.npz"),
-        ("results/0001/masks/sky/CAM_FRONT/*.png", "masks", False, "results/0001/street/checkpoint.npz"),
-        ("results/0001/seed.ply", "lidar_seed", False, "results/0001/parser.pkl"),
+        pytest.param(
+            "results/0001/masks/sky/CAM_FRONT/*.png",
+            "masks",
+            False,
+            "results/0001/street/checkpoint.npz",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("results/0001/seed.ply", "lidar_seed", False, "results/0001/parser.pkl", marks=pytest.mark.slow),
     ],
 )
 def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, lost, target):

@@ -374,6 +374,7 @@ def only_complaint(done: subprocess.CompletedProcess) -> str:
     return lines.pop()
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("download")
 def test_through_the_workflow_it_is_refused_then_fetched_then_read(archive, tmp_path):

@@ -61,6 +61,7 @@ def test_the_workflow_runs_from_elsewhere_into_a_folder_of_its_own(copy, tmp_pat
     assert planned.returncode == 0 and "rule edit:" in planned.stdout, planned.stdout
 
 
+@pytest.mark.slow
 def test_a_dataset_that_has_moved_reruns_nothing_and_is_read_where_it_is(copy, tmp_path):
     mine = copy.again(tmp_path / "workflow")
     assert mine.run("results/0001/parser.pkl").returncode == 0

@@ -463,6 +463,7 @@ def test_there_are_never_more_gpu_jobs_than_gpus_and_each_sees_its_own(trained, 
         assert all(ended <= began for (_, ended), (began, _) in itertools.pairwise(spans))
 
 
+@pytest.mark.slow
 def test_a_second_run_in_one_folder_is_refused(copy):
     results = copy.folder / "results"
     results.mkdir()

@@ -214,6 +214,7 @@ def test_on_amd_gsplat_loads_its_own_way(gsplat_package, monkeypatch):
     assert choose_device(DeviceSettings()) == torch.device("cuda")
 
 
+@pytest.mark.slow
 def test_without_gsplat_the_training_stage_fails_with_one_sentence():
     """What the script of the rule `train` does on a machine where gsplat is not installed."""
     script = (

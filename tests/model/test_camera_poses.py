@@ -171,6 +171,7 @@ def learned() -> SplatModel:
     return fitted(poses(LOOSE))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", [*TIMES, 1.5])
 def test_wrong_poses_are_corrected_at_training_and_held_out_images(learned, time):
     shift, turn = off(learned, time)

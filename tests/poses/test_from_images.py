@@ -267,6 +267,7 @@ def test_a_vehicle_without_translation_is_refused(tmp_path, ego_path):
         case.made()
 
 
+@pytest.mark.slow
 def test_disconnected_models_are_listed(tmp_path):
     """Images before the sixth see other points than those after it."""
     case = case_of(tmp_path, shows=lambda i, points: points % 2 == (i > 5), points=points_along(curve, 1400))
@@ -287,6 +288,7 @@ def test_unplaced_images_are_interpolated(tmp_path):
     np.testing.assert_allclose(poses[4:6, :3, 3], thirds, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_scale_drift_is_followed_up_to_a_limit(tmp_path):
     """LiDAR finds all things 4 % farther off at every key frame, as if the images' scale shrank."""
     case = case_of(tmp_path, stretch=lambda i: 1.04**i)

@@ -318,6 +318,7 @@ def test_a_process_forked_after_rendering_can_render():
         child.join()
 
 
+@pytest.mark.slow
 def test_kernels_compile_where_numba_cannot_write_its_cache():
     """With a read-only installation and home each process compiles again."""
     script = """

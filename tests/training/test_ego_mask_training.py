@@ -154,6 +154,7 @@ def prepared(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_body_that_was_found_reaches_the_training_of_its_camera(prepared, monkeypatch, tmp_path):
     inputs, _ = read_inputs(str(prepared / "parser.pkl"), str(prepared / "masks/masks.json"), [], [], [])
     assert inputs.cameras_with_ego == {"CAM_BACK"}

@@ -54,8 +54,8 @@ def test_a_training_has_curves_of_training_and_held_out_images(tmp_path):
     assert [event.step for event in board.Images("recorded_and_rendered")] == [15, 20]
 
 
-@pytest.mark.parametrize("street", [False, True])
-@pytest.mark.parametrize("strategy", ["mcmc", "default"])
+@pytest.mark.parametrize("street", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("strategy", ["mcmc", pytest.param("default", marks=pytest.mark.slow)])
 def test_curves_change_no_trained_parameter(strategy, street, tmp_path):
     """Bit by bit, with views at times and from places that the training does not have."""
     views, trained = recorded_views(), {}

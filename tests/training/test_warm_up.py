@@ -21,6 +21,7 @@ for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
 """
 
 
+@pytest.mark.slow
 def test_the_warm_up_compiles_every_kernel_of_a_training():
     done = subprocess.run([sys.executable, "-c", LEFT], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     compiled = dict(line.rsplit(" ", 1) for line in done.stdout.splitlines())

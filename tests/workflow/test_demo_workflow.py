@@ -108,6 +108,7 @@ def test_without_a_target_the_demo_stays_out(finished):
     assert "results/0001/metrics.json" in done.stdout and "results/demo" not in done.stdout
 
 
+@pytest.mark.slow
 def test_a_recorded_drive_is_still_refused_without_a_gpu(finished):
     done = finished.run("results/0001/vanilla/checkpoint.npz")
     assert done.returncode != 0

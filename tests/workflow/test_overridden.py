@@ -65,6 +65,7 @@ def test_a_run_reports_it_before_its_estimate(tmp_path):
     assert " jobs, time not measured yet, " in lines[1]
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 def test_it_is_reported_once_by_a_dry_run_by_a_run_and_when_nothing_is_to_be_done(tmp_path):
     """The job of the run reads the Snakefile again, in a process of its own, and does not repeat it."""

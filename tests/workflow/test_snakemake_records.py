@@ -12,6 +12,7 @@ from drivesplat.workflow.snakemake_records import drop_foreign_records
 FOREIGN = {"binary": bytes(range(256)), "a list": b"[1, 2]", "a number": b"7"}
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 def test_a_run_with_damaged_records_names_them_and_goes_on(tmp_path):
     copy = WorkflowCopy.make(tmp_path / "workflow", methods=VANILLA)
