@@ -13,8 +13,7 @@ from drivesplat.settings.extract import SceneSource
 with job(snakemake) as current:
     tables, rows = current.input.tables, current.input.scene_tables
     root, of_scene = Path(snakemake.params.root), Path(rows[0]) if rows else None
-    resampled = Path(current.output.scene).parent / "undistorted"
-    scene = extract_scene(current.settings(SceneSource), root, of_scene, resampled)
+    scene = extract_scene(current.settings(SceneSource), root, of_scene, Path(current.output.scene).parent)
     refuse_unknown_tracks(current.track_references(), scene)
     current.record_dataset(
         images=(frame.image_path for frame in scene.frames), sweeps=(sweep.path for sweep in scene.sweeps)

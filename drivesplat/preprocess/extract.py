@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.undistort import undistorted
-from drivesplat.readers.datasets import reader
+from drivesplat.readers.datasets import reader, unpacker
 from drivesplat.readers.drive_checks import jumps
 from drivesplat.readers.image_file import image_fault
 from drivesplat.readers.plausibility import pose_warnings
@@ -23,14 +23,14 @@ MAX_NAMED = 10
 
 
 def extract_scene(
-    source: SceneSource, root: Path, scene_tables: Path | None = None, undistorted_images: Path | None = None
+    source: SceneSource, root: Path, scene_tables: Path | None = None, results: Path | None = None
 ) -> Scene:
     """Reads and checks a scene and decodes each of its images once. Logs warnings about properties of the drive that
     affect its metrics.
 
-    `root` holds the folder of tables, `scene_tables` the scene's extract of them (None: the reader finds it). Images of
-    distorted cameras are resampled into the folder `undistorted_images`. Raises DatasetError naming the token and path
-    of the fault.
+    `root` holds the folder of tables, `scene_tables` the scene's extract of them (None: the reader finds it).
+    Recordings that are no files of their own are written into the scene's folder `results`, and images of distorted
+    cameras resampled into its folder `undistorted`. Raises DatasetError naming the token and path of the fault.
     """
     scene = reader(source.reader).read(root, source, scene_tables)
     if not scene.frames:
@@ -38,6 +38,9 @@ def extract_scene(
             f"scene {source.scene}: it has no image of {', '.join(source.cameras)}; name cameras that have some "
             "(cameras); nothing is trained or measured on LiDAR alone yet"
         )
+    files = unpacker(source.reader)
+    if files is not None:
+        scene = files.unpack(scene, root, source, _folder(results, source))
     with ThreadPoolExecutor() as pool:
         faults = list(pool.map(image_fault, scene.frames))
     bad = [(frame, fault) for frame, fault in zip(scene.frames, faults, strict=True) if fault]
@@ -55,13 +58,18 @@ def extract_scene(
         )
     scene = dataclasses.replace(scene, dataset=source.dataset, frames=kept, missing_images=len(bad))
     if any(camera.distortion_model != "none" for camera in scene.cameras):
-        if undistorted_images is None:
-            raise DatasetError(f"scene {source.scene}: its images are distorted, and there is no folder for others")
-        shutil.rmtree(undistorted_images, ignore_errors=True)
-        scene = undistorted(scene, undistorted_images)
+        resampled = _folder(results, source) / "undistorted"
+        shutil.rmtree(resampled, ignore_errors=True)
+        scene = undistorted(scene, resampled)
     for sentence in (*jumps(scene), *pose_warnings(scene), *scene_warnings(scene, luminance(scene))):
         log.warning("scene %s: %s", scene.name, sentence)
     return scene
+
+
+def _folder(results: Path | None, source: SceneSource) -> Path:
+    if results is None:
+        raise DatasetError(f"scene {source.scene}: its images have to be written anew, and there is no folder for them")
+    return results
 
 
 def _remedied(frame: Frame, fault: str) -> str:

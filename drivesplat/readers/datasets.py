@@ -3,7 +3,8 @@
 `layout` locates the files (`find_root`, `table_files`), names the cameras (`camera_names`) and is cheap to import;
 `reader` reads a scene (`read`). A dataset with LiDAR also has `sweep_file`, which reads a sweep
 (`drivesplat.readers.sweeps`); one with large tables has `scene_tables`, which splits them into a file per scene
-(`index_tables`, `scene_file`). `DatasetSettings.reader` lists the allowed names of readers.
+(`index_tables`, `scene_file`); one whose images and sweeps are no files of their own has `unpack`, which writes them as
+such (`unpack`). `DatasetSettings.reader` lists the allowed names of readers.
 """
 
 from types import ModuleType
@@ -13,6 +14,7 @@ from drivesplat.readers.by_name import dataset_module, has_module
 LAYOUT = "drivesplat.readers.*.layout"
 SCENE_TABLES = "drivesplat.readers.*.scene_tables"
 READER = "drivesplat.readers.*.reader"
+UNPACK = "drivesplat.readers.*.unpack"
 
 
 def layout(name: str) -> ModuleType:
@@ -28,6 +30,11 @@ def index(name: str) -> ModuleType | None:
 def reads_unposed(name: str) -> bool:
     """Whether a reader reads drives without poses, for stages that estimate them (`layout.POSES_OPTIONAL`)."""
     return getattr(layout(name), "POSES_OPTIONAL", False)
+
+
+def unpacker(name: str) -> ModuleType | None:
+    """The module that writes a dataset's images and sweeps as files; None if they are files already."""
+    return dataset_module(UNPACK, name) if has_module(UNPACK, name) else None
 
 
 def reader(name: str) -> ModuleType:

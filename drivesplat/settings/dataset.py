@@ -26,14 +26,14 @@ DEMO_OVERRIDES = {
 
 
 class DatasetSettings(Settings):
-    reader: Literal["nuscenes", "drive"] = "nuscenes"
-    """Dataset format: 'nuscenes', or 'drive', a folder that you write (docs/own_data.md)."""
+    reader: Literal["nuscenes", "drive", "waymo"] = "nuscenes"
+    """Dataset format: 'nuscenes', 'waymo' (docs/waymo.md), or 'drive', a folder that you write (docs/own_data.md)."""
     dataroot: str = "~/data/nuscenes/v1.0-mini"
     """Folder that contains the folder of tables (or that folder itself, or its grandparent)."""
     version: str = "v1.0-mini"
-    """Name of the folder of tables: v1.0-mini, v1.0-trainval, ..."""
+    """Name of the folder of tables: v1.0-mini, v1.0-trainval, ... Waymo: v1 or v2, needed only where both are there."""
     scenes: tuple[str, ...] = MINI_SCENES
-    """Scene numbers in quotes. YAML reads a bare 0061 as an octal number."""
+    """Scene numbers in quotes. YAML reads a bare 0061 as an octal number. Waymo: names of segments."""
     frames: dict[str, tuple[int, int]] = Field(default_factory=dict)
     """Range of key frames to use, by scene: [first, last + 1). They are then counted from 0. Other scenes are used
     completely."""

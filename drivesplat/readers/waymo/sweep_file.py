@@ -1,0 +1,38 @@
+"""Sweeps of Waymo as `unpack` writes them: .npz with the returns as drive folders have them (x, y, z, intensity, ring)
+and all rays of the range image: `azimuth` (columns,), `elevation` (rows,), `range` (rows, columns), NaN without a
+return."""
+
+from pathlib import Path
+
+import numpy as np
+
+from drivesplat.readers.drive.sweep_file import file_fault, read_file
+from drivesplat.readers.waymo.range_image import Rays
+
+__all__ = ["file_fault", "read_file", "read_rays", "write_file"]
+
+
+def write_file(
+    path: Path, azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray, **returns: np.ndarray
+) -> None:
+    """Writes a sweep: `ranges` (rows, columns) with NaN for dropped returns, and the columns of `returns` by name."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, azimuth=azimuth, elevation=elevation, range=ranges.astype(np.float32), **returns)
+
+
+def read_rays(path: Path) -> Rays:
+    """All rays of a sweep, row by row."""
+    with np.load(path, allow_pickle=False) as arrays:
+        ranges = arrays["range"].astype(np.float64)
+        return rays_of(arrays["azimuth"], arrays["elevation"], ranges)
+
+
+def rays_of(azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray) -> Rays:
+    """The rays of a range image (rows, columns), row by row."""
+    shape = ranges.shape
+    return Rays(
+        np.broadcast_to(azimuth, shape).ravel(),
+        np.broadcast_to(elevation[:, None], shape).ravel(),
+        ranges.ravel(),
+        np.broadcast_to(np.arange(shape[0])[:, None], shape).ravel(),
+    )

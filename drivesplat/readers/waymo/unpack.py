@@ -1,0 +1,103 @@
+"""Writes the images and sweeps of a segment as files, since later stages open each by its path, many times and in any
+order: images/{camera}/{timestamp}.jpg, the bytes of the dataset unchanged, and sweeps/{laser}/{timestamp}.npz.
+
+They are written once, by the rule `extract`, one recording at a time, so that memory does not grow with the segment. A
+rerun writes the same bytes.
+"""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from drivesplat.errors import DatasetError
+from drivesplat.readers.drive_checks import MAX_RANGE
+from drivesplat.readers.waymo.calibration import laser_elevations, laser_mount, pose_of
+from drivesplat.readers.waymo.layout import segment_files
+from drivesplat.readers.waymo.names import CAMERAS, LASERS
+from drivesplat.readers.waymo.range_image import azimuths, points_of
+from drivesplat.readers.waymo.reader import format_of
+from drivesplat.readers.waymo.segment import ImageFile, RangeImage, Recordings, sweep_name
+from drivesplat.readers.waymo.sweep_file import rays_of, write_file
+from drivesplat.scene.scene import Frame, Scene
+from drivesplat.settings.extract import SceneSource
+
+FOLDERS = ("images", "sweeps")
+
+
+def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene:
+    """Writes the images and sweeps of a scene that `reader.read` returned below `folder`, in place of those that are
+    there. Returns the scene with their paths.
+
+    Raises DatasetError naming the first range image that is damaged, and a frame without an image unless
+    `source.on_missing` is 'warn'.
+    """
+    for name in FOLDERS:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    files = segment_files(root, source.version, source.scene)
+    images = {frame.token: folder / frame.image_path for frame in scene.frames}
+    sweeps = {sweep.token: folder / sweep.path for sweep in scene.sweeps}
+    for recording in format_of(files.version).read_recordings(files, _wanted(scene)):
+        if isinstance(recording, RangeImage):
+            _write_sweep(recording, sweeps[f"{LASERS[recording.laser.number]}/{recording.frame}"])
+        elif recording.content:
+            _write_image(recording, images[f"{CAMERAS[recording.camera]}/{recording.frame}"])
+    if source.on_missing == "stop":
+        for frame in scene.frames:
+            if not images[frame.token].is_file():
+                raise _no_image(frame)
+    return dataclasses.replace(
+        scene,
+        frames=tuple(dataclasses.replace(frame, image_path=str(images[frame.token])) for frame in scene.frames),
+        sweeps=tuple(dataclasses.replace(sweep, path=str(sweeps[sweep.token])) for sweep in scene.sweeps),
+    )
+
+
+def _wanted(scene: Scene) -> Recordings:
+    cameras = {name: number for number, name in CAMERAS.items()}
+    lasers = {name: number for number, name in LASERS.items()}
+    times = scene.key_frame_timestamps.tolist()
+    return Recordings(
+        frozenset((times[frame.sample_index], cameras[frame.camera]) for frame in scene.frames),
+        frozenset((times[sweep.sample_index], lasers[sweep.lidar]) for sweep in scene.sweeps),
+    )
+
+
+def _write_image(image: ImageFile, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(image.content)
+
+
+def _no_image(frame: Frame) -> DatasetError:
+    camera, time = frame.token.split("/")
+    return DatasetError(
+        f"key frame {frame.sample_index}: frame {time} has no image of camera {camera}; download the segment again, or "
+        "set extract.on_missing: warn to go on without it"
+    )
+
+
+def _write_sweep(image: RangeImage, path: Path) -> None:
+    """Writes a range image as rays, and as returns in the laser's frame at the pose of the frame. Waymo's ranges of
+    dropped returns are not positive."""
+    mount, sweep = laser_mount(image.laser), sweep_name(image.laser.number, image.frame)
+    rows, columns, _ = image.values.shape
+    if image.poses is not None and image.poses.shape[:2] != (rows, columns):
+        raise DatasetError(
+            f"{sweep}: its range image is {rows}x{columns}, and the poses of its pixels are "
+            f"{image.poses.shape[0]}x{image.poses.shape[1]}; both must be of one segment"
+        )
+    azimuth, elevation = azimuths(columns, mount), laser_elevations(image.laser, rows)
+    ranges = image.values[..., 0].astype(np.float64)
+    ranges[~((ranges > 0) & (ranges <= MAX_RANGE))] = np.nan
+    rays = rays_of(azimuth, elevation, ranges)
+    hit = np.isfinite(rays.range)
+    poses = None if image.poses is None else image.poses.reshape(-1, 6)
+    x, y, z = points_of(rays, mount, poses, pose_of(image.frame_pose, sweep)).T.astype(np.float32)
+    intensity, ring = _intensity(image.values[..., 1].ravel()[hit]), rays.row[hit].astype(np.int16)
+    write_file(path, azimuth, elevation, ranges, x=x, y=y, z=z, intensity=intensity, ring=ring)
+
+
+def _intensity(values: np.ndarray) -> np.ndarray:
+    """Intensities in [0, 1]. Waymo's have no unit and no upper bound; most are below 1."""
+    return np.tanh(np.nan_to_num(values.astype(np.float64), nan=0.0).clip(0.0)).astype(np.float32)

@@ -1,0 +1,130 @@
+"""Segments of v1: a TFRecord file with one `Frame` message for each frame."""
+
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from drivesplat.errors import DatasetError
+from drivesplat.readers.record_names import shown
+from drivesplat.readers.waymo.layout import SegmentFiles
+from drivesplat.readers.waymo.messages import message
+from drivesplat.readers.waymo.names import FRAMES, TOP
+from drivesplat.readers.waymo.segment import (
+    MAX_CELLS,
+    BoxRecord,
+    CameraRecord,
+    ImageFile,
+    ImageRecord,
+    LaserRecord,
+    RangeImage,
+    Recordings,
+    Segment,
+    cells,
+    frame_name,
+    sweep_name,
+)
+from drivesplat.readers.waymo.tfrecord import records
+
+
+def read_segment(files: SegmentFiles) -> Segment:
+    """The segment of a file, read one frame at a time."""
+    segment = Segment(files.name, files.version)
+    for frame in _frames(files):
+        time = frame.timestamp_micros
+        if time in segment.frames:
+            raise DatasetError(f"{frame_name(time)}: {files.files[FRAMES]} has it twice")
+        segment.frames[time] = list(frame.pose.transform)
+        if len(segment.frames) == 1:
+            _add_calibrations(segment, frame.context)
+        segment.images += [_image(time, image) for image in frame.images]
+        segment.boxes += [_box(time, label) for label in frame.laser_labels]
+        for laser in frame.lasers:
+            if laser.ri_return1.range_image_compressed:
+                segment.sweeps.append((time, laser.name))
+                if laser.name not in segment.shapes:
+                    segment.shapes[laser.name] = _returns(laser, time).shape[:2]
+    return segment
+
+
+def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile | RangeImage]:
+    """The wanted images and range images, one at a time."""
+    calibrated = Segment(files.name, files.version)
+    for frame in _frames(files):
+        time = frame.timestamp_micros
+        if not calibrated.lasers:
+            _add_calibrations(calibrated, frame.context)
+        for image in frame.images:
+            if (time, image.name) in wanted.images:
+                yield ImageFile(time, image.name, image.image)
+        for laser in frame.lasers:
+            if (time, laser.name) in wanted.sweeps:
+                values, poses = _returns(laser, time), None
+                if laser.name == TOP:
+                    poses = _matrix(laser.ri_return1.range_image_pose_compressed, 6, sweep_name(TOP, time))
+                yield RangeImage(time, calibrated.laser(laser.name), list(frame.pose.transform), values, poses)
+
+
+def _frames(files: SegmentFiles) -> Iterator[Any]:
+    """The frames of a segment's file, in its order."""
+    path, frame_of = files.files[FRAMES], message("Frame")
+    number = -1
+    for number, record in enumerate(records(path)):
+        try:
+            frame = frame_of.FromString(record)
+        except DecodeError as error:
+            raise DatasetError(f"record {number} of {path} is no Frame message ({error})") from error
+        name = frame.context.name.decode(errors="replace")
+        if name != files.name:
+            raise DatasetError(
+                f"record {number} of {path} is a frame of segment {shown(name)}, and the file is called {files.name}; "
+                "name it after its segment, as it was published"
+            )
+        yield frame
+    if number < 0:
+        raise DatasetError(f"{path} is empty; download it again")
+
+
+def _add_calibrations(segment: Segment, context: Any) -> None:
+    for camera in context.camera_calibrations:
+        segment.cameras[camera.name] = CameraRecord(
+            camera.name, list(camera.intrinsic), list(camera.extrinsic.transform), camera.width, camera.height,
+            camera.rolling_shutter_direction,
+        )  # fmt: skip
+    for laser in context.laser_calibrations:
+        segment.lasers[laser.name] = LaserRecord(
+            laser.name, list(laser.beam_inclinations), laser.beam_inclination_min, laser.beam_inclination_max,
+            list(laser.extrinsic.transform),
+        )  # fmt: skip
+
+
+def _image(time: int, image: Any) -> ImageRecord:
+    pose = list(image.pose.transform)
+    return ImageRecord(
+        time, image.name, pose, image.pose_timestamp, image.shutter, image.camera_trigger_time,
+        image.camera_readout_done_time,
+    )  # fmt: skip
+
+
+def _box(time: int, label: Any) -> BoxRecord:
+    box = label.box
+    center, size = [box.center_x, box.center_y, box.center_z], [box.length, box.width, box.height]
+    return BoxRecord(time, label.id.decode(errors="replace"), label.type, center, size, box.heading)
+
+
+def _returns(laser: Any, time: int) -> np.ndarray:
+    return _matrix(laser.ri_return1.range_image_compressed, 4, sweep_name(laser.name, time))
+
+
+def _matrix(compressed: bytes, channels: int, record: str) -> np.ndarray:
+    """A zlib-compressed MatrixFloat (rows, columns, channels)."""
+    limit = 4 * MAX_CELLS * channels
+    try:
+        unpacked = zlib.decompressobj().decompress(compressed, limit)
+        matrix = message("MatrixFloat").FromString(unpacked)
+    except (zlib.error, DecodeError) as error:
+        raise DatasetError(f"{record}: its range image is damaged ({error})") from error
+    data = matrix.data[: len(matrix.data) // 4 * 4]
+    return cells(np.frombuffer(data, dtype="<f4"), matrix.shape.dims, channels, record)
