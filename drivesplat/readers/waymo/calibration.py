@@ -11,7 +11,6 @@ import numpy as np
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import (
-    EXACT,
     MAX_COORDINATE,
     MAX_MOUNT,
     checked_beams,
@@ -32,6 +31,8 @@ FROM_OPENCV = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 """OpenCV's camera axes (x right, y down, z forward) to Waymo's."""
 MAX_INTRINSIC = 1e6
 HALF_PIXEL = 0.5
+SINGLE = 1e-6
+"""Deviation of an angle that is the rounding of single precision."""
 
 
 def pose_of(values: Any, record: str, bound: float = MAX_COORDINATE) -> np.ndarray:
@@ -95,7 +96,7 @@ def laser_elevations(laser: LaserRecord, rows: int) -> np.ndarray:
     if explicit is not None:
         return elevations(explicit, 0.0, 0.0, rows, record)
     ends = checked_numbers(
-        [laser.lowest, laser.highest], 2, np.pi / 2 + EXACT, record, "range of beam inclinations", "radians"
+        [laser.lowest, laser.highest], 2, np.pi / 2 + SINGLE, record, "range of beam inclinations", "radians"
     )
     lowest, highest = ends.clip(-np.pi / 2, np.pi / 2)
     if not lowest < highest:

@@ -81,7 +81,7 @@ def message(name: str) -> type[Any]:
 
 
 @cache
-def _pool() -> descriptor_pool.DescriptorPool:
+def _pool() -> Any:
     file = descriptor_pb2.FileDescriptorProto(name="waymo.proto", package=_PACKAGE, syntax="proto2")
     for name, fields in _FIELDS.items():
         record = file.message_type.add(name=name)

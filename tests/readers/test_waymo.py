@@ -1,0 +1,217 @@
+"""The Waymo Open Dataset: one drive through nuScenes' tables, v2 and v1 gives the same scene."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.waymo_drive import GLOBAL, NAME, READOUT_S, Drive, tiny_drive
+from helpers.waymo_files import write_v1, write_v2
+from PIL import Image
+
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.readers.sweeps import read_returns
+from drivesplat.readers.waymo.sweep_file import read_rays
+from drivesplat.scene.object_class import ObjectClass
+from drivesplat.scene.rigid import apply
+from drivesplat.scene.scene import Scene, read_scene, write_scene
+from drivesplat.scene.tracks import boxes_at
+from drivesplat.settings.extract import SceneSource
+
+VERSIONS = ("v2", "v1")
+WRITERS = {"v2": write_v2, "v1": write_v1}
+
+
+def source(**changes: Any) -> SceneSource:
+    given = {
+        "dataset": "mine", "reader": "waymo", "version": "", "scene": NAME, "frames": None,
+        "cameras": ("FRONT", "SIDE_LEFT"), "sweeps": True, "lidar_sweeps": True, "on_missing": "stop",
+    }  # fmt: skip
+    return SceneSource(**{**given, **changes})
+
+
+@pytest.fixture(scope="module")
+def recorded(tiny_root) -> tuple[Drive, Scene]:
+    """The tiny drive as Waymo records it, and as nuScenes' tables give it."""
+    return tiny_drive(tiny_root)
+
+
+@pytest.fixture(scope="module")
+def roots(recorded, tmp_path_factory) -> dict[str, Path]:
+    return {version: WRITERS[version](tmp_path_factory.mktemp(version), recorded[0]) for version in VERSIONS}
+
+
+@pytest.fixture(scope="module")
+def scenes(roots, tmp_path_factory) -> dict[str, Scene]:
+    return {
+        version: extract_scene(source(), root, None, tmp_path_factory.mktemp(f"results_{version}"))
+        for version, root in roots.items()
+    }
+
+
+def moved(pose: np.ndarray, scene: Scene) -> np.ndarray:
+    """A pose of nuScenes' scene in the world of a Waymo scene."""
+    there = GLOBAL @ pose
+    there[..., :3, 3] -= scene.origin
+    return there
+
+
+NOT_HELD = {
+    "category": "Waymo has four classes; cones become signs, which are as static",
+    "visibility": "unknown",
+    "description": "not read",
+    "sweeps": "another sensor: range images with poses of pixels",
+    "readout": "stated by Waymo alone",
+}
+"""Fields of nuScenes' scene that Waymo's formats cannot hold, or hold in another way."""
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_scene_is_that_of_the_tables_in_all_that_the_format_can_hold(version, scenes, recorded):
+    scene, (drive, other) = scenes[version], recorded
+    assert scene.version == version and scene.poses == "waymo" and "Non-Commercial" in scene.licence
+    np.testing.assert_array_equal(scene.key_frame_timestamps, other.key_frame_timestamps)
+    assert scene.key_frame_hz == other.key_frame_hz and scene.missing_images == 0
+    np.testing.assert_array_equal(scene.origin, drive.frames[int(other.key_frame_timestamps[0])][:3, 3])
+    front = [frame for frame in scene.frames if frame.camera == "FRONT"]
+    for mine, theirs in zip(front, other.frames, strict=True):
+        assert (mine.width, mine.height) == (theirs.width, theirs.height)
+        assert (mine.is_key_frame, mine.sample_index) == (True, theirs.sample_index)
+        assert abs(mine.timestamp - theirs.timestamp) <= 1
+        np.testing.assert_allclose(mine.intrinsics, theirs.intrinsics, atol=1e-12)
+        for name in ("camera_to_world", "ego_to_world"):
+            np.testing.assert_allclose(getattr(mine, name), moved(getattr(theirs, name), scene), atol=1e-9)
+        assert Path(mine.image_path).read_bytes() == Path(theirs.image_path).read_bytes()
+    for mine, theirs in zip(scene.tracks, other.tracks, strict=True):
+        assert mine.id == theirs.id
+        np.testing.assert_array_equal(mine.timestamps, theirs.timestamps)
+        np.testing.assert_array_equal(mine.sample_indices, theirs.sample_indices)
+        np.testing.assert_allclose(mine.size, theirs.size, atol=1e-12)
+        np.testing.assert_allclose(mine.object_to_world, moved(theirs.object_to_world, scene), atol=1e-9)
+        assert mine.visibility.tolist() == [0] * len(mine.timestamps)
+
+
+def test_both_versions_give_one_scene(scenes, tmp_path):
+    """To the last bit, but for the names of files and the version."""
+    texts = []
+    for version, scene in scenes.items():
+        names = {"image_path": lambda frame: Path(frame.image_path).name, "path": lambda sweep: Path(sweep.path).name}
+        frames = tuple(replace(frame, image_path=names["image_path"](frame)) for frame in scene.frames)
+        sweeps = tuple(replace(sweep, path=names["path"](sweep)) for sweep in scene.sweeps)
+        write_scene(tmp_path / f"{version}.json", replace(scene, version="", frames=frames, sweeps=sweeps))
+        texts.append((tmp_path / f"{version}.json").read_text())
+        assert len(read_scene(tmp_path / f"{version}.json").sweeps) == len(scene.sweeps)
+    assert texts[0] == texts[1]
+    for one, other in zip(*(scene.sweeps for scene in scenes.values()), strict=True):
+        assert Path(one.path).read_bytes() == Path(other.path).read_bytes()
+
+
+def test_classes_are_those_that_waymo_has(scenes):
+    kinds = {track.category: track.object_class for track in scenes["v2"].tracks}
+    assert kinds == {
+        "vehicle": ObjectClass.VEHICLE, "pedestrian": ObjectClass.PEDESTRIAN, "sign": ObjectClass.OTHER_MOVABLE,
+    }  # fmt: skip
+    assert not kinds["sign"].is_dynamic and ObjectClass.CAR not in kinds.values()
+
+
+def test_cameras_keep_size_mount_and_readout(scenes, recorded):
+    front, left = scenes["v1"].cameras
+    assert (front.name, front.width, front.height) == ("FRONT", 96, 54)
+    assert (left.name, left.width, left.height) == ("SIDE_LEFT", 96, 38)
+    assert (front.readout_direction, left.readout_direction) == ("right", "down")
+    assert front.readout_s == pytest.approx(READOUT_S, abs=1e-6) == left.readout_s
+    frame = next(frame for frame in scenes["v1"].frames if frame.camera == "SIDE_LEFT")
+    with Image.open(frame.image_path) as image:
+        assert image.size == (96, 38)
+    ahead, to_left = frame.ego_to_world[:3, 0], frame.ego_to_world[:3, 1]
+    np.testing.assert_allclose(frame.camera_to_world[:3, 2], to_left, atol=1e-9)
+    np.testing.assert_allclose(frame.camera_to_world[:3, 0], ahead, atol=1e-9)
+    np.testing.assert_allclose(frame.camera_to_world[:3, 1], [0, 0, -1], atol=1e-9)
+
+
+def test_boxes_are_interpolated_to_the_times_of_images(scenes, recorded):
+    scene, (_, other) = scenes["v2"], recorded
+    mine, theirs = scene.frames[4], other.frames[4]
+    assert mine.timestamp not in scene.key_frame_timestamps
+    for one, two in zip(boxes_at(scene, mine.timestamp), boxes_at(other, theirs.timestamp), strict=True):
+        np.testing.assert_allclose(one.object_to_world, moved(two.object_to_world, scene), atol=1e-5)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_points_of_range_images_are_where_the_rays_end(version, scenes, recorded):
+    """Each within 2 cm, in the order of rows, and no other."""
+    scene, (drive, _) = scenes[version], recorded
+    assert [lidar.name for lidar in scene.lidars] == ["TOP", "FRONT", "REAR"]
+    by_token = {sweep.token: sweep for sweep in scene.sweeps}
+    names = {1: "TOP", 2: "FRONT", 5: "REAR"}
+    assert len(by_token) == len(drive.sweeps) == 30
+    for recording in drive.sweeps:
+        sweep = by_token[f"{names[recording.laser]}/{recording.frame}"]
+        returns = read_returns(sweep)
+        ends = recording.hits.reshape(-1, 3)
+        there = np.isfinite(ends[:, 0])
+        points = apply(sweep.sensor_to_world, returns.points)
+        assert points.shape == ends[there].shape and len(points) > 300
+        assert np.abs(points - (ends[there] - scene.origin)).max() < 0.02
+        np.testing.assert_allclose(returns.intensity, np.tanh(0.25), atol=1e-6)
+        rows = np.repeat(np.arange(recording.values.shape[0]), recording.values.shape[1])
+        np.testing.assert_array_equal(returns.rings, rows[there])
+
+
+def test_ignoring_the_poses_of_pixels_would_move_points(scenes, recorded):
+    """The vehicle drives 0.4 m during a sweep: without the poses of pixels points are up to 20 cm off."""
+    drive, sweep = recorded[0], next(s for s in scenes["v2"].sweeps if s.lidar == "TOP" and s.sample_index == 3)
+    rays = read_rays(Path(sweep.path))
+    recording = next(r for r in drive.sweeps if r.laser == 1 and r.frame == sweep.timestamp)
+    level, hit = np.cos(rays.elevation), np.isfinite(rays.range)
+    ray = np.stack([level * np.cos(rays.azimuth), level * np.sin(rays.azimuth), np.sin(rays.elevation)], axis=1)
+    points = apply(sweep.sensor_to_world, (ray * rays.range[:, None])[hit])
+    off = np.linalg.norm(points - (recording.hits.reshape(-1, 3)[hit] - scenes["v2"].origin), axis=1)
+    assert 0.15 < off.max() < 0.25 and off.min() < 0.02
+
+
+def test_dropped_returns_stay_as_rays(scenes, recorded):
+    drive, scene = recorded[0], scenes["v1"]
+    sweep = next(sweep for sweep in scene.sweeps if sweep.lidar == "TOP")
+    rays, recording = read_rays(Path(sweep.path)), drive.sweeps[0]
+    values = recording.values[..., 0].ravel()
+    assert len(rays.range) == values.size and 0.1 < (values < 0).mean() < 0.8
+    np.testing.assert_array_equal(np.isnan(rays.range), values < 0)
+    np.testing.assert_allclose(rays.range[values > 0], values[values > 0], rtol=1e-6)
+    elevations = scene.lidars[0].beam_elevations
+    assert (np.diff(elevations) < 0).all() and len(elevations) == 64 and scene.lidars[0].azimuth_steps == 120
+    np.testing.assert_allclose(rays.elevation, elevations[rays.row])
+    assert rays.azimuth[0] > rays.azimuth[1]
+    low = scene.lidars[1].beam_elevations
+    assert len(low) == 20 and low[0] == pytest.approx(np.pi / 6 - np.pi / 60) and low[-1] > -np.pi / 2
+
+
+def test_a_frame_range_renumbers_key_frames_and_writes_no_others(roots, recorded, tmp_path):
+    for version, root in roots.items():
+        folder = tmp_path / version
+        scene = extract_scene(source(frames=(2, 5), cameras=("FRONT",)), root, None, folder)
+        np.testing.assert_array_equal(scene.key_frame_timestamps, recorded[1].key_frame_timestamps[2:5])
+        assert [frame.sample_index for frame in scene.frames] == [0, 1, 2] and scene.key_frame_range == [2, 5]
+        assert len(list(folder.glob("images/*/*.jpg"))) == 3 and len(list(folder.glob("sweeps/*/*.npz"))) == 9
+        np.testing.assert_allclose(scene.frames[0].ego_to_world[:3, 3], 0.0, atol=0.2)
+
+
+def test_a_second_extraction_writes_the_same_bytes_and_leaves_nothing_old(roots, tmp_path):
+    kept = []
+    for frames in (None, (0, 3), None):
+        extract_scene(source(frames=frames, cameras=("FRONT",)), roots["v2"], None, tmp_path)
+        kept.append({file.relative_to(tmp_path): file.read_bytes() for file in tmp_path.rglob("*.*")})
+    assert kept[0] == kept[2] and len(kept[1]) < len(kept[0])
+
+
+def test_floats_of_single_precision_and_keys_as_text_are_read(recorded, scenes, tmp_path):
+    root = write_v2(tmp_path / "data", recorded[0], single=True, text_keys=True)
+    scene = extract_scene(source(), root, None, tmp_path / "results")
+    assert len(scene.sweeps) == 30
+    for mine, theirs in zip(scene.frames, scenes["v2"].frames, strict=True):
+        np.testing.assert_allclose(
+            apply(mine.camera_to_world, np.zeros((1, 3))) + scene.origin,
+            apply(theirs.camera_to_world, np.zeros((1, 3))) + scenes["v2"].origin,
+            atol=0.01,
+        )
