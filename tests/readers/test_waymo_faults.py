@@ -1,0 +1,319 @@
+"""Faults of Waymo's files: each is refused in a sentence, or handled."""
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from helpers.tiny_world import World, write_world
+from helpers.waymo_drive import NAME, Drive, tiny_drive
+from helpers.waymo_files import write_v1, write_v2
+
+from drivesplat.errors import DatasetError
+from drivesplat.preprocess.extract import extract_scene
+from drivesplat.readers.waymo.layout import camera_names, find_root, segment_files, table_files
+from drivesplat.readers.waymo.tfrecord import masked_crc
+from drivesplat.scene.scene import Scene
+from drivesplat.settings.extract import SceneSource
+
+WRITERS = {"v2": write_v2, "v1": write_v1}
+V1_FILE = f"segment-{NAME}_with_camera_labels.tfrecord"
+OTHER = "1234567890123456789_900_000_920_000"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory) -> Drive:
+    world = World(key_frames=3, width=48, height=27)
+    return tiny_drive(write_world(tmp_path_factory.mktemp("small"), world), world, lasers=(1, 2))[0]
+
+
+@pytest.fixture(scope="module")
+def roots(drive, tmp_path_factory) -> dict[str, Path]:
+    return {version: WRITERS[version](tmp_path_factory.mktemp(version), drive) for version in WRITERS}
+
+
+@pytest.fixture
+def written(tmp_path) -> Callable[..., Path]:
+    """Writes a drive as v2 or v1."""
+    return lambda version, drive: WRITERS[version](tmp_path / version, drive)
+
+
+def extracted(root: Path, folder: Path, **changes: Any) -> Scene:
+    given = {
+        "dataset": "mine", "reader": "waymo", "version": "v1.0-mini", "scene": NAME, "frames": None,
+        "cameras": ("FRONT",), "sweeps": False, "on_missing": "stop",
+    }  # fmt: skip
+    return extract_scene(SceneSource(**{**given, **changes}), root, None, folder)
+
+
+def refusal(root: Path, folder: Path, **changes: Any) -> str:
+    """The sentence that refuses a drive."""
+    with pytest.raises(DatasetError) as stopped:
+        extracted(root, folder, **changes)
+    message = str(stopped.value)
+    assert "\n" not in message and 10 < len(message) < 600
+    return message
+
+
+def first(items: list, **changes: Any) -> list:
+    """The items, the first one changed."""
+    return [replace(items[0], **changes), *items[1:]]
+
+
+def test_a_folder_without_segments_is_refused_with_what_to_do(tmp_path):
+    with pytest.raises(DatasetError, match=r"there is no folder .*nowhere; docs/waymo\.md"):
+        find_root(str(tmp_path / "nowhere"), "")
+    with pytest.raises(DatasetError, match=r"looked for \*\.tfrecord and camera_image/\*\.parquet"):
+        find_root(str(tmp_path), "")
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_an_unknown_segment_is_refused_with_those_there_are(version, roots, tmp_path):
+    assert find_root(str(roots[version]), "") == roots[version] and len(camera_names(roots[version], "")) == 5
+    assert f"scene 77 is not there; in {roots[version]} there are: {NAME}" in refusal(
+        roots[version], tmp_path, scene="77"
+    )
+
+
+def test_the_beginning_of_a_name_selects_a_segment_unless_several_begin_so(roots, tmp_path):
+    root = Path(shutil.copytree(roots["v1"], tmp_path / "data"))
+    assert segment_files(root, "", NAME[:19]).name == NAME
+    shutil.copy(root / V1_FILE, root / f"{OTHER}.tfrecord")
+    assert table_files(root, "", NAME) == [root / V1_FILE]
+    assert f"begins the names of several segments; in {root} there are: {NAME}, {OTHER}" in refusal(
+        root, tmp_path, scene=NAME[:19]
+    )
+
+
+def test_both_versions_of_a_segment_are_refused_unless_one_is_named(drive, tmp_path):
+    write_v1(write_v2(tmp_path / "data", drive), drive)
+    sentence = refusal(tmp_path / "data", tmp_path / "results")
+    assert f"as v1 ({V1_FILE}) and as v2; set datasets.<name>.version to v1 or v2" in sentence
+    for version in WRITERS:
+        assert extracted(tmp_path / "data", tmp_path / "results", version=version).version == version
+
+
+def test_a_missing_component_is_named(roots, tmp_path):
+    root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
+    shutil.rmtree(root / "lidar_pose")
+    assert f"lidar_pose/{NAME}.parquet is missing in {root}; docs/waymo.md" in refusal(root, tmp_path)
+    (root / f"lidar_box/{NAME}.parquet").unlink()
+    assert f"lidar_pose/{NAME}.parquet, lidar_box/{NAME}.parquet are missing" in refusal(root, tmp_path)
+
+
+def test_a_missing_column_is_named(roots, tmp_path):
+    root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
+    path = root / f"camera_image/{NAME}.parquet"
+    pq.write_table(pq.read_table(path).drop_columns(["[CameraImageComponent].pose.transform"]), path)
+    assert f"{path} has no column [CameraImageComponent].pose.transform" in refusal(root, tmp_path)
+
+
+@pytest.mark.parametrize("component", ["camera_image", "lidar", "vehicle_pose"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_a_truncated_parquet_file_is_named(component, share, roots, tmp_path):
+    root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
+    path = root / f"{component}/{NAME}.parquet"
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    assert f"{path} cannot be read (" in refusal(root, tmp_path)
+
+
+@pytest.mark.parametrize("cut", [1, 6, 14, 5000, -3])
+def test_a_truncated_tfrecord_is_named_with_its_record(cut, roots, tmp_path):
+    whole = (roots["v1"] / V1_FILE).read_bytes()
+    (tmp_path / V1_FILE).write_bytes(whole[:cut])
+    assert re.search(r"record [02] of .* is truncated; download the file again", refusal(tmp_path, tmp_path / "out"))
+
+
+def test_an_empty_tfrecord_is_named(tmp_path):
+    (tmp_path / V1_FILE).write_bytes(b"")
+    assert f"{V1_FILE} is empty" in refusal(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("place", "part"), [(3, "length"), (9, "length"), (100, "data"), (-2, "data")])
+def test_a_wrong_checksum_is_named(place, part, roots, tmp_path):
+    content = bytearray((roots["v1"] / V1_FILE).read_bytes())
+    content[place] ^= 4
+    (tmp_path / V1_FILE).write_bytes(content)
+    sentence = refusal(tmp_path, tmp_path / "out")
+    assert f"the checksum (CRC-32C) of its {part} differs" in sentence and "record " in sentence
+
+
+def test_the_mask_of_a_checksum_is_that_of_tensorflow():
+    """The CRC-32C of '123456789' is e3069283 (RFC 3720); the mask rotates it by 15 bits and adds a282ead8."""
+    assert masked_crc(b"123456789") == (0x2507C60D + 0xA282EAD8) % 2**32
+
+
+def test_a_record_that_is_no_frame_is_named(tmp_path):
+    from helpers.waymo_files import tfrecord
+
+    (tmp_path / V1_FILE).write_bytes(tfrecord(b"\x0a\xff\xff\xff\xff\xff\xff\xff\xff"))
+    assert f"record 0 of {tmp_path / V1_FILE} is no Frame message" in refusal(tmp_path, tmp_path / "out")
+
+
+def test_a_file_of_another_segment_is_named(drive, tmp_path):
+    root = write_v1(tmp_path / "v1", replace(drive, name=OTHER))
+    (root / V1_FILE.replace(NAME, OTHER)).rename(root / V1_FILE)
+    assert f"is a frame of segment '{OTHER}', and the file is called {NAME}" in refusal(root, tmp_path)
+    root = write_v2(tmp_path / "v2", drive)
+    shutil.copy(write_v2(tmp_path / "other", replace(drive, name=OTHER)) / f"lidar/{OTHER}.parquet", root / "lidar")
+    (root / f"lidar/{OTHER}.parquet").replace(root / f"lidar/{NAME}.parquet")
+    assert f"holds segment '{OTHER}', not {NAME}" in refusal(root, tmp_path)
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize("absent", ["record", "content"])
+def test_a_frame_without_image_is_named_or_left_out(version, absent, drive, written, tmp_path):
+    lost = next(i for i, image in enumerate(drive.images) if image.camera == 1 and image.frame != drive.images[0].frame)
+    images = list(drive.images)
+    images[lost : lost + 1] = [] if absent == "record" else [replace(images[lost], content=b"")]
+    root = written(version, replace(drive, images=images))
+    sentence = refusal(root, tmp_path / "results")
+    assert f"key frame 1: frame {drive.images[lost].frame} has no image of camera FRONT" in sentence
+    assert "set extract.on_missing: warn" in sentence
+    scene = extracted(root, tmp_path / "results", on_missing="warn")
+    assert scene.missing_images == 1 and [frame.sample_index for frame in scene.frames] == [0, 2]
+
+
+def test_a_corrupt_image_is_named(drive, written, tmp_path):
+    root = written("v2", replace(drive, images=first(drive.images, content=drive.images[0].content[:200])))
+    assert re.search(r"key frame 0, token FRONT/\d+ \(FRONT\): image .* is corrupt", refusal(root, tmp_path / "out"))
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_a_drive_without_boxes_or_lidar_is_a_static_one(version, drive, written, tmp_path):
+    scene = extracted(written(version, replace(drive, boxes=[], sweeps=[])), tmp_path / "results")
+    assert scene.tracks == scene.sweeps == scene.lidars == () and len(scene.frames) == 3
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_a_range_image_of_another_size_than_the_inclinations_is_named(version, drive, written, tmp_path):
+    top = drive.sweeps[0]
+    fewer = first(drive.sweeps, values=top.values[:40], poses=top.poses[:40])
+    sentence = refusal(written(version, replace(drive, sweeps=fewer)), tmp_path / "results")
+    assert "laser TOP: its range image has 40 rows, and its laser 64 beam inclinations" in sentence
+    later = [*drive.sweeps]
+    later[2] = replace(later[2], values=later[2].values[:40], poses=later[2].poses[:40])
+    sentence = refusal(written(version, replace(drive, sweeps=later)), tmp_path / "results")
+    assert "40 rows, and its laser 64 beam inclinations" in sentence
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_poses_of_pixels_of_another_size_are_named(version, drive, written, tmp_path):
+    fewer = first(drive.sweeps, poses=drive.sweeps[0].poses[:, :50])
+    sentence = refusal(written(version, replace(drive, sweeps=fewer)), tmp_path / "results")
+    assert re.search(r"sweep TOP/\d+: its range image is 64x120, and the poses of its pixels are 64x50", sentence)
+
+
+def test_missing_poses_of_pixels_are_named(drive, written, tmp_path):
+    fewer = first(drive.sweeps, poses=None)
+    assert re.search(
+        r"sweep TOP/\d+: .*lidar_pose.* has no poses of its pixels",
+        refusal(written("v2", replace(drive, sweeps=fewer)), tmp_path),
+    )
+    assert re.search(
+        r"sweep TOP/\d+: its range image has 0 values", refusal(written("v1", replace(drive, sweeps=fewer)), tmp_path)
+    )
+
+
+def scaled(matrix: np.ndarray) -> np.ndarray:
+    return matrix * np.array([2.0, 2.0, 2.0, 1.0])[:, None]
+
+
+FAULTS: dict[str, tuple[Callable[[Drive], Drive], str]] = {
+    "an image pose that scales": (
+        lambda d: replace(d, images=first(d.images, pose=scaled(d.images[0].pose))),
+        r"image FRONT of frame \d+: its transform is not rigid",
+    ),
+    "a frame pose with NaN": (
+        lambda d: replace(d, frames=d.frames | {min(d.frames): np.full((4, 4), np.nan)}),
+        r"frame \d+: its transform is .* 4x4 matrix of finite numbers",
+    ),
+    "an image time of another clock": (
+        lambda d: replace(d, images=first(d.images, seconds=12.5)),
+        r"image FRONT of frame \d+: its time is 12\.5 s, more than a second from that of its frame",
+    ),
+    "a focal length of zero": (
+        lambda d: replace(d, cameras=first(d.cameras, intrinsic=[0.0] * 9)),
+        r"camera FRONT: its camera matrix is singular",
+    ),
+    "a camera without calibration": (
+        lambda d: replace(d, cameras=d.cameras[1:]),
+        r"camera FRONT: segment \w+ has no calibration of it",
+    ),
+    "a laser without calibration": (
+        lambda d: replace(d, lasers=d.lasers[1:]),
+        r"laser TOP: segment \w+ has range images of it, but no calibration",
+    ),
+    "inclinations from the top": (
+        lambda d: replace(d, lasers=[d.lasers[0], replace(d.lasers[1], lowest=0.5, highest=0.1)]),
+        r"laser FRONT: its least beam inclination 0\.5 is not below the greatest, 0\.1",
+    ),
+    "inclinations in degrees": (
+        lambda d: replace(d, lasers=first(d.lasers, inclinations=np.degrees(d.lasers[0].inclinations))),
+        r"laser TOP: its beam elevations .* radians",
+    ),
+    "two boxes of one object": (
+        lambda d: replace(d, boxes=[*d.boxes, d.boxes[0]]),
+        r"box .* it has two boxes in frame \d+",
+    ),
+    "a box without size": (
+        lambda d: replace(d, boxes=first(d.boxes, size=np.zeros(3))),
+        r"box .* in frame \d+: its size is .* three positive numbers",
+    ),
+    "a box at infinity": (
+        lambda d: replace(d, boxes=first(d.boxes, center=np.array([np.inf, 0.0, 0.0]))),
+        r"box .* in frame \d+: its centre .* not finite",
+    ),
+    "an image twice": (
+        lambda d: replace(d, images=[*d.images, d.images[0]]),
+        r"image FRONT of frame \d+: the segment has it twice",
+    ),
+    "a sweep twice": (
+        lambda d: replace(d, sweeps=[*d.sweeps, d.sweeps[0]]),
+        r"sweep TOP/\d+: the segment has it twice",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_wrong_values_are_named_in_both_versions(fault, drive, written, tmp_path):
+    change, words = FAULTS[fault]
+    for version in WRITERS:
+        assert re.search(words, refusal(written(version, change(drive)), tmp_path / "results")), version
+
+
+def test_records_of_frames_that_are_not_there_are_named(drive, written, tmp_path):
+    for change, words in (
+        (replace(drive, images=first(drive.images, frame=5)), "image FRONT of frame 5: the segment has no such frame"),
+        (replace(drive, boxes=first(drive.boxes, frame=5)), "the segment has no frame at its time 5"),
+    ):
+        assert words in refusal(written("v2", change), tmp_path / "results")
+
+
+def test_a_key_that_is_no_number_is_named(drive, tmp_path):
+    root = write_v2(tmp_path / "data", drive, text_keys=True)
+    path = root / f"vehicle_pose/{NAME}.parquet"
+    table = pq.read_table(path)
+    keys = ["noon", *table["key.frame_timestamp_micros"].to_pylist()[1:]]
+    pq.write_table(
+        table.set_column(
+            table.schema.get_field_index("key.frame_timestamp_micros"), "key.frame_timestamp_micros", [keys]
+        ),
+        path,
+    )
+    assert "a key.frame_timestamp_micros is 'noon'; it must be a whole number" in refusal(root, tmp_path)
+
+
+def test_a_frame_range_beyond_the_end_is_refused(roots, tmp_path):
+    assert "ends beyond its 3 key frames" in refusal(roots["v1"], tmp_path, frames=(0, 4))
+
+
+def test_an_unknown_camera_is_refused_with_those_there_are(roots, tmp_path):
+    assert "there is no camera 'REAR'; there are: FRONT, FRONT_LEFT" in refusal(
+        roots["v1"], tmp_path, cameras=("REAR",)
+    )
