@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers.tiny_world import World, write_world
 from helpers.waymo_drive import NAME, Drive, tiny_drive
-from helpers.waymo_files import write_v1, write_v2
+from helpers.waymo_files import tfrecord, write_v1, write_v2
 
 from drivesplat.errors import DatasetError
 from drivesplat.preprocess.extract import extract_scene
@@ -113,6 +114,15 @@ def test_a_missing_column_is_named(roots, tmp_path):
     assert f"{path} has no column [CameraImageComponent].pose.transform" in refusal(root, tmp_path)
 
 
+def test_a_column_of_another_type_is_named(roots, tmp_path):
+    root = Path(shutil.copytree(roots["v2"], tmp_path / "data"))
+    path, name = root / f"lidar/{NAME}.parquet", "[LiDARComponent].range_image_return1.values"
+    table = pq.read_table(path)
+    place = table.schema.get_field_index(name)
+    pq.write_table(table.set_column(place, name, pa.array([0.5] * len(table))), path)
+    assert f"{path}: its column {name} is of type double" in refusal(root, tmp_path)
+
+
 @pytest.mark.parametrize("component", ["camera_image", "lidar", "vehicle_pose"])
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
 def test_a_truncated_parquet_file_is_named(component, share, roots, tmp_path):
@@ -149,8 +159,6 @@ def test_the_mask_of_a_checksum_is_that_of_tensorflow():
 
 
 def test_a_record_that_is_no_frame_is_named(tmp_path):
-    from helpers.waymo_files import tfrecord
-
     (tmp_path / V1_FILE).write_bytes(tfrecord(b"\x0a\xff\xff\xff\xff\xff\xff\xff\xff"))
     assert f"record 0 of {tmp_path / V1_FILE} is no Frame message" in refusal(tmp_path, tmp_path / "out")
 

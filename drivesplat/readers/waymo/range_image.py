@@ -63,9 +63,9 @@ def points_of(
     points = directions(rays.azimuth[hit], rays.elevation[hit]) * rays.range[hit, None]
     if pixel_poses is None or frame_pose is None:
         return points
-    in_world = _moved(apply(extrinsic, points), pixel_poses[hit].astype(np.float64), frame_pose[:3, 3])
-    in_vehicle = in_world @ frame_pose[:3, :3]
-    return apply(inverse(extrinsic), in_vehicle)
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged poses; `sweep_file` leaves their points out
+        in_world = _moved(apply(extrinsic, points), pixel_poses[hit].astype(np.float64), frame_pose[:3, 3])
+        return apply(inverse(extrinsic), in_world @ frame_pose[:3, :3])
 
 
 def _moved(points: np.ndarray, poses: np.ndarray, origin: np.ndarray) -> np.ndarray:

@@ -60,7 +60,7 @@ class BoxRecord:
     """A box of the frame at `frame`, in the vehicle's frame at the frame's pose: `size` is length, width, height."""
 
     frame: int
-    id: str
+    id: Any
     type: int
     center: list[Any]
     size: list[Any]
@@ -148,8 +148,9 @@ def frame_name(time: Any) -> str:
 def cells(values: np.ndarray, shape: Iterable[Any], channels: int, record: str) -> np.ndarray:
     """The flat values of a range image as (rows, columns, channels) float32. Raises DatasetError naming `record` where
     their number is another one."""
-    size = [int(length) for length in shape]
-    fits = len(size) == 3 and size[2] == channels and min(size) > 0 and size[0] * size[1] <= MAX_CELLS
+    size = list(shape)
+    fits = len(size) == 3 and all(isinstance(length, int) and 0 < length <= MAX_CELLS for length in size)
+    fits = fits and size[2] == channels and size[0] * size[1] <= MAX_CELLS
     if not fits or len(values) != size[0] * size[1] * size[2]:
         raise DatasetError(
             f"{record}: its range image has {len(values)} values and the shape {shown(size)}; it must have rows, "

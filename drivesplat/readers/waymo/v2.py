@@ -172,6 +172,7 @@ def _floats(value: pa.Scalar) -> np.ndarray:
     """The numbers of a list; none where it is no list of numbers."""
     inside = getattr(value, "values", None)
     try:
-        return np.zeros(0) if inside is None else inside.to_numpy(zero_copy_only=False).astype(np.float32)
+        with np.errstate(over="ignore"):
+            return np.zeros(0) if inside is None else inside.to_numpy(zero_copy_only=False).astype(np.float32)
     except (TypeError, ValueError):
         return np.zeros(0)
