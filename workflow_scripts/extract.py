@@ -16,7 +16,9 @@ with job(snakemake) as current:
     scene = extract_scene(current.settings(SceneSource), root, of_scene, Path(current.output.scene).parent)
     refuse_unknown_tracks(current.track_references(), scene)
     current.record_dataset(
-        images=(frame.image_path for frame in scene.frames), sweeps=(sweep.path for sweep in scene.sweeps)
+        images=(frame.image_path for frame in scene.frames),
+        sweeps=(sweep.path for sweep in scene.sweeps),
+        classes=(frame.classes_path for frame in scene.frames if frame.classes_path),
     )
     provenance = current.provenance(inputs={"tables": digests_of([*tables, *rows])})
     write_scene(current.output.scene, dataclasses.replace(scene, provenance=provenance))

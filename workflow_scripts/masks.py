@@ -9,7 +9,7 @@ from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.scene import read_scene
 from drivesplat.settings.masks import MaskJob
 
-with job(snakemake, dataset=("images", "sweeps")) as current:
+with job(snakemake, dataset=("images", "sweeps", "classes")) as current:
     scene, (ego_mask, upstream) = read_scene(current.input.scene), read_ego_mask(current.input.own_car)
     record = make_masks(scene, current.settings(MaskJob), Path(current.output.masks).parent, ego_mask)
     write_json(current.output.masks, {**vars(record), "provenance": current.provenance(scene.provenance, upstream)})

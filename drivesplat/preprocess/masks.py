@@ -69,14 +69,17 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
         labels[ego_mask.pixels(frame.camera, size)] = LABELS["own_car"]
         body = labels == LABELS["own_car"]
         sweeps = training if group == "train" else scene.sweeps
-        sky = _sky(sweeps, frame, job, size, scene.key_frame_interval) & ~body
+        sky = _sky(sweeps, scene, frame, job, size) & ~body
         write_png(folder / mask_name("sky", frame.camera, frame.timestamp), sky.astype(np.uint8) * 255)
         write_png(folder / mask_name("regions", frame.camera, frame.timestamp), labels)
-        return float(sky.mean()), _semantic(frame, job, body, folder), bool(body.any())
+        return float(sky.mean()), _semantic(scene, frame, job, body, folder), bool(body.any())
 
     with ThreadPoolExecutor() as pool:
         sky_shares, classes, bodies = zip(*pool.map(one, scene.frames, groups), strict=True)
     seeing = {frame.camera for frame, body in zip(scene.frames, bodies, strict=True) if body}
+    labelled = sum(frame.classes_path is not None for frame in scene.frames)
+    if labelled and not (job.masks.sky_folder and job.masks.semantic_folder):
+        log.info("scene %s: %d of %d images have class maps of the dataset", scene.name, labelled, len(scene.frames))
     sky_known = job.masks.sky_folder is not None or float(np.mean(sky_shares)) >= MIN_SKY
     if not sky_known:
         log.warning(NO_SKY, scene.name)
@@ -93,23 +96,38 @@ def make_masks(scene: Scene, job: MaskJob, folder: Path, ego_mask: EgoMask = NO_
     )
 
 
-def _semantic(frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int:
-    """Writes the user's semantic classes of an image, if given, unlabelled within the ego vehicle's `body` (h, w) bool.
-    Returns the highest class plus one, or 0."""
-    if not job.masks.semantic_folder:
+def _semantic(scene: Scene, frame: Frame, job: MaskJob, body: np.ndarray, folder: Path) -> int:
+    """Writes the semantic classes of an image, the user's or the dataset's, if given, unlabelled within the ego
+    vehicle's `body` (h, w) bool. Returns the highest class plus one, or 0."""
+    size = (body.shape[1], body.shape[0])
+    if job.masks.semantic_folder:
+        classes = _users_mask(job.masks.semantic_folder, frame, size).copy()
+    elif any(other.classes_path is not None for other in scene.frames):
+        classes = _datasets_classes(frame, size)
+        classes[classes == scene.sky_class] = UNLABELLED  # the sky has no Gaussians
+    else:
         return 0
-    classes = _users_mask(job.masks.semantic_folder, frame, (body.shape[1], body.shape[0])).copy()
     classes[body] = UNLABELLED
     write_png(folder / mask_name("semantic", frame.camera, frame.timestamp), classes)
     labelled = classes[classes != UNLABELLED]
     return int(labelled.max()) + 1 if len(labelled) else 0
 
 
-def _sky(sweeps: Sequence[Sweep], frame: Frame, job: MaskJob, size: tuple[int, int], interval: float) -> np.ndarray:
-    """The sky (h, w) bool of a frame; the heuristic uses the nearest of `sweeps` within `interval` microseconds."""
+def _datasets_classes(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """The dataset's classes (h, w) of an image, UNLABELLED where it has none."""
+    if frame.classes_path is None:
+        return np.full((size[1], size[0]), UNLABELLED, dtype=np.uint8)
+    return read_mask(frame.classes_path, size, (frame.width, frame.height)).copy()
+
+
+def _sky(sweeps: Sequence[Sweep], scene: Scene, frame: Frame, job: MaskJob, size: tuple[int, int]) -> np.ndarray:
+    """The sky (h, w) bool of a frame: the user's, that of the dataset's class map, or found by a heuristic, which uses
+    the nearest of `sweeps` within the interval of key frames."""
     if job.masks.sky_folder:
         return _users_mask(job.masks.sky_folder, frame, size) > 127
-    lidar = nearest_returns(sweeps, frame.timestamp, interval)
+    if frame.classes_path is not None and scene.sky_class is not None:
+        return _datasets_classes(frame, size) == scene.sky_class
+    lidar = nearest_returns(sweeps, frame.timestamp, scene.key_frame_interval)
     return sky_mask(
         read_image(frame.image_path, size), continuous_intrinsics(frame, size), frame.camera_to_world, lidar
     )

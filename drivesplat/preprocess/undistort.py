@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from drivesplat.errors import DatasetError
-from drivesplat.scene.images import read_image, write_png
+from drivesplat.scene.images import read_image, read_mask, write_png
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.scene.sensors import Camera
 
@@ -25,7 +25,7 @@ LONGEST = 10.0
 
 def undistorted(scene: Scene, folder: Path) -> Scene:
     """The scene with the images of distorted cameras resampled into `folder`, {camera}/{timestamp}.png, and with the
-    intrinsics of these images.
+    intrinsics of these images. Class maps are resampled by nearest neighbour, into {camera}/{timestamp}_classes.png.
 
     Raises DatasetError naming a camera whose distortion cannot be undone at ten times its focal length.
     """
@@ -38,7 +38,11 @@ def undistorted(scene: Scene, folder: Path) -> Scene:
         path = folder / frame.camera / f"{frame.timestamp}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, cv2.remap(read_image(frame.image_path), x, y, cv2.INTER_CUBIC))
-        return dataclasses.replace(frame, image_path=str(path), intrinsics=k)
+        classes = None if frame.classes_path is None else str(path.with_name(f"{path.stem}_classes.png"))
+        if frame.classes_path is not None and classes is not None:
+            labels = read_mask(frame.classes_path, (frame.width, frame.height), (frame.width, frame.height))
+            write_png(classes, cv2.remap(labels, x, y, cv2.INTER_NEAREST))
+        return dataclasses.replace(frame, image_path=str(path), intrinsics=k, classes_path=classes)
 
     with ThreadPoolExecutor() as pool:
         frames = tuple(pool.map(one, scene.frames))

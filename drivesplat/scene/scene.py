@@ -30,7 +30,7 @@ REFINED = "scene_refined.json"
 @dataclass(frozen=True)
 class Frame:
     """One image. `camera` is a name in `Scene.cameras`; `camera_to_world` and `ego_to_world` hold at the image's own
-    timestamp."""
+    timestamp. `classes_path` is the dataset's own class map of the image (8 bits, 255: unlabelled), if it has one."""
 
     camera: str
     timestamp: int
@@ -43,6 +43,7 @@ class Frame:
     is_key_frame: bool
     sample_index: int
     token: str
+    classes_path: str | None = None
 
     @property
     def camera_to_ego(self) -> np.ndarray:
@@ -92,7 +93,8 @@ class Scene:
     Key frame i of `key_frame_timestamps` is `sample_index` i. `origin`: global = world + origin. `poses` names
     where the poses come from (a reader, 'refined', 'images', UNPOSED); `key_frame_hz` is the nominal rate of key
     frames; `key_frame_range` the dataset's key frames [first, last + 1) that were read, None for all. `cameras` and
-    `lidars` are the sensors that frames and sweeps name; `licence` says who may use the recording, where it is known.
+    `lidars` are the sensors that frames and sweeps name; `licence` says who may use the recording, where it is known;
+    `sky_class` is the sky in class maps of the dataset.
     """
 
     name: str
@@ -112,6 +114,7 @@ class Scene:
     lidars: tuple[Lidar, ...] = ()
     provenance: Provenance = field(default_factory=dict)
     licence: str = ""
+    sky_class: int | None = None
 
     @property
     def key_frame_interval(self) -> float:

@@ -10,7 +10,7 @@ from drivesplat.settings import quoted
 NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]*"
 MAX_LENGTH = 100
 """Characters of a name: file systems allow 255 bytes, and the workflow adds prefixes and suffixes."""
-RESERVED = ("logs", "benchmarks", "masks", "images", "sweeps", "undistorted")
+RESERVED = ("logs", "benchmarks", "masks", "images", "classes", "sweeps", "undistorted")
 """Folders of the workflow beside those of scenes and methods."""
 RESULT_SUFFIXES = (".csv", ".html", ".json", ".mp4", ".npz", ".pkl", ".ply", ".png", ".usdz")
 """Suffixes of files of the workflow beside folders of scenes and methods."""

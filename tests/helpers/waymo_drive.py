@@ -6,7 +6,7 @@ poses of their own, and others with a least and a greatest inclination. Everythi
 Waymo's world does.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 
@@ -85,6 +85,16 @@ class ImageRecording:
 
 
 @dataclass
+class LabelRecording:
+    """A panoptic label: a PNG file of 16 bits with `divisor` times the class plus an instance."""
+
+    frame: int
+    camera: int
+    content: bytes
+    divisor: int
+
+
+@dataclass
 class RangeRecording:
     """`hits` (rows, columns, 3): where each ray ends in the segment's world, NaN without a return."""
 
@@ -114,22 +124,36 @@ class Drive:
     images: list[ImageRecording]
     sweeps: list[RangeRecording]
     boxes: list[BoxRecording] = field(default_factory=list)
+    labels: list[LabelRecording] = field(default_factory=list)
 
 
-def tiny_drive(root: Path, world: World | None = None, lasers: tuple[int, ...] = (1, 2, 5)) -> tuple[Drive, Scene]:
-    """The tiny drive in `root` as Waymo records it, and the scene that nuScenes' tables give."""
+def tiny_drive(
+    root: Path,
+    world: World | None = None,
+    lasers: tuple[int, ...] = (1, 2, 5),
+    scan: LaserRecording | None = None,
+    place: np.ndarray = GLOBAL,
+) -> tuple[Drive, Scene]:
+    """The tiny drive in `root` as Waymo records it, and the scene that nuScenes' tables give. With `scan`, that is its
+    only laser. `place` (4, 4): the scene's world in that of the segment."""
     scene, world = scene_at(root, sweeps=False), world or World()
-    poses = {time: GLOBAL @ transform(np.eye(3), world.ego_at(seconds_of(time))) for time in scene.key_frame_timestamps}
-    recorded = [laser for laser in _lasers() if laser.number in lasers]
+    poses = {time: place @ transform(np.eye(3), world.ego_at(seconds_of(time))) for time in scene.key_frame_timestamps}
+    recorded = [scan] if scan else [laser for laser in _lasers() if laser.number in lasers]
     return Drive(
         NAME,
         {int(time): pose for time, pose in poses.items()},
         _cameras(scene),
         recorded,
-        _images(scene),
-        [_sweep(world, laser, int(time)) for time in poses for laser in recorded],
-        _boxes(scene, poses),
+        _images(scene, place),
+        [_sweep(world, laser, int(time), place) for time in poses for laser in recorded],
+        _boxes(scene, poses, place),
     ), scene
+
+
+def tables_scan() -> LaserRecording:
+    """The beams and steps of the LiDAR in nuScenes' tables, all at one time: a laser without poses of pixels."""
+    inclinations = np.radians(np.linspace(-28, 10, 24))
+    return LaserRecording(2, transform(np.eye(3), LIDAR_AT), 24, 240, inclinations, inclinations[0], inclinations[-1])
 
 
 def _lasers() -> list[LaserRecording]:
@@ -159,10 +183,10 @@ def _cameras(scene: Scene) -> list[CameraRecording]:
     ]
 
 
-def _images(scene: Scene) -> list[ImageRecording]:
+def _images(scene: Scene, place: np.ndarray) -> list[ImageRecording]:
     found = []
     for frame in scene.frames:
-        pose, seconds = GLOBAL @ frame.ego_to_world, frame.timestamp * 1e-6
+        pose, seconds = place @ frame.ego_to_world, frame.timestamp * 1e-6
         time = int(scene.key_frame_timestamps[frame.sample_index])
         found.append(ImageRecording(time, 1, pose, seconds, Path(frame.image_path).read_bytes()))
         plain = BytesIO()
@@ -171,7 +195,7 @@ def _images(scene: Scene) -> list[ImageRecording]:
     return found
 
 
-def _sweep(world: World, laser: LaserRecording, time: int) -> RangeRecording:
+def _sweep(world: World, laser: LaserRecording, time: int, place: np.ndarray) -> RangeRecording:
     """A revolution around the time of a frame; lasers without poses of pixels measure at that time."""
     rows, columns = laser.rows, laser.columns
     values, poses = np.full((rows, columns, 4), -1.0), np.zeros((rows, columns, 6))
@@ -189,28 +213,30 @@ def _sweep(world: World, laser: LaserRecording, time: int) -> RangeRecording:
         distance, _ = cast(world, sensor[:3, 3], turned, seconds)
         hit = distance < REACH
         ends = np.where(hit[:, None], sensor[:3, 3] + turned * distance[:, None], np.nan)
-        hits[:, part] = (ends @ GLOBAL[:3, :3].T + GLOBAL[:3, 3]).reshape(rows, -1, 3)
+        hits[:, part] = (ends @ place[:3, :3].T + place[:3, 3]).reshape(rows, -1, 3)
         values[:, part, 0] = np.where(hit, distance, -1.0).reshape(rows, -1)
         values[:, part, 1] = np.where(hit, 0.25, -1.0).reshape(rows, -1)
         values[:, part, 2] = np.where(hit, 0.0, -1.0).reshape(rows, -1)
-        pose = GLOBAL @ vehicle
+        pose = place @ vehicle
         yaw_pitch_roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")
         poses[:, part] = [*yaw_pitch_roll[::-1], *pose[:3, 3]]
     return RangeRecording(time, laser.number, values, poses if laser.number == 1 else None, hits)
 
 
-def _boxes(scene: Scene, poses: dict[int, np.ndarray]) -> list[BoxRecording]:
+def _boxes(scene: Scene, poses: dict[int, np.ndarray], place: np.ndarray) -> list[BoxRecording]:
     """Boxes in the vehicle's frame of each frame. The vehicle drives straight on: a heading is a whole rotation."""
     found = []
     for track in scene.tracks:
         for time, pose in zip(track.timestamps, track.object_to_world, strict=True):
-            in_vehicle = np.linalg.inv(poses[time]) @ GLOBAL @ pose
+            in_vehicle = np.linalg.inv(poses[time]) @ place @ pose
             heading = float(np.arctan2(in_vehicle[1, 0], in_vehicle[0, 0]))
             kind = TYPES[track.object_class]
             found.append(BoxRecording(int(time), track.id, kind, in_vehicle[:3, 3], track.size, heading))
     return found
 
 
-def without(drive: Drive, **changes) -> Drive:
-    """The same drive with other fields."""
-    return replace(drive, **changes)
+def panoptic(frame: int, camera: int, classes: np.ndarray, divisor: int = 1000) -> LabelRecording:
+    """The panoptic label of an image with these classes, all of instance 7."""
+    png = BytesIO()
+    Image.fromarray((classes.astype(np.uint16) * divisor + 7).astype(np.uint16)).save(png, "PNG")
+    return LabelRecording(frame, camera, png.getvalue(), divisor)

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from helpers.waymo_drive import READOUT_S, SHUTTER_S, Drive, ImageRecording, RangeRecording
+from helpers.waymo_drive import READOUT_S, SHUTTER_S, Drive, ImageRecording, LabelRecording, RangeRecording
 
 Row = dict[str, object]
 NUMBERS = ("key.frame_timestamp_micros", "key.camera_name", "key.laser_name")
@@ -20,6 +20,8 @@ NUMBERS = ("key.frame_timestamp_micros", "key.camera_name", "key.laser_name")
 def write_v2(root: Path, drive: Drive, single: bool = False, text_keys: bool = False, rows_per_group: int = 3) -> Path:
     """Writes the components below `root`; `single`: floats of single precision; `text_keys`: keys as text."""
     for component, rows in components(drive).items():
+        if component == "camera_segmentation" and not rows:  # which most segments lack
+            continue
         path = root / component / f"{drive.name}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         if text_keys:
@@ -50,6 +52,7 @@ def components(drive: Drive) -> dict[str, list[Row]]:
             if sweep.poses is not None
         ],
         "lidar_box": [_box_row(key, box) for box in drive.boxes],
+        "camera_segmentation": [_label_row(key, label) for label in drive.labels],
     }
 
 
@@ -115,6 +118,12 @@ def _box_row(key: Row, box) -> Row:
     }
 
 
+def _label_row(key: Row, label: LabelRecording) -> Row:
+    name = "[CameraSegmentationLabelComponent].panoptic_label"
+    label_columns = {f"{name}_divisor": label.divisor, name: label.content}
+    return {**_at(key, label.frame), "key.camera_name": label.camera, **label_columns}
+
+
 def _matrix(component: str, values: np.ndarray) -> Row:
     name = f"[{component}].range_image_return1"
     return {f"{name}.values": values.ravel().tolist(), f"{name}.shape": list(values.shape)}
@@ -127,7 +136,7 @@ def _schema(component: str, single: bool, text_keys: bool) -> pa.Schema:
     keys = {
         "vehicle_pose": ("time",), "camera_calibration": ("camera",), "lidar_calibration": ("laser",),
         "camera_image": ("time", "camera"), "lidar": ("time", "laser"), "lidar_pose": ("time", "laser"),
-        "lidar_box": ("time", "object"),
+        "lidar_box": ("time", "object"), "camera_segmentation": ("time", "camera"),
     }[component]  # fmt: skip
     known = {
         "time": ("key.frame_timestamp_micros", pa.string() if text_keys else pa.int64()),
@@ -140,10 +149,10 @@ def _schema(component: str, single: bool, text_keys: bool) -> pa.Schema:
             fields[name] = pa.list_(real, 16) if name.endswith("transform") else pa.list_(real)
         elif name.endswith((".values", ".shape")):
             fields[name] = pa.list_(pa.float32()) if name.endswith("values") else pa.list_(pa.int32(), 3)
-        elif name.endswith((".width", ".height", ".type", "direction")):
+        elif name.endswith((".width", ".height", ".type", "direction", "_divisor")):
             fields[name] = pa.int32()
-        elif name.endswith((".image", "_timestamp", "_time", ".shutter")):
-            fields[name] = pa.binary() if name.endswith("image") else pa.float64()
+        elif name.endswith((".image", "_label", "_timestamp", "_time", ".shutter")):
+            fields[name] = pa.binary() if name.endswith((".image", "_label")) else pa.float64()
         else:
             fields[name] = real
     return pa.schema(list(fields.items()))
@@ -158,6 +167,7 @@ def _columns(component: str) -> list[str]:
         "camera_image": _image_row({}, ImageRecording(0, 1, np.eye(4), 0.0, b"")),
         "lidar": _matrix("LiDARComponent", np.zeros((1, 1, 4))),
         "lidar_pose": _matrix("LiDARPoseComponent", np.zeros((1, 1, 6))), "lidar_box": _box_row({}, _Blank()),
+        "camera_segmentation": _label_row({}, LabelRecording(0, 1, b"", 1)),
     }  # fmt: skip
     return [name for name in rows[component] if name.startswith("[")]
 
@@ -225,10 +235,20 @@ def _context(drive: Drive) -> bytes:
     return content
 
 
-def _image(image: ImageRecording) -> bytes:
+def _image(image: ImageRecording, labels: Iterable[LabelRecording]) -> bytes:
     shutter, trigger, done = _times(image)
     times = real(5, image.seconds) + real(6, shutter) + real(7, trigger) + real(8, done)
-    return number(1, image.camera) + block(2, image.content) + pose(3, image.pose) + times
+    return (
+        number(1, image.camera)
+        + block(2, image.content)
+        + pose(3, image.pose)
+        + times
+        + b"".join(
+            block(10, number(1, label.divisor) + block(2, label.content))
+            for label in labels
+            if (label.frame, label.camera) == (image.frame, image.camera)
+        )
+    )
 
 
 def _laser(sweep: RangeRecording) -> bytes:
@@ -248,7 +268,7 @@ def _label(box) -> bytes:
 def frame_message(drive: Drive, time: int) -> bytes:
     """A `Frame`. Fields that no reader needs are left out, except an unknown one, which it must skip."""
     content = block(1, _context(drive)) + number(2, time) + pose(3, drive.frames[time])
-    content += b"".join(block(4, _image(image)) for image in drive.images if image.frame == time)
+    content += b"".join(block(4, _image(image, drive.labels)) for image in drive.images if image.frame == time)
     content += b"".join(block(5, _laser(sweep)) for sweep in drive.sweeps if sweep.frame == time)
     content += b"".join(block(6, _label(box)) for box in drive.boxes if box.frame == time)
     return content + block(9, number(1, 1))

@@ -1,16 +1,18 @@
 """The Waymo Open Dataset: one drive through nuScenes' tables, v2 and v1 gives the same scene."""
 
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.waymo_drive import GLOBAL, NAME, READOUT_S, Drive, tiny_drive
+from helpers.waymo_drive import GLOBAL, NAME, READOUT_S, Drive, panoptic, tiny_drive
 from helpers.waymo_files import write_v1, write_v2
 from PIL import Image
 
 from drivesplat.preprocess.extract import extract_scene
+from drivesplat.preprocess.masks import make_masks
 from drivesplat.readers.sweeps import read_returns
 from drivesplat.readers.waymo.sweep_file import read_rays
 from drivesplat.scene.object_class import ObjectClass
@@ -18,6 +20,7 @@ from drivesplat.scene.rigid import apply
 from drivesplat.scene.scene import Scene, read_scene, write_scene
 from drivesplat.scene.tracks import boxes_at
 from drivesplat.settings.extract import SceneSource
+from drivesplat.settings.masks import MaskJob
 
 VERSIONS = ("v2", "v1")
 WRITERS = {"v2": write_v2, "v1": write_v1}
@@ -215,3 +218,51 @@ def test_floats_of_single_precision_and_keys_as_text_are_read(recorded, scenes, 
             apply(theirs.camera_to_world, np.zeros((1, 3))) + scenes["v2"].origin,
             atol=0.01,
         )
+
+
+SKY, ROAD, UNDEFINED, NONE = 25, 20, 0, 255
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_labelled_images_give_sky_masks_and_class_maps(version, recorded, tmp_path):
+    """The label wins over the heuristic of the sky; images without one have it, and no classes."""
+    classes = np.full((54, 96), ROAD)
+    classes[40:], classes[:, 50:] = SKY, UNDEFINED
+    frame = recorded[0].images[6].frame
+    root = WRITERS[version](tmp_path / "data", replace(recorded[0], labels=[panoptic(frame, 1, classes)]))
+    scene = extract_scene(source(cameras=("FRONT",)), root, None, tmp_path / "results")
+    assert scene.sky_class == SKY
+    assert [bool(f.classes_path) for f in scene.frames] == [i == 3 for i in range(10)]
+    with Image.open(scene.frames[3].classes_path) as image:
+        np.testing.assert_array_equal(np.asarray(image), np.where(classes == UNDEFINED, NONE, classes))
+    job = MaskJob.model_validate({"masks": {}, "holdout": {}, "images": {}})
+    record = make_masks(scene, job, tmp_path / "masks")
+    assert record.semantic_classes == ROAD + 1
+    sky, semantic = (
+        [np.asarray(Image.open(tmp_path / f"masks/{kind}/FRONT/{f.timestamp}.png")) for f in scene.frames]
+        for kind in ("sky", "semantic")
+    )
+    np.testing.assert_array_equal(sky[3] == 255, classes == SKY)
+    assert (sky[2] == 255)[:20].mean() > 0.2 and not (sky[2] == 255)[40:].any()
+    np.testing.assert_array_equal(semantic[3], np.where(classes == ROAD, ROAD, NONE))
+    assert all((semantic[i] == NONE).all() for i in range(10) if i != 3)
+
+
+def test_class_maps_of_distorted_images_are_resampled_as_the_images(recorded, tmp_path):
+    drive = recorded[0]
+    classes = np.repeat(np.arange(24).reshape(3, 8), 18, axis=0).repeat(12, axis=1)
+    png = BytesIO()
+    Image.fromarray((10 * classes).astype(np.uint8)).convert("RGB").save(png, "PNG")
+    first = replace(drive.images[0], content=png.getvalue())
+    front = replace(drive.cameras[0], intrinsic=[*drive.cameras[0].intrinsic[:4], 0.05, -0.3, 0.002, -0.002, 0.0])
+    changed = replace(
+        drive, images=[first, *drive.images[1:]], cameras=[front], labels=[panoptic(first.frame, 1, classes)]
+    )
+    scene = extract_scene(source(cameras=("FRONT",)), write_v2(tmp_path / "data", changed), None, tmp_path / "results")
+    assert scene.cameras[0].distortion_model == "none" and "undistorted" in scene.frames[0].image_path
+    labels, image = (
+        np.asarray(Image.open(path)) for path in (scene.frames[0].classes_path, scene.frames[0].image_path)
+    )
+    expected = np.rint(image[..., 0] / 10.0)
+    inside = np.where(labels == NONE, 0, labels) == expected
+    assert inside.mean() > 0.8 and (labels != np.where(classes == 0, NONE, classes)).any()

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers.tiny_world import World, write_world
-from helpers.waymo_drive import NAME, Drive, tiny_drive
+from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
 from helpers.waymo_files import tfrecord, write_v1, write_v2
 
 from drivesplat.errors import DatasetError
@@ -293,6 +293,24 @@ def test_wrong_values_are_named_in_both_versions(fault, drive, written, tmp_path
     change, words = FAULTS[fault]
     for version in WRITERS:
         assert re.search(words, refusal(written(version, change(drive)), tmp_path / "results")), version
+
+
+LABELS = {
+    "no image": (
+        lambda label: replace(label, content=b"\x89PNG junk"),
+        r"label FRONT/\d+: its panoptic label is corrupt",
+    ),
+    "another divisor": (lambda label: replace(label, divisor=3), r"label FRONT/\d+: .* no classes from 0 to 28"),
+    "no divisor": (lambda label: replace(label, divisor=0), r"label FRONT/\d+: .* with the divisor 0"),
+}
+
+
+@pytest.mark.parametrize("fault", LABELS)
+def test_a_panoptic_label_that_cannot_be_is_named(fault, drive, written, tmp_path):
+    change, words = LABELS[fault]
+    label = change(panoptic(drive.images[0].frame, 1, np.full((27, 48), 20)))
+    for version in WRITERS:
+        assert re.search(words, refusal(written(version, replace(drive, labels=[label])), tmp_path / "results"))
 
 
 def test_records_of_frames_that_are_not_there_are_named(drive, written, tmp_path):

@@ -70,6 +70,14 @@ def test_cameras_look_where_they_are_mounted(scene):
         assert 0.043 < camera.readout_s < 0.045 and camera.readout_direction == "right"
 
 
+def test_the_labels_have_sky_above_and_road_below(root, tmp_path):
+    scene = extract_scene(SOURCE.model_copy(update={"cameras": ("FRONT",)}), root, None, tmp_path)
+    classes = np.asarray(Image.open(scene.frames[0].classes_path))
+    assert classes.shape == (1280, 1920) and scene.sky_class == 25
+    sky, road = classes == 25, classes == 20
+    assert sky[:200].mean() > 0.5 and not sky[800:].any() and road[900:].mean() > 0.5 and not road[:400].any()
+
+
 def test_there_are_75_boxes(scene):
     assert Counter(track.category for track in scene.tracks) == {
         "vehicle": 37, "sign": 25, "pedestrian": 12, "cyclist": 1,

@@ -21,7 +21,9 @@ def pose(seed: int) -> np.ndarray:
 def some_scene(times: tuple[int, ...] = (1_532_402_927_647_951, 1_532_402_928_147_950)) -> Scene:
     first, last = times[0], times[-1]
     intrinsics = np.array([[1266.417203046554, 0.0, 816.2670197447984], [0.0, 1266.4, 491.507], [0.0, 0.0, 1.0]])
-    frame = Frame("CAM_FRONT", first - 35_000, "/data/ä.jpg", 1600, 900, intrinsics, pose(1), pose(2), True, 0, "a")
+    frame = Frame(
+        "CAM_FRONT", first - 35_000, "/data/ä.jpg", 1600, 900, intrinsics, pose(1), pose(2), True, 0, "a", "a.png"
+    )
     between = dataclasses.replace(frame, timestamp=first + 10, is_key_frame=False, token="b")
     sweep = Sweep("/data/a.pcd.bin", first, pose(3), True, 0, "c", "LIDAR_TOP", "nuscenes")
     track = Track(
@@ -33,6 +35,7 @@ def some_scene(times: tuple[int, ...] = (1_532_402_927_647_951, 1_532_402_928_14
         np.array(times), (frame, between), (sweep,), (track,), "refined", 2.0, [0, 2], 3,
         (Camera("CAM_FRONT", 1600, 900, intrinsics, np.zeros(5), 0.03, "down"), Camera("CAM_BACK", 8, 9, intrinsics)),
         (Lidar("LIDAR_TOP", np.array([-0.1, 0.1]), 1085), Lidar("LIDAR_SIDE")), {"stages": {"extract": {}}},
+        "of the tests", 25,
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivesplat.errors import DatasetError
-from drivesplat.readers.waymo.names import CAMERAS, COMPONENTS, FRAMES, V1, V2
+from drivesplat.readers.waymo.names import CAMERAS, COMPONENTS, FRAMES, SEGMENTATION, V1, V2
 
 HOW = "docs/waymo.md says what to download; set datasets.<name>.dataroot to the folder that holds it"
 PREFIX, SUFFIX = "segment-", "_with_camera_labels"
@@ -73,7 +73,8 @@ def segment_files(root: Path, version: str, scene: str) -> SegmentFiles:
             f"scene {scene}: {', '.join(f'{component}/{name}.parquet' for component in absent)} "
             f"{'is' if len(absent) == 1 else 'are'} missing in {root}; docs/waymo.md lists the components that are read"
         )
-    return SegmentFiles(name, V2, files)
+    segmentation = root / SEGMENTATION / f"{name}.parquet"
+    return SegmentFiles(name, V2, files | ({SEGMENTATION: segmentation} if segmentation.is_file() else {}))
 
 
 def _segments(root: Path, version: str) -> dict[str, Path]:

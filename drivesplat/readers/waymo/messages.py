@@ -38,6 +38,7 @@ _FIELDS = {
     },
     "RangeImage": {"range_image_compressed": (2, "bytes"), "range_image_pose_compressed": (4, "bytes")},
     "Laser": {"name": (1, "int32"), "ri_return1": (2, "RangeImage")},
+    "CameraSegmentationLabel": {"panoptic_label_divisor": (1, "int32"), "panoptic_label": (2, "bytes")},
     "CameraImage": {
         "name": (1, "int32"),
         "image": (2, "bytes"),
@@ -46,6 +47,7 @@ _FIELDS = {
         "shutter": (6, "double"),
         "camera_trigger_time": (7, "double"),
         "camera_readout_done_time": (8, "double"),
+        "camera_segmentation_label": (10, "CameraSegmentationLabel"),
     },
     "Box": {
         "center_x": (1, "double"),

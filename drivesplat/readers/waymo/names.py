@@ -16,5 +16,9 @@ COMPONENTS = (
     "camera_image", "camera_calibration", "vehicle_pose", "lidar", "lidar_calibration", "lidar_pose", "lidar_box",
 )  # fmt: skip
 """Folders of a v2 dataset that are read."""
+SEGMENTATION = "camera_segmentation"
+"""A component that is read where it is there."""
+UNDEFINED_CLASS, SKY_CLASS, MAX_CLASS = 0, 25, 28
+"""`CameraSegmentation.Type` in protos/camera_segmentation.proto of the same repository."""
 FRAMES = "frames"
 """What a v1 segment's only file holds."""

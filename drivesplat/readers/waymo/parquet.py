@@ -12,7 +12,7 @@ from drivesplat.readers.record_names import shown
 
 SEGMENT = "key.segment_context_name"
 TEXTS = (SEGMENT, "key.laser_object_id")
-LISTS, BYTES = (".transform", ".values", ".shape"), ".image"
+LISTS, BYTES = (".transform", ".values", ".shape"), (".image", ".panoptic_label")
 """Ends of names of columns that hold lists of numbers, or bytes."""
 BUFFER = 1 << 20
 """Bytes that are read of a column at once: less than its whole chunk, which may hold all images of a segment."""

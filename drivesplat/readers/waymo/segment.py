@@ -113,6 +113,16 @@ class ImageFile:
 
 
 @dataclass(frozen=True)
+class PanopticLabel:
+    """The panoptic label of an image: a PNG file of 16 bits, whose values are class * `divisor` + instance."""
+
+    frame: int
+    camera: int
+    content: bytes
+    divisor: int
+
+
+@dataclass(frozen=True)
 class RangeImage:
     """The first returns of a laser in the frame at `frame`, whose pose is `frame_pose`. `values` (rows, columns, 4)
     float32: range in metres, intensity, elongation, no-label zone; `poses` (rows, columns, 6) float32: roll, pitch,

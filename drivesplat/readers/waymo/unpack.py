@@ -1,5 +1,6 @@
 """Writes the images and sweeps of a segment as files, since later stages open each by its path, many times and in any
-order: images/{camera}/{timestamp}.jpg, the bytes of the dataset unchanged, and sweeps/{laser}/{timestamp}.npz.
+order: images/{camera}/{timestamp}.jpg, the bytes of the dataset unchanged, classes/{camera}/{timestamp}.png, the
+classes of labelled images, and sweeps/{laser}/{timestamp}.npz.
 
 They are written once, by the rule `extract`, one recording at a time, so that memory does not grow with the segment. A
 rerun writes the same bytes.
@@ -7,28 +8,32 @@ rerun writes the same bytes.
 
 import dataclasses
 import shutil
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.drive_checks import MAX_RANGE
 from drivesplat.readers.waymo.calibration import laser_elevations, laser_mount, pose_of
 from drivesplat.readers.waymo.layout import segment_files
-from drivesplat.readers.waymo.names import CAMERAS, LASERS
+from drivesplat.readers.waymo.names import CAMERAS, LASERS, MAX_CLASS, SKY_CLASS, UNDEFINED_CLASS
 from drivesplat.readers.waymo.range_image import azimuths, points_of
 from drivesplat.readers.waymo.reader import format_of
-from drivesplat.readers.waymo.segment import ImageFile, RangeImage, Recordings, sweep_name
+from drivesplat.readers.waymo.segment import ImageFile, PanopticLabel, RangeImage, Recordings, sweep_name
 from drivesplat.readers.waymo.sweep_file import rays_of, write_file
+from drivesplat.scene.images import DECODING_ERRORS, write_png
+from drivesplat.scene.masks import UNLABELLED
 from drivesplat.scene.scene import Frame, Scene
 from drivesplat.settings.extract import SceneSource
 
-FOLDERS = ("images", "sweeps")
+FOLDERS = ("images", "classes", "sweeps")
 
 
 def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene:
-    """Writes the images and sweeps of a scene that `reader.read` returned below `folder`, in place of those that are
-    there. Returns the scene with their paths.
+    """Writes the images, class maps and sweeps of a scene that `reader.read` returned below `folder`, in place of those
+    that are there. Returns the scene with their paths.
 
     Raises DatasetError naming the first range image that is damaged, and a frame without an image unless
     `source.on_missing` is 'warn'.
@@ -38,18 +43,29 @@ def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene
     files = segment_files(root, source.version, source.scene)
     images = {frame.token: folder / frame.image_path for frame in scene.frames}
     sweeps = {sweep.token: folder / sweep.path for sweep in scene.sweeps}
+    classes: dict[str, str] = {}
     for recording in format_of(files.version).read_recordings(files, _wanted(scene)):
         if isinstance(recording, RangeImage):
             _write_sweep(recording, sweeps[f"{LASERS[recording.laser.number]}/{recording.frame}"])
+            continue
+        token = f"{CAMERAS[recording.camera]}/{recording.frame}"
+        if isinstance(recording, PanopticLabel):
+            path = folder / "classes" / CAMERAS[recording.camera] / f"{images[token].stem}.png"
+            _write_classes(recording, path)
+            classes[token] = str(path)
         elif recording.content:
-            _write_image(recording, images[f"{CAMERAS[recording.camera]}/{recording.frame}"])
+            _write_image(recording, images[token])
     if source.on_missing == "stop":
         for frame in scene.frames:
             if not images[frame.token].is_file():
                 raise _no_image(frame)
     return dataclasses.replace(
         scene,
-        frames=tuple(dataclasses.replace(frame, image_path=str(images[frame.token])) for frame in scene.frames),
+        sky_class=SKY_CLASS if classes else None,
+        frames=tuple(
+            dataclasses.replace(frame, image_path=str(images[frame.token]), classes_path=classes.get(frame.token))
+            for frame in scene.frames
+        ),
         sweeps=tuple(dataclasses.replace(sweep, path=str(sweeps[sweep.token])) for sweep in scene.sweeps),
     )
 
@@ -67,6 +83,23 @@ def _wanted(scene: Scene) -> Recordings:
 def _write_image(image: ImageFile, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(image.content)
+
+
+def _write_classes(label: PanopticLabel, path: Path) -> None:
+    """Writes the class of each pixel, UNLABELLED where Waymo's is undefined."""
+    record = f"label {CAMERAS[label.camera]}/{label.frame}"
+    try:
+        with Image.open(BytesIO(label.content)) as image:
+            panoptic = np.asarray(image)
+    except DECODING_ERRORS as error:
+        raise DatasetError(f"{record}: its panoptic label is corrupt ({error}); download the segment again") from error
+    if label.divisor < 1 or panoptic.ndim != 2 or panoptic.max() // label.divisor > MAX_CLASS:
+        raise DatasetError(
+            f"{record}: its panoptic label has no classes from 0 to {MAX_CLASS} with the divisor {label.divisor}"
+        )
+    classes = panoptic // label.divisor
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, np.where(classes == UNDEFINED_CLASS, UNLABELLED, classes).astype(np.uint8))
 
 
 def _no_image(frame: Frame) -> DatasetError:

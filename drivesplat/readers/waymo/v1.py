@@ -19,6 +19,7 @@ from drivesplat.readers.waymo.segment import (
     ImageFile,
     ImageRecord,
     LaserRecord,
+    PanopticLabel,
     RangeImage,
     Recordings,
     Segment,
@@ -49,8 +50,8 @@ def read_segment(files: SegmentFiles) -> Segment:
     return segment
 
 
-def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile | RangeImage]:
-    """The wanted images and range images, one at a time."""
+def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile | PanopticLabel | RangeImage]:
+    """The wanted images, with their labels, and range images, one at a time."""
     calibrated = Segment(files.name, files.version)
     for frame in _frames(files):
         time = frame.timestamp_micros
@@ -59,6 +60,9 @@ def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFi
         for image in frame.images:
             if (time, image.name) in wanted.images:
                 yield ImageFile(time, image.name, image.image)
+                label = image.camera_segmentation_label
+                if label.panoptic_label:
+                    yield PanopticLabel(time, image.name, label.panoptic_label, label.panoptic_label_divisor)
         for laser in frame.lasers:
             if (time, laser.name) in wanted.sweeps:
                 values, poses = _returns(laser, time), None

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from drivesplat.errors import DatasetError
 from drivesplat.readers.waymo.layout import SegmentFiles
-from drivesplat.readers.waymo.names import TOP
+from drivesplat.readers.waymo.names import SEGMENTATION, TOP
 from drivesplat.readers.waymo.parquet import batches, rows, whole
 from drivesplat.readers.waymo.segment import (
     BoxRecord,
@@ -21,6 +21,7 @@ from drivesplat.readers.waymo.segment import (
     ImageFile,
     ImageRecord,
     LaserRecord,
+    PanopticLabel,
     RangeImage,
     Recordings,
     Segment,
@@ -35,6 +36,7 @@ TIME, CAMERA, LASER, OBJECT = (
 INTRINSIC = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 RANGES, POSES = "[LiDARComponent].range_image_return1", "[LiDARPoseComponent].range_image_return1"
 IMAGE = "[CameraImageComponent].image"
+LABEL = "[CameraSegmentationLabelComponent].panoptic_label"
 LARGE_ROWS = 4
 """Images and range images that are read at once."""
 Key = tuple[int, int]
@@ -56,9 +58,9 @@ def read_segment(files: SegmentFiles) -> Segment:
     return segment
 
 
-def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile | RangeImage]:
-    """The wanted images and range images, one at a time."""
-    return chain(_image_files(files, wanted), _range_images(files, wanted))
+def read_recordings(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile | PanopticLabel | RangeImage]:
+    """The wanted images, with their labels, and range images, one at a time."""
+    return chain(_image_files(files, wanted), _labels(files, wanted), _range_images(files, wanted))
 
 
 def _frames_and_lasers(files: SegmentFiles, read: "_Rows") -> Segment:
@@ -133,6 +135,16 @@ def _image_files(files: SegmentFiles, wanted: Recordings) -> Iterator[ImageFile]
         time, camera = whole(row[TIME], path, TIME), whole(row[CAMERA], path, CAMERA)
         if (time, camera) in wanted.images:
             yield ImageFile(time, camera, row[IMAGE] if isinstance(row[IMAGE], bytes) else b"")
+
+
+def _labels(files: SegmentFiles, wanted: Recordings) -> Iterator[PanopticLabel]:
+    if SEGMENTATION not in files.files:
+        return
+    path, divisor = files.files[SEGMENTATION], f"{LABEL}_divisor"
+    for row in rows(path, [TIME, CAMERA, LABEL, divisor], files.name, LARGE_ROWS):
+        time, camera = whole(row[TIME], path, TIME), whole(row[CAMERA], path, CAMERA)
+        if (time, camera) in wanted.images and isinstance(row[LABEL], bytes):
+            yield PanopticLabel(time, camera, row[LABEL], whole(row[divisor], path, divisor))
 
 
 def _range_images(files: SegmentFiles, wanted: Recordings) -> Iterator[RangeImage]:
