@@ -37,7 +37,7 @@ def undistorted(scene: Scene, folder: Path) -> Scene:
         k, x, y = maps[frame.camera]
         path = folder / frame.camera / f"{frame.timestamp}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_png(path, cv2.remap(read_image(frame.image_path), x, y, cv2.INTER_CUBIC))
+        write_png(path, cv2.remap(read_image(frame.image_path), x, y, cv2.INTER_CUBIC), level=1)
         classes = None if frame.classes_path is None else str(path.with_name(f"{path.stem}_classes.png"))
         if frame.classes_path is not None and classes is not None:
             labels = read_mask(frame.classes_path, (frame.width, frame.height), (frame.width, frame.height))

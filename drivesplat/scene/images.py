@@ -58,13 +58,14 @@ def write_image(path: str | Path, colors: np.ndarray) -> None:
     write_png(path, (colors.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
 
 
-def write_png(path: str | Path, pixels: np.ndarray) -> None:
-    """Writes pixels as a PNG: uint8 (h, w) or (h, w, 3), or uint16 (h, w).
+def write_png(path: str | Path, pixels: np.ndarray, level: int = 6) -> None:
+    """Writes pixels as a PNG: uint8 (h, w) or (h, w, 3), or uint16 (h, w). `level` 1 takes a sixth of the time of 6
+    and an eighth more disk.
 
     Raises ResultError that names the path on failure.
     """
     with atomic_write(path) as file:
-        Image.fromarray(pixels).save(file, format="PNG")
+        Image.fromarray(pixels).save(file, format="PNG", compress_level=level)
 
 
 def read_mask(path: str | Path, size: tuple[int, int], of_image: tuple[int, int] | None = None) -> np.ndarray:

@@ -48,7 +48,6 @@ def test_metrics_are_near_those_of_the_tables(copy):
     assert mean[1] == pytest.approx(mean[0], abs=0.5)
     pixels = [[one[0][region]["pixels"] for region in ("all", "static", "vehicle")] for one in figures]
     assert pixels[0] == pixels[1]
-    assert figures[1][0]["car"] is None and figures[0][0]["car"], "Waymo has one class of vehicles"
 
 
 def test_both_versions_give_the_same_seed_and_masks(copy):
