@@ -25,8 +25,8 @@ class MasksRecord:
     """The content of masks.json: the `labels` of regions, the number of `images`, whether regions come from 'boxes' or
     'masks' and the sky from a 'heuristic' (in images with a class map of the dataset: from that) or 'masks', the mean
     share of sky pixels, whether any sky was found, the number of semantic classes (0: none), the source of the ego mask
-    by camera that sees the ego vehicle, and whether the visibility of boxes is 'annotated' or 'estimated' (None where no
-    box makes a region)."""
+    by camera that sees the ego vehicle, and whether the visibility of boxes is 'annotated' or 'estimated' (None where
+    no box makes a region)."""
 
     labels: dict[str, int]
     images: int
