@@ -15,7 +15,7 @@ from helpers.tiny_world import World, write_world
 from helpers.waymo_drive import NAME, Drive, panoptic, tiny_drive
 from helpers.waymo_files import tfrecord, write_v1, write_v2
 
-from drivesplat.errors import DatasetError
+from drivesplat.errors import DatasetError, ResultError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.readers.waymo.layout import camera_names, find_root, segment_files, table_files
 from drivesplat.readers.waymo.tfrecord import masked_crc
@@ -343,3 +343,10 @@ def test_an_unknown_camera_is_refused_with_those_there_are(roots, tmp_path):
     assert "there is no camera 'REAR'; there are: FRONT, FRONT_LEFT" in refusal(
         roots["v1"], tmp_path, cameras=("REAR",)
     )
+
+
+@pytest.mark.parametrize("name", ["images", "sweeps"])
+def test_a_file_that_cannot_be_written_is_named(name, roots, tmp_path):
+    (tmp_path / name).touch()  # where a folder has to be
+    with pytest.raises(ResultError, match=rf"{tmp_path}/{name}/.* cannot be written"):
+        extracted(roots["v2"], tmp_path)

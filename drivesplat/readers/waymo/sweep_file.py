@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drivesplat.io.storage import atomic_write
 from drivesplat.readers.drive.sweep_file import file_fault, read_file
 from drivesplat.readers.waymo.range_image import Rays
 
@@ -15,9 +16,10 @@ __all__ = ["file_fault", "read_file", "read_rays", "write_file"]
 def write_file(
     path: Path, azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray, **returns: np.ndarray
 ) -> None:
-    """Writes a sweep: `ranges` (rows, columns) with NaN for dropped returns, and the columns of `returns` by name."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, azimuth=azimuth, elevation=elevation, range=ranges.astype(np.float32), **returns)
+    """Writes a sweep: `ranges` (rows, columns) with NaN for dropped returns, and the columns of `returns` by name.
+    Raises ResultError naming the file where it cannot be written."""
+    with atomic_write(path) as file:
+        np.savez(file, azimuth=azimuth, elevation=elevation, range=ranges.astype(np.float32), **returns)
 
 
 def read_rays(path: Path) -> Rays:

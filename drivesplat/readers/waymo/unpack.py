@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from drivesplat.errors import DatasetError
+from drivesplat.io.storage import atomic_write
 from drivesplat.readers.drive_checks import MAX_RANGE
 from drivesplat.readers.waymo.calibration import laser_elevations, laser_mount, pose_of
 from drivesplat.readers.waymo.layout import segment_files
@@ -36,7 +37,7 @@ def unpack(scene: Scene, root: Path, source: SceneSource, folder: Path) -> Scene
     that are there. Returns the scene with their paths.
 
     Raises DatasetError naming the first range image that is damaged, and a frame without an image unless
-    `source.on_missing` is 'warn'.
+    `source.on_missing` is 'warn'; ResultError naming a file that cannot be written.
     """
     for name in FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
@@ -81,8 +82,8 @@ def _wanted(scene: Scene) -> Recordings:
 
 
 def _write_image(image: ImageFile, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(image.content)
+    with atomic_write(path) as file:
+        file.write(image.content)
 
 
 def _write_classes(label: PanopticLabel, path: Path) -> None:
@@ -98,7 +99,6 @@ def _write_classes(label: PanopticLabel, path: Path) -> None:
             f"{record}: its panoptic label has no classes from 0 to {MAX_CLASS} with the divisor {label.divisor}"
         )
     classes = panoptic // label.divisor
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, np.where(classes == UNDEFINED_CLASS, UNLABELLED, classes).astype(np.uint8))
 
 
