@@ -130,7 +130,7 @@ class _Reading:
         """The images of a camera."""
         name, mount = CAMERAS[number], camera_mount(self.segment.camera(number))
         camera = self.camera(number)
-        images = self._byframe_name(number)
+        images = self._images_by_frame(number)
         times = [self._time(images.get(int(key)), int(key)) for key in self.key_times]
         require_increasing(times, [f"{name}/{time}" for time in times], "image")
         for index, (key, time) in enumerate(zip(self.key_times.tolist(), times, strict=True)):
@@ -152,7 +152,7 @@ class _Reading:
                 token=f"{name}/{key}",
             )
 
-    def _byframe_name(self, number: int) -> dict[int, ImageRecord]:
+    def _images_by_frame(self, number: int) -> dict[int, ImageRecord]:
         found: dict[int, ImageRecord] = {}
         for image in self.segment.images:
             if image.camera == number:
