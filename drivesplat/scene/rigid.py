@@ -1,7 +1,6 @@
 """Rigid transforms as 4x4 matrices, float64, applied to column vectors."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 
 def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -27,6 +26,8 @@ def interpolate(start: np.ndarray, end: np.ndarray, fraction: float) -> np.ndarr
 
     Outside [0, 1] the motion is extrapolated.
     """
+    from scipy.spatial.transform import Rotation  # here: planning imports this module, and scipy takes long
+
     turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
     rotation = start[:3, :3] @ Rotation.from_rotvec(fraction * turn).as_matrix()
     return rigid(rotation, (1.0 - fraction) * start[:3, 3] + fraction * end[:3, 3])
