@@ -23,6 +23,8 @@ from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
 
+pytestmark = pytest.mark.slow
+
 KEY_FRAMES = 7
 AHEAD = recorder_of().instance("vehicle 0")
 JOB = job_of(
@@ -71,7 +73,6 @@ def png(path) -> np.ndarray:
     return np.asarray(Image.open(path))
 
 
-@pytest.mark.slow
 def test_key_frames_come_at_10_hz_and_images_at_20(root, scene):
     assert set(np.diff([row["timestamp"] for row in table(root, "sample")])) == {100_000}
     images = [frame.timestamp for frame in scene.frames]

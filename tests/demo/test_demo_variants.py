@@ -50,6 +50,7 @@ def test_the_same_settings_give_the_same_bytes_with_one_worker_and_with_two(tmp_
     assert [name for name in one if one[name] != two[name]] == []
 
 
+@pytest.mark.slow
 def test_another_random_seed_gives_another_street():
     a, b = (recorder_of(random_seed=s).image(FRONT, 0) for s in (1, 2))
     again = Recorder(world_of(random_seed=1)).image(FRONT, 0)

@@ -254,6 +254,7 @@ def test_the_caption_says_where_an_object_shows_a_side_that_no_camera_saw(scene,
     np.testing.assert_array_equal(noted(turn), 0.25 * np.arange(19) >= 2.0)
 
 
+@pytest.mark.slow
 def test_the_still_is_not_beyond_the_last_training_image(scene, model, tmp_path):
     """With all held out from a second before the largest difference, of a vehicle that falls behind."""
     behind = {"speed": {"track": AHEAD, "factor": 0.5}}

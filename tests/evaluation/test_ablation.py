@@ -450,6 +450,7 @@ def planned_files(copy: WorkflowCopy, target: str, rule: str) -> dict[str, list[
     return {m.group(1) if m else "": job["input"].split(", ") for m, job in zip(methods, fields, strict=True)}
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.xdist_group("ablation")
 def test_the_target_plans_one_training_per_variant_and_seed(copy):

@@ -179,6 +179,7 @@ def test_following_the_advice_rebuilds_the_file(finished, tmp_path, path, rule, 
     assert damaged.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_an_image_replaced_after_extract_is_refused_and_following_the_advice_measures_it(finished, tmp_path):
     copy = finished.again(tmp_path / "copy")
     images = sorted((copy.folder / "data/samples/CAM_FRONT").glob("*.jpg"))

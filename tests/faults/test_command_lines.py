@@ -42,6 +42,7 @@ def test_an_unusable_config_file_is_named_with_its_line(copy, text, words):
     assert f"bad.yaml{words}" in line or f"bad.yaml: {words}" in line, line
 
 
+@pytest.mark.slow
 def test_the_workflow_runs_from_elsewhere_into_a_folder_of_its_own(copy, tmp_path):
     """Which has no config.yaml: the workflow's own holds. The demo's edits are found, too."""
     work = tmp_path / "work"

@@ -198,6 +198,7 @@ NO_RESULTS = {
     "reader.py": "tables of one scene in a temporary folder",
     "scene_tables.py": "files in the making in a temporary folder, which go that way when whole",
     "storage.py": "the way all others go",
+    "sweep_file.py": "into a file of storage",
     "array_file.py": "members of an archive, which goes that way",
 }
 """The modules that open files for writing by themselves, and what."""

@@ -97,13 +97,31 @@ EDITS = (
     ("target", "words"),
     [
         ("vanilla/edits/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
-        ("vanilla/parts.mp4", ["'vanilla' knows no actors", "those do: street"]),
-        ("street/edits/halt.mp4", ["no edit called 'halt'", "there are: stop, gone", "datasets.<name>.edits"]),
-        ("vanilla/quad/stop.mp4", ["'vanilla' knows no actors", "those do: street"]),
-        ("street/quad/halt.mp4", ["no edit called 'halt'", "there are: stop, gone"]),
-        ("street/edits/halt.json", ["no edit called 'halt'", "there are: stop, gone"]),
-        ("street/edits/halt/drive/drive.json", ["no edit called 'halt'", "there are: stop, gone"]),
-        ("vanilla/edits/stop/drive/drive.json", ["'vanilla' knows no actors", "those do: street"]),
+        pytest.param("vanilla/parts.mp4", ["'vanilla' knows no actors", "those do: street"], marks=pytest.mark.slow),
+        pytest.param(
+            "street/edits/halt.mp4",
+            ["no edit called 'halt'", "there are: stop, gone", "datasets.<name>.edits"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "vanilla/quad/stop.mp4", ["'vanilla' knows no actors", "those do: street"], marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "street/quad/halt.mp4", ["no edit called 'halt'", "there are: stop, gone"], marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "street/edits/halt.json", ["no edit called 'halt'", "there are: stop, gone"], marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "street/edits/halt/drive/drive.json",
+            ["no edit called 'halt'", "there are: stop, gone"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "vanilla/edits/stop/drive/drive.json",
+            ["'vanilla' knows no actors", "those do: street"],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_an_edit_that_there_is_none_of_stops_before_any_job(copy, target, words):
@@ -446,7 +464,7 @@ with job(snakemake) as current:
 """
 
 
-@pytest.mark.parametrize("gpus", [1, 4])
+@pytest.mark.parametrize("gpus", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_there_are_never_more_gpu_jobs_than_gpus_and_each_sees_its_own(trained, gpus):
     """However many cores there are. None waits for a GPU, since none is started before one is free."""
     names = [f"GPU-{os.getpid()}-{number}" for number in range(gpus)]

@@ -352,6 +352,7 @@ def demo_root(tmp_path_factory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_depths_of_the_demo_world_agree_with_its_ground_truth(demo_root):
     """With meshes instead of boxes, 2 cm of noise and LiDAR on the roof, 95 % of all depths are correct to 5 % and 0.3
     m, and nearly all of moving objects."""

@@ -179,6 +179,7 @@ def test_wrong_poses_are_corrected_at_training_and_held_out_images(learned, time
     assert shift < 0.6 * given_shift and turn < 0.35 * given_turn
 
 
+@pytest.mark.slow
 def test_a_held_out_image_uses_the_corrections_of_its_neighbours(learned):
     with torch.no_grad():
         truth = model_of(None).render(a_view(1.5)).image

@@ -67,6 +67,7 @@ def wobble(scene: Scene, truth: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(errors[:, :3, :3]).as_rotvec(degrees=True).std(axis=0)
 
 
+@pytest.mark.slow
 def test_images_of_a_street_reduce_the_errors_of_noisy_poses(tmp_path):
     scene, truth = filmed(recorder_of(pose_noise=True), tmp_path)
     refined = refine_poses(scene, JOB, threads=2)
