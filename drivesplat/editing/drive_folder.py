@@ -47,15 +47,25 @@ def write_rendered_drive(
     DeviceError; ResultError where a rendering contains NaN or Inf, or the disk is full.
     """
     folder, what = path.parent, " ".join(f"{key} {value}" for key, value in source.items())
-    for earlier in (folder / "images", folder / TABLES):
-        if earlier.exists():
-            shutil.rmtree(earlier)
+    _remove(folder)
     model, device = open_model(checkpoint, device_settings)
     drive = rendered_drive(scene, model, job, folder, what)
-    pictures = _pictures(model, drive, drive.views(device))
-    with explain_out_of_memory(lambda: len(model)):
-        for frame, pixels in zip(drive.scene.frames, prefetch_items(pictures), strict=True):
-            _write_jpeg(Path(frame.image_path), pixels)
+    try:
+        with explain_out_of_memory(lambda: len(model)):
+            pictures = prefetch_items(_pictures(model, drive, drive.views(device)))
+            for frame, pixels in zip(drive.scene.frames, pictures, strict=True):
+                _write_jpeg(Path(frame.image_path), pixels)
+        _write_records(scene, drive, job, path, source, provenance)
+    except BaseException:
+        _remove(folder)
+        raise
+
+
+def _write_records(
+    scene: Scene, drive: RenderedDrive, job: DriveJob, path: Path, source: dict[str, str], provenance: Provenance
+) -> None:
+    """Writes the nuScenes tables of a rendered drive, and last its drive.json."""
+    folder, what = path.parent, " ".join(f"{key} {value}" for key, value in source.items())
     marked = replace(
         drive.scene,
         name=f"{source['scene']}_{source.get('edit') or source.get('trajectory')}",
@@ -69,6 +79,13 @@ def write_rendered_drive(
     write_nuscenes(marked, folder / TABLES, VERSION, log)
     write_json(folder / TABLES / "provenance.json", {"rendered": rendered, "provenance": provenance})
     write_record(path, replace(marked, tracks=drive.tracks), {**rendered, "provenance": provenance})
+
+
+def _remove(folder: Path) -> None:
+    """Removes the images and tables of an earlier or a failed run."""
+    for part in (folder / "images", folder / TABLES):
+        if part.exists():
+            shutil.rmtree(part)
 
 
 def _pictures(model: SplatModel, drive: RenderedDrive, views: Iterator[View]) -> Iterator[np.ndarray]:

@@ -27,7 +27,8 @@ from scipy.spatial import ConvexHull
 
 from drivesplat.editing.drive_folder import TABLES, VERSION, write_rendered_drive
 from drivesplat.editing.rendered_drive import rendered_drive
-from drivesplat.errors import ConfigError
+from drivesplat.errors import ConfigError, ResultError
+from drivesplat.io.storage import unwritable
 from drivesplat.model.part import ActorPlacement
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
@@ -276,6 +277,16 @@ def test_a_second_writing_leaves_no_image_of_the_first(scene, model, tmp_path):
     folder = written(scene, model, tmp_path, a_job({"ego": {"speed": 2.0}}, width=32))
     for below in ("images", TABLES):
         assert all(int(file.stem.split("_")[-1]) <= MIDDLE for file in (folder / below).rglob("*.jpg"))
+
+
+def test_a_disk_that_is_full_leaves_nothing_and_names_the_file(scene, model, tmp_path, monkeypatch):
+    def full(path: Path, *_: Any) -> None:
+        raise unwritable(path, "No space left on device")
+
+    monkeypatch.setattr("drivesplat.editing.drive_folder.write_record", full)
+    with pytest.raises(ResultError, match=r"drive\.json: cannot be written \(No space left on device\)"):
+        written(scene, model, tmp_path, a_job({"ego": {"speed": 2.0}}, width=32))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_model_without_actors_has_trajectories_and_no_edits(scene, tmp_path):

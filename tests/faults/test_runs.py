@@ -351,7 +351,6 @@ LOOK_SCRIPTS = {
     "compare": "compare.mp4",
     "quad": "street/quad/gone.mp4",
     "edit": "street/edits/gone.mp4",
-    "drive_folder": "street/edits/gone/drive/drive.json",
     "ghost_panel": "vanilla/ghost_panel.png",
     "remove_actor": "vanilla/with_car.png",
     "export": "vanilla/splat.ply",
