@@ -19,7 +19,9 @@ def test_work_on_the_main_thread_is_measured_page_by_page(tmp_path):
     speeds = by_turns(pages, rounds=2, frames=5)
     assert [len(found) for found in speeds] == [2, 2]
     idle, busy = (min(speed.main_thread_ms for speed in found) for found in speeds)
-    assert 0.0 < idle < 60.0 <= busy and all(0.0 < speed.frames < 1000.0 / 60.0 for speed in speeds[1])
+    assert 0.0 < idle < 60.0 <= busy
+    # five frames of 60 ms; their times are those of refreshes of the screen, 1/60 s apart
+    assert all(0.0 < speed.frames <= 5 / (5 * 0.060 - 1 / 60) for speed in speeds[1])
 
 
 def test_a_table_has_medians_and_extremes(tmp_path):
