@@ -2,11 +2,30 @@
 
 from collections.abc import Iterable
 
-from drivesplat.edited_motion.edited_actors import EditedActor
+import numpy as np
+
+from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
 from drivesplat.errors import ConfigError, ResultError
 from drivesplat.model.splat_model import SplatModel
+from drivesplat.rendering.trajectory import recorded_frames
 from drivesplat.scene.motion import Motion
 from drivesplat.scene.scene import Scene
+from drivesplat.settings.edit import Edit
+
+
+def recorded_and_edited(
+    model: SplatModel, scene: Scene, camera: str, edit: Edit, where: str
+) -> tuple[list[EditedActor], list[EditedActor]]:
+    """The actors of the model, and these after an edit. Steps that place a copy count from the ego poses at the images
+    of `camera`.
+
+    Raises ConfigError, starting with `where`, if the edit does not fit the scene or the model has no actors;
+    DatasetError if the scene lacks the camera; ResultError as `editable_actors`.
+    """
+    recorded = editable_actors(model, scene, where)
+    others = {track.id for track in scene.tracks} - {actor.id for actor in recorded}
+    ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, camera)])
+    return recorded, edited_actors(recorded, edit, where, others, ego_to_world)
 
 
 def editable_actors(model: SplatModel, scene: Scene, where: str) -> list[EditedActor]:

@@ -55,17 +55,23 @@ def write_rendered_drive(
             pictures = prefetch_items(_pictures(model, drive, drive.views(device)))
             for frame, pixels in zip(drive.scene.frames, pictures, strict=True):
                 _write_jpeg(Path(frame.image_path), pixels)
-        _write_records(scene, drive, job, path, source, provenance)
+        _write_records(scene, drive, job, path, what, source, provenance)
     except BaseException:
         _remove(folder)
         raise
 
 
 def _write_records(
-    scene: Scene, drive: RenderedDrive, job: DriveJob, path: Path, source: dict[str, str], provenance: Provenance
+    scene: Scene,
+    drive: RenderedDrive,
+    job: DriveJob,
+    path: Path,
+    what: str,
+    source: dict[str, str],
+    provenance: Provenance,
 ) -> None:
-    """Writes the nuScenes tables of a rendered drive, and last its drive.json."""
-    folder, what = path.parent, " ".join(f"{key} {value}" for key, value in source.items())
+    """Writes the nuScenes tables of a rendered drive, and last its drive.json; `what` is `source` in words."""
+    folder = path.parent
     marked = replace(
         drive.scene,
         name=f"{source['scene']}_{source.get('edit') or source.get('trajectory')}",

@@ -5,14 +5,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drivesplat.edited_motion.edited_actors import edited_actors
 from drivesplat.edited_motion.edited_drive import CameraMotion, EditedDrive, Instance, sampled_actor
-from drivesplat.editing.actors import editable_actors
+from drivesplat.editing.actors import recorded_and_edited
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.errors import ConfigError
 from drivesplat.model.checkpoint import TrainedCheckpoint, trained_model
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rendering.trajectory import recorded_frames, sampled_path
+from drivesplat.rendering.trajectory import sampled_path
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.edit import Edit
 
@@ -41,12 +40,9 @@ def edited_drives(
 def _edited_drive(
     model: SplatModel, scene: Scene, camera: str, name: str, edit: Edit, rate: int, where: str
 ) -> EditedDrive:
-    actors = editable_actors(model, scene, where)
-    others = {track.id for track in scene.tracks} - {actor.id for actor in actors}
-    ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, camera)])
+    _, edited = recorded_and_edited(model, scene, camera, edit, where)
     timestamps, _ = sampled_path(scene, camera, rate)
     seconds = np.array([scene.seconds(timestamp) for timestamp in timestamps])
-    edited = edited_actors(actors, edit, where, others, ego_to_world)
     instances = tuple(
         Instance(
             actor.id, actor.source, actor.category, actor.size, actor.scale,

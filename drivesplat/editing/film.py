@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
-from drivesplat.editing.actors import editable_actors, other_objects
+from drivesplat.edited_motion.edited_actors import EditedActor
+from drivesplat.editing.actors import other_objects, recorded_and_edited
 from drivesplat.editing.ego import edited_camera_path
 from drivesplat.editing.unseen_sides import UNSEEN, unseen_sides
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
@@ -19,7 +19,7 @@ from drivesplat.model.view import View
 from drivesplat.rendering.film import Shot, recorded_shot, write_film
 from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
-from drivesplat.rendering.trajectory import film_path, recorded_frames
+from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.images import write_png
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
@@ -101,10 +101,7 @@ class EditedDrive:
 def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> EditedDrive:
     """The drive with the edit of `job`. Raises ConfigError, starting with `where` (the scene and the edit), if the edit
     does not fit the scene or the model has no actors, DatasetError if the scene lacks the camera."""
-    recorded = editable_actors(model, scene, where)
-    ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, job.camera)])
-    others = {track.id for track in scene.tracks} - {actor.id for actor in recorded}
-    actors = edited_actors(recorded, job.edit, where, others, ego_to_world)
+    recorded, actors = recorded_and_edited(model, scene, job.camera, job.edit, where)
     path = edited_camera_path(scene, job.camera, job.fps, job.edit, where)
     unedited = film_path(scene, job.camera, job.fps, TrajectorySettings())[: len(path)]
     before, after = (Shot(scene, cameras, job, (job.width, job.height)) for cameras in (unedited, path))

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
-from drivesplat.editing.actors import editable_actors, other_objects, trained_actors
+from drivesplat.edited_motion.edited_actors import EditedActor
+from drivesplat.editing.actors import other_objects, recorded_and_edited, trained_actors
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.film import actor_placements, warn_of_collisions
 from drivesplat.model.part import ActorPlacement
@@ -65,16 +65,16 @@ def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path,
     camera is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the scene
     or the model has no actors; DatasetError if the scene lacks a camera.
     """
-    trained = trained_actors(model, scene, where) if job.edit is None else editable_actors(model, scene, where)
-    others = other_objects(scene, trained)
-    actors = list(trained)
-    if job.edit is not None:
-        ego_to_world = np.stack([frame.ego_to_world for frame in recorded_frames(scene, job.eval_camera)])
-        actors = edited_actors(trained, job.edit, where, {item.id for item in others}, ego_to_world)
+    if job.edit is None:
+        ego, trained = None, trained_actors(model, scene, where)
+        actors = trained
+    else:
+        trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
+        ego = EgoEdit.of(scene, job.eval_camera, job.edit, where)
     frames = [
         replace(_resized(frame, job), image_path=str(folder / "images" / camera / f"{frame.timestamp}{IMAGE_SUFFIX}"))
         for camera in job.cameras
-        for frame in _moved_frames(scene, camera, job, where)
+        for frame in _moved_frames(scene, camera, ego, job.trajectory)
     ]
     last = max((frame.sample_index for frame in frames if frame.is_key_frame), default=0)
     frames = [replace(frame, sample_index=min(frame.sample_index, last)) for frame in frames]
@@ -82,7 +82,7 @@ def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path,
     seconds = _seconds(scene, frames)
     camera_to_world = np.stack([frame.camera_to_world for frame in frames])
     warn_of_collisions(actors, camera_to_world, seconds, where)
-    objects, key_times = [*actors, *others], rendered.key_frame_timestamps
+    objects, key_times = [*actors, *other_objects(scene, trained)], rendered.key_frame_timestamps
     times = [*key_times.tolist(), *(frame.timestamp for frame in frames)]
     label_times = np.union1d(key_times, np.arange(min(times), max(times) + 1, LABEL_INTERVAL))
     return RenderedDrive(
@@ -93,21 +93,22 @@ def rendered_drive(scene: Scene, model: SplatModel, job: DriveJob, folder: Path,
     )
 
 
-def _moved_frames(scene: Scene, camera: str, job: DriveJob, where: str) -> list[Frame]:
-    """The images of a camera with the poses after the edit, or beside the recorded path."""
+def _moved_frames(
+    scene: Scene, camera: str, change: EgoEdit | None, trajectory: TrajectorySettings | None
+) -> list[Frame]:
+    """The images of a camera with the poses after a change of the ego vehicle's path, or beside the recorded path."""
     frames = recorded_frames(scene, camera)
-    change = None if job.edit is None else EgoEdit.of(scene, job.eval_camera, job.edit, where)
     if change is not None:
         seconds = _seconds(scene, frames)
         within = change.within(frames, seconds)
         kept = [frame for frame, inside in zip(frames, within, strict=True) if inside]
         return _posed(kept, *change.poses(frames, seconds[within]))
-    if job.trajectory is None or job.trajectory == TrajectorySettings():
+    if trajectory is None or trajectory == TrajectorySettings():
         return frames
     camera_to_world = np.stack([frame.camera_to_world for frame in frames])
     ego_to_world = np.stack([frame.ego_to_world for frame in frames])
-    moved = displaced(camera_to_world, ego_to_world, job.trajectory)
-    aside = TrajectorySettings(lateral=job.trajectory.lateral)
+    moved = displaced(camera_to_world, ego_to_world, trajectory)
+    aside = TrajectorySettings(lateral=trajectory.lateral)
     return _posed(frames, moved, displaced(ego_to_world, ego_to_world, aside))
 
 

@@ -26,8 +26,9 @@ from helpers.hand_made_traffic import placed
 from PIL import Image
 
 from drivesplat.edited_motion.edited_actors import EditedActor, edited_actors
+from drivesplat.editing.actors import editable_actors
 from drivesplat.editing.ego import edited_camera_path
-from drivesplat.editing.film import EditFiles, Still, actor_placements, collisions, editable_actors, render_edit
+from drivesplat.editing.film import EditFiles, Still, actor_placements, collisions, render_edit
 from drivesplat.errors import ConfigError, DriveSplatError, ResultError
 from drivesplat.io.prefetch import THREADS
 from drivesplat.io.video import read_footage

@@ -9,7 +9,7 @@ from helpers.small_runs import Finished, run
 from helpers.tiny_world import World, write_world
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from drivesplat.editing.film import editable_actors
+from drivesplat.editing.actors import editable_actors
 from drivesplat.errors import ConfigError
 from drivesplat.evaluation.summary import sentences
 from drivesplat.inspection.ghost_panel import ghost_panel

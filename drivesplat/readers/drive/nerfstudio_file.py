@@ -99,7 +99,7 @@ def time_key(values: Mapping[str, Any], path: Path) -> str:
     for key in TIME_KEYS:
         if all(key in frame for frame in values["frames"]):
             return key
-    lacking = next(i for i, frame in enumerate(values["frames"]) if not any(key in frame for key in TIME_KEYS[:1]))
+    lacking = next(i for i, frame in enumerate(values["frames"]) if TIME_KEYS[0] not in frame)
     raise DatasetError(
         f"{path}: frames[{lacking}] has no timestamp and not all frames have a time; a drive needs the time of every "
         "image"
