@@ -196,7 +196,7 @@ def removal_metrics(
             box, inside = seen
             view = view_of(recording.record, index, device)
             with torch.no_grad():
-                gaussians = model.gaussians_at(view.time)
+                gaussians = model.gaussians_in(view)
                 kept = gaussians[~removal_of(model, gaussians, box, margin).removed]
             pictures = rendered(model, view, kept), rendered(model, view, gaussians)
             yield RemovalRenderings(index, truth.image, inside, *pictures)

@@ -32,7 +32,7 @@ from drivesplat.model.checkpoint import TrainedCheckpoint
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.reach import INSIDE, reach_of
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.model.view import View
+from drivesplat.model.view import View, where_seen
 from drivesplat.rasterization import rasterize
 
 log = logging.getLogger(__name__)
@@ -143,7 +143,7 @@ def _largest_change(model: SplatModel, far: FarGaussians, views: Sequence[View])
     """The largest change of a pixel of the views by `far`, in [0, 1]."""
     largest = 0.0
     for view in views:
-        shown = model.gaussians_at(view.time)
+        shown = model.gaussians_in(view)
         before = model.render(view, gaussians=shown).image.clamp(0.0, 1.0)
         after = model.render(view, gaussians=_changed(shown, far)).image.clamp(0.0, 1.0)
         largest = max(largest, float((after - before).abs().max()))
@@ -168,11 +168,12 @@ def _visibility(
 def _contributions(model: SplatModel, view: View) -> Float[Tensor, " n"]:
     """The sum over a view's pixels of each Gaussian's weight in the compositing: the gradient of the summed image by
     the Gaussians' values."""
-    shown, seen_from = model.gaussians_at(view.time), model.seen_from(view)
+    shown, seen_from = model.gaussians_in(view), model.seen_from(view)
     with torch.enable_grad():
         values = shown.means.new_zeros(len(shown), 1).requires_grad_()
+        means, scales = where_seen(shown, seen_from)
         rendering = rasterize(
-            shown.means.detach(), shown.quats.detach(), shown.scales.detach(), shown.opacities.detach(), values,
+            means.detach(), shown.quats.detach(), scales.detach(), shown.opacities.detach(), values,
             seen_from.viewmat.detach()[None], view.K[None], view.width, view.height, antialiased=model.antialiased,
         )  # fmt: skip
         (gradient,) = torch.autograd.grad(rendering.image.sum(), values)

@@ -63,7 +63,7 @@ def digests(provenance: Provenance) -> dict[str, str]:
 
 
 def _finite(gaussians: Gaussians, name: str) -> Gaussians:
-    values = [value.isfinite().reshape(len(gaussians), -1).all(dim=1) for value in vars(gaussians).values()]
+    values = [value.isfinite().reshape(len(gaussians), -1).all(dim=1) for value in gaussians.tensors.values()]
     finite = torch.stack(values).all(dim=0)
     if finite.all():
         return gaussians

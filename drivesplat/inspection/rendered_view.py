@@ -60,7 +60,7 @@ class RenderedView:
     def gaussians(self) -> Gaussians:
         """The model's Gaussians at the image's time, in world coordinates."""
         with torch.no_grad():
-            return self.drive.model.gaussians_at(self.camera.time)
+            return self.drive.model.gaussians_in(self.camera)
 
     @torch.no_grad()
     def render(self, rows: Bool[Tensor, " n"] | None = None) -> Picture:

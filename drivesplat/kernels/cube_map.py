@@ -25,16 +25,18 @@ def over_cube_map(
     K: Float[Tensor, "3 3"],
     camera_to_world: Float[Tensor, "4 4"],
     rays: Callable[[], Float[Tensor, "h w 3"]],
+    turning: Float[Tensor, "6"] | None = None,
 ) -> Float[Tensor, "h w 3"]:
     """`image`, premultiplied by `alpha`, over the cube map that a pinhole camera sees (OpenCV axes, K in pixels).
 
-    `rays` returns the world directions of the pixels' centres; it is called where no kernel computes them. Gradients
-    reach the image, alpha and texels, and the camera through `rays`.
+    `rays` returns the world directions of the pixels' centres; it is called where no kernel computes them. A camera
+    with rolling shutter is `turning`: a, b, c and its angular velocity (3,) about its own axes, which at the pixel (x,
+    y) has lasted for a x + b y + c seconds. Gradients reach the image, alpha and texels, and the camera through `rays`.
     """
     if triton_support.usable_for(image) and not camera_to_world.requires_grad:
         from drivesplat.kernels.triton.cube_map import OverCubeMap
 
-        return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world)
+        return OverCubeMap.apply(image, alpha, *cube, K, camera_to_world, turning)
     return image + (1.0 - alpha) * cube_map_colors(cube, rays())
 
 

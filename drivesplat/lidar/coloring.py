@@ -6,17 +6,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivesplat.io.prefetch import prefetch
+from drivesplat.scene.rigid import inverse
+from drivesplat.scene.shutter import Shutter, where_seen
 
 
 @dataclass(frozen=True)
 class ColorView:
-    """An image that colours points. `pixels` (h, w, 3) uint8, `usable` (h, w) bool, continuous `intrinsics`."""
+    """An image that colours points. `pixels` (h, w, 3) uint8, `usable` (h, w) bool, continuous `intrinsics`; `shutter`
+    is None for a global one."""
 
     pixels: np.ndarray
     intrinsics: np.ndarray
     world_to_camera: np.ndarray
     timestamp: int
     usable: np.ndarray
+    shutter: Shutter | None = None
+
+    def where_seen(self, points: np.ndarray) -> np.ndarray:
+        """Resting world points (n, 3) moved as `drivesplat.scene.shutter.where_seen` does."""
+        height, width = self.pixels.shape[:2]
+        return where_seen(points, self.shutter, inverse(self.world_to_camera), self.intrinsics, (width, height))
 
 
 CELL = 4
@@ -43,7 +52,8 @@ def color_by_visibility(
 
     def seen_by(view: ColorView) -> tuple[np.ndarray, np.ndarray, int]:
         """The points that a view sees, their colours in it, and its time."""
-        index, rows, columns, _ = visible(points, view.world_to_camera, view.intrinsics, view.pixels.shape[:2])
+        shown, shape = view.where_seen(points), view.pixels.shape[:2]
+        index, rows, columns, _ = visible(shown, view.world_to_camera, view.intrinsics, shape)
         usable = view.usable[rows, columns]
         return index[usable], view.pixels[rows[usable], columns[usable]], view.timestamp
 

@@ -13,6 +13,7 @@ from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.regions import fill, hulls_in
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
+from drivesplat.scene.shutter import shutter_of, where_seen
 from drivesplat.scene.splits import Group
 from drivesplat.settings.lidar_depth import LidarDepthJob
 
@@ -58,11 +59,16 @@ def depths_in(scene: Scene, frame: Frame, cloud: Cloud, job: LidarDepthJob, body
     """The nearest return of a cloud at each pixel of a frame. Returns of objects that are absent at the frame's time,
     and pixels of the ego vehicle's `body` (h, w) bool, are left out."""
     size, seconds = target_size(frame, job.images), scene.seconds(frame.timestamp)
-    posed = [(item.pose(seconds), returns) for item, returns in cloud.dynamic]
-    dynamic = [apply(pose, returns) for pose, returns in posed if pose is not None]
-    points = np.concatenate([cloud.static, *dynamic])
+    posed = [(item, item.pose(seconds), returns) for item, returns in cloud.dynamic]
+    dynamic = [(item, returns, apply(pose, returns)) for item, pose, returns in posed if pose is not None]
+    points = np.concatenate([cloud.static, *(moved for *_, moved in dynamic)])
     shape, intrinsics = (size[1], size[0]), continuous_intrinsics(frame, size)
-    index, rows, columns, depth = visible(points, inverse(frame.camera_to_world), intrinsics, shape)
+    shown, shutter = points, shutter_of(scene, frame)
+    if shutter is not None:
+        own = [item.velocities(returns, seconds) for item, returns, _ in dynamic]
+        velocities = np.concatenate([np.zeros_like(cloud.static), *own])
+        shown = where_seen(points, shutter, frame.camera_to_world, intrinsics, size, velocities)
+    index, rows, columns, depth = visible(shown, inverse(frame.camera_to_world), intrinsics, shape)
     ranges = np.linalg.norm(points[index] - cloud.origin, axis=1)
     front = unoccluded(rows, columns, depth, patches(ranges, depth, intrinsics, job.ray_spacing), shape)
     index, rows, columns, depth = index[front], rows[front], columns[front], depth[front]

@@ -12,6 +12,9 @@ from drivesplat.scene.tracks import in_box, moving_tracks
 CLEARANCE = 0.1
 """Height in metres above a box's floor up to which a return may belong to the road."""
 
+HALF_STEP = 0.02
+"""Half the time in seconds between the two poses that give a velocity."""
+
 
 @dataclass(frozen=True)
 class DynamicObject:
@@ -24,6 +27,12 @@ class DynamicObject:
         """Object to world (4, 4) at a time (seconds since the scene's first image); None if it is absent."""
         at = np.array([seconds])
         return self.motion.poses(at)[0] if self.motion.present(at)[0] else None
+
+    def velocities(self, points: np.ndarray, seconds: float) -> np.ndarray:
+        """The velocities (n, 3) in the world, m/s, of points (n, 3) in the object's frame at a time."""
+        poses = self.motion.poses(seconds + HALF_STEP * np.array([-1.0, 1.0]))
+        before, after = (apply(pose, points) for pose in poses)
+        return (after - before) / (2.0 * HALF_STEP)
 
     def own(self, points: np.ndarray, seconds: float, margin: float) -> np.ndarray:
         """The points in its box at a time, of world points (n, 3): (m, 3) in the object's frame. The sides and the roof

@@ -27,6 +27,9 @@ from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.scene.motion import Motion
 from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings
 
+HALF_STEP = 0.02
+"""Half the time in seconds between the two poses that give a velocity; some readout times of a camera."""
+
 
 def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:
     """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
@@ -116,6 +119,18 @@ class Actors(Part):
         sizes = torch.ones_like(state.translations[:, 0])
         translations = state.translations + weights @ self.shared["translation"]
         return ObjectPoses(quats, translations, sizes, state.present.to(sizes.dtype))
+
+    @torch.no_grad()
+    def velocities(self, time: float) -> Float[Tensor, "n 3"]:
+        states = self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
+        before, after = (self._positions(self.poses(state)) for state in states)
+        return (after - before) / (2.0 * HALF_STEP)
+
+    def _positions(self, poses: ObjectPoses) -> Float[Tensor, "n 3"]:
+        """The centres of its Gaussians in the world."""
+        p = self.params
+        local = LocalGaussians(p["means"], p["quats"], p["scales"], p["opacities"])
+        return place(local, poses, p["owner"], self._owns)[0]
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         state, known = self.time_state(time), [track.id for track in self.timeline.tracks]

@@ -60,6 +60,7 @@ def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, sett
         settings.antialiased,
         _exposures(init.exposed, settings),
         _camera_poses(init.posed, settings),
+        settings.rolling_shutter,
     )
 
 
@@ -91,6 +92,7 @@ def rebuild_model(
         settings.antialiased,
         _exposures(exposed, settings),
         _camera_poses(posed, settings),
+        settings.rolling_shutter,
     )
     model.load_state_dict(state)
     return model

@@ -15,7 +15,8 @@ from drivesplat.kernels.spherical_harmonics import SH_C0
 @dataclass(frozen=True)
 class Gaussians:
     """n Gaussians: `means` and `scales` in metres, `quats` w, x, y, z, `opacities` in [0, 1], and spherical harmonics
-    of RGB colours: `sh0` of degree 0, `shN` of the degrees above."""
+    of RGB colours: `sh0` of degree 0, `shN` of the degrees above. `velocities` (m/s) are None where they are not known
+    or all 0."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -23,6 +24,7 @@ class Gaussians:
     opacities: Float[Tensor, " n"]
     sh0: Float[Tensor, "n 1 3"]
     shN: Float[Tensor, "n k_less_1 3"]
+    velocities: Float[Tensor, "n 3"] | None = None
 
     @classmethod
     def of(
@@ -41,7 +43,13 @@ class Gaussians:
 
     def __getitem__(self, chosen: Bool[Tensor, " n"] | Int[Tensor, " m"] | slice) -> "Gaussians":
         """A subset, by mask, indices or slice."""
-        return Gaussians(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+        return Gaussians(**{name: values[chosen] for name, values in self.tensors.items()})
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """Its tensors by field name, without velocities where they are None."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
 
     @property
     def sh_degree(self) -> int:
@@ -66,7 +74,9 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         return sets[0]
     degree = max(s.sh_degree for s in sets)
     sets = [with_sh_degree(s, degree) for s in sets]
-    return Gaussians(**{f.name: torch.cat([getattr(s, f.name) for s in sets]) for f in fields(Gaussians)})
+    if any(s.velocities is not None for s in sets):
+        sets = [replace(s, velocities=torch.zeros_like(s.means)) if s.velocities is None else s for s in sets]
+    return Gaussians(**{name: torch.cat([s.tensors[name] for s in sets]) for name in sets[0].tensors})
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -99,6 +99,10 @@ class Part(nn.Module, ABC):
         NotImplementedError for a part without time states."""
         raise NotImplementedError(f"the part {self.name!r} has no time states")
 
+    def velocities(self, time: float) -> Float[Tensor, "n 3"] | None:
+        """The velocities of its Gaussians in the world at a time, m/s, without gradient; None for a static part."""
+        return None
+
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one
         object are appended as extra rows."""

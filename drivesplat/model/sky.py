@@ -53,7 +53,9 @@ class CubemapSky(Sky):
         rays: Float[Tensor, "h w 3"] | None = None,
     ) -> Float[Tensor, "h w 3"]:
         directions = view.rays if rays is None else lambda: rays
-        return over_cube_map(splats, alpha, self._cube_map, view.K, view.camera_to_world, directions)
+        return over_cube_map(
+            splats, alpha, self._cube_map, view.K, view.camera_to_world, directions, view.turning_by_line
+        )
 
     @property
     def _cube_map(self) -> CubeMap:

@@ -1,7 +1,7 @@
 """A model of a scene: a list of parts, a sky, and the properties of cameras; and its rendering."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
@@ -15,7 +15,7 @@ from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Sky
-from drivesplat.model.view import View
+from drivesplat.model.view import View, depth_at_lines, where_seen
 from drivesplat.rasterization import Rendering, rasterize
 
 
@@ -33,7 +33,8 @@ class Picture:
 
 
 class SplatModel(nn.Module):
-    """Parts, a sky (None: black), exposures of cameras (None: all alike), pose corrections (None: recorded poses)."""
+    """Parts, a sky (None: black), exposures of cameras (None: all alike), pose corrections (None: recorded poses).
+    Without `rolling_shutter`, views are rendered as if they had a global shutter."""
 
     def __init__(
         self,
@@ -42,6 +43,7 @@ class SplatModel(nn.Module):
         antialiased: bool = False,
         exposure: Exposures | None = None,
         camera_poses: CameraPoses | None = None,
+        rolling_shutter: bool = True,
     ):
         super().__init__()
         self.parts = nn.ModuleList(parts)
@@ -49,6 +51,7 @@ class SplatModel(nn.Module):
         self.exposure = exposure
         self.camera_poses = camera_poses
         self.antialiased = antialiased
+        self.rolling_shutter = rolling_shutter
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
@@ -64,9 +67,15 @@ class SplatModel(nn.Module):
         for part in self.parts:
             part.precompute(times)
 
-    def gaussians_at(self, time: float) -> Gaussians:
-        """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order."""
-        return concatenate([part.at(time) for part in self.parts])
+    def gaussians_at(self, time: float, with_velocities: bool = False) -> Gaussians:
+        """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order;
+        `with_velocities`, which a rolling shutter needs, where a part moves."""
+        found = [part.at(time) for part in self.parts]
+        if with_velocities:
+            found = [
+                replace(own, velocities=part.velocities(time)) for own, part in zip(found, self.parts, strict=True)
+            ]
+        return concatenate(found)
 
     def time_states(self, time: float) -> list[Sequence[Tensor]] | None:
         """The time state of every part: see `Part.time_state`. None where one has none."""
@@ -127,13 +136,14 @@ class SplatModel(nn.Module):
     ) -> Picture:
         """Renders a view with spherical harmonics up to `sh_degree` (None: all).
 
-        `gaussians` replace `gaussians_at(view.time)`; `rays` (h, w, 3) are `view.rays()` if already known.
+        `gaussians` replace `gaussians_in(view)`; `rays` (h, w, 3) are `view.rays()` if already known.
         """
-        shown = self.gaussians_at(view.time) if gaussians is None else gaussians
+        shown = self.gaussians_in(view) if gaussians is None else gaussians
         seen_from = self.seen_from(view)
         colors, degree = _colors(shown, seen_from, sh_degree)
+        means, scales = where_seen(shown, seen_from)
         rendering = rasterize(
-            shown.means, shown.quats, shown.scales, shown.opacities, colors,
+            means, shown.quats, scales, shown.opacities, colors,
             seen_from.viewmat[None], view.K[None], view.width, view.height, sh_degree=degree,
             antialiased=self.antialiased, absgrad=absgrad, with_depth=with_depth,
         )  # fmt: skip
@@ -143,12 +153,18 @@ class SplatModel(nn.Module):
             image = self.sky.behind(splats, alpha, seen_from, rays if seen_from is view else None)
         if self.exposure is not None:
             image = self.exposure.applied(image, view.camera)
-        depth = rendering.depth[0, ..., 0] if rendering.depth is not None else None
+        depth = None if rendering.depth is None else depth_at_lines(rendering.depth[0, ..., 0], seen_from)
         return Picture(shown, image, splats, alpha[..., 0], depth, rendering.info)
 
+    def gaussians_in(self, view: View) -> Gaussians:
+        """The Gaussians that `render` shows in a view."""
+        return self.gaussians_at(view.time, with_velocities=self.rolling_shutter and view.shutter is not None)
+
     def seen_from(self, view: View) -> View:
-        """The view from its camera's corrected pose, where this model corrects poses."""
-        return view if self.camera_poses is None else self.camera_poses.corrected(view)
+        """The view from its camera's corrected pose, where this model corrects poses, and without rolling shutter,
+        where it renders none."""
+        shown = view if self.rolling_shutter else view.global_shutter
+        return shown if self.camera_poses is None else self.camera_poses.corrected(shown)
 
     def objects_alpha(self, picture: Picture, view: View) -> Float[Tensor, "h w"] | None:
         """The alpha of the dynamic parts rendered alone, for a picture of this model; None without such parts."""
@@ -166,9 +182,11 @@ class SplatModel(nn.Module):
         return self._composited(picture.gaussians, logits, view).image[0]
 
     def _composited(self, gaussians: Gaussians, values: Float[Tensor, "n v"], view: View) -> Rendering:
+        seen_from = self.seen_from(view)
+        means, scales = where_seen(gaussians, seen_from)
         return rasterize(
-            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, values,
-            self.seen_from(view).viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
+            means, gaussians.quats, scales, gaussians.opacities, values,
+            seen_from.viewmat[None], view.K[None], view.width, view.height, antialiased=self.antialiased,
         )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from drivesplat.scene.images import continuous_intrinsics, read_image, target_si
 from drivesplat.scene.regions import MIN_PIXELS, hulls_in, owner_image
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Frame, Scene, Sweep
+from drivesplat.scene.shutter import Shutter, shutter_of, where_seen
 from drivesplat.scene.splits import training_images
 from drivesplat.settings.actor_seed import ActorSeedJob, ActorSeedSettings
 from drivesplat.settings.train import STAGE_OF_PART, PartName
@@ -89,6 +90,7 @@ class ActorView:
     owners: np.ndarray
     tracks: dict[str, int]
     seen: set[str]
+    shutter: Shutter | None
 
 
 def actor_view(scene: Scene, frame: Frame, job: ActorSeedJob, ego_mask: EgoMask) -> ActorView:
@@ -102,7 +104,8 @@ def actor_view(scene: Scene, frame: Frame, job: ActorSeedJob, ego_mask: EgoMask)
     visible = np.bincount(owners[owners >= 0], minlength=len(hulls))
     seen = {track for track, number in tracks.items() if visible[number] and covered[number] >= MIN_PIXELS}
     pixels, intrinsics = read_image(frame.image_path, size), continuous_intrinsics(frame, size)
-    return ActorView(frame, scene.seconds(frame.timestamp), intrinsics, pixels, owners, tracks, seen)
+    shutter = shutter_of(scene, frame)
+    return ActorView(frame, scene.seconds(frame.timestamp), intrinsics, pixels, owners, tracks, seen, shutter)
 
 
 class Seed:
@@ -127,11 +130,18 @@ class Seed:
         self.pixels += int((view.owners == number).sum())
         points = apply(pose, self._points)
         camera = inverse(view.frame.camera_to_world), view.intrinsics
-        index, rows, columns, _ = in_image(points, *camera, view.owners.shape)
+        index, rows, columns, _ = in_image(self._where_seen(points, view), *camera, view.owners.shape)
         distances = np.linalg.norm(points[index] - view.frame.camera_to_world[:3, 3], axis=1)
         nearer = (view.owners[rows, columns] == number) & (distances < self._distances[index])
         self._distances[index[nearer]] = distances[nearer]
         self._colors[index[nearer]] = view.pixels[rows[nearer], columns[nearer]]
+
+    def _where_seen(self, points: np.ndarray, view: ActorView) -> np.ndarray:
+        """The world points (n, 3) of the object as `drivesplat.scene.shutter.where_seen` moves them."""
+        if view.shutter is None:
+            return points
+        (height, width), own = view.owners.shape, self.dynamic_object.velocities(self._points, view.seconds)
+        return where_seen(points, view.shutter, view.frame.camera_to_world, view.intrinsics, (width, height), own)
 
     def record(self) -> ActorRecord:
         """The actor's record. Points that no image shows get the mean colour of the others, or UNSEEN."""

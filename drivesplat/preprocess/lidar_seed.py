@@ -24,6 +24,7 @@ from drivesplat.scene.images import continuous_intrinsics, read_image, target_si
 from drivesplat.scene.regions import fill, hulls_in
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Frame, Scene
+from drivesplat.scene.shutter import shutter_of
 from drivesplat.scene.splits import sweep_groups, training_images
 from drivesplat.scene.tracks import boxes_of, moving_tracks
 from drivesplat.settings.images import ImageSettings
@@ -147,6 +148,7 @@ def color_view(scene: Scene, frame: Frame, images: ImageSettings, ego_mask: EgoM
         inverse(frame.camera_to_world),
         frame.timestamp,
         usable,
+        shutter_of(scene, frame),
     )
 
 
@@ -179,7 +181,7 @@ def uncovered(view: ColorView, points: np.ndarray) -> np.ndarray:
     world points (n, 3) projects."""
     height, width = view.pixels.shape[:2]
     cells = np.zeros((height // COVERAGE_CELL + 1, width // COVERAGE_CELL + 1), dtype=bool)
-    _, rows, columns, _ = in_image(points, view.world_to_camera, view.intrinsics, (height, width))
+    _, rows, columns, _ = in_image(view.where_seen(points), view.world_to_camera, view.intrinsics, (height, width))
     cells[rows // COVERAGE_CELL, columns // COVERAGE_CELL] = True
     covered = cells.repeat(COVERAGE_CELL, axis=0).repeat(COVERAGE_CELL, axis=1)[:height, :width]
     return np.flatnonzero(view.usable & ~covered)

@@ -9,6 +9,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.io.point_cloud import PointCloud
 from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.scene import Scene
+from drivesplat.scene.shutter import shutters
 from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
 from drivesplat.settings.images import ParserJob
@@ -29,6 +30,7 @@ def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingR
         )
     camera_to_world = np.stack([frame.camera_to_world for frame in frames])
     centers = camera_to_world[splits["train"], :3, 3]
+    readout_s, velocities = _rolling_shutters(scene)
     return TrainingRecord(
         Ks=np.stack([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)]),
         camtoworlds=camera_to_world,
@@ -56,4 +58,16 @@ def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingR
             key_frame_hz=scene.key_frame_hz,
         ),
         seed=SeedInfo(**{key: value for key, value in seed.note.items() if key != "provenance"}),
+        readout_s=readout_s,
+        camera_velocities=velocities,
     )
+
+
+def _rolling_shutters(scene: Scene) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """`TrainingRecord.readout_s` (n, 3) and `camera_velocities` (n, 6)."""
+    found = shutters(scene)
+    if not any(found):
+        return None, None
+    readouts = [np.zeros(3) if shutter is None else shutter.readout_s for shutter in found]
+    velocities = [np.zeros(6) if shutter is None else shutter.velocity for shutter in found]
+    return np.stack(readouts), np.stack(velocities)

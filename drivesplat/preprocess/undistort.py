@@ -53,8 +53,20 @@ def undistorted(scene: Scene, folder: Path) -> Scene:
 def _pinhole(camera: Camera, maps: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Camera:
     if camera.name not in maps:
         return camera
-    k, *_ = maps[camera.name]
-    return dataclasses.replace(camera, intrinsics=k, distortion=np.zeros(5), distortion_model="none")
+    k, x, y = maps[camera.name]
+    return dataclasses.replace(
+        camera, intrinsics=k, distortion=np.zeros(5), distortion_model="none", readout_s=_readout(camera, x, y)
+    )
+
+
+def _readout(camera: Camera, x: np.ndarray, y: np.ndarray) -> float | None:
+    """The readout time of the new image: the line that fits the times of its pixels best, from edge to edge. `x` and
+    `y` (h, w) are the sources of the pixels."""
+    if camera.readout_s is None or camera.readout_direction is None:
+        return camera.readout_s
+    sources = x if camera.readout_direction in ("left", "right") else y.T
+    lines = np.arange(sources.shape[1], dtype=np.float64)
+    return camera.readout_s * float(np.polyfit(lines, sources.mean(axis=0), 1)[0])
 
 
 def _maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

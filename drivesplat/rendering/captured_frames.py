@@ -102,9 +102,10 @@ class GpuFrameRenderer:
         return self._pending(frame, torch.empty(0, dtype=torch.int32), [], wanted)
 
     def _time_states(self, view: View) -> TimeStates | None:
-        """The parts' time states of a view; None where a frame of it cannot be captured: Python looks up the poses and
-        exposures of cameras of the rig."""
-        return self._model.time_states(view.time) if self._captures and view.camera is None else None
+        """The parts' time states of a view; None where a frame of it cannot be captured: Python looks up the poses,
+        exposures and rolling shutters of cameras of the rig."""
+        captured = self._captures and view.camera is None and view.shutter is None
+        return self._model.time_states(view.time) if captured else None
 
     def _graph_for(self, view: View, states: TimeStates) -> "_FrameGraph | None":
         """The graph for a view, captured now unless there is one; None where the GPU or its driver refuses."""

@@ -180,7 +180,7 @@ def _shot_of_parts(model: SplatModel, shot: Shot, device: torch.device, parts: S
 def frames_of_parts(model: SplatModel, view: View, shown: Sequence[ShownParts]) -> list[np.ndarray]:
     """A view (h, w, 3) uint8 of everything, of the static or of the moving parts, for each of `shown`. Moving parts are
     before plain grey."""
-    gaussians, dynamic = model.gaussians_at(view.time), model.moving()
+    gaussians, dynamic = model.gaussians_in(view), model.moving()
 
     def frame(parts: ShownParts) -> np.ndarray:
         if parts != "moving":

@@ -30,7 +30,8 @@ REFINED = "scene_refined.json"
 @dataclass(frozen=True)
 class Frame:
     """One image. `camera` is a name in `Scene.cameras`; `camera_to_world` and `ego_to_world` hold at the image's own
-    timestamp. `classes_path` is the dataset's own class map of the image (8 bits, 255: unlabelled), if it has one."""
+    timestamp; `readout_middle_s` is the time in seconds from there to the middle of a rolling shutter's readout.
+    `classes_path` is the dataset's own class map of the image (8 bits, 255: unlabelled), if it has one."""
 
     camera: str
     timestamp: int
@@ -44,6 +45,7 @@ class Frame:
     sample_index: int
     token: str
     classes_path: str | None = None
+    readout_middle_s: float = 0.0
 
     @property
     def camera_to_ego(self) -> np.ndarray:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from drivesplat.io.plain_pickle import read_plain_pickle, write_plain_pickle
 from drivesplat.io.storage import Provenance, unreadable
 from drivesplat.io.typed_record import field_values, typed_record
+from drivesplat.scene.shutter import Shutter
 
 RULE = "parser"
 
@@ -49,7 +50,9 @@ class TrainingRecord:
     (width, height), the size at which images are trained and evaluated; `camtoworlds` is camera to world;
     `camera_indices` index `camera_names`; `timestamps` are in microseconds; `sample_indices` number the key frame that
     an image belongs to. `scene_scale` is the distance in metres of the farthest training camera from their mean, at
-    least 1. `splits` has the image indices by group, `held_out_frames` the held-out key frames by group.
+    least 1. `splits` has the image indices by group, `held_out_frames` the held-out key frames by group. `readout_s`
+    and `camera_velocities` are those of `drivesplat.scene.shutter.Shutter`, 0 for an image with a global shutter; None
+    where all have one.
     """
 
     Ks: Float[np.ndarray, "n 3 3"]
@@ -70,6 +73,8 @@ class TrainingRecord:
     held_out_frames: dict[str, list[int]]
     scene: SceneInfo
     seed: SeedInfo
+    readout_s: Float[np.ndarray, "n 3"] | None = None
+    camera_velocities: Float[np.ndarray, "n 6"] | None = None
     provenance: Provenance = field(default_factory=dict)
 
     @property
@@ -89,6 +94,12 @@ class TrainingRecord:
     def seconds(self, index: int) -> float:
         """The time of an image in seconds since the first one."""
         return float(self.timestamps[index] - self.timestamps.min()) * 1e-6
+
+    def shutter(self, index: int) -> Shutter | None:
+        """The rolling shutter of an image; None for a global shutter."""
+        if self.readout_s is None or self.camera_velocities is None or not self.readout_s[index, :2].any():
+            return None
+        return Shutter(self.readout_s[index], self.camera_velocities[index])
 
     def to_plain(self) -> dict[str, Any]:
         """The content of parser.pkl: plain containers and arrays."""

@@ -258,6 +258,9 @@ class TrainSettings(Settings):
     """Learning rate of the sky's colours (logits)."""
     antialiased: bool = False
     """Use Mip-Splatting's 2D filter instead of the dilation of 3DGS."""
+    rolling_shutter: bool = True
+    """Render the rolling shutter of cameras whose dataset states its readout time and direction: each Gaussian where
+    it is at the time of its line. false: as if all lines were recorded at the image's timestamp."""
     checkpoint_every: int = Field(500, ge=1)
     """Iterations between resume checkpoints."""
     checkpoint_apart_s: float = Field(60.0, ge=0)

@@ -55,7 +55,7 @@ def reduced(view: TrainingView, factor: int) -> TrainingView:
     width, height = view.view.width // factor, view.view.height // factor
     K = view.view.K.clone()
     K[:2] /= factor
-    camera = View(K, view.view.camera_to_world, width, height, view.view.time, view.view.camera)
+    camera = dataclasses.replace(view.view, K=K, width=width, height=height)
     colors = F.avg_pool2d(view.pixels.permute(2, 0, 1).float(), factor)
     return dataclasses.replace(
         view,

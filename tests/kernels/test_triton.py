@@ -33,7 +33,7 @@ from drivesplat.kernels.time_varying_colors import colors_in_world
 from drivesplat.kernels.view_colors import fused_view_colors
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.sky import CubemapSky
-from drivesplat.model.view import View
+from drivesplat.model.view import RollingShutter, View
 from drivesplat.settings.train import McmcSettings
 from drivesplat.training.trainer import Trainer
 
@@ -167,7 +167,8 @@ def test_regularized_means_and_their_gradients_agree_with_torch():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_an_image_over_a_cube_map_and_its_gradients_agree_with_torch(seed):
-    """For cameras that see edges and corners of the cube, and with long focal lengths, which see few texels."""
+    """For cameras that see edges and corners of the cube, with long focal lengths, which see few texels, and with a
+    rolling shutter."""
     torch.manual_seed(seed)
     sky = CubemapSky(9, torch.tensor([0.3, 0.5, 0.7]), 1e-2).to(DEVICE)
     texels = sky.params["texels"]
@@ -176,12 +177,16 @@ def test_an_image_over_a_cube_map_and_its_gradients_agree_with_torch(seed):
     pose[:3, :3] = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
     K = torch.tensor([[10.0, 0.0, 14.0], [0.0, 11.0, 6.0], [0.0, 0.0, 1.0]])
     K[:2, :2] *= (seed % 2) * 9.0 + 1.0
-    view = View(K.to(DEVICE), pose.to(DEVICE), 29, 13, 0.0)
+    turning = 4.0 * torch.cross(torch.eye(3), torch.randn(3, 1).expand(3, 3), dim=0)
+    motion = torch.cat([turning, torch.ones(3, 1)], dim=1).to(DEVICE)
+    shutter = RollingShutter(torch.tensor([0.03, -0.05, 0.01], device=DEVICE), motion)
+    view = View(K.to(DEVICE), pose.to(DEVICE), 29, 13, 0.0, shutter=shutter if seed > 1 else None)
     image, alpha = torch.rand(13, 29, 3, device=DEVICE), 0.99 * torch.rand(13, 29, 1, device=DEVICE)
     alpha[3:5] = 1.0
     inputs = [image.requires_grad_(), alpha.requires_grad_(), texels]
     cube = CubeMap(texels, sky.index)
-    expected, found = both_ways(over_cube_map, image, alpha, cube, view.K, view.camera_to_world, view.rays)
+    camera = view.K, view.camera_to_world, view.rays, view.turning_by_line
+    expected, found = both_ways(over_cube_map, image, alpha, cube, *camera)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0.0)
     assert_same_gradients([[expected], [found]], inputs, atol=1e-5, rtol=1e-4)
 

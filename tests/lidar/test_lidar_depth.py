@@ -103,6 +103,26 @@ def test_depths_match_the_surfaces_visible_at_the_images_own_time(tmp_path, thin
     assert np.concatenate(fitting).mean() > 0.96
 
 
+@pytest.mark.parametrize("things", [World().things, [CROSSING]], ids=["street", "crossing"])
+def test_depths_are_at_the_pixels_and_times_of_a_rolling_shutter(tmp_path, things):
+    """Against rays cast at the time of each row of a camera that takes 0.4 seconds to read them."""
+    world, still = World(things=things), drive(tmp_path, *things)
+    readout = {"readout_s": 0.4, "readout_direction": "down"}
+    rolling = dataclasses.replace(still, cameras=(dataclasses.replace(still.cameras[0], **readout),))
+
+    def fitting(scene: Scene) -> float:
+        fit = []
+        for frame, image in zip(scene.frames, lidar_depths(scene, job(NOTHING_HELD_OUT)), strict=True):
+            for row in np.unique(image.rows):
+                own = image.rows == row
+                later = round(0.4e6 * ((row + 0.5) / world.height - 0.5))
+                line = dataclasses.replace(frame, timestamp=frame.timestamp + later)
+                fit += [fits(world, line, PixelDepths(image.rows[own], image.columns[own], image.depth[own]), 0.03)]
+        return float(np.concatenate(fit).mean())
+
+    assert fitting(rolling) > 0.97 and fitting(still) < 0.95
+
+
 @pytest.mark.parametrize("dynamic_object", [CROSSING, SPEEDING], ids=["crossing", "speeding"])
 def test_depths_of_a_moving_object_match_its_position_in_the_image(tmp_path, dynamic_object):
     """Depths at its pixels are correct to a centimetre, except for returns from the road, also while it accelerates:

@@ -77,6 +77,24 @@ def test_resampled_images_are_those_of_a_pinhole_camera(scene, tmp_path):
     assert bent < 25.0, "the distortion is visible"
 
 
+@pytest.mark.parametrize("scene", ["barrel", "pincushion"], indirect=True)
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_the_readout_time_is_that_of_the_part_of_the_image_that_is_left(scene, direction, tmp_path):
+    camera = dataclasses.replace(scene.cameras[0], readout_s=0.04, readout_direction=direction)
+    (straight,) = undistorted(dataclasses.replace(scene, cameras=(camera,)), tmp_path / "straight").cameras
+    k, axis, side = straight.intrinsics, ("right", "down").index(direction), SIZE[("right", "down").index(direction)]
+    middles = np.tile(k[:2, 2], (2, 1))
+    middles[:, axis] = [0.25 * side, 0.75 * side]
+    rays = np.column_stack([(middles - k[:2, 2]) / k.diagonal()[:2], np.ones(2)])
+    sources, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, camera.distortion)
+    expected = 0.04 * np.ptp(sources[:, 0, axis]) / (0.5 * side)
+    assert straight.readout_s == pytest.approx(expected, rel=0.08) and straight.readout_direction == direction
+    assert abs(straight.readout_s - 0.04) > 1e-4
+    unknown = dataclasses.replace(camera, readout_direction=None)
+    (straight,) = undistorted(dataclasses.replace(scene, cameras=(unknown,)), tmp_path / "straight").cameras
+    assert straight.readout_s == 0.04
+
+
 def test_other_cameras_stay_as_they_are(tiny_scene, tmp_path):
     assert undistorted(tiny_scene, tmp_path / "none").frames == tiny_scene.frames
     assert not (tmp_path / "none").exists()

@@ -21,16 +21,19 @@ class OverCubeMap(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, alpha: Tensor, texels: Tensor, index: Tensor, K: Tensor, camera_to_world: Tensor
-    ) -> Tensor:
-        camera = K.contiguous(), camera_to_world.contiguous()
+        ctx: Any, image: Tensor, alpha: Tensor, texels: Tensor, index: Tensor, K: Tensor, camera_to_world: Tensor,
+        turning: Tensor | None,
+    ) -> Tensor:  # fmt: skip
+        camera = K.contiguous(), camera_to_world.contiguous(), K if turning is None else turning.contiguous()
         image, alpha = image.contiguous(), alpha.contiguous()
         blended = torch.empty_like(image)
         pixels = alpha.numel()
         _blend[(triton.cdiv(pixels, BLOCK),)](
-            image, alpha, texels, index, *camera, blended, pixels, image.shape[1], index.shape[1], BLOCK
-        )
+            image, alpha, texels, index, *camera, blended, pixels, image.shape[1], index.shape[1],
+            turning is not None, BLOCK,
+        )  # fmt: skip
         ctx.save_for_backward(alpha, texels, index, *camera)
+        ctx.turns = turning is not None
         return blended
 
     @staticmethod
@@ -41,30 +44,40 @@ class OverCubeMap(torch.autograd.Function):
         v_alpha, v_texels = torch.empty_like(alpha), torch.zeros_like(texels)
         pixels = alpha.numel()
         _gradients[(triton.cdiv(pixels, BLOCK),)](
-            v_image, alpha, texels, index, *camera, v_alpha, v_texels, pixels, v_image.shape[1], index.shape[1], BLOCK
-        )
-        return v_image, v_alpha, v_texels, None, None, None
+            v_image, alpha, texels, index, *camera, v_alpha, v_texels, pixels, v_image.shape[1], index.shape[1],
+            ctx.turns, BLOCK,
+        )  # fmt: skip
+        return v_image, v_alpha, v_texels, None, None, None, None
 
 
 @triton.jit
 @no_type_check
-def _ray(K, camera_to_world, pixel, width):
+def _ray(K, camera_to_world, turning, pixel, width, TURNS: tl.constexpr):
     """World directions of the pixels' centres, not normalized."""
-    x = ((pixel % width).to(tl.float32) + 0.5 - tl.load(K + 2)) / tl.load(K)
-    y = ((pixel // width).to(tl.float32) + 0.5 - tl.load(K + 5)) / tl.load(K + 4)
+    column, row = (pixel % width).to(tl.float32) + 0.5, (pixel // width).to(tl.float32) + 0.5
+    x, y = (column - tl.load(K + 2)) / tl.load(K), (row - tl.load(K + 5)) / tl.load(K + 4)
+    z = 0.0 * x + 1.0
+    if TURNS:
+        seconds = tl.load(turning) * column + tl.load(turning + 1) * row + tl.load(turning + 2)
+        by_x, by_y, by_z = tl.load(turning + 3), tl.load(turning + 4), tl.load(turning + 5)
+        x, y, z = (
+            x + seconds * (by_y - by_z * y),
+            y + seconds * (by_z * x - by_x),
+            z + seconds * (by_x * y - by_y * x),
+        )
     pose = camera_to_world
-    ray_x = tl.load(pose) * x + tl.load(pose + 1) * y + tl.load(pose + 2)
-    ray_y = tl.load(pose + 4) * x + tl.load(pose + 5) * y + tl.load(pose + 6)
-    ray_z = tl.load(pose + 8) * x + tl.load(pose + 9) * y + tl.load(pose + 10)
+    ray_x = tl.load(pose) * x + tl.load(pose + 1) * y + tl.load(pose + 2) * z
+    ray_y = tl.load(pose + 4) * x + tl.load(pose + 5) * y + tl.load(pose + 6) * z
+    ray_z = tl.load(pose + 8) * x + tl.load(pose + 9) * y + tl.load(pose + 10) * z
     return ray_x, ray_y, ray_z
 
 
 @triton.jit
 @no_type_check
-def _corners(index, K, camera_to_world, pixel, width, resolution, inside):
+def _corners(index, K, camera_to_world, turning, pixel, width, resolution, inside, TURNS: tl.constexpr):
     """The four texels around the points that pixels see, and the offsets from the first one along both edges of the
     face."""
-    ray_x, ray_y, ray_z = _ray(K, camera_to_world, pixel, width)
+    ray_x, ray_y, ray_z = _ray(K, camera_to_world, turning, pixel, width, TURNS)
     far_x, far_y, far_z = tl.abs(ray_x), tl.abs(ray_y), tl.abs(ray_z)
     on_x = (far_x >= far_y) & (far_x >= far_z)
     on_y = (far_y > far_x) & (far_y >= far_z)
@@ -98,10 +111,13 @@ def _color(texels, channel, texel_00, texel_01, texel_10, texel_11, part_u, part
 
 @triton.jit(do_not_specialize=["pixels", "width"])
 @no_type_check
-def _blend(image, alpha, texels, index, K, camera_to_world, blended, pixels, width, resolution, BLOCK: tl.constexpr):
+def _blend(
+    image, alpha, texels, index, K, camera_to_world, turning, blended, pixels, width, resolution,
+    TURNS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < pixels
-    a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, pixel, width, resolution, inside)
+    a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, turning, pixel, width, resolution, inside, TURNS)
     left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
     for channel in tl.static_range(3):
         sky = _color(texels, channel, a, b, c, d, part_u, part_v, inside)
@@ -133,12 +149,13 @@ def _add(place, value, visible, alike, BLOCK: tl.constexpr):
 @triton.jit(do_not_specialize=["pixels", "width"])
 @no_type_check
 def _gradients(
-    v_image, alpha, texels, index, K, camera_to_world, v_alpha, v_texels, pixels, width, resolution, BLOCK: tl.constexpr
-):
+    v_image, alpha, texels, index, K, camera_to_world, turning, v_alpha, v_texels, pixels, width, resolution,
+    TURNS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """The gradients of alpha, and the sums of those of texels."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < pixels
-    a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, pixel, width, resolution, inside)
+    a, b, c, d, part_u, part_v = _corners(index, K, camera_to_world, turning, pixel, width, resolution, inside, TURNS)
     left = 1.0 - tl.load(alpha + pixel, mask=inside, other=1.0)
     hidden = tl.zeros((BLOCK,), tl.float32)
     visible = inside & (left > MIN_TRANSMITTANCE)

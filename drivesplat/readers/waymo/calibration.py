@@ -13,6 +13,7 @@ from drivesplat.errors import DatasetError
 from drivesplat.readers.checks import (
     MAX_COORDINATE,
     MAX_MOUNT,
+    MAX_READOUT_S,
     checked_beams,
     checked_intrinsics,
     checked_numbers,
@@ -81,6 +82,16 @@ def _readout(images: Iterable[ImageRecord]) -> float | None:
         if all(map(is_number, (image.trigger, image.shutter, image.readout_done))) and image.trigger > 0
     ]
     return float(np.median(times)) if times else None
+
+
+def readout_middle(image: ImageRecord) -> float:
+    """Seconds from the time of an image's pose to the middle between its trigger and the end of its readout; 0 where
+    these are unknown, or too far from the pose to be times of one clock."""
+    times = image.pose_timestamp, image.trigger, image.readout_done
+    if not all(map(is_number, times)) or image.trigger <= 0:
+        return 0.0
+    middle = 0.5 * (image.trigger + image.readout_done) - image.pose_timestamp
+    return float(middle) if abs(middle) <= MAX_READOUT_S else 0.0
 
 
 def lidar_of(laser: LaserRecord, shape: tuple[int, int] | None) -> Lidar:

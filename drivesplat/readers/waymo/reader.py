@@ -27,7 +27,7 @@ from drivesplat.readers.drive.reader import nominal_rate
 from drivesplat.readers.drive_checks import require_microseconds
 from drivesplat.readers.record_names import named, shown
 from drivesplat.readers.waymo import v1, v2
-from drivesplat.readers.waymo.calibration import camera_mount, camera_of, laser_mount, lidar_of, pose_of
+from drivesplat.readers.waymo.calibration import camera_mount, camera_of, laser_mount, lidar_of, pose_of, readout_middle
 from drivesplat.readers.waymo.layout import segment_files
 from drivesplat.readers.waymo.names import CAMERAS, LASERS, V1
 from drivesplat.readers.waymo.segment import BoxRecord, ImageRecord, Segment, frame_name
@@ -150,6 +150,7 @@ class _Reading:
                 is_key_frame=True,
                 sample_index=index,
                 token=f"{name}/{key}",
+                readout_middle_s=0.0 if image is None else readout_middle(image),
             )
 
     def _images_by_frame(self, number: int) -> dict[int, ImageRecord]:
