@@ -13,9 +13,10 @@ class ImageSettings(Settings):
 
 class HoldoutSettings(Settings):
     every_nth: int = Field(8, ge=0)
-    """Hold out key frames i with i % every_nth == offset: group 'interpolation'. 0 = none."""
+    """Hold out every so many key frames, from key frame `offset` on: group 'interpolation'. 0 = none."""
     offset: int = Field(4, ge=0)
-    """See every_nth. Must be less than every_nth. 0 would hold out the first key frame, which has no predecessor."""
+    """The first of these key frames, at most every_nth: every_nth: 10 and offset: 10 hold out 10, 20, 30, ... 0 would
+    hold out the first key frame, which has no predecessor."""
     last_block: int = Field(4, ge=0)
     """Number of key frames held out at the end of the drive: group 'extrapolation'. 0 = none."""
     neighbourhood_s: float = Field(0.25, ge=0, le=5)
@@ -24,9 +25,9 @@ class HoldoutSettings(Settings):
 
     @model_validator(mode="after")
     def _offset_within_period(self) -> "HoldoutSettings":
-        if self.every_nth and self.offset >= self.every_nth:
+        if self.every_nth and self.offset > self.every_nth:
             raise ValueError(
-                f"offset must be under every_nth ({self.every_nth}), or no key frame would ever be held out"
+                f"offset must be at most every_nth ({self.every_nth}): it is the first key frame that is held out"
             )
         return self
 

@@ -52,6 +52,8 @@ def test_the_defaults_on_39_key_frames_are_those_of_the_protocol():
         (39, {"every_nth": 0, "last_block": 0}, [], []),
         (10, {"every_nth": 4, "offset": 0, "last_block": 1}, [0, 4, 8], [9]),
         (10, {"every_nth": 1, "offset": 0, "last_block": 3}, [0, 1, 2, 3, 4, 5, 6], [7, 8, 9]),
+        (41, {"every_nth": 10, "offset": 10, "last_block": 0}, [10, 20, 30, 40], []),
+        (4, {"every_nth": 1, "offset": 1, "last_block": 0}, [1, 2, 3], []),
         (3, {}, [], [0, 1, 2]),
         (1, {"last_block": 0}, [], []),
         (5, {"last_block": 0}, [4], []),
@@ -68,9 +70,9 @@ def test_a_frame_in_both_groups_belongs_to_the_block(last_block):
     assert interpolation == [i for i in (1, 3, 5, 7, 9, 11) if i < 12 - last_block]
 
 
-@pytest.mark.parametrize(("every_nth", "offset"), [(8, 8), (8, 9), (1, 1), (4, 4)])
-def test_an_offset_that_holds_out_nothing_is_refused(every_nth, offset):
-    with pytest.raises(ValidationError, match="offset must be under every_nth"):
+@pytest.mark.parametrize(("every_nth", "offset"), [(8, 9), (1, 2), (4, 40)])
+def test_an_offset_beyond_the_first_period_is_refused(every_nth, offset):
+    with pytest.raises(ValidationError, match="offset must be at most every_nth"):
         HoldoutSettings(every_nth=every_nth, offset=offset)
 
 

@@ -115,7 +115,7 @@ def refusal(values: dict[str, Any]) -> str:
         ("train.opacity_reg", math.inf, ["train.opacity_reg", "inf"]),
         ("train", None, ["train", "None"]),
         ("sky", "blue", ["sky", "blue", "'none', 'mask' or 'cubemap'"]),
-        ("holdout", {"every_nth": 4, "offset": 4}, ["holdout", "offset", "every_nth (4)"]),
+        ("holdout", {"every_nth": 4, "offset": 5}, ["holdout", "offset", "every_nth (4)"]),
         ("lidar_seed.on_missing", "ignore", ["lidar_seed.on_missing", "ignore", "'stop' or 'warn'"]),
         ("lidar_seed.far_depths", [3.0, -1.0], ["lidar_seed.far_depths", "-1.0", "greater than 0"]),
         ("lidar_seed.far_depths", [3.0], ["lidar_seed.far_depths"]),
