@@ -14,6 +14,7 @@ from drivesplat.evaluation.comparison import GROUP_PLACES
 from drivesplat.io.storage import read_json, unreadable
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.provenance.record import differences
+from drivesplat.report.published import Measured, beside_published, measured_figures
 from drivesplat.report.statistics import PairedPsnr, gap_closed, mean_over_scenes
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.report import ReportJob
@@ -21,7 +22,7 @@ from drivesplat.workflow.job_logs import why_missing
 
 SCHEMA = 3
 REGIONS = ("moving_vehicle", "static", "vehicle")
-WHOLE_IMAGE = ("psnr", "ssim", "lpips")
+WHOLE_IMAGE = ("psnr", "psnr_frame_mean", "ssim", "lpips")
 """The metrics of all pixels of an image."""
 
 
@@ -30,19 +31,20 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
 
     Results of other settings or code than `job` expects, or of another protocol than the first, are listed under
     `left_out`. `missing` lists the configured scenes without a result, with the reason from the jobs' `logs`.
-    `partial`: whether either is not empty.
+    `partial`: whether either is not empty. `published` has published figures beside those of the same scenes.
     """
     rows: list[dict[str, Any]] = []
     left_out: list[dict[str, str]] = []
     measured: dict[str, Any] = {}
     protocols: dict[str, Any] = {}
+    figures: dict[str, Measured] = {}
     for path in paths:
         scene = Path(path).parent.name
         try:
             record = read_json(path, rule="scene_metrics")
             checked_digest(path, warn=False)
             reasons = _mismatches(record, job.expected, measured)
-            scene_rows = _rows(record)
+            scene_rows, scene_figures = _rows(record), measured_figures(record, job.published)
             scene = record["scene"]
         except ResultError as error:
             reasons = [str(error)]
@@ -53,6 +55,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
             left_out.append({"scene": scene, "why": "; ".join(reasons)})
             continue
         measured[scene], protocols[scene] = _comparable(record), record["protocol"]
+        figures[scene] = scene_figures
         rows += scene_rows
     named = {*measured, *(item["scene"] for item in left_out)}
     missing = [{"scene": scene, "why": why_missing(logs, scene)} for scene in job.expected if scene not in named]
@@ -66,6 +69,7 @@ def gap_report(paths: list[str], job: ReportJob, logs: Path) -> dict[str, Any]:
         "left_out": left_out,
         "missing": missing,
         "protocols": protocols,
+        "published": beside_published(job.published, figures),
     }
 
 

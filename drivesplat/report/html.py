@@ -12,6 +12,7 @@ from drivesplat.report import page
 from drivesplat.report.gaps import summary_sentences
 from drivesplat.report.media import MethodMedia, data_url, difference_position, read_image
 from drivesplat.report.plot import gap_plot
+from drivesplat.report.tables import pixels_label, scene_label
 
 MediaByMethod = Mapping[tuple[str, str], MethodMedia]
 NAMES = [{"key": name, "title": name, "form": "{}", "kind": "name"} for name in ("scene", "method")]
@@ -27,6 +28,14 @@ WHOLE_IMAGE_FIGURES = [
     {"key": "lpips", "title": "LPIPS ↓", "form": "{:.3f}", "kind": ""},
 ]
 """The columns of a group of held-out frames: key of the figure, title, format and CSS class."""
+PUBLISHED_FIGURES = [
+    *(
+        {**column, "form": form}
+        for column, form in zip(WHOLE_IMAGE_FIGURES, ("{:.2f}", "{:.3f}", "{:.3f}"), strict=True)
+    ),
+    {"key": "train_minutes", "title": "training, min", "form": "{:.1f}", "kind": "first"},
+    {"key": "gpu", "title": "GPU", "form": "{}", "kind": "name"},
+]
 COSTS = [
     {"key": "gaussians", "title": "Gaussians", "form": "{:,.0f}", "kind": "first"},
     {"key": "train_seconds", "title": "training, s", "form": "{:,.0f}", "kind": ""},
@@ -59,6 +68,8 @@ def report_page(
             _table("Moving vehicles and static pixels: PSNR in dB", REGION_FIGURES, []),
             _table("Whole images, with the cost of training", WHOLE_IMAGE_FIGURES, COSTS),
         ],
+        publications=_publications(report["published"]),
+        published_columns=PUBLISHED_FIGURES,
         scenes=scenes,
         links_of=lambda scene: media.get((scene, ""), MethodMedia()).links,
         media_of=lambda row: _looks(row, media.get((row["scene"], row["method"]), MethodMedia())),
@@ -77,6 +88,20 @@ def _table(title: str, of_groups: list[dict[str, str]], of_methods: list[dict[st
     groups = [(place, len(of_groups)) for place in GROUP_PLACES.values()]
     groups += [("", len(of_methods))] if of_methods else []
     return {"title": title, "groups": groups, "columns": [*NAMES, *figures, *of_methods]}
+
+
+def _publications(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The tables of published figures: per publication its name and address, and its rows with those measured on the
+    same scenes; `first` marks the first row of a comparison."""
+    tables: dict[str, dict[str, Any]] = {}
+    before: tuple[Any, ...] | None = None
+    for row in rows:
+        table = tables.setdefault(row["source"], {"source": row["source"], "url": row["url"], "rows": []})
+        place = (row["source"], row["scene"], row["group"], row["region"])
+        shown = {**row, "scene_label": scene_label(row), "pixels": pixels_label(row), "first": place != before}
+        table["rows"].append(shown)
+        before = place
+    return list(tables.values())
 
 
 def _looks(row: dict[str, Any], media: MethodMedia) -> dict[str, Any]:

@@ -6,8 +6,9 @@ from typing import Any
 import pandas as pd
 
 from drivesplat.io.storage import atomic_write
-from drivesplat.report.gaps import COLUMNS, REGIONS, WHOLE_IMAGE
+from drivesplat.report.gaps import COLUMNS, REGIONS
 from drivesplat.scene.splits import HELD_OUT_GROUPS
+from drivesplat.settings.published import MEAN
 
 NAMES, COSTS = ["scene", "method"], ["gaussians", "train_seconds"]
 TITLES = {"moving_vehicle": "moving", "gap_db": "gap", "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}
@@ -21,9 +22,23 @@ def figures_of(report: dict[str, Any]) -> pd.DataFrame:
 
 
 def write_figures(path: str | Path, report: dict[str, Any]) -> None:
-    """Writes the figures of a report as CSV; missing ones are empty cells."""
+    """Writes the figures of a report as CSV; missing ones are empty cells. Published figures of whole images follow, in
+    the same columns, with their source; so do the measured means that they are compared with."""
+    table = figures_of(report)
+    if report["published"]:
+        shown = [row for row in report["published"] if row["region"] == "all"]
+        added = [_csv_row(row) for row in shown if not row["measured"] or row["scene"] == MEAN]
+        table = pd.concat([table, pd.DataFrame(added, columns=[*COLUMNS, "source", "url"], dtype=object)])
     with atomic_write(path) as file:
-        file.write(figures_of(report).to_csv(index=False).encode())
+        file.write(table.to_csv(index=False).encode())
+
+
+def _csv_row(row: dict[str, Any]) -> dict[str, Any]:
+    figures = {"psnr_frame_mean": row["psnr"], "ssim": row["ssim"], "lpips": row["lpips"]}
+    seconds = None if row["train_minutes"] is None else 60.0 * row["train_minutes"]
+    origin = {} if row["measured"] else {"source": row["source"], "url": row["url"]}
+    of_group = {f"{row['group']}_{name}": value for name, value in figures.items()}
+    return {"scene": row["scene"], "method": row["method"], "train_seconds": seconds, **of_group, **origin}
 
 
 def gap_table(report: dict[str, Any]) -> str:
@@ -33,7 +48,34 @@ def gap_table(report: dict[str, Any]) -> str:
 
 def whole_image_table(report: dict[str, Any]) -> str:
     """PSNR, SSIM and LPIPS of whole images in both groups, Gaussians and training time, and the means over scenes."""
-    return _as_text(report, list(WHOLE_IMAGE), COSTS)
+    return _as_text(report, ["psnr", "ssim", "lpips"], COSTS)
+
+
+def published_table(report: dict[str, Any]) -> str:
+    """Published figures and those measured on the same scenes: a line per method, and whether it was measured here."""
+    forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "train_minutes": "{:.1f}"}
+    lines = [
+        {
+            "publication": row["source"],
+            "scene": scene_label(row),
+            "pixels": pixels_label(row),
+            "method": f"{row['method']} (here)" if row["measured"] else row["method"],
+            **{name: "-" if row[name] is None else form.format(row[name]) for name, form in forms.items()},
+        }
+        for row in report["published"]
+    ]
+    return pd.DataFrame(lines).rename(columns={**TITLES, "train_minutes": "minutes"}).to_string(index=False)
+
+
+def scene_label(row: dict[str, Any]) -> str:
+    """The scene of a row of published or measured figures; of a mean also the number of scenes, where it is known."""
+    return row["scene"] if row["scenes"] is None else f"{row['scene']} of {row['scenes']}"
+
+
+def pixels_label(row: dict[str, Any]) -> str:
+    """The pixels of a row of published or measured figures, and the group of held-out images if it is the harder."""
+    region = "whole images" if row["region"] == "all" else row["region"].replace("_", " ")
+    return region if row["group"] == HELD_OUT_GROUPS[0] else f"{region}, {row['group']}"
 
 
 def _as_text(report: dict[str, Any], of_groups: list[str], of_methods: list[str]) -> str:

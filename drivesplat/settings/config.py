@@ -29,6 +29,7 @@ from drivesplat.settings.lidar_seed import LidarSeedSettings
 from drivesplat.settings.masks import MaskSettings
 from drivesplat.settings.method import VARIATION_OVERRIDES, MethodSettings, merged
 from drivesplat.settings.names import require_name, suggestion
+from drivesplat.settings.published import PublishedFigures
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.results_folder import ResultsFolder
@@ -87,6 +88,11 @@ class Config(Settings):
     removal: RemovalSettings = RemovalSettings()
     export: ExportSettings = ExportSettings()
     lpips: LpipsSettings = LpipsSettings()
+    published: tuple[PublishedFigures, ...] = ()
+    """Published figures that the report shows beside measured ones, a list: {source: name of the publication, url: its
+    address, scene: "0061", method: its name there, psnr: mean over images in dB, ssim, lpips, train_minutes, gpu}. One
+    figure suffices. `scene: mean` is a mean over scenes, `scenes` their number. `group` ('interpolation' unless given)
+    and `region` ('all') are those of metrics.json. presets/protocols/ has such lists (docs/results.md)."""
     device: DeviceSettings = DeviceSettings()
     random_seed: int = Field(0, ge=0, lt=2**31)
     """Random seed of all stages."""
@@ -98,6 +104,13 @@ class Config(Settings):
     def _text_on_the_command_line(cls, value: Any) -> Any:
         if value in ("true", "false"):
             raise ValueError(f"write {value.capitalize()}: Snakemake's --config takes {value} for text")
+        return value
+
+    @field_validator("published", mode="before")
+    @classmethod
+    def _published_figures_are_a_list(cls, value: Any) -> Any:
+        if not isinstance(value, (list, tuple)):
+            raise ValueError("it must be a list, each entry of which begins with '- '")
         return value
 
     @field_validator("methods")

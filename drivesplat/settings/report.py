@@ -3,6 +3,7 @@
 from typing import Any
 
 from drivesplat.settings import Settings
+from drivesplat.settings.published import PublishedFigures
 
 HELD_OUT_PAIR = {"recorded": "held_out_recorded.png", "rendered": "held_out_rendered.png"}
 """One held-out image, recorded and rendered, written by the evaluation of a method."""
@@ -22,3 +23,5 @@ class ReportJob(Settings):
     """The method whose gap others close: the first without moving parts. None where there is none."""
     random_seed: int
     """Random seed of the bootstrap over scenes."""
+    published: tuple[PublishedFigures, ...] = ()
+    """Published figures to show beside the measured ones."""

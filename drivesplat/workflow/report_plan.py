@@ -74,6 +74,7 @@ class ReportPlan:
             expected={scene: self._plan.metrics_stages(scene) for scene in config.batch_scenes},
             reference=next(static_methods, None),
             random_seed=config.random_seed,
+            published=config.published,
         )
         return canonical_json(job.model_dump(mode="json"))
 

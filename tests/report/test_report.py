@@ -39,11 +39,11 @@ def test_a_row_has_the_figures_of_both_groups(write):
         {
             "scene": "0061", "dataset": "nuscenes", "method": "vanilla",
             "interpolation_static": 24.0, "interpolation_vehicle": 19.0, "interpolation_moving_vehicle": 17.0,
-            "interpolation_gap_db": 7.0, "interpolation_psnr": 23.0, "interpolation_ssim": 0.8,
-            "interpolation_lpips": 0.3,
+            "interpolation_gap_db": 7.0, "interpolation_psnr": 23.0,
+            "interpolation_psnr_frame_mean": 23.0, "interpolation_ssim": 0.8, "interpolation_lpips": 0.3,
             "extrapolation_static": 22.0, "extrapolation_vehicle": 14.0, "extrapolation_moving_vehicle": 14.0,
-            "extrapolation_gap_db": 8.0, "extrapolation_psnr": 21.0, "extrapolation_ssim": 0.8,
-            "extrapolation_lpips": None,
+            "extrapolation_gap_db": 8.0, "extrapolation_psnr": 21.0,
+            "extrapolation_psnr_frame_mean": 21.0, "extrapolation_ssim": 0.8, "extrapolation_lpips": None,
             "gaussians": 1000, "train_seconds": 60.0, "shown": None,
         }
     ]  # fmt: skip
@@ -310,7 +310,7 @@ def test_the_csv_has_a_line_per_row_and_empty_cells_for_null(tmp_path, report):
     write_figures(tmp_path / "gap_report.csv", report)
     with open(Path(tmp_path / "gap_report.csv"), newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    figures = ("moving_vehicle", "static", "vehicle", "gap_db", "psnr", "ssim", "lpips")
+    figures = ("moving_vehicle", "static", "vehicle", "gap_db", "psnr", "psnr_frame_mean", "ssim", "lpips")
     assert list(rows[0]) == [
         "scene", "dataset", "method",
         *(f"interpolation_{name}" for name in figures), *(f"extrapolation_{name}" for name in figures),

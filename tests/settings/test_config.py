@@ -20,6 +20,7 @@ LOOKS = (
 )  # fmt: skip
 OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "tracks", "compare")
 STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "train", "evaluate", *LOOKS)
+PUBLISHED = {"source": "A paper", "url": "https://example.org", "scene": "0061", "method": "M", "psnr": 20.0}
 
 
 def spelled(values: dict[str, Any] | Config, stage: str, scene: str = "0061", method: str = "vanilla") -> str:
@@ -389,6 +390,7 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("export.max_distance", 9), "far_gaussians"),
         (at("export.sh_degree", 3), "export"),
         (at("export.formats", ["ply"]), ""),
+        (at("published", [PUBLISHED]), ""),
         (at("device", "cpu"), ""),
         (at("device.min_free_gb", 3), ""),
         (at("results_dir", "elsewhere"), ""),

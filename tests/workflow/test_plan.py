@@ -291,6 +291,14 @@ def test_the_reference_is_the_first_static_method():
     assert reference({"vanilla": None, "street": None, "moves": {"parts": ACTORS}}) is None
 
 
+def test_published_figures_reach_the_report_and_its_job_alone():
+    """A change of them reruns the report alone: no stage and no result that it expects knows of them."""
+    figures = {"source": "S", "url": "https://example.org", "scene": "a1", "method": "M", "psnr": 20.0}
+    before, after = (json.loads(plan(**more).report([]).settings()) for more in ({}, {"published": [figures]}))
+    assert before.pop("published") == [] and before == {name: after[name] for name in before}
+    assert after["published"][0].items() >= figures.items()
+
+
 def test_a_report_asked_for_by_itself_is_not_made_empty_where_other_scenes_have_been_measured(tmp_path):
     """As after the demo: its report would give way to one of nothing."""
     datasets = {"a": {"scenes": ["a1"]}, "demo": {"scenes": ["demo"], "batch": False}}
