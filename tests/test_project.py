@@ -57,10 +57,15 @@ def test_planning_imports_nothing_heavy():
     assert not heavy & set(modules.split())
 
 
-@pytest.mark.parametrize("preset", sorted(path.name for path in (REPOSITORY / "presets").glob("*.yaml")))
+PRESETS = [
+    path for pattern in ("*.yaml", "protocols/*.yaml") for path in sorted((REPOSITORY / "presets").glob(pattern))
+]
+
+
+@pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
 def test_presets_are_valid_over_the_defaults(preset):
     defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text())
-    config = load(merged(defaults, yaml.safe_load((REPOSITORY / "presets" / preset).read_text())))
+    config = load(merged(defaults, yaml.safe_load(preset.read_text())))
     assert config.scenes
 
 

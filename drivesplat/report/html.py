@@ -94,14 +94,16 @@ def _publications(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The tables of published figures: per publication its name and address, and its rows with those measured on the
     same scenes; `first` marks the first row of a comparison."""
     tables: dict[str, dict[str, Any]] = {}
-    before: tuple[Any, ...] | None = None
-    for row in rows:
+    for before, row in zip([None, *rows], rows, strict=False):
         table = tables.setdefault(row["source"], {"source": row["source"], "url": row["url"], "rows": []})
-        place = (row["source"], row["scene"], row["group"], row["region"])
-        shown = {**row, "scene_label": scene_label(row), "pixels": pixels_label(row), "first": place != before}
+        first = not row["measured"] and before is not None and _comparison(before) != _comparison(row)
+        shown = {**row, "scene_label": scene_label(row), "pixels": pixels_label(row), "first": first}
         table["rows"].append(shown)
-        before = place
     return list(tables.values())
+
+
+def _comparison(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("scene", "scenes", "group", "region"))
 
 
 def _looks(row: dict[str, Any], media: MethodMedia) -> dict[str, Any]:

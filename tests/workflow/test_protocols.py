@@ -1,0 +1,155 @@
+"""The presets of published protocols: they plan, hold out what their documents say, and repeat published figures."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+from helpers import REPOSITORY
+
+from drivesplat.readers.waymo.names import COMPONENTS
+from drivesplat.scene.splits import held_out_key_frames
+from drivesplat.settings.config import for_scene, merged
+from drivesplat.workflow.config_files import check_config_files
+from drivesplat.workflow.plan import Plan
+
+FILES = {path.stem: path for path in sorted((REPOSITORY / "presets/protocols").glob("*.yaml"))}
+WAYMO = ("amd_street_gaussians", "omnire_waymo")
+EVERY = pytest.mark.parametrize("name", FILES)
+
+
+def plan(name: str, **changes: Any) -> Plan:
+    """The plan of a preset over the defaults, with `changes` over both."""
+    defaults = yaml.safe_load((REPOSITORY / "config.yaml").read_text(encoding="utf-8"))
+    preset = yaml.safe_load(FILES[name].read_text(encoding="utf-8"))
+    return Plan(merged(merged(defaults, preset), changes), str(REPOSITORY))
+
+
+def header(name: str) -> str:
+    """The comment at the beginning of a preset, on one line."""
+    lines = FILES[name].read_text(encoding="utf-8").splitlines()
+    end = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    return " ".join(line.removeprefix("#").strip() for line in lines[:end])
+
+
+@EVERY
+def test_one_command_measures_both_methods_on_every_scene_and_writes_the_report(name):
+    made = plan(name)
+    report = made.report(["metrics", "report"])
+    (dataset,) = [found for found in made.config.datasets.values() if found.batch]
+    assert report.metrics() == [f"results/protocols/{name}/{scene}/metrics.json" for scene in dataset.scenes]
+    assert list(made.config.methods) == ["vanilla", "street"]
+    command = f"snakemake --cores 4 --configfile presets/protocols/{name}.yaml -- metrics report"
+    assert command in header(name)
+
+
+@EVERY
+def test_a_header_says_what_is_held_out_and_needed_and_whether_it_was_run(name):
+    text = header(name)
+    assert "Held out: " in text and "Data: " in text and "Not run by the authors" in text
+    for url in {figures.url for figures in plan(name).config.published}:
+        assert url in text or url.replace("https://arxiv.org/abs/", "arXiv ") in text
+
+
+@EVERY
+def test_a_preset_sets_what_has_an_effect(name):
+    """Iterations, held-out images and cameras as the document has them, for every scene and method."""
+    config = plan(name).config
+    for scene in config.batch_scenes:
+        for method in config.methods:
+            there = for_scene(config, scene, method)
+            assert there.train.iterations == 30_000 and there.holdout.last_block == 0
+            assert there.eval_camera == there.cameras[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "held_out"),
+    [
+        ("omnire_waymo", 200, list(range(10, 200, 10))),
+        ("amd_street_gaussians", 198, list(range(10, 198, 10))),
+        ("amd_street_gaussians", 90, [10, 20, 30, 40, 50, 60, 70, 80]),
+        ("vad_gs_nuscenes", 39, [4, 8, 12, 16, 20, 24, 28, 32, 36]),
+    ],
+)
+def test_held_out_are_the_frames_of_the_document(name, frames, held_out):
+    holdout = plan(name).config.holdout
+    assert held_out_key_frames(frames, holdout) == {"interpolation": held_out, "extrapolation": []}
+
+
+@pytest.mark.parametrize("name", WAYMO)
+def test_neighbours_of_held_out_frames_at_10_hz_are_trained_on_and_poses_are_recorded(name):
+    config = plan(name).config
+    assert config.holdout.neighbourhood_s == 0.0 and config.refine_poses.enabled is False
+    assert config.images.width == {"amd_street_gaussians": None, "omnire_waymo": 960}[name]
+
+
+def test_a_segment_is_measured_whole_and_cut_with_results_of_their_own(tmp_path):
+    made = plan("amd_street_gaussians", datasets={"waymo": {"dataroot": str(tmp_path)}})
+    whole = [scene for scene in made.config.batch_scenes if "_" in scene]
+    for component in COMPONENTS:
+        for segment in whole:
+            (tmp_path / component).mkdir(exist_ok=True)
+            (tmp_path / component / f"{segment}.parquet").touch()
+    made.refuse_absent_data(["metrics", "report"])
+    assert len(whole) == 4 and len(set(made.report([]).metrics())) == 8
+    ranges = []
+    for segment in whole:
+        short = segment.partition("_")[0]
+        tables = [made.tables(SimpleNamespace(scene=scene)) for scene in (segment, short)]
+        assert tables[0] != [] and tables[0] == tables[1], "the same files"
+        of_scene = [made.config.datasets["waymo"].frames.get(scene) for scene in (segment, short)]
+        assert of_scene[0] is None
+        ranges.append(of_scene[1])
+    assert ranges == [(100, 190), (20, 115), (0, 160), (0, 85)]
+
+
+def figures(name: str, *keys: str) -> list[tuple[Any, ...]]:
+    return [tuple(getattr(item, key) for key in keys) for item in plan(name).config.published]
+
+
+def test_the_article_of_amd_is_repeated():
+    """PSNR, SSIM, LPIPS and time of its table, each segment whole and cut."""
+    times = ("17:50.67", "19:31.57", "34:47.04", "25:12.93", "17:16.39", "16:03.89", "20:28.26", "20:25.74")
+    minutes = [int(time[:2]) + float(time[3:]) / 60.0 for time in times]
+    found = figures("amd_street_gaussians", "scene", "psnr", "ssim", "lpips", "train_minutes")
+    assert [item[0] for item in found] == plan("amd_street_gaussians").config.batch_scenes
+    assert [item[1:4] for item in found] == [
+        (32.59, 0.93, 0.26), (37.25, 0.95, 0.19), (32.96, 0.93, 0.21), (34.12, 0.93, 0.21),
+        (32.56, 0.90, 0.26), (34.41, 0.93, 0.20), (27.39, 0.85, 0.27), (25.76, 0.82, 0.38),
+    ]  # fmt: skip
+    assert [item[4] for item in found] == pytest.approx(minutes, abs=0.005)
+    assert set(figures("amd_street_gaussians", "method", "gpu")) == {("Street Gaussians", "AMD Instinct MI300X")}
+
+
+def test_the_table_of_vad_gs_is_repeated():
+    found = {
+        (scene, method, region): psnr
+        for scene, method, region, psnr in figures("vad_gs_nuscenes", "scene", "method", "region", "psnr")
+    }
+    methods = ("Street Gaussians", "OmniRe", "PVG", "VAD-GS")
+    table = {
+        "0061": (22.87, 22.71, 22.77, 25.54),
+        "0103": (22.12, 22.27, 22.91, 23.69),
+        "mean": (22.9, 22.8, 23.0, 24.5),
+    }
+    expected = {
+        (scene, method, "all"): psnr for scene, row in table.items() for method, psnr in zip(methods, row, strict=True)
+    }
+    assert found == expected | {("mean", "VAD-GS", "moving_vehicle"): 23.2}
+    perceptual = figures("vad_gs_nuscenes", "ssim", "lpips")
+    assert perceptual[:5] == [(0.65, 0.13), (0.63, 0.16), (0.63, 0.22), (0.81, 0.16), (0.66, 0.23)]
+    assert perceptual[7] == (0.76, 0.24) and {*perceptual[5:7], *perceptual[8:]} == {(None, None)}
+
+
+@EVERY
+def test_published_figures_are_of_measured_scenes_or_means_over_a_known_number(name):
+    config = plan(name).config
+    assert config.published
+    for item in config.published:
+        assert item.scene in config.batch_scenes or (item.scene == "mean" and item.scenes)
+        assert item.group == "interpolation"
+
+
+def test_a_preset_has_no_key_twice():
+    """Of which YAML silently keeps the last."""
+    check_config_files([str(path) for path in FILES.values()])
