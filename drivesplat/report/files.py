@@ -10,7 +10,7 @@ from drivesplat.report.gaps import gap_report, summary_sentences
 from drivesplat.report.ghosts import render_ghosts_page
 from drivesplat.report.html import report_page
 from drivesplat.report.media import collect_media
-from drivesplat.report.tables import gap_table, published_table, whole_image_table, write_figures
+from drivesplat.report.tables import gap_table, published_tables, whole_image_table, write_figures
 from drivesplat.settings.report import ReportJob
 from drivesplat.workflow.costs.measured import read_costs
 from drivesplat.workflow.costs.table import scene_totals
@@ -55,6 +55,4 @@ def console_table(report: dict[str, Any]) -> str:
     notes += [f"{item['scene']}: {item['why']}" for item in report["missing"]]
     title = "PSNR in dB on held-out frames" + (" (partial: see below)" if report["partial"] else "")
     tables = [gap_table(report), "Whole images", whole_image_table(report)] if report["rows"] else []
-    if report["published"]:
-        tables += ["Beside published figures (PSNR: mean over images)", published_table(report)]
-    return "\n".join([title, *tables, *summary_sentences(report), *notes])
+    return "\n".join([title, *tables, *published_tables(report), *summary_sentences(report), *notes])

@@ -35,7 +35,7 @@ def write_figures(path: str | Path, report: dict[str, Any]) -> None:
 
 def _csv_row(row: dict[str, Any]) -> dict[str, Any]:
     figures = {"psnr_frame_mean": row["psnr"], "ssim": row["ssim"], "lpips": row["lpips"]}
-    seconds = None if row["train_minutes"] is None else 60.0 * row["train_minutes"]
+    seconds = None if row["train_minutes"] is None else round(60.0 * row["train_minutes"], 1)
     origin = {} if row["measured"] else {"source": row["source"], "url": row["url"]}
     of_group = {f"{row['group']}_{name}": value for name, value in figures.items()}
     return {"scene": row["scene"], "method": row["method"], "train_seconds": seconds, **of_group, **origin}
@@ -51,20 +51,23 @@ def whole_image_table(report: dict[str, Any]) -> str:
     return _as_text(report, ["psnr", "ssim", "lpips"], COSTS)
 
 
-def published_table(report: dict[str, Any]) -> str:
-    """Published figures and those measured on the same scenes: a line per method, and whether it was measured here."""
+def published_tables(report: dict[str, Any]) -> list[str]:
+    """Published figures and those measured on the same scenes, a heading and a table per publication: a line per
+    method, and whether it was measured here."""
     forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "train_minutes": "{:.1f}"}
-    lines = [
-        {
-            "publication": row["source"],
-            "scene": scene_label(row),
-            "pixels": pixels_label(row),
-            "method": f"{row['method']} (here)" if row["measured"] else row["method"],
-            **{name: "-" if row[name] is None else form.format(row[name]) for name, form in forms.items()},
-        }
-        for row in report["published"]
+    lines: dict[str, list[dict[str, str]]] = {}
+    for row in report["published"]:
+        names = {"scene": scene_label(row), "pixels": pixels_label(row)}
+        names["method"] = f"{row['method']} (here)" if row["measured"] else row["method"]
+        figures = {name: "-" if row[name] is None else form.format(row[name]) for name, form in forms.items()}
+        lines.setdefault(row["source"], []).append(names | figures)
+    titles = {**TITLES, "train_minutes": "minutes"}
+    tables = {source: pd.DataFrame(own).rename(columns=titles).to_string(index=False) for source, own in lines.items()}
+    return [
+        text
+        for source, table in tables.items()
+        for text in (f"Beside the figures of {source} (PSNR: mean over images)", table)
     ]
-    return pd.DataFrame(lines).rename(columns={**TITLES, "train_minutes": "minutes"}).to_string(index=False)
 
 
 def scene_label(row: dict[str, Any]) -> str:

@@ -128,9 +128,11 @@ def test_the_csv_has_published_figures_in_the_same_columns(tmp_path):
 
 def test_the_console_has_published_figures(tmp_path):
     text = console_table(report_of(tmp_path))
-    assert "Beside published figures" in text and re.search(r"A & B 2026 +0061 +whole images +SG +22\.87 +0\.650", text)
+    first, second = text.index("Beside the figures of A & B 2026"), text.index("Beside the figures of A blog")
+    assert first < text.index("<PVG>") < second
+    assert re.search(r"0061 +whole images +SG +22\.87 +0\.650", text)
     assert re.search(r"mean of 2 +whole images +street \(here\) +29\.00", text)
-    assert "Beside published figures" not in console_table(report_of(tmp_path, []))
+    assert "Beside the figures" not in console_table(report_of(tmp_path, []))
 
 
 def test_the_page_has_a_table_per_publication_with_its_link(tmp_path):

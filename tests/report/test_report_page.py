@@ -116,6 +116,15 @@ def test_a_page_has_the_metrics_of_whole_images_and_a_glossary(results):
     assert "Higher is better" in dict(explained)["PSNR"] and "Lower is better" in dict(explained)["LPIPS"]
 
 
+def test_a_page_says_which_key_frames_were_used_and_how_near_training_images_are(results):
+    found = made(results)
+    assert "of the recording" not in page_of(results) and "from training images" not in page_of(results)
+    found["protocols"]["0061"] |= {"key_frame_range": [100, 190], "nearest_training_s": 0.1}
+    page = re.sub(r"\s+", " ", report_page(found, {}))
+    assert page.count("key frames 100 to 189 of the recording, counted from 0,") == 1
+    assert page.count("held-out images at least 0.10 s from training images,") == 1
+
+
 def test_a_page_is_deterministic(results):
     assert page_of(results) == page_of(results)
 
