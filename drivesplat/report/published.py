@@ -67,7 +67,8 @@ def _own(item: PublishedFigures) -> dict[str, Any]:
 
 
 def _means(place: Place, scenes: Iterable[Measured], count: int | None) -> list[dict[str, Any]]:
-    """The means of every method over the scenes; without figures where their number is not `count`."""
+    """The means of every method over the scenes; without figures where their number is not `count`, and without a
+    figure that a scene lacks."""
     methods: dict[str, list[dict[str, Any]]] = {}
     for measured in scenes:
         for method, figures in measured.items():
@@ -76,12 +77,12 @@ def _means(place: Place, scenes: Iterable[Measured], count: int | None) -> list[
     for method, of_scenes in methods.items():
         comparable = count is None or count == len(of_scenes)
         figures = {name: _mean(of_scenes, name) if comparable else None for name in FIGURES}
-        gpus = {figures["gpu"] for figures in of_scenes}
+        gpus = {own["gpu"] for own in of_scenes}
         gpu = gpus.pop() if len(gpus) == 1 else None
         rows.append({"method": method, "scenes": len(of_scenes), **figures, "gpu": gpu})
     return rows
 
 
 def _mean(of_scenes: Iterable[Mapping[str, Any]], name: str) -> float | None:
-    known = [figures[name] for figures in of_scenes if figures[name] is not None]
-    return mean(known) if known else None
+    values = [own[name] for own in of_scenes]
+    return None if None in values else mean(values)

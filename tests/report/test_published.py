@@ -12,6 +12,7 @@ from drivesplat.io.storage import write_json
 from drivesplat.report.files import console_table
 from drivesplat.report.gaps import COLUMNS, gap_report
 from drivesplat.report.html import report_page
+from drivesplat.report.published import beside_published, measured_figures
 from drivesplat.report.tables import write_figures
 from drivesplat.settings.published import PublishedFigures
 
@@ -72,6 +73,16 @@ def test_a_mean_is_compared_with_one_over_as_many_scenes_only(tmp_path):
     ], "the second two beside the mean of six"  # fmt: skip
     any_number = report_of(tmp_path, [{**PAPER, "scene": "mean", "method": "SG", "psnr": 22.9}])
     assert [row["psnr"] for row in any_number["published"]] == [22.9, 27.0, 29.0]
+
+
+def test_a_figure_that_a_scene_lacks_has_no_mean(tmp_path):
+    entry = PublishedFigures(**PAPER, scene="mean", method="SG", psnr=22.9)
+    scenes = {}
+    for scene, lpips in (("0061", 0.3), ("0103", None)):
+        between = {**group(24.0), "all": region(20.0, lpips)}
+        scenes[scene] = measured_figures(metrics(scene, {"street": method(between, group(22.0))}), [entry])
+    _, street = beside_published([entry], scenes)
+    assert (street["psnr"], street["lpips"], street["scenes"]) == (20.0, None, 2)
 
 
 def test_regions_groups_and_publications_are_compared_apart(tmp_path):
