@@ -1,5 +1,6 @@
-"""Rasterization: 3D Gaussians in; image, alpha and depth out."""
+"""Rasterization: 3D Gaussians in; images, or LiDAR scans, out."""
 
 from drivesplat.rasterization.rasterization import Rendering, rasterize
+from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
 
-__all__ = ["Rendering", "rasterize"]
+__all__ = ["RayGrid", "Rendering", "ScanMotion", "ScanRendering", "rasterize", "rasterize_scan"]

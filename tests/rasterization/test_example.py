@@ -1,11 +1,14 @@
-"""The worked example in the documentation of `rasterize`."""
+"""The worked examples in the documentation of `rasterize` and `rasterize_scan`."""
 
 import doctest
 
-from drivesplat.rasterization import rasterization, rasterize
+import pytest
+
+from drivesplat.rasterization import rasterization, rasterize, rasterize_scan, scans
 
 
-def test_the_example_of_rasterize_runs():
-    (example,) = doctest.DocTestFinder(recurse=False).find(rasterize, "rasterize", module=rasterization, globs={})
+@pytest.mark.parametrize(("function", "module"), [(rasterize, rasterization), (rasterize_scan, scans)])
+def test_the_example_runs(function, module):
+    (example,) = doctest.DocTestFinder(recurse=False).find(function, function.__name__, module=module, globs={})
     assert len(example.examples) > 8
     assert doctest.DocTestRunner().run(example).failed == 0

@@ -118,7 +118,7 @@ def _ended(s):
 
 @fast_callee
 @no_type_check
-def _alpha(dx, dy, a, b, c, opacity):
+def gaussian_alpha(dx, dy, a, b, c, opacity):
     """A Gaussian's alpha at an offset from its centre, before it is limited to 0.999; 0 below 1/255."""
     real = type(dx)
     half, zero, far = real(0.5), real(0.0), real(-25.0)
@@ -141,7 +141,7 @@ def _weigh(s, begin, end, shape):
     a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     zero, one, max_alpha, min_transmittance = real(0.0), real(1.0), real(MAX_ALPHA), real(MIN_TRANSMITTANCE)
     for p in range(begin, end):
-        alpha = _alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
+        alpha = gaussian_alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
         alpha = alpha if alpha < max_alpha else max_alpha
         before = s[_at(TRANSMITTANCE) + p]
         after = before * (one - alpha)
@@ -208,7 +208,7 @@ def _begin_backward(s, begin, end, shape):
     mean_x, mean_y, opacity = shape[layout.MEAN_X], shape[layout.MEAN_Y], shape[layout.OPACITY]
     a, b, c = shape[layout.CONIC_XX], shape[layout.CONIC_XY], shape[layout.CONIC_YY]
     for p in range(begin, end):
-        s[_at(RAW) + p] = _alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
+        s[_at(RAW) + p] = gaussian_alpha(s[_at(X) + p] - mean_x, s[_at(Y) + p] - mean_y, a, b, c, opacity)
         s[_at(VALUE) + p] = s[_at(GRADIENT) + p]
 
 

@@ -1,0 +1,195 @@
+"""Spherical projection of Gaussians into a LiDAR scan (SplatAD, CVPR 2025), in torch operations on any device.
+
+In the sensor's frame at x, y, z, with ρ² = x² + y² and r² = ρ² + z², the Jacobian's rows are those of azimuth
+atan2(y, x): (−y, x, 0) / ρ²; of elevation asin(z / r): (−x z, −y z, ρ²) / (r² ρ); and of range r: (x, y, z) / r. With
+T = J W R S (scales S, rotation R, world to sensor W) and T's rows a, e and d, the covariance of azimuth and elevation
+has the determinant |a × e|², which neither cancels nor turns negative as xx yy - xy² does for needles in float32.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+MIN_ALPHA = 1.0 / 255.0
+"""Minimum alpha: smaller contributions are not drawn."""
+MIN_RANGE = 0.2
+"""Gaussians nearer to the sensor (metres) are skipped."""
+MAX_ELEVATION = math.radians(80.0)
+"""Gaussians nearer to the poles are skipped: azimuths, and so the linearisation, degenerate there."""
+MAX_DEVIATIONS = 3.0
+"""Maximum correction of the range within a Gaussian, in standard deviations of the range along its plane within its
+footprint, which the beams widen. Standard deviations of its own range alone would cut off the plane of the road, where
+beams graze it, and shift it towards the sensor."""
+MIN_SINE_SQUARED = 1e-8
+"""Gaussians seen as a line, where the squared sine between a and e is smaller, have no slope."""
+FIRING_STEPS = 4
+"""Iterations to find the time at which a moving Gaussian meets the spinning beams; each reduces the error by the ratio
+of the Gaussian's angular velocity to the sensor's."""
+
+
+class ScannedGaussians(NamedTuple):
+    """n Gaussians as a LiDAR sees them: `means2d`, azimuth and elevation in radians; `ranges` in metres; `conics`, the
+    upper triangles of inverse covariances of azimuth and elevation; `slopes`, metres of range by radian of azimuth and
+    of elevation, which correct the range of a ray by at most `range_limits` metres; `radii`, the reach in radians, 0
+    for Gaussians that are skipped; `opacities`."""
+
+    means2d: Float[Tensor, "n 2"]
+    ranges: Float[Tensor, " n"]
+    conics: Float[Tensor, "n 3"]
+    slopes: Float[Tensor, "n 2"]
+    range_limits: Float[Tensor, " n"]
+    radii: Float[Tensor, "n 2"]
+    opacities: Float[Tensor, " n"]
+
+
+class FiringTimes(NamedTuple):
+    """When each azimuth fires: `azimuths` (a,) in radians, ascending within ±π, and their `offsets_s` (a,)."""
+
+    azimuths: Float[Tensor, " a"]
+    offsets_s: Float[Tensor, " a"]
+
+
+class Placement(NamedTuple):
+    """Where Gaussians are in the sensor's frame, and how they lie: centres (3, n) in metres, and axes (3, 3, n): the
+    scaled principal axes, coordinates first."""
+
+    centers: Float[Tensor, "3 n"]
+    axes: Float[Tensor, "3 3 n"]
+
+
+def placed(
+    means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"],
+    world_to_sensor: Float[Tensor, "4 4"],
+) -> Placement:  # fmt: skip
+    """The Gaussians in the sensor's frame at the sweep's timestamp."""
+    w, x, y, z = normalize(quats, dim=-1).T.unbind()
+    xx, yy, zz, xy, xz, yz = 2 * x * x, 2 * y * y, 2 * z * z, 2 * x * y, 2 * x * z, 2 * y * z
+    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
+    rotations = torch.stack([
+        1 - yy - zz, xy - wz, xz + wy,
+        xy + wz, 1 - xx - zz, yz - wx,
+        xz - wy, yz + wx, 1 - xx - yy,
+    ]).reshape(3, 3, -1)  # fmt: skip
+    rotation, translation = world_to_sensor[:3, :3], world_to_sensor[:3, 3:]
+    axes = (rotation @ (rotations * scales.T).reshape(3, -1)).reshape(3, 3, -1)
+    return Placement(rotation @ means.T + translation, axes)
+
+
+def at_firing(
+    gaussians: Placement, firings: FiringTimes, linear: Float[Tensor, "3"], angular: Float[Tensor, "3"],
+    velocities: Float[Tensor, "n 3"] | None, world_to_sensor: Float[Tensor, "4 4"],
+) -> Placement:  # fmt: skip
+    """The Gaussians in the sensor's frame at the times at which the beams pass them.
+
+    The sensor moves with `linear` (m/s) and turns with `angular` (rad/s), both in its frame at the sweep's timestamp;
+    Gaussians move with `velocities` (m/s in world coordinates). The times are taken as constants: gradients treat a
+    Gaussian as if it always met the beams at the same time.
+    """
+    with torch.no_grad():
+        relative = -linear[:, None].expand_as(gaussians.centers)
+        if velocities is not None:
+            relative = relative + world_to_sensor[:3, :3] @ velocities.T
+        offsets = gaussians.centers.new_zeros(gaussians.centers.shape[1])
+        for _ in range(FIRING_STEPS):
+            x, y, _ = _turned(_turns(-angular, offsets), gaussians.centers + relative * offsets)
+            offsets = _offsets_at(firings, torch.atan2(y, x))
+        turns, moved = _turns(-angular, offsets), relative * offsets
+    axes = torch.stack([_turned(turns, axis) for axis in gaussians.axes.unbind(1)], dim=1)
+    return Placement(_turned(turns, gaussians.centers + moved), axes)
+
+
+def firing_times(azimuths: Float[Tensor, "b a"], offsets_s: Float[Tensor, "b a"]) -> FiringTimes:
+    """The mean azimuth and time of each firing of a scan."""
+    mean = torch.atan2(azimuths.sin().sum(dim=0), azimuths.cos().sum(dim=0))
+    order = mean.argsort()
+    return FiringTimes(mean[order], offsets_s.mean(dim=0)[order])
+
+
+def _offsets_at(firings: FiringTimes, azimuths: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """The offsets of the firings nearest to the azimuths."""
+    known, count = firings.azimuths, len(firings.azimuths)
+    above = torch.searchsorted(known, azimuths)
+    candidates = torch.stack([(above - 1) % count, above % count])
+    distance = wrapped(known[candidates] - azimuths).abs()
+    return firings.offsets_s[torch.where(distance[0] <= distance[1], candidates[0], candidates[1])]
+
+
+def _length(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
+    return (vectors * vectors).sum(dim=0).sqrt()
+
+
+def wrapped(angles: Tensor) -> Tensor:
+    """Angles in radians within ±π."""
+    return angles - 2.0 * math.pi * torch.round(angles / (2.0 * math.pi))
+
+
+def _turns(angular: Float[Tensor, "3"], seconds: Float[Tensor, " n"]) -> Float[Tensor, "3 3 n"]:
+    """Rotations by an angular velocity over times, after Rodrigues."""
+    speed = angular.norm().clamp(min=1e-12)
+    x, y, z = (angular / speed).unbind()
+    nothing = torch.zeros_like(x)
+    cross = torch.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing]).reshape(3, 3, 1)
+    twice = (cross[..., 0] @ cross[..., 0])[..., None]
+    eye = torch.eye(3, dtype=angular.dtype, device=angular.device)[..., None]
+    return eye + torch.sin(speed * seconds) * cross + (1.0 - torch.cos(speed * seconds)) * twice
+
+
+def _turned(turns: Float[Tensor, "3 3 n"], vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
+    return turns[:, 0] * vectors[0] + turns[:, 1] * vectors[1] + turns[:, 2] * vectors[2]
+
+
+def project_scan(
+    gaussians: Placement, opacities: Float[Tensor, " n"], beam_spread: tuple[float, float], max_range: float
+) -> ScannedGaussians:
+    """Projects Gaussians in the sensor's frame to azimuth, elevation and range. `beam_spread` are the standard
+    deviations (radians) of the beams' footprint in azimuth and elevation, which Gaussians are widened by."""
+    with torch.no_grad():
+        distance = _length(gaussians.centers)
+        sine = gaussians.centers[2] / distance.clamp(min=MIN_RANGE)
+        seen = (distance >= MIN_RANGE) & (distance <= max_range) & (sine.abs() <= math.sin(MAX_ELEVATION))
+        elsewhere = gaussians.centers.new_tensor([1.0, 0.0, 0.0])[:, None]
+    x, y, z = torch.where(seen, gaussians.centers, elsewhere).unbind()
+    across_squared = x * x + y * y
+    across, ranges = across_squared.sqrt(), (across_squared + z * z).sqrt()
+    axis_x, axis_y, axis_z = gaussians.axes.unbind()
+    outward = x * axis_x + y * axis_y
+    a = (x * axis_y - y * axis_x) / across_squared
+    e = (across_squared * axis_z - z * outward) / (ranges * ranges * across)
+    d = (outward + z * axis_z) / ranges
+    conics, slopes, deviations = _footprints(a, e, d, beam_spread)
+    with torch.no_grad():
+        spread = d.new_tensor(beam_spread)
+        variance = (d * d).sum(dim=0) + (slopes * spread).square().sum(dim=1)
+        limits = torch.minimum(MAX_DEVIATIONS * variance.sqrt(), ranges)
+        reach = (2.0 * torch.log(opacities / MIN_ALPHA).clamp(min=0.0)).sqrt()
+        radii = torch.where(seen & (opacities >= MIN_ALPHA), reach * deviations, reach.new_zeros(())).T
+    means2d = torch.stack([torch.atan2(y, x), torch.atan2(z, across)], dim=-1)
+    return ScannedGaussians(means2d, ranges, conics, slopes, limits, radii, opacities)
+
+
+def _footprints(
+    a: Float[Tensor, "3 n"], e: Float[Tensor, "3 n"], d: Float[Tensor, "3 n"], beam_spread: tuple[float, float]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 2"], Float[Tensor, "2 n"]]:
+    """Conics, slopes and standard deviations of the widened footprints of Gaussians, by the rows of T.
+
+    The slopes are those of the Gaussian itself, without the beams' footprint: between the Gaussians of a plane they
+    extrapolate the plane.
+    """
+    spread_a, spread_e = beam_spread[0] ** 2, beam_spread[1] ** 2
+    aa, ae, ee = (a * a).sum(dim=0), (a * e).sum(dim=0), (e * e).sum(dim=0)
+    normal = torch.linalg.cross(a, e, dim=0)
+    area = (normal * normal).sum(dim=0)
+    determinant = area + spread_e * aa + spread_a * ee + spread_a * spread_e
+    determinant = determinant.clamp(min=torch.finfo(a.dtype).tiny)
+    wide_a, wide_e = aa + spread_a, ee + spread_e
+    conics = torch.stack([wide_e, -ae, wide_a], dim=-1) / determinant[:, None]
+    sloped = (area > MIN_SINE_SQUARED * aa * ee) & (area > 0)
+    safe = torch.where(sloped, area, 1.0)
+    by_a = (normal * torch.linalg.cross(d, e, dim=0)).sum(dim=0) / safe
+    by_e = (normal * torch.linalg.cross(a, d, dim=0)).sum(dim=0) / safe
+    slopes = torch.where(sloped[:, None], torch.stack([by_a, by_e], dim=-1), 0.0)
+    return conics, slopes, torch.stack([wide_a, wide_e]).detach().sqrt()

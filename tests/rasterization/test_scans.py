@@ -1,0 +1,275 @@
+"""LiDAR scans on the CPU against the reference, which test_scan_reference.py compares with closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
+
+from drivesplat.kernels.numba import scan_tiles
+from drivesplat.kernels.scan_compositing import composite_scan
+from drivesplat.rasterization import RayGrid, ScanMotion
+
+AGREEMENT = 1e-5
+"""Maximum error in float64, relative to the tensor's maximum."""
+INPUTS = ("means", "quats", "scales", "opacities", "values", "world_to_sensor")
+SEEN = ("range", "alpha", "values", "alpha_before")
+PROJECTED = ("means2d", "conics", "slopes")
+MOTION = ScanMotion(torch.tensor([9.0, -2.0, 0.5]).double(), torch.tensor([0.1, -0.2, 0.8]).double())
+
+
+def seen_and_gradients(scene: ScanScene, backend: str = "cpu", **options) -> dict[str, torch.Tensor]:
+    """What the rays measure, and the gradients of a fixed random weighting of all that has gradients."""
+    inputs = {name: getattr(scene, name).detach().clone().requires_grad_() for name in INPUTS}
+    rendering = replace(scene, **inputs).render(backend, before=torch.full_like(scene.rays.azimuths, 6.0), **options)
+    for name in PROJECTED:
+        getattr(rendering.gaussians, name).retain_grad()
+    seen = {name: getattr(rendering, name) for name in SEEN}
+    generator = torch.Generator().manual_seed(1)
+    weights = [torch.rand(v.shape, generator=generator, dtype=torch.float64).to(v) for v in seen.values()]
+    torch.autograd.backward(list(seen.values()), weights)
+    gradients = {f"gradient of {name}": value.grad for name, value in inputs.items()}
+    gradients |= {f"gradient of {name}": getattr(rendering.gaussians, name).grad for name in PROJECTED}
+    found = {**seen, "median range": rendering.median_range, **gradients}
+    return {name: value.detach() for name, value in found.items()}
+
+
+def disagreements(scene: ScanScene, bound: float = AGREEMENT, **options) -> dict[str, float]:
+    """The results that differ from the reference by more than `bound`, and their errors."""
+    expected = seen_and_gradients(scene, "reference", **options)
+    found = seen_and_gradients(scene, "cpu", **options)
+    errors = {}
+    for name, truth in expected.items():
+        assert found[name].shape == truth.shape and found[name].dtype == truth.dtype, name
+        error = float((found[name] - truth).abs().max()) if truth.numel() else 0.0
+        limit = bound * float(truth.abs().max()) if truth.numel() else 0.0
+        if not error <= limit:
+            errors[name] = error
+    return errors
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("beams", "firings"), [(1, 1), (5, 7), (8, 32), (9, 33), (20, 130)])
+def test_every_size_of_scan_agrees(seed, beams, firings):
+    """A revolution of 7 firings is a single tile that goes all the way round."""
+    scene = random_scan(seed, n=80, rays=even_rays(beams, firings))
+    assert beams * firings == 1 or (scene.render().alpha > 0.1).any()
+    assert not disagreements(scene)
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_uneven_beams_in_any_order_agree(seed):
+    assert not disagreements(random_scan(seed, n=120, rays=uneven_rays(seed, 19, 150)))
+
+
+def test_firings_in_any_order_agree():
+    """Clockwise, beginning anywhere, and shuffled: tiles take their borders from their rays."""
+    rays = even_rays(9, 100)
+    for order in (torch.arange(99, -1, -1), torch.arange(100).roll(37), torch.randperm(100)):
+        shuffled = RayGrid(*(getattr(rays, name)[:, order] for name in ("azimuths", "elevations", "offsets_s")))
+        assert not disagreements(random_scan(4, n=60, rays=shuffled))
+
+
+def test_azimuths_beyond_one_turn_are_those_within():
+    scene = random_scan(5, n=40, rays=even_rays(8, 64))
+    turned = replace(scene, rays=replace(scene.rays, azimuths=scene.rays.azimuths + 4.0 * np.pi))
+    torch.testing.assert_close(turned.render().alpha, scene.render().alpha)
+
+
+def test_moving_sensor_and_gaussians_agree():
+    scene = random_scan(6, n=100, rays=uneven_rays(6, 12, 120))
+    velocities = torch.randn(100, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) * 5.0
+    assert not disagreements(scene, motion=MOTION)
+    assert not disagreements(scene, motion=replace(MOTION, velocities=velocities))
+    still, moved = scene.render().range, scene.render(motion=replace(MOTION, velocities=velocities)).range
+    assert (still - moved).abs().max() > 0.1
+
+
+def test_extreme_gaussians_agree():
+    """Points, giants, needles and sheets; a zero quaternion; faint and opaque; near, far and at the poles."""
+    scene = random_scan(30, n=64, rays=uneven_rays(30, 17, 90))
+    scene.world_to_sensor = torch.eye(4, dtype=torch.float64)
+    s = scene.scales
+    s[:8], s[8:12], s[16:24, 1:], s[24:32, 0] = 1e-5, 4.0, 1e-2, 1e-3
+    s[16:24, 0] = 2.0
+    scene.quats[33] = 0.0
+    scene.opacities[34:38] = torch.tensor([0.0, 1.001 / 255.0, 0.999 / 255.0, 1.0])
+    scene.means[40:46] = torch.tensor(
+        [[50.0, 0.0, 3.0], [0.0, -250.0, 2.0], [0.1, 0.0, 0.1], [0.0, 0.0, 3.0], [0.0, 0.0, 0.0], [0.2, 0.3, 0.0]]
+    )
+    found = seen_and_gradients(scene)
+    assert all(value.isfinite().all() for value in found.values())
+    assert not disagreements(scene)
+
+
+def test_rays_that_end_early_agree():
+    """With opaque Gaussians in many layers most lists are not processed to their end."""
+    scene = random_scan(32, n=500, rays=even_rays(10, 70))
+    scene.opacities[:] = torch.linspace(0.6, 1.0, 500)
+    assert not disagreements(scene)
+
+
+def test_equal_ranges_keep_their_order():
+    scene = random_scan(31, n=60, rays=even_rays(10, 70))
+    scene.world_to_sensor = torch.eye(4, dtype=torch.float64)
+    scene.means[:, :] = torch.tensor([5.0, 1.0, 0.0])
+    assert not disagreements(scene)
+
+
+def test_without_gaussians_nothing_is_met():
+    scene = random_scan(9, n=0, rays=even_rays(4, 20))
+    found = seen_and_gradients(scene, motion=MOTION)
+    assert all(not value.any() for value in found.values())
+    assert found["values"].shape == (4, 20, 2)
+
+
+def test_without_rays_there_is_an_error():
+    scene = random_scan(9, n=3, rays=even_rays(4, 20))
+    empty = RayGrid(*(torch.zeros(0, 20, dtype=torch.float64) for _ in range(3)))
+    with pytest.raises(ValueError, match="needs rays; this one has 0 beams x 20"):
+        replace(scene, rays=empty).render()
+
+
+@pytest.mark.parametrize("azimuth", [np.pi, -np.pi + 1e-3, np.pi - 0.02, 0.0])
+def test_a_gaussian_at_any_azimuth_is_met_alike(azimuth):
+    """At ±π, behind the sensor, as ahead of it: on both sides."""
+    rays = even_rays(16, 360)
+    ahead = random_scan(10, n=1, rays=rays)
+    ahead.world_to_sensor, ahead.means[0] = torch.eye(4).double(), torch.tensor([6.0, 0.0, -0.3]).double()
+    ahead.scales, ahead.opacities[:] = torch.tensor([[0.3, 0.6, 0.2]], dtype=torch.float64), 0.9
+    turned = replace(ahead, rays=replace(rays, azimuths=rays.azimuths + azimuth))
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:2, :2] = torch.tensor([[np.cos(azimuth), -np.sin(azimuth)], [np.sin(azimuth), np.cos(azimuth)]])
+    turned.world_to_sensor = turn
+    expected, found = ahead.render(), turned.render()
+    assert (expected.alpha > 0).sum() > 50
+    for name in ("alpha", "range", "values", "median_range"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9)
+
+
+def test_each_beam_meets_its_own_gaussian():
+    """Unevenly spaced beams and one small Gaussian on each: its opacity, its range, its value, on no other beam."""
+    elevations = torch.deg2rad(torch.tensor([-25.0, -15.5, -8.0, -4.0, -3.5, -1.0, 0.3, 2.0, 5.5, 14.0])).double()
+    azimuths = torch.full((10, 1), 0.7, dtype=torch.float64)
+    ranges = torch.linspace(3.0, 40.0, 10, dtype=torch.float64)
+    flat = elevations.cos()
+    directions = torch.stack([flat * np.cos(0.7), flat * np.sin(0.7), elevations.sin()], dim=-1)
+    scene = ScanScene(
+        means=ranges[:, None] * directions,
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(10, 1),
+        scales=torch.full((10, 3), 1e-3, dtype=torch.float64),
+        opacities=torch.linspace(0.5, 0.95, 10, dtype=torch.float64),
+        values=torch.eye(10, dtype=torch.float64),
+        world_to_sensor=torch.eye(4, dtype=torch.float64),
+        rays=RayGrid(azimuths, elevations[:, None], torch.zeros_like(azimuths)),
+    )
+    rendering = scene.render(beam_spread=(1e-3, 1e-3))
+    torch.testing.assert_close(rendering.alpha[:, 0], scene.opacities)
+    torch.testing.assert_close(rendering.range[:, 0], ranges)
+    torch.testing.assert_close(rendering.values[:, 0], torch.diag(scene.opacities))
+
+
+def test_the_number_of_windows_does_not_change_a_scan(monkeypatch):
+    scene = random_scan(34, n=80, rays=even_rays(20, 130))
+    whole = seen_and_gradients(scene)
+    monkeypatch.setattr(scan_tiles, "MAX_ENTRIES", 40)
+    windows = []
+    listed = scan_tiles.scan_lists
+    monkeypatch.setattr(
+        scan_tiles, "scan_lists", lambda *given: (windows.append(given[2:]), (yield from listed(*given)))
+    )
+    for name, value in seen_and_gradients(scene).items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-10, atol=1e-10)
+    assert len(windows) > 4
+
+
+def test_tiles_list_only_gaussians_that_reach_them():
+    """A small Gaussian away from borders is in one list; behind the sensor too."""
+    scene = random_scan(11, n=1, rays=even_rays(16, 320))
+    scene.world_to_sensor, scene.scales = torch.eye(4).double(), torch.full((1, 3), 1e-3, dtype=torch.float64)
+    arcs_and_splats = []
+    for azimuth in (0.3 * np.pi, -0.9 * np.pi):
+        direction = [np.cos(azimuth) * np.cos(0.1), np.sin(azimuth) * np.cos(0.1), np.sin(0.1)]
+        scene.means[0] = 10.0 * torch.tensor(direction, dtype=torch.float64)
+        arcs_and_splats.append(_lists_of(scene))
+    assert [len(lists.ranks) for lists in arcs_and_splats] == [1, 1]
+    assert arcs_and_splats[0].offsets.tolist() != arcs_and_splats[1].offsets.tolist()
+
+
+def _lists_of(scene: ScanScene) -> scan_tiles.ScanLists:
+    from drivesplat.kernels.scan_borders import scan_borders
+
+    arrays = [tensor.numpy() for tensor in scene.render().gaussians]
+    splats = scan_tiles.by_range(*arrays, scene.values.numpy())
+    (lists,) = scan_tiles.scan_lists(
+        splats, scan_tiles.Arcs.of(scan_borders(scene.rays.azimuths, scene.rays.elevations))
+    )
+    return lists
+
+
+@pytest.mark.parametrize("seed", [35, 36])
+def test_float32_is_near_the_reference(seed):
+    scene = random_scan(seed, n=100, rays=uneven_rays(seed, 16, 100))
+    expected, found = seen_and_gradients(scene, "reference"), seen_and_gradients(scene.float())
+    for name, truth in expected.items():
+        error = (found[name] - truth).abs().flatten() / truth.abs().max()
+        assert float(error.quantile(0.99)) < 1e-3, name
+
+
+def test_gradients_are_those_of_finite_differences():
+    """Where no range is limited: limits are taken as constants."""
+    scene = random_scan(8, n=4, rays=even_rays(4, 16))
+    scene.scales = 0.5 * scene.scales + 0.6
+    scene.opacities = 0.5 + 0.4 * scene.opacities
+    inputs = [getattr(scene, name).clone().requires_grad_() for name in INPUTS]
+
+    def seen(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        rendering = replace(scene, **dict(zip(INPUTS, values, strict=True))).render(beam_spread=(0.02, 0.02))
+        return rendering.range * rendering.alpha, rendering.alpha, rendering.values
+
+    assert float(seen(*inputs)[1].detach().mean()) > 0.05
+    assert torch.autograd.gradcheck(seen, inputs, eps=1e-6, atol=1e-4, rtol=1e-3)
+
+
+def test_gradients_of_projected_gaussians_are_those_of_finite_differences():
+    """Of all that compositing reads, also where ranges are limited."""
+    scene = random_scan(12, n=4, rays=even_rays(4, 16))
+    projected = scene.render(beam_spread=(0.2, 0.1)).gaussians
+    names = ("means2d", "ranges", "conics", "slopes", "opacities")
+    inputs = [getattr(projected, name).clone() for name in names]
+    inputs[3] = 30.0 * inputs[3] + 5.0
+    rays, limits = scene.rays, torch.tensor([0.2, 1.0, 2.0, 3.0]).double()
+
+    def seen(values: torch.Tensor, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        gaussians = projected._replace(**dict(zip(names, tensors, strict=True)), range_limits=limits)
+        return composite_scan(gaussians, values, rays.azimuths, rays.elevations, torch.full_like(rays.azimuths, 7.0))[
+            :4
+        ]
+
+    free = seen(scene.values, *inputs)[0]
+    limits = limits * 1e6
+    assert (seen(scene.values, *inputs)[0] != free).any()
+    limits = limits * 1e-6
+    inputs = [scene.values, *inputs]
+    assert torch.autograd.gradcheck(seen, [value.requires_grad_() for value in inputs], eps=1e-7, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_results_are_bitwise_equal_for_every_run_and_number_of_threads(count):
+    scene = random_scan(39, n=20_000, rays=uneven_rays(39, 32, 300)).float()
+    scene.scales = scene.scales * 0.1
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        expected = seen_and_gradients(scene, motion=_float(MOTION))
+        torch.set_num_threads(count)
+        for _ in range(2):
+            found = seen_and_gradients(scene, motion=_float(MOTION))
+            assert all(torch.equal(found[name], value) for name, value in expected.items())
+    finally:
+        torch.set_num_threads(before)
+
+
+def _float(motion: ScanMotion) -> ScanMotion:
+    return ScanMotion(motion.linear.float(), motion.angular.float())
