@@ -103,10 +103,10 @@ def at_firing(
 
 
 def firing_times(azimuths: Float[Tensor, "b a"], offsets_s: Float[Tensor, "b a"]) -> FiringTimes:
-    """The mean azimuth and time of each firing of a scan."""
+    """The mean azimuth and the median time of each firing of a scan."""
     mean = torch.atan2(azimuths.sin().sum(dim=0), azimuths.cos().sum(dim=0))
     order = mean.argsort()
-    return FiringTimes(mean[order], offsets_s.mean(dim=0)[order])
+    return FiringTimes(mean[order], offsets_s.median(dim=0).values[order])
 
 
 def _offsets_at(firings: FiringTimes, azimuths: Float[Tensor, " n"]) -> Float[Tensor, " n"]:

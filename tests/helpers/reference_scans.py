@@ -56,7 +56,7 @@ def _at_firing(centers: Tensor, motion: ScanMotion, rays: RayGrid, world_to_sens
         for _ in range(4):
             x, y, _ = torch.matrix_exp(-skew * seconds) @ (center + v * seconds)
             off = torch.exp(1j * (firing - torch.atan2(y, x))).angle().abs()
-            seconds = rays.offsets_s.mean(dim=0)[off.argmin()]
+            seconds = rays.offsets_s.median(dim=0).values[off.argmin()]
         turns.append(torch.matrix_exp(-skew * seconds))
         shifts.append(v * seconds)
     return torch.stack(turns), torch.stack(shifts)

@@ -1,0 +1,201 @@
+"""Scans rebuilt from returns, against the demo world's own rays and against patterns made by hand."""
+
+import doctest
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.demo_worlds import LIDAR, recorder_of
+from scipy.spatial.transform import Rotation
+
+from drivesplat.demo.optics.lidar import FORWARD
+from drivesplat.errors import DatasetError
+from drivesplat.lidar import scans
+from drivesplat.lidar.scans import Spin, mean_velocity, scan_of, sensor_poses, wrapped
+from drivesplat.scene.rigid import apply, inverse, rigid
+from drivesplat.scene.scan import Scan
+from drivesplat.scene.scene import Sweep
+from drivesplat.scene.sensors import Lidar, LidarReturns, SweepMotion
+
+TIME_US = 2_000_000
+REVOLUTION_US = 50_000
+
+
+def standing(offsets: np.ndarray) -> np.ndarray:
+    return np.tile(np.eye(4), (len(offsets), 1, 1))
+
+
+def sweep_at(timestamp: int, sensor_to_world: np.ndarray, motion: SweepMotion | None = None) -> Sweep:
+    return Sweep("", timestamp, sensor_to_world, True, 0, "", "top", "nuscenes", motion)
+
+
+@pytest.fixture(scope="module")
+def recorder():
+    """A car that turns a corner, with a LiDAR that spins."""
+    return recorder_of(lidar={"spins": True}, bend_deg=35.0)
+
+
+@pytest.fixture(scope="module")
+def rebuilt(recorder) -> Scan:
+    """The scan of a file as nuScenes writes it: compensated points with rings, without times."""
+    rows = recorder.sweep(LIDAR, TIME_US).astype(np.float64)
+    times = TIME_US + REVOLUTION_US * np.arange(-2, 2)
+    poses = recorder.ego_to_street(times * 1e-6) @ LIDAR.sensor_to_ego
+    sweeps = [sweep_at(int(time), pose) for time, pose in zip(times, poses, strict=True)]
+    returns = LidarReturns(rows[:, :3], (rows[:, 3] / 255.0).astype(np.float32), rows[:, 4].astype(np.int64))
+    lidar = Lidar("top", recorder.pattern.elevations, len(recorder.pattern.azimuths))
+    spin = Spin(REVOLUTION_US * 1e-6, -REVOLUTION_US * 1e-6, 0.5 * np.pi + 2.0 * np.pi * FORWARD)
+    return scan_of(returns, lidar, sensor_poses(sweeps[2], sweeps), spin)
+
+
+def test_the_demo_worlds_rays_are_rebuilt(recorder, rebuilt):
+    """Directions, times, ranges, intensities and holes of every ray, while the car drives round a bend."""
+    truth, pattern = recorder.scan(LIDAR, TIME_US), recorder.pattern
+    azimuths = 0.5 * np.pi - pattern.azimuths  # the demo's are clockwise from the y axis
+    mean = np.angle(np.exp(1j * rebuilt.rays.azimuths.astype(np.float64)).mean(axis=0))
+    columns = np.abs(wrapped(mean - azimuths[:, None])).argmin(axis=1)
+    assert rebuilt.rays.shape == pattern.shape and len(set(columns)) == len(columns)
+    np.testing.assert_array_equal(rebuilt.returned[:, columns], truth.returned)
+    np.testing.assert_allclose(wrapped(rebuilt.rays.azimuths[:, columns] - azimuths), 0.0, atol=1e-4)
+    np.testing.assert_allclose(rebuilt.rays.elevations[:, columns] - pattern.elevations[:, None], 0.0, atol=1e-4)
+    np.testing.assert_allclose(rebuilt.rays.offsets_s[:, columns] - pattern.offsets, 0.0, atol=1e-6)
+    for found, expected in ((rebuilt.ranges, truth.measured), (rebuilt.intensities, truth.intensity)):
+        expected = np.where(truth.returned, expected, 0.0)
+        np.testing.assert_allclose(found[:, columns], expected, atol=2e-3)
+
+
+def test_without_the_motion_rays_would_be_elsewhere(recorder, rebuilt):
+    """The car drives metres a second: its first ray, 50 ms before the timestamp, starts decimetres behind."""
+    rows = recorder.sweep(LIDAR, TIME_US).astype(np.float64)
+    lidar = Lidar("top", recorder.pattern.elevations, len(recorder.pattern.azimuths))
+    still = scan_of(LidarReturns(rows[:, :3], None, rows[:, 4].astype(np.int64)), lidar, standing)
+    both = still.returned & rebuilt.returned
+    assert np.abs(still.ranges - rebuilt.ranges)[both].max() > 0.1
+    assert not still.rays.offsets_s.any() and still.intensities is None
+
+
+def pattern_returns(beams: np.ndarray, steps: int, shifts: np.ndarray, keep: np.ndarray) -> LidarReturns:
+    """Returns at 10 m + ring of the rays where `keep` (b, steps), each ring shifted in azimuth."""
+    rings, columns = np.nonzero(keep)
+    azimuths = -np.pi + (columns + shifts[rings]) * 2.0 * np.pi / steps
+    flat = np.cos(beams[rings])
+    directions = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), np.sin(beams[rings])], axis=-1)
+    return LidarReturns((10.0 + rings[:, None]) * directions, rings=rings.astype(np.int64))
+
+
+BEAMS = np.radians([-20.0, -9.0, -4.0, 1.0, 8.0])
+KEEP = np.random.default_rng(0).random((5, 90)) < 0.7
+SHIFTS = np.array([0.0, 0.3, -0.4, 0.1, 0.45])
+
+
+@pytest.mark.parametrize("steps", [90, None])
+@pytest.mark.parametrize("rings", [True, False])
+@pytest.mark.parametrize("elevations", [True, False])
+def test_rings_steps_and_elevations_are_found_where_they_are_unknown(steps, rings, elevations):
+    returns = pattern_returns(BEAMS, 90, SHIFTS, KEEP)
+    lidar = Lidar("top", BEAMS if elevations else None, steps)
+    if not rings:
+        returns = replace(returns, rings=None)
+    if not rings and not elevations:
+        with pytest.raises(DatasetError, match="LiDAR top: its returns have no rings and its beam_elevations"):
+            scan_of(returns, lidar, standing)
+        return
+    scan = scan_of(returns, lidar, standing)
+    assert scan.rays.shape == (5, 90)
+    np.testing.assert_array_equal(scan.returned.sum(axis=1), KEEP.sum(axis=1))
+    np.testing.assert_allclose(scan.ranges, np.where(scan.returned, 10.0 + np.arange(5)[:, None], 0.0), atol=1e-5)
+    np.testing.assert_allclose(scan.rays.elevations, np.tile(BEAMS[:, None], 90), atol=1e-5)
+    steps_of = np.diff(np.unwrap(scan.rays.azimuths.astype(np.float64)), axis=1)
+    np.testing.assert_allclose(steps_of, 2.0 * np.pi / 90, atol=1e-5)
+
+
+def test_holes_have_the_directions_of_the_grid_and_returns_their_own():
+    returns = pattern_returns(BEAMS, 90, SHIFTS, KEEP)
+    jitter = Rotation.from_euler("z", np.random.default_rng(1).normal(0.0, 2e-3, (len(returns.points), 1)))
+    scan = scan_of(replace(returns, points=jitter.apply(returns.points)), Lidar("top", BEAMS, 90), standing)
+    off = wrapped(scan.rays.azimuths - (-np.pi + (np.arange(90) + SHIFTS[:, None]) * 2.0 * np.pi / 90))
+    assert scan.returned.sum() == KEEP.sum()
+    assert np.abs(off[~scan.returned]).max() < 1e-3 < np.abs(off[scan.returned]).max()
+    found = scan.points()
+    assert max(np.linalg.norm(found - point, axis=1).min() for point in jitter.apply(returns.points)) < 1e-4
+
+
+def test_the_nearest_of_several_returns_is_kept():
+    points = np.array([[9.0, 0.0, 0.0], [4.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
+    returns = LidarReturns(points, np.array([0.1, 0.2, 0.3], np.float32), np.zeros(3, np.int64))
+    scan = scan_of(returns, Lidar("top", np.zeros(1), 8), standing)
+    assert scan.returned.sum() == 1 and scan.ranges.max() == 4.0
+    assert scan.intensities.max() == pytest.approx(0.2)
+    unknown = replace(returns, intensity=np.full(3, np.nan, np.float32))
+    assert not scan_of(unknown, Lidar("top", np.zeros(1), 8), standing).intensities.any()
+
+
+def test_more_rings_than_beam_elevations_are_measured():
+    """As in a file of another sensor than the one that its table describes."""
+    scan = scan_of(pattern_returns(BEAMS, 90, SHIFTS, KEEP), Lidar("top", BEAMS[:3], 90), standing)
+    np.testing.assert_allclose(scan.rays.elevations, np.tile(BEAMS[:, None], 90), atol=1e-5)
+
+
+def test_times_of_returns_are_kept_and_holes_have_those_of_their_firing():
+    returns = pattern_returns(BEAMS, 90, np.zeros(5), KEEP)
+    columns = np.nonzero(KEEP)[1]
+    scan = scan_of(replace(returns, offsets_s=1e-3 * columns), Lidar("top", BEAMS, 90), standing)
+    np.testing.assert_allclose(scan.rays.offsets_s, np.tile(1e-3 * np.arange(90), (5, 1)), atol=1e-6)
+
+
+def test_a_sweep_without_returns_is_all_holes():
+    empty = LidarReturns(np.zeros((0, 3)), rings=np.zeros(0, np.int64))
+    scan = scan_of(empty, Lidar("top", BEAMS, 90), standing, Spin(0.1, -0.1, 0.0))
+    assert scan.rays.shape == (5, 90) and not scan.returned.any()
+    for lidar in (Lidar("top", None, 90), Lidar("top", BEAMS, None)):
+        with pytest.raises(DatasetError, match=r"needs (the LiDAR's )?(beam_elevations|azimuth_steps)"):
+            scan_of(empty, lidar, standing)
+
+
+def test_the_motion_of_the_sensor_is_that_between_sweeps_and_extrapolated():
+    def pose(seconds: float) -> np.ndarray:
+        return rigid(Rotation.from_euler("z", 0.4 * seconds + 1.0).as_matrix(), np.array([8.0 * seconds, 3.0, 1.0]))
+
+    times = (900_000, 1_000_000, 1_100_000)
+    sweeps = [sweep_at(time, pose(time * 1e-6)) for time in times]
+    offsets = np.array([-0.35, -0.07, 0.0, 0.04, 0.2])
+    expected = np.stack([inverse(pose(1.0)) @ pose(1.0 + offset) for offset in offsets])
+    poses = sensor_poses(sweeps[1], sweeps)
+    np.testing.assert_allclose(poses(offsets), expected, atol=1e-12)
+    linear, angular = mean_velocity(poses, -0.1, 0.0)
+    np.testing.assert_allclose(linear, 8.0 * np.array([np.cos(1.4), -np.sin(1.4), 0.0]), atol=1e-9)
+    np.testing.assert_allclose(angular, [0.0, 0.0, 0.4], atol=1e-9)
+    alone = sensor_poses(sweeps[1], sweeps[1:2])
+    np.testing.assert_allclose(alone(offsets), standing(offsets), atol=1e-12)
+    assert not np.any(mean_velocity(alone, 0.0, 0.0))
+
+
+def test_the_motion_of_a_sweep_is_used_where_the_dataset_gives_it():
+    mount = rigid(Rotation.from_euler("z", 0.5).as_matrix(), np.array([1.0, 0.0, 2.0]))
+    ego = np.stack([inverse(mount), rigid(np.eye(3), np.array([2.0, 0.0, 0.0])) @ inverse(mount)])
+    motion = SweepMotion(np.array([0.0, 0.1]), ego, mount)
+    found = sensor_poses(sweep_at(0, np.eye(4), motion), [])(np.array([0.0, 0.05]))
+    np.testing.assert_allclose(found[:, :3, 3], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], atol=1e-12)
+
+
+def test_points_at_their_own_times_are_the_returns():
+    """Of a sensor that drives and turns: each point of the scan, moved to the timestamp, is a return."""
+    returns = pattern_returns(BEAMS, 90, SHIFTS, KEEP)
+    spin = Spin(0.1, -0.1, 2.0, clockwise=False)
+    end = rigid(Rotation.from_euler("z", 0.05).as_matrix(), np.array([2.0, 0.0, 0.0]))
+    poses = sensor_poses(sweep_at(100_000, end), [sweep_at(0, np.eye(4))])
+    scan = scan_of(returns, Lidar("top", BEAMS, 90), poses, spin)
+    offsets = scan.rays.offsets_s[scan.returned].astype(np.float64)
+    fraction = spin.fractions(scan.rays.azimuths[scan.returned].astype(np.float64))
+    inner = np.abs(fraction - 0.5) < 0.45
+    np.testing.assert_allclose(offsets[inner], -0.1 + 0.1 * fraction[inner], atol=1e-6)
+    pairs = zip(poses(offsets), scan.points(), strict=True)
+    moved = np.concatenate([apply(pose, point[None]) for pose, point in pairs])
+    distances = np.linalg.norm(moved[:, None] - returns.points[None], axis=2).min(axis=1)
+    assert distances.max() < 1e-4
+
+
+def test_the_example_runs():
+    (example,) = doctest.DocTestFinder(recurse=False).find(scan_of, "scan_of", module=scans, globs={})
+    assert len(example.examples) > 5
+    assert doctest.DocTestRunner().run(example).failed == 0
