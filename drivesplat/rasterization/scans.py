@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from drivesplat.kernels.scan_compositing import composite_scan
+from drivesplat.kernels.scan_compositing import CompositedScan, composite_scan
 from drivesplat.kernels.scan_projection import ScannedGaussians, at_firing, firing_times, placed, project_scan
 from drivesplat.scene.scan import ScanRays
 
@@ -46,7 +46,7 @@ class ScanRendering:
     `range` is the expected range in metres, weighted with alpha and 0 where nothing is met. `median_range`, without
     gradient, is the range at which transmittance falls to 0.5, 0 where it does not. `values` are premultiplied by
     `alpha`. `alpha_before` is alpha of what is nearer than the given ranges, or None. `gaussians` are the projected
-    Gaussians; `retain_grad` of their `means2d` serves densification.
+    Gaussians, with motion those of each half of the revolution; `retain_grad` of their `means2d` serves densification.
     """
 
     range: Float[Tensor, "b a"]
@@ -54,7 +54,7 @@ class ScanRendering:
     alpha: Float[Tensor, "b a"]
     values: Float[Tensor, "b a channels"]
     alpha_before: Float[Tensor, "b a"] | None
-    gaussians: ScannedGaussians
+    gaussians: tuple[ScannedGaussians, ...]
 
 
 def rasterize_scan(
@@ -80,8 +80,9 @@ def rasterize_scan(
     float64, in as many threads as torch uses and with results that do not depend on their number. Gradients reach the
     first six arguments.
 
-    With `motion` a Gaussian is where it is when the beams pass its centre. Gradients treat that time as constant. All
-    rays that meet the Gaussian share it, also those on the other side of the azimuth at which the revolution begins.
+    With `motion` a Gaussian is where it is when the beams pass its centre. All rays share that time, and gradients
+    treat it as constant. The halves of the revolution are rendered one after the other: where it begins and ends, a
+    Gaussian is at two places, and the rays of each time meet it at its own.
 
     Args:
         means: Centres in world coordinates, metres.
@@ -125,12 +126,29 @@ def rasterize_scan(
     if rays.azimuths.numel() == 0:
         raise ValueError(f"a scan needs rays; this one has {rays.azimuths.shape[0]} beams x {rays.azimuths.shape[1]}")
     gaussians = placed(means, quats, scales, world_to_sensor)
-    if motion is not None:
-        firings = firing_times(rays.azimuths, rays.offsets_s)
-        gaussians = at_firing(gaussians, firings, motion.linear, motion.angular, motion.velocities, world_to_sensor)
-    projected = project_scan(gaussians, opacities, beam_spread, max_range)
     until = torch.zeros_like(rays.azimuths) if before is None else before
-    composited = composite_scan(projected, values, rays.azimuths, rays.elevations, until)
-    expected = composited.range_sum / composited.alpha.clamp(min=1e-10)
-    nearer = None if before is None else composited.alpha_before
-    return ScanRendering(expected, composited.median_range, composited.alpha, composited.values, nearer, projected)
+    parts = [slice(None)] if motion is None else _halves(rays.offsets_s)
+    projected, composited = [], []
+    for part in parts:
+        azimuths, elevations, offsets_s = (t[:, part] for t in (rays.azimuths, rays.elevations, rays.offsets_s))
+        moved = gaussians
+        if motion is not None:
+            firings = firing_times(azimuths, offsets_s)
+            moved = at_firing(gaussians, firings, motion.linear, motion.angular, motion.velocities, world_to_sensor)
+        projected.append(project_scan(moved, opacities, beam_spread, max_range))
+        composited.append(composite_scan(projected[-1], values, azimuths, elevations, until[:, part]))
+    range_sum, alpha, nearer, out, median = composited[0] if motion is None else _joined(composited, parts)
+    expected = range_sum / alpha.clamp(min=1e-10)
+    return ScanRendering(expected, median, alpha, out, None if before is None else nearer, tuple(projected))
+
+
+def _halves(offsets_s: Float[Tensor, "b a"]) -> list[Int[Tensor, " _"]]:
+    """The firings of the first and of the second half of a revolution, by time; without an empty one."""
+    order = offsets_s.median(dim=0).values.argsort(stable=True)
+    return [half for half in order.tensor_split(2) if len(half)]
+
+
+def _joined(composited: list[CompositedScan], parts: list[Int[Tensor, " _"]]) -> CompositedScan:
+    """The scan whose firings `parts` names."""
+    places = torch.cat(parts).argsort()
+    return CompositedScan(*(torch.cat(tensors, dim=1)[:, places] for tensors in zip(*composited, strict=True)))

@@ -26,20 +26,30 @@ def rasterize_scan_reference(
     max_range: float = 200.0,
 ) -> ScanRendering:  # fmt: skip
     """As `drivesplat.rasterization.rasterize_scan`."""
+    firings = torch.arange(rays.azimuths.shape[1])
+    if motion is None:
+        parts = [firings]
+    else:  # where a revolution begins, it ends at another time
+        in_time = rays.offsets_s.median(dim=0).values.argsort(stable=True)
+        middle = (len(firings) + 1) // 2
+        parts = [in_time[:middle], in_time[middle:]][: len(firings)]
     covariances, _ = _quat_scale_to_covar_preci(quats, scales, compute_covar=True, compute_preci=False)
-    centers = means @ world_to_sensor[:3, :3].T + world_to_sensor[:3, 3]
-    rotations = world_to_sensor[:3, :3].expand(len(means), 3, 3)
-    if motion is not None:
-        turns, shifts = _at_firing(centers.detach(), motion, rays, world_to_sensor.detach())
-        centers = (turns @ (centers + shifts)[..., None])[..., 0]
-        rotations = turns @ rotations
-    gaussians = _project(centers, rotations @ covariances @ rotations.mT, opacities, beam_spread, max_range)
-    range_sum, median, alpha, nearer, out = _composite(gaussians, values, rays, before)
-    shape = rays.azimuths.shape
-    return ScanRendering(
-        (range_sum / alpha.clamp(min=1e-10)).reshape(shape), median.reshape(shape), alpha.reshape(shape),
-        out.reshape(*shape, -1), None if before is None else nearer.reshape(shape), gaussians,
-    )  # fmt: skip
+    projected, sums = [], []
+    for part in parts:
+        own = RayGrid(rays.azimuths[:, part], rays.elevations[:, part], rays.offsets_s[:, part])
+        centers = means @ world_to_sensor[:3, :3].T + world_to_sensor[:3, 3]
+        rotations = world_to_sensor[:3, :3].expand(len(means), 3, 3)
+        if motion is not None:
+            turns, shifts = _at_firing(centers.detach(), motion, own, world_to_sensor.detach())
+            centers = (turns @ (centers + shifts)[..., None])[..., 0]
+            rotations = turns @ rotations
+        projected.append(_project(centers, rotations @ covariances @ rotations.mT, opacities, beam_spread, max_range))
+        composited = _composite(projected[-1], values, own, None if before is None else before[:, part])
+        sums.append([value.reshape(*own.azimuths.shape, *value.shape[1:]) for value in composited])
+    places = torch.cat(parts).argsort()
+    range_sum, median, alpha, nearer, out = (torch.cat(s, dim=1)[:, places] for s in zip(*sums, strict=True))
+    expected = range_sum / alpha.clamp(min=1e-10)
+    return ScanRendering(expected, median, alpha, out, None if before is None else nearer, tuple(projected))
 
 
 def _at_firing(centers: Tensor, motion: ScanMotion, rays: RayGrid, world_to_sensor: Tensor) -> tuple[Tensor, Tensor]:

@@ -23,14 +23,14 @@ def seen_and_gradients(scene: ScanScene, backend: str = "cpu", **options) -> dic
     """What the rays measure, and the gradients of a fixed random weighting of all that has gradients."""
     inputs = {name: getattr(scene, name).detach().clone().requires_grad_() for name in INPUTS}
     rendering = replace(scene, **inputs).render(backend, before=torch.full_like(scene.rays.azimuths, 6.0), **options)
-    for name in PROJECTED:
-        getattr(rendering.gaussians, name).retain_grad()
+    projected = {f"{name} {i}": getattr(g, name) for i, g in enumerate(rendering.gaussians) for name in PROJECTED}
+    for value in projected.values():
+        value.retain_grad()
     seen = {name: getattr(rendering, name) for name in SEEN}
     generator = torch.Generator().manual_seed(1)
     weights = [torch.rand(v.shape, generator=generator, dtype=torch.float64).to(v) for v in seen.values()]
     torch.autograd.backward(list(seen.values()), weights)
-    gradients = {f"gradient of {name}": value.grad for name, value in inputs.items()}
-    gradients |= {f"gradient of {name}": getattr(rendering.gaussians, name).grad for name in PROJECTED}
+    gradients = {f"gradient of {name}": value.grad for name, value in (inputs | projected).items()}
     found = {**seen, "median range": rendering.median_range, **gradients}
     return {name: value.detach() for name, value in found.items()}
 
@@ -200,7 +200,7 @@ def test_tiles_list_only_gaussians_that_reach_them():
 def _lists_of(scene: ScanScene) -> scan_tiles.ScanLists:
     from drivesplat.kernels.scan_borders import scan_borders
 
-    arrays = [tensor.numpy() for tensor in scene.render().gaussians]
+    arrays = [tensor.numpy() for tensor in scene.render().gaussians[0]]
     splats = scan_tiles.by_range(*arrays, scene.values.numpy())
     (lists,) = scan_tiles.scan_lists(
         splats, scan_tiles.Arcs.of(scan_borders(scene.rays.azimuths, scene.rays.elevations))
@@ -235,7 +235,7 @@ def test_gradients_are_those_of_finite_differences():
 def test_gradients_of_projected_gaussians_are_those_of_finite_differences():
     """Of all that compositing reads, also where ranges are limited."""
     scene = random_scan(12, n=4, rays=even_rays(4, 16))
-    projected = scene.render(beam_spread=(0.2, 0.1)).gaussians
+    projected = scene.render(beam_spread=(0.2, 0.1)).gaussians[0]
     names = ("means2d", "ranges", "conics", "slopes", "opacities")
     inputs = [getattr(projected, name).clone() for name in names]
     inputs[3] = 30.0 * inputs[3] + 5.0
