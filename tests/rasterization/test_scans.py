@@ -8,6 +8,7 @@ import torch
 from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
 
 from drivesplat.kernels.numba import scan_tiles
+from drivesplat.kernels.scan_borders import scan_borders
 from drivesplat.kernels.scan_compositing import composite_scan
 from drivesplat.rasterization import RayGrid, ScanMotion
 
@@ -185,21 +186,19 @@ def test_the_number_of_windows_does_not_change_a_scan(monkeypatch):
 
 
 def test_tiles_list_only_gaussians_that_reach_them():
-    """A small Gaussian away from borders is in one list; behind the sensor too."""
-    scene = random_scan(11, n=1, rays=even_rays(16, 320))
+    """A small Gaussian within a tile is in one list; also where a tile lies on both sides of ±π."""
+    rays = even_rays(16, 320)
+    shifted = RayGrid(*(getattr(rays, name).roll(16, dims=1) for name in ("azimuths", "elevations", "offsets_s")))
+    scene = random_scan(11, n=1, rays=shifted)
     scene.world_to_sensor, scene.scales = torch.eye(4).double(), torch.full((1, 3), 1e-3, dtype=torch.float64)
-    arcs_and_splats = []
-    for azimuth in (0.3 * np.pi, -0.9 * np.pi):
+    for azimuth, column in ((0.0, 5), (0.95 * np.pi, 0), (np.pi, 0), (-0.85 * np.pi, 1), (0.85 * np.pi, 9)):
         direction = [np.cos(azimuth) * np.cos(0.1), np.sin(azimuth) * np.cos(0.1), np.sin(0.1)]
         scene.means[0] = 10.0 * torch.tensor(direction, dtype=torch.float64)
-        arcs_and_splats.append(_lists_of(scene))
-    assert [len(lists.ranks) for lists in arcs_and_splats] == [1, 1]
-    assert arcs_and_splats[0].offsets.tolist() != arcs_and_splats[1].offsets.tolist()
+        lists = _lists_of(scene)
+        assert np.flatnonzero(np.diff(lists.offsets)).tolist() == [10 + column], azimuth
 
 
 def _lists_of(scene: ScanScene) -> scan_tiles.ScanLists:
-    from drivesplat.kernels.scan_borders import scan_borders
-
     arrays = [tensor.numpy() for tensor in scene.render().gaussians[0]]
     splats = scan_tiles.by_range(*arrays, scene.values.numpy())
     (lists,) = scan_tiles.scan_lists(
