@@ -29,6 +29,8 @@ MIN_SINE_SQUARED = 1e-8
 FIRING_STEPS = 4
 """Iterations to find the time at which a moving Gaussian meets the spinning beams; each reduces the error by the ratio
 of the Gaussian's angular velocity to the sensor's."""
+SERIAL = 32768
+"""Number of values up to which torch uses one thread."""
 
 
 class ScannedGaussians(NamedTuple):
@@ -96,7 +98,7 @@ def at_firing(
         offsets = gaussians.centers.new_zeros(gaussians.centers.shape[1])
         for _ in range(FIRING_STEPS):
             x, y, _ = _turned(_turns(-angular, offsets), gaussians.centers + relative * offsets)
-            offsets = _offsets_at(firings, torch.atan2(y, x))
+            offsets = _offsets_at(firings, _atan2(y, x))
         turns, moved = _turns(-angular, offsets), relative * offsets
     axes = torch.stack([_turned(turns, axis) for axis in gaussians.axes.unbind(1)], dim=1)
     return Placement(_turned(turns, gaussians.centers + moved), axes)
@@ -120,6 +122,13 @@ def _offsets_at(firings: FiringTimes, azimuths: Float[Tensor, " n"]) -> Float[Te
 
 def _length(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
     return (vectors * vectors).sum(dim=0).sqrt()
+
+
+def _atan2(y: Float[Tensor, " n"], x: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """torch.atan2. Its last bits on a CPU depend on how threads share the values: here, each part has one thread."""
+    if y.is_cuda:
+        return torch.atan2(y, x)
+    return torch.cat([torch.atan2(*part) for part in zip(y.split(SERIAL), x.split(SERIAL), strict=True)])
 
 
 def wrapped(angles: Tensor) -> Tensor:
@@ -167,7 +176,7 @@ def project_scan(
         limits = torch.minimum(MAX_DEVIATIONS * variance.sqrt(), ranges)
         reach = (2.0 * torch.log(opacities / MIN_ALPHA).clamp(min=0.0)).sqrt()
         radii = torch.where(seen & (opacities >= MIN_ALPHA), reach * deviations, reach.new_zeros(())).T
-    means2d = torch.stack([torch.atan2(y, x), torch.atan2(z, across)], dim=-1)
+    means2d = torch.stack([_atan2(y, x), _atan2(z, across)], dim=-1)
     return ScannedGaussians(means2d, ranges, conics, slopes, limits, radii, opacities)
 
 
