@@ -97,7 +97,7 @@ def at_firing(
             relative = relative + world_to_sensor[:3, :3] @ velocities.T
         offsets = gaussians.centers.new_zeros(gaussians.centers.shape[1])
         for _ in range(FIRING_STEPS):
-            x, y, _ = _turned(_turns(-angular, offsets), gaussians.centers + relative * offsets)
+            x, y = _turned(_turns(-angular, offsets)[:2], gaussians.centers + relative * offsets)
             offsets = _offsets_at(firings, _atan2(y, x))
         turns, moved = _turns(-angular, offsets), relative * offsets
     axes = torch.stack([_turned(turns, axis) for axis in gaussians.axes.unbind(1)], dim=1)
@@ -113,11 +113,10 @@ def firing_times(azimuths: Float[Tensor, "b a"], offsets_s: Float[Tensor, "b a"]
 
 def _offsets_at(firings: FiringTimes, azimuths: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """The offsets of the firings nearest to the azimuths."""
-    known, count = firings.azimuths, len(firings.azimuths)
-    above = torch.searchsorted(known, azimuths)
-    candidates = torch.stack([(above - 1) % count, above % count])
-    distance = wrapped(known[candidates] - azimuths).abs()
-    return firings.offsets_s[torch.where(distance[0] <= distance[1], candidates[0], candidates[1])]
+    first, last = slice(0, 1), slice(-1, None)
+    known, offsets = firings.azimuths, torch.cat([firings.offsets_s[last], firings.offsets_s, firings.offsets_s[first]])
+    around = torch.cat([known[last] - 2.0 * math.pi, known, known[first] + 2.0 * math.pi])
+    return offsets[torch.searchsorted(0.5 * (around[1:] + around[:-1]), azimuths)]
 
 
 def _length(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
@@ -147,7 +146,7 @@ def _turns(angular: Float[Tensor, "3"], seconds: Float[Tensor, " n"]) -> Float[T
     return eye + torch.sin(speed * seconds) * cross + (1.0 - torch.cos(speed * seconds)) * twice
 
 
-def _turned(turns: Float[Tensor, "3 3 n"], vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
+def _turned(turns: Float[Tensor, "rows 3 n"], vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "rows n"]:
     return turns[:, 0] * vectors[0] + turns[:, 1] * vectors[1] + turns[:, 2] * vectors[2]
 
 

@@ -207,10 +207,8 @@ def test_tiles_list_only_gaussians_that_reach_them():
 
 def _lists_of(scene: ScanScene) -> scan_tiles.ScanLists:
     arrays = [tensor.numpy() for tensor in scene.render().gaussians[0]]
-    splats = scan_tiles.by_range(*arrays, scene.values.numpy())
-    (lists,) = scan_tiles.scan_lists(
-        splats, scan_tiles.Arcs.of(scan_borders(scene.rays.azimuths, scene.rays.elevations))
-    )
+    arcs = scan_tiles.Arcs.of(scan_borders(scene.rays.azimuths, scene.rays.elevations))
+    (lists,) = scan_tiles.scan_lists(scan_tiles.by_range(*arrays, scene.values.numpy(), arcs), arcs)
     return lists
 
 

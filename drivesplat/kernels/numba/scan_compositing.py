@@ -44,8 +44,8 @@ class ScanCompositing(torch.autograd.Function):
         sums = [means2d.new_empty(azimuths.shape) for _ in range(4)]
         out = means2d.new_empty((*azimuths.shape, values.shape[1]))
         range_sum, alpha, before, median = sums
-        splats = by_range(*arrays(means2d, ranges, conics, slopes, range_limits, radii, opacities, values))
         arcs, rays, lists = Arcs.of(borders), arrays(azimuths, elevations, until), None
+        splats = by_range(*arrays(means2d, ranges, conics, slopes, range_limits, radii, opacities, values), arcs)
         tiles = arrays(borders.centers, borders.half_widths, borders.beam_lows, borders.beam_highs)
         for lists in scan_lists(splats, arcs):
             parallel_for(

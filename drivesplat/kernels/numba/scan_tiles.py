@@ -22,6 +22,8 @@ MAX_ENTRIES = 4_000_000
 values."""
 CHUNK = 4096
 """Gaussians per chunk."""
+RADIUS_MARGIN = 1.001
+"""Factor of radii, larger than any rounding error."""
 SLACK = 4e-6
 """Margin of ellipses in radians, larger than any float32 rounding error of an azimuth."""
 AZIMUTH, ELEVATION, CONIC_AA, CONIC_AE, CONIC_EE, OPACITY, REACH, RADIUS_A, RADIUS_E = range(9)
@@ -77,6 +79,14 @@ class Arcs:
     def tiles(self) -> int:
         return self.centers.size
 
+    def may_reach(self, azimuths: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """Whether intervals around azimuths (n,) may meet rays at all: (n,) bool. Half a revolution has none behind."""
+        middle = self.centers.flat[self.centers.size // 2]
+        off = wrapped(self.centers - middle)
+        low, high = (off - self.half_widths).min() - SLACK, (off + self.half_widths).max() + SLACK
+        away = np.abs(wrapped(azimuths - (middle + 0.5 * (low + high))))
+        return away <= 0.5 * (high - low) + radii
+
     @property
     def arguments(self) -> tuple[np.ndarray, ...]:
         return self.centers, self.half_widths, self.half_widths.max(axis=1), self.order, self.lows, self.highs
@@ -84,10 +94,15 @@ class Arcs:
 
 def by_range(
     means2d: np.ndarray, ranges: np.ndarray, conics: np.ndarray, slopes: np.ndarray, range_limits: np.ndarray,
-    radii: np.ndarray, opacities: np.ndarray, values: np.ndarray,
+    radii: np.ndarray, opacities: np.ndarray, values: np.ndarray, arcs: Arcs,
 ) -> ScanSplats:  # fmt: skip
-    """The Gaussians that are not skipped and whose opacity is at least 1/255; the order of equal ranges is kept."""
-    visible = np.flatnonzero((radii[:, 0] > 0) & (radii[:, 1] > 0) & (opacities >= MIN_ALPHA))
+    """The Gaussians that are not skipped, that some tile may meet and whose opacity is at least 1/255; the order of
+    equal ranges is kept."""
+    elevations, reach = means2d[:, 1], radii[:, 1] * RADIUS_MARGIN + SLACK
+    visible = (radii > 0).all(axis=1) & (opacities >= MIN_ALPHA)
+    visible &= (elevations + reach >= arcs.lows.min()) & (elevations - reach <= arcs.highs.max())
+    visible = np.flatnonzero(visible)
+    visible = visible[arcs.may_reach(means2d[visible, 0], radii[visible, 0] * RADIUS_MARGIN + SLACK)]
     order = visible[np.argsort(ranges[visible], kind="stable")]
     reach = 2.0 * np.log(opacities[order].astype(np.float64) / MIN_ALPHA) + 1e-3
     columns = (means2d, conics, opacities[:, None], radii, ranges[:, None], slopes, range_limits[:, None])
@@ -118,6 +133,11 @@ def scan_lists(splats: ScanSplats, arcs: Arcs, first: int = 0, last: int | None 
     slots = np.argsort(tile_of, kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(tile_of, minlength=last - first))])
     yield ScanLists(first, last, offsets, rank_of[slots], slots.astype(np.int32), slot_offsets)
+
+
+def wrapped(angles: np.ndarray) -> np.ndarray:
+    """Angles in radians within ±π."""
+    return angles - 2.0 * np.pi * np.round(angles / (2.0 * np.pi))
 
 
 @callee
@@ -159,12 +179,12 @@ def span(a, b, c, reach, low, high, bound):
 @no_type_check
 def _arc(shape, low, high):
     """Middle and half width of the azimuths that a Gaussian reaches between two elevations; half width -1: none."""
-    elevation, radius = float(shape[ELEVATION]), float(shape[RADIUS_E]) + SLACK
+    elevation, radius = float(shape[ELEVATION]), float(shape[RADIUS_E]) * RADIUS_MARGIN + SLACK
     if elevation + radius < low or elevation - radius > high:
         return 0.0, -1.0
     left, right = span(
         float(shape[CONIC_AA]), float(shape[CONIC_AE]), float(shape[CONIC_EE]), float(shape[REACH]),
-        low - elevation, high - elevation, min(float(shape[RADIUS_A]) * (1.0 + 1e-3), math.pi),
+        low - elevation, high - elevation, min(float(shape[RADIUS_A]) * RADIUS_MARGIN, math.pi),
     )  # fmt: skip
     if left > right:
         return 0.0, -1.0
