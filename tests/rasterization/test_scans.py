@@ -8,9 +8,9 @@ import torch
 from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
 
 from drivesplat.kernels.numba import scan_tiles
-from drivesplat.kernels.scan_borders import scan_borders
 from drivesplat.kernels.scan_compositing import composite_scan
 from drivesplat.rasterization import RayGrid, ScanMotion
+from drivesplat.scene.scan import ScanRays
 
 AGREEMENT = 1e-5
 """Maximum error in float64, relative to the tensor's maximum."""
@@ -192,24 +192,12 @@ def test_the_number_of_windows_does_not_change_a_scan(monkeypatch):
     assert len(windows) > 4
 
 
-def test_tiles_list_only_gaussians_that_reach_them():
-    """A small Gaussian within a tile is in one list; also where a tile lies on both sides of ±π."""
-    rays = even_rays(16, 320)
-    shifted = RayGrid(*(getattr(rays, name).roll(16, dims=1) for name in ("azimuths", "elevations", "offsets_s")))
-    scene = random_scan(11, n=1, rays=shifted)
-    scene.world_to_sensor, scene.scales = torch.eye(4).double(), torch.full((1, 3), 1e-3, dtype=torch.float64)
-    for azimuth, column in ((0.0, 5), (0.95 * np.pi, 0), (np.pi, 0), (-0.85 * np.pi, 1), (0.85 * np.pi, 9)):
-        direction = [np.cos(azimuth) * np.cos(0.1), np.sin(azimuth) * np.cos(0.1), np.sin(0.1)]
-        scene.means[0] = 10.0 * torch.tensor(direction, dtype=torch.float64)
-        lists = _lists_of(scene)
-        assert np.flatnonzero(np.diff(lists.offsets)).tolist() == [10 + column], azimuth
-
-
-def _lists_of(scene: ScanScene) -> scan_tiles.ScanLists:
-    arrays = [tensor.numpy() for tensor in scene.render().gaussians[0]]
-    arcs = scan_tiles.Arcs.of(scan_borders(scene.rays.azimuths, scene.rays.elevations))
-    (lists,) = scan_tiles.scan_lists(scan_tiles.by_range(*arrays, scene.values.numpy(), arcs), arcs)
-    return lists
+def test_recorded_rays_become_tensors_like_the_gaussians():
+    angles, offsets = np.array([[0.1, 0.2]], np.float32), np.array([[0.0, 0.01]], np.float32)
+    rays = RayGrid.of(ScanRays(angles, -angles, offsets), torch.zeros(3, dtype=torch.float64))
+    found = (rays.azimuths, rays.elevations, rays.offsets_s)
+    assert all(tensor.dtype == torch.float64 for tensor in found)
+    assert [tensor.tolist() for tensor in found] == [array.tolist() for array in (angles, -angles, offsets)]
 
 
 @pytest.mark.parametrize("seed", [35, 36])

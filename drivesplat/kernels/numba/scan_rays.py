@@ -49,15 +49,8 @@ def _beams(shape, center, half_width, beam_lows, beam_highs):
     offset = wrap(center - float(shape[scan_tiles.AZIMUTH]))
     if abs(offset) + half_width < math.pi:  # else the tile's rays are on both sides of the Gaussian
         left, right = offset - half_width, offset + half_width
-    bottom, top = span(
-        c,
-        b,
-        a,
-        float(shape[scan_tiles.REACH]),
-        left,
-        right,
-        float(shape[scan_tiles.RADIUS_E]) * scan_tiles.RADIUS_MARGIN,
-    )
+    reach, radius = float(shape[scan_tiles.REACH]), float(shape[scan_tiles.RADIUS_E]) * scan_tiles.RADIUS_MARGIN
+    bottom, top = span(c, b, a, reach, left, right, radius)
     begin, end = 0, 0
     if bottom <= top:
         bottom, top = shape[scan_tiles.ELEVATION] + bottom - SLACK, shape[scan_tiles.ELEVATION] + top + SLACK
