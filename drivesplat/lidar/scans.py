@@ -126,7 +126,7 @@ def scan_of(returns: LidarReturns, lidar: Lidar, poses: SensorPoses, spin: Spin 
     """
     offsets, azimuths, elevations, ranges = _seen(returns, poses, spin)
     rings, beams = _beams(returns, lidar, elevations)
-    steps = lidar.azimuth_steps or _steps(azimuths, rings)
+    steps = lidar.azimuth_steps or _steps(lidar, azimuths, rings)
     phases = _phases(azimuths, rings, len(beams), steps)
     columns = np.round((azimuths + np.pi - phases[rings]) * steps / (2.0 * np.pi)).astype(np.int64) % steps
     shape = (len(beams), steps)
@@ -218,13 +218,13 @@ def _medians(elevations: np.ndarray, rings: np.ndarray) -> Float[np.ndarray, " b
     return np.interp(np.arange(present.max() + 1), present, [np.median(elevations[rings == ring]) for ring in present])
 
 
-def _steps(azimuths: np.ndarray, rings: np.ndarray) -> int:
+def _steps(lidar: Lidar, azimuths: np.ndarray, rings: np.ndarray) -> int:
     """The number of firings of a revolution, by the median gap between neighbouring returns of a beam."""
     order = np.lexsort([azimuths, rings])
     gaps = np.diff(azimuths[order])[np.diff(rings[order]) == 0]
     gaps = gaps[gaps > 1e-5]  # duplicated returns
     if not len(gaps):
-        raise DatasetError("a sweep with too few returns needs the LiDAR's azimuth_steps to tell its rays")
+        raise DatasetError(f"LiDAR {lidar.name}: a sweep with so few returns needs azimuth_steps to tell its rays")
     return max(1, round(2.0 * np.pi / float(np.median(gaps))))
 
 
