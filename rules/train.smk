@@ -16,6 +16,7 @@ rule train:
         actors=plan.training_input("actors"),
         lidar_depth=plan.training_input("lidar_depth"),
         free_space=plan.training_input("free_space"),
+        scans=plan.training_input("scans"),
     output:
         checkpoint="<results>/{scene}/{method}/checkpoint.npz",
         summary="<results>/{scene}/{method}/train.json",

@@ -89,10 +89,12 @@ class Actors(Part):
         settings: ActorSettings,
         gaussians: GaussianSettings,
         classes: int = 0,
+        echo: tuple[float, float] | None = None,
     ) -> "Actors":
-        """Initialised from every track's points (p, 3) in its object's frame and their colours (p, 3) in [0, 1]."""
+        """Initialised from every track's points (p, 3) in its object's frame and their colours (p, 3) in [0, 1]; see
+        `init_params`."""
         own = gaussians.model_copy(update={"sh_degree": settings.sh_degree})
-        sets = [init_params(p, c, own, classes) for p, c in zip(points, colors, strict=True)]
+        sets = [init_params(p, c, own, classes, echo) for p, c in zip(points, colors, strict=True)]
         params = {key: torch.cat([s[key] for s in sets]) for key in sets[0]}
         for key in ("sh0", "shN"):
             constant = params[key][:, None]
@@ -125,6 +127,13 @@ class Actors(Part):
         states = self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
         before, after = (self._positions(self.poses(state)) for state in states)
         return (after - before) / (2.0 * HALF_STEP)
+
+    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
+        if "echoes" not in self.params:
+            return None
+        own, turns = self.params["echoes"], rotation_matrix(self.poses(self.time_state(time)).quats.detach())
+        turned = of_owners(turns, self._owns) @ own[:, 1:]
+        return torch.cat([own[:, :1], turned], dim=1)
 
     def _positions(self, poses: ObjectPoses) -> Float[Tensor, "n 3"]:
         """The centres of its Gaussians in the world."""

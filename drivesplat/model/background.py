@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.model.gaussians import Gaussians
@@ -25,10 +26,16 @@ class Background(Part):
 
     @classmethod
     def from_points(
-        cls, positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings, extent: float, classes: int = 0
+        cls,
+        positions: np.ndarray,
+        colors: np.ndarray,
+        settings: GaussianSettings,
+        extent: float,
+        classes: int = 0,
+        echo: tuple[float, float] | None = None,
     ) -> "Background":
-        """Initialised from seed points: `positions` (n, 3) metres and `colors` (n, 3) in [0, 1]."""
-        return cls(init_params(positions, colors, settings, classes), settings, extent)
+        """Initialised from seed points: `positions` (n, 3) metres and `colors` (n, 3) in [0, 1]; see `init_params`."""
+        return cls(init_params(positions, colors, settings, classes, echo), settings, extent)
 
     def time_state(self, time: float) -> Sequence[Tensor]:
         return ()
@@ -43,6 +50,9 @@ class Background(Part):
             p["sh0"],
             p["shN"],
         )
+
+    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
+        return self.params.get("echoes")
 
     def learning_rates(self) -> dict[str, float]:
         return learning_rates(self._settings, self.extent)

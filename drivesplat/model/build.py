@@ -32,7 +32,8 @@ class ModelInit:
     """What a model is initialised from: the scene's training `record`, those of its `actors` (empty where none are
     wanted), the mean colour (3,) in [0, 1] of its sky, the number of semantic `classes` (0: none), the initial gains
     (3,) of every camera in `exposed`, whose exposure is learned, and for every camera in `posed`, whose poses are
-    corrected, the times of its training images in seconds."""
+    corrected, the times of its training images in seconds, and the initial logits of LiDAR's intensity and return
+    (`echo`; None: LiDAR is not rendered)."""
 
     record: TrainingRecord
     actors: list[ActorRecord]
@@ -40,6 +41,7 @@ class ModelInit:
     classes: int = 0
     exposed: dict[str, np.ndarray] = field(default_factory=dict)
     posed: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    echo: tuple[float, float] | None = None
 
 
 def gaussian_cap(record: TrainingRecord, settings: TrainSettings) -> int:
@@ -102,7 +104,7 @@ def _init_background(init: ModelInit, settings: TrainSettings) -> Part:
     record = init.record
     kept = random_subset(len(record.points), settings.cap_max)
     positions, colors = record.points[kept], record.points_rgb[kept] / 255.0
-    return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes)
+    return Background.from_points(positions, colors, settings.gaussians, record.scene_scale, init.classes, init.echo)
 
 
 def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
@@ -117,7 +119,8 @@ def _init_actors(init: ModelInit, settings: TrainSettings) -> Part | None:
     chosen = list(zip(actors, kept, strict=True))
     points, colors = [actor.points[rows] for actor, rows in chosen], [actor.points_rgb[rows] for actor, rows in chosen]
     capped = settings.actors.model_copy(update={"cap_max": min(settings.actors.cap_max, sum(limits))})
-    return Actors.from_points(tracks, points, [c / 255.0 for c in colors], capped, settings.gaussians, init.classes)
+    colors = [values / 255.0 for values in colors]
+    return Actors.from_points(tracks, points, colors, capped, settings.gaussians, init.classes, init.echo)
 
 
 def actor_cap(actor: ActorRecord, settings: TrainSettings) -> int:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from drivesplat.model.view import View
-from drivesplat.settings.train import CameraPoseSettings
+from drivesplat.settings.train_cameras import CameraPoseSettings
 
 TIMES = "times_"
 """Prefix of the names of the buffers of times; the camera name follows."""

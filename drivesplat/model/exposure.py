@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from drivesplat.settings.train import ExposureSettings
+from drivesplat.settings.train_cameras import ExposureSettings
 
 CHANNELS = ("red", "green", "blue")
 

@@ -16,7 +16,8 @@ from drivesplat.kernels.spherical_harmonics import SH_C0
 class Gaussians:
     """n Gaussians: `means` and `scales` in metres, `quats` w, x, y, z, `opacities` in [0, 1], and spherical harmonics
     of RGB colours: `sh0` of degree 0, `shN` of the degrees above. `velocities` (m/s) are None where they are not known
-    or all 0."""
+    or all 0. `echoes` are what a LiDAR measures of them, linear functions of the direction from the sensor: the logits
+    of intensity and of a return are echoes[:, 0] + direction @ echoes[:, 1:]; None without LiDAR."""
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -25,6 +26,7 @@ class Gaussians:
     sh0: Float[Tensor, "n 1 3"]
     shN: Float[Tensor, "n k_less_1 3"]
     velocities: Float[Tensor, "n 3"] | None = None
+    echoes: Float[Tensor, "n 4 2"] | None = None
 
     @classmethod
     def of(
@@ -47,7 +49,7 @@ class Gaussians:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by field name, without velocities where they are None."""
+        """Its tensors by field name, without those that are None."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -76,7 +78,8 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     sets = [with_sh_degree(s, degree) for s in sets]
     if any(s.velocities is not None for s in sets):
         sets = [replace(s, velocities=torch.zeros_like(s.means)) if s.velocities is None else s for s in sets]
-    return Gaussians(**{name: torch.cat([s.tensors[name] for s in sets]) for name in sets[0].tensors})
+    shared = [name for name in sets[0].tensors if all(name in s.tensors for s in sets)]
+    return Gaussians(**{name: torch.cat([s.tensors[name] for s in sets]) for name in shared})
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:

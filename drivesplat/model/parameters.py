@@ -1,7 +1,8 @@
 """The parameters of Gaussians, under the names and in the units that gsplat's strategies densify.
 
 `means` (n, 3) metres, `scales` (n, 3) log metres, `quats` (n, 4) w, x, y, z, `opacities` (n,) logits, `sh0` and `shN`
-spherical harmonics of degree 0 and of the degrees above; with semantic classes also `classes` (n, c) logits.
+spherical harmonics of degree 0 and of the degrees above; with semantic classes also `classes` (n, c) logits; with LiDAR
+also `echoes` (n, 4, 2), see `drivesplat.model.gaussians.Gaussians`, their directions in the frame of the Gaussians.
 """
 
 import math
@@ -16,10 +17,14 @@ from drivesplat.settings.train import GaussianSettings
 
 
 def init_params(
-    positions: np.ndarray, colors: np.ndarray, settings: GaussianSettings, classes: int = 0
+    positions: np.ndarray,
+    colors: np.ndarray,
+    settings: GaussianSettings,
+    classes: int = 0,
+    echo: tuple[float, float] | None = None,
 ) -> dict[str, Tensor]:
-    """Parameters of Gaussians initialised at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1] and equal logits
-    for all `classes`: `sh0` (n, 1, 3), `shN` (n, k - 1, 3)."""
+    """Parameters of Gaussians initialised at `positions` (n, 3) metres with `colors` (n, 3) in [0, 1], equal logits for
+    all `classes`, and the logits `echo` of intensity and return (None: no LiDAR)."""
     neighbours = min(4, len(positions))
     distances = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0].reshape(len(positions), -1)[:, 1:]
     spacing = np.sqrt(np.mean(distances**2, axis=1)) if neighbours > 1 else np.ones(len(positions))
@@ -33,7 +38,14 @@ def init_params(
         "sh0": ((torch.from_numpy(np.asarray(colors)).float() - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3),
         **({"classes": torch.zeros(count, classes)} if classes else {}),
+        **({} if echo is None else {"echoes": _echoes(count, echo)}),
     }
+
+
+def _echoes(count: int, logits: tuple[float, float]) -> Tensor:
+    echoes = torch.zeros(count, 4, 2)
+    echoes[:, 0] = torch.tensor(logits)
+    return echoes
 
 
 def make_parameters(params: dict[str, Tensor]) -> nn.ParameterDict:
@@ -50,4 +62,4 @@ def learning_rates(settings: GaussianSettings, extent: float) -> dict[str, float
     """The initial learning rate of each parameter of Gaussians that spread over `extent` metres."""
     rates = {"means": settings.lr_means * extent, "scales": settings.lr_scales, "quats": settings.lr_quats}
     rates |= {"opacities": settings.lr_opacities, "sh0": settings.lr_sh0, "shN": settings.lr_shN}
-    return {**rates, "classes": settings.lr_classes}
+    return {**rates, "classes": settings.lr_classes, "echoes": settings.lr_echoes}

@@ -103,6 +103,11 @@ class Part(nn.Module, ABC):
         """The velocities of its Gaussians in the world at a time, m/s, without gradient; None for a static part."""
         return None
 
+    def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
+        """What a LiDAR measures of its Gaussians at a time, along directions in the world (`Gaussians.echoes`); None
+        for a part that was not trained with LiDAR."""
+        return None
+
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
         """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one
         object are appended as extra rows."""

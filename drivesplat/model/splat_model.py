@@ -15,6 +15,7 @@ from drivesplat.model.camera_poses import CameraPoses
 from drivesplat.model.exposure import Exposures
 from drivesplat.model.gaussians import Gaussians, concatenate
 from drivesplat.model.part import ActorPlacement, Part, RigidGroup, Sky
+from drivesplat.model.scans import ScanPicture, ScanView, scan_picture
 from drivesplat.model.view import View, depth_at_lines, where_seen
 from drivesplat.rasterization import Rendering, rasterize
 
@@ -67,14 +68,15 @@ class SplatModel(nn.Module):
         for part in self.parts:
             part.precompute(times)
 
-    def gaussians_at(self, time: float, with_velocities: bool = False) -> Gaussians:
+    def gaussians_at(self, time: float, with_velocities: bool = False, with_echoes: bool = False) -> Gaussians:
         """All parts' Gaussians in world coordinates at a time (seconds since the first image), in the parts' order;
-        `with_velocities`, which a rolling shutter needs, where a part moves."""
-        found = [part.at(time) for part in self.parts]
-        if with_velocities:
-            found = [
-                replace(own, velocities=part.velocities(time)) for own, part in zip(found, self.parts, strict=True)
-            ]
+        `with_velocities` of those that move, which rolling shutters and LiDARs need, and `with_echoes` for LiDARs."""
+        found = []
+        for part in self.parts:
+            velocities = part.velocities(time) if with_velocities else None
+            found.append(
+                replace(part.at(time), velocities=velocities, echoes=part.echoes(time) if with_echoes else None)
+            )
         return concatenate(found)
 
     def time_states(self, time: float) -> list[Sequence[Tensor]] | None:
@@ -155,6 +157,17 @@ class SplatModel(nn.Module):
             image = self.exposure.applied(image, view.camera)
         depth = None if rendering.depth is None else depth_at_lines(rendering.depth[0, ..., 0], seen_from)
         return Picture(shown, image, splats, alpha[..., 0], depth, rendering.info)
+
+    def scan(
+        self, view: ScanView, *, gaussians: Gaussians | None = None, before: Float[Tensor, "b a"] | None = None
+    ) -> ScanPicture:
+        """What a LiDAR measures in a revolution. `gaussians` replace the model's own; `before`: see `scan_picture`.
+
+        Raises ResultError for a model that was trained without LiDAR.
+        """
+        if gaussians is None:
+            gaussians = self.gaussians_at(view.time, with_velocities=True, with_echoes=True)
+        return scan_picture(gaussians, view, before)
 
     def gaussians_in(self, view: View) -> Gaussians:
         """The Gaussians that `render` shows in a view."""

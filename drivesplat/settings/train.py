@@ -2,9 +2,11 @@
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from drivesplat.settings import Settings
+from drivesplat.settings.train_cameras import CameraPoseSettings, ExposureSettings
+from drivesplat.settings.train_scans import ScanTrainingSettings
 
 PartName = Literal["background", "actors"]
 STAGE_OF_PART: dict[PartName, str] = {"actors": "actors"}
@@ -53,6 +55,8 @@ class GaussianSettings(Settings):
     """Learning rate of the colours' constant term."""
     lr_classes: float = Field(1e-2, gt=0)
     """Learning rate of class logits, where class maps are given (masks.semantic_folder)."""
+    lr_echoes: float = Field(1e-2, gt=0)
+    """Learning rate of LiDAR's logits of intensity and return, where LiDAR is rendered (train.scans)."""
     lr_shN: float = Field(1.25e-4, gt=0)
     """Learning rate of the colours' view-dependent terms."""
 
@@ -92,28 +96,6 @@ class ActorSettings(Settings):
     box_margin: float = Field(0.1, ge=0, le=2)
     """Gaussians with centres farther than this (metres) outside their box are faded out."""
     tracks: TrackSettings = TrackSettings()
-
-
-class CameraPoseSettings(Settings):
-    """Bounded, smooth corrections of the camera poses of training images, learned along with the Gaussians. Held-out
-    images and all other times take interpolated corrections.
-
-    Applies after `refine_poses`, or instead of it. Unbounded corrections raise training PSNR and lower held-out PSNR,
-    since training poses drift away from held-out poses.
-    """
-
-    corrected: bool = False
-    """Correct camera poses during training."""
-    max_shift: float = Field(0.05, gt=0, le=1)
-    """Maximum translation of a camera along each of its axes (metres)."""
-    max_turn: float = Field(0.3, gt=0, le=10)
-    """Maximum rotation of a camera about each of its axes (degrees)."""
-    learning_rate: float = Field(2e-3, gt=0)
-    """Learning rate, in fractions of these bounds. Decays exponentially to a hundredth."""
-    size_weight: float = Field(0.001, ge=0)
-    """Loss weight of the mean square of the corrections, in fractions of the bounds."""
-    bend_weight: float = Field(0.01, ge=0)
-    """Loss weight of the mean square of their second differences from image to image, in the same units."""
 
 
 class CoarseToFineSettings(Settings):
@@ -180,25 +162,6 @@ class FloaterSettings(Settings):
     """Iterations between these steps."""
 
 
-class ExposureSettings(Settings):
-    """Exposure of each camera. Cameras of one rig set exposure and white balance independently, which causes seams
-    where their images overlap."""
-
-    kind: Literal["none", "affine"] = "none"
-    """'affine': a gain and an offset per colour channel for every camera but eval_camera, which is the reference. They
-    are initialised from surfaces that several cameras recorded, then learned. No effect with one camera."""
-    sigma_gain: float = Field(0.1, gt=0)
-    """Expected deviation of a camera's gains from their initial values (natural logarithm)."""
-    sigma_offset: float = Field(0.02, gt=0)
-    """Expected deviation of a camera's offsets from 0 (1 = full scale)."""
-    weight: float = Field(0.002, ge=0)
-    """Loss weight of the mean square of log gains and offsets, in units of these deviations."""
-    start: float = Field(0.1, ge=0, le=1)
-    """Fraction of the iterations after which exposures are learned."""
-    learning_rate: float = Field(1e-2, gt=0)
-    """Learning rate of log gains and offsets, in the same units. Decays exponentially to a hundredth."""
-
-
 class TrainSettings(Settings):
     iterations: int = Field(15_000, ge=1, le=1_000_000)
     """Number of optimisation steps, one image each."""
@@ -220,6 +183,7 @@ class TrainSettings(Settings):
     exposure: ExposureSettings = ExposureSettings()
     camera_poses: CameraPoseSettings = CameraPoseSettings()
     coarse_to_fine: CoarseToFineSettings = CoarseToFineSettings()
+    scans: ScanTrainingSettings = ScanTrainingSettings()
     refine_start: float = Field(0.0167, ge=0, le=1)
     """Fraction of the iterations after which densification starts."""
     refine_stop: float = Field(0.833, ge=0, le=1)
@@ -275,6 +239,12 @@ class TrainSettings(Settings):
     psnr_every: int = Field(1_000, ge=0)
     """Iterations between TensorBoard's PSNRs of a few training and held-out images. The last iteration has them, too.
     0: none."""
+
+    @model_validator(mode="after")
+    def _scans_need_mcmc(self) -> "TrainSettings":
+        if self.scans.share and self.strategy != "mcmc":
+            raise ValueError("scans.share needs strategy: mcmc, since densification by gradient knows images alone")
+        return self
 
     def for_parts(self, parts: tuple[PartName, ...]) -> "TrainSettings":
         """These settings with those at their defaults that have no effect on a method of `parts`: those of other moving

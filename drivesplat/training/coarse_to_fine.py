@@ -24,16 +24,16 @@ class TrainingImages:
         self._seed = seed
         self._factor, self._reduced = 1, views
 
-    def at(self, step: int) -> TrainingView:
-        """The image of an iteration."""
+    def at(self, step: int, image_step: int | None = None) -> TrainingView:
+        """The image of an iteration, the `image_step`-th that takes one (None: every iteration does)."""
         factor = self.factor(step)
         if factor != self._factor:
             self._reduced = self.views if factor == 1 else [reduced(view, factor) for view in self.views]
             self._factor = factor
-        return self._reduced[self.number(step)]
+        return self._reduced[self.number(step if image_step is None else image_step)]
 
     def number(self, step: int) -> int:
-        """The index of an iteration's image in `views`."""
+        """The index in `views` of the image that the `step`-th iteration with an image takes."""
         return view_index(len(self.views), step, self._seed)
 
     def factor(self, step: int) -> int:

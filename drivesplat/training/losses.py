@@ -7,6 +7,7 @@ from torch import Tensor
 
 from drivesplat.kernels.color_difference import color_difference
 from drivesplat.kernels.regularizers import mean_opacity_and_scale
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.part import active_fraction
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.scene.masks import UNLABELLED
@@ -22,7 +23,6 @@ def loss_terms(
 ) -> dict[str, Float[Tensor, ""]]:
     """The weighted terms whose sum is minimised. Gaussians that are absent at the view's time are not regularised,
     since the image could not counteract. Pixels of the ego vehicle have no effect."""
-    gaussians = picture.gaussians
     alpha = picture.alpha if view.ego_mask is None else picture.alpha.masked_fill(view.ego_mask, 1.0)
     moving = view.moving if settings.dynamic_weight > 0 else None
     difference = color_difference(picture.image, view.pixels, view.ego_mask, moving)
@@ -32,10 +32,7 @@ def loss_terms(
     }
     if difference.moving_l1 is not None:
         terms["dynamic"] = settings.dynamic_weight * difference.moving_l1
-    regularizers = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
-    if any(regularizers.values()):
-        means, active = mean_opacity_and_scale(gaussians.opacities, gaussians.scales), active_fraction(model.parts)
-        terms |= {name: w * mean / active for (name, w), mean in zip(regularizers.items(), means, strict=True) if w}
+    terms |= regularization(picture.gaussians, model, settings)
     if view.sky is not None and model.sky is not None and model.sky.keeps_gaussians_out:
         terms["sky_alpha"] = settings.sky_alpha_weight * sky_alpha_loss(alpha, view.sky)
     if view.sky is not None and settings.sky_bce_weight:
@@ -50,6 +47,15 @@ def loss_terms(
         if penalty is not None:
             terms[name] = penalty
     return {**terms, **_dynamic_terms(picture, view, model, settings)}
+
+
+def regularization(gaussians: Gaussians, model: SplatModel, settings: TrainSettings) -> dict[str, Float[Tensor, ""]]:
+    """The weighted mean opacity and scale (metres) of a model's Gaussians at one time."""
+    weights = {"opacity_reg": settings.opacity_reg, "scale_reg": settings.scale_reg}
+    if not any(weights.values()):
+        return {}
+    means, active = mean_opacity_and_scale(gaussians.opacities, gaussians.scales), active_fraction(model.parts)
+    return {name: w * mean / active for (name, w), mean in zip(weights.items(), means, strict=True) if w}
 
 
 def _dynamic_terms(

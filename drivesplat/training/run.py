@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from drivesplat.errors import TrainingError
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import Provenance, canonical_json, read_record, sha256_text, write_json
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
@@ -22,6 +23,7 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.actor_record import ActorRecord, read_actors
 from drivesplat.scene.masks import read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
+from drivesplat.scene.scan_record import RecordedScan, read_scans
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.scene.training_record import TrainingRecord, read_training_record
 from drivesplat.settings.device import DeviceSettings
@@ -30,6 +32,7 @@ from drivesplat.training import resume_state
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
+from drivesplat.training.scans import TrainingScan, initial_echo, load_scans
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import Guides, TrainingView, load_views
 
@@ -39,7 +42,8 @@ class TrainingInputs:
     """The inputs of a training: the training record, the folder of masks, the records of actors and of LiDAR depth
     (empty where the method does not use them), the number of semantic `classes` in the user's maps (0: none), the
     cameras that see the ego vehicle, `sky_known` (False where no sky was found, so that sky masks say nothing), and the
-    record of free space (None where the method does not use it)."""
+    record of free space (None where the method does not use it), and the LiDAR scans of the training split (empty where
+    the method does not render LiDAR)."""
 
     record: TrainingRecord
     masks: Path
@@ -49,6 +53,7 @@ class TrainingInputs:
     cameras_with_ego: frozenset[str] = frozenset()
     sky_known: bool = True
     free_space: FreeSpace | None = None
+    scans: list[RecordedScan] = dataclasses.field(default_factory=list)
 
     def guides(self, job: TrainJob) -> Guides:
         """The guides of the training images that `job` uses."""
@@ -93,15 +98,21 @@ class TrainingInputs:
 
 
 def read_inputs(
-    parser: str, masks: str, actors: Sequence[str], lidar_depth: Sequence[str], free_space: Sequence[str]
+    parser: str,
+    masks: str,
+    actors: Sequence[str],
+    lidar_depth: Sequence[str],
+    free_space: Sequence[str],
+    scans: Sequence[str] = (),
 ) -> tuple[TrainingInputs, list[Provenance]]:
-    """Reads the inputs of a training from the files of the parser, of masks and, where given, of actors, LiDAR depth
-    and free space; returns them with the provenances of these files."""
+    """Reads the inputs of a training from the files of the parser, of masks and, where given, of actors, LiDAR depth,
+    free space and scans; returns them with the provenances of these files."""
     folder = Path(masks).parent
     record, made = read_training_record(parser), read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
     spaces = [read_free_space(path) for path in free_space]
+    revolutions = [read_scans(path) for path in scans]
     inputs = TrainingInputs(
         record,
         folder,
@@ -111,8 +122,10 @@ def read_inputs(
         frozenset(made.own_car),
         made.sky_known,
         next(iter(spaces), None),
+        [scan for it in revolutions for scan in it.of_group("train")],
     )
-    upstream = [record.provenance, made.provenance, *(it.provenance for it in (*moving, *depths, *spaces))]
+    others = (*moving, *depths, *spaces, *revolutions)
+    upstream = [record.provenance, made.provenance, *(it.provenance for it in others)]
     return inputs, upstream
 
 
@@ -131,13 +144,14 @@ class TrainingFiles:
 
 @dataclass(frozen=True)
 class Prepared:
-    """What the first iteration of a training needs, and the images of its PSNR curves."""
+    """What the first iteration of a training needs, the images of its PSNR curves, and its LiDAR scans."""
 
     model: SplatModel
     views: list[TrainingView]
     settings: TrainSettings
     priors: GeometryPriors
     curves: CurveViews
+    scans: list[TrainingScan]
 
 
 def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prepared:
@@ -153,13 +167,18 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
         inputs.semantic_classes(job),
         initial_gains(inputs.record, views, exposed, job.reference_camera) if exposed else {},
         _times_by_camera(views) if job.train.camera_poses.corrected else {},
+        initial_echo(inputs.scans) if job.train.scans.share else None,
     )
     if job.sky != "mask" and not job.train.sky_bce_weight:  # no loss uses the masks, a byte per pixel on the device
         views = [dataclasses.replace(view, sky=None) for view in views]
     with explain_out_of_memory(lambda: 0):
         curves = curve_views(inputs, views, job, device)
+        scans = load_scans(inputs.scans, job.train.scans, device) if job.train.scans.share else []
+    if job.train.scans.share and not scans:
+        raise TrainingError("no LiDAR scan is there to train with; set train.scans.share to 0")
     model = build_model(init, job.parts, job.sky, settings)
-    return Prepared(model, views, settings, geometry_priors(inputs.record, inputs.free_space, settings), curves)
+    priors = geometry_priors(inputs.record, inputs.free_space, settings)
+    return Prepared(model, views, settings, priors, curves, scans)
 
 
 def curve_views(
@@ -197,7 +216,10 @@ def run_training(
         )
         folders = TrainingFolders(files.resume, files.checkpoint.parent / "tensorboard", fingerprint, label)
         model, seed = begun.model, job.random_seed
-        summary = train(model, begun.views, begun.settings, seed, device, folders, begun.priors, curves=begun.curves)
+        summary = train(
+            model, begun.views, begun.settings, seed, device, folders, begun.priors,
+            curves=begun.curves, scans=begun.scans,
+        )  # fmt: skip
         write_checkpoint(files.checkpoint, TrainedCheckpoint.of(model, job, provenance))
         write_json(files.summary, {**dataclasses.asdict(summary), "provenance": provenance})
     if os.getppid() == started_by:

@@ -4,6 +4,7 @@ import logging
 import math
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -23,6 +24,7 @@ from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor
 from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
+from drivesplat.training.scans import TrainingScan
 from drivesplat.training.trainer import Trainer
 from drivesplat.training.views import TrainingView
 
@@ -77,15 +79,16 @@ def train(
     priors: GeometryPriors = NO_PRIORS,
     clock: Clock = UNTIMED,
     curves: CurveViews = MappingProxyType({}),
+    scans: Sequence[TrainingScan] = (),
 ) -> TrainingSummary:
-    """Fits `model` in place, resuming an interrupted run of the same training; `clock` times its stages. `curves` are
-    the images of PSNR curves in TensorBoard.
+    """Fits `model` in place to `views` and LiDAR `scans`, resuming an interrupted run of the same training; `clock`
+    times its stages. `curves` are the images of PSNR curves in TensorBoard.
 
     Raises TrainingError where a loss or gradient is not finite or no Gaussian is left, DeviceError where the GPU's
     memory is exhausted. The last good checkpoint survives both.
     """
     with explain_out_of_memory(lambda: len(model)), capture_stream(device):
-        trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock)
+        trainer = Trainer.begin(model.to(device), views, settings, seed, device, priors, clock, scans)
         run = TrainingRun.begin(trainer, folders, curves)
         with Monitor(folders.tensorboard, settings.iterations, trainer.step, folders.label) as monitor:
             _iterate(run, monitor)
@@ -197,7 +200,7 @@ def _iterate(run: TrainingRun, monitor: Monitor) -> None:
             if trainer.step % settings.log_every == 0:
                 run.check()
                 monitor.scalars(trainer.step, _scalars(terms, trainer), settings.log_every)
-            if with_picture and picture is not None:
+            if with_picture and picture is not None and view is not None:
                 monitor.image(trainer.step, view, picture)
             monitor.psnrs(trainer.step, run.psnrs())
             if run.save_due:

@@ -1,12 +1,13 @@
 """The state of a training and its iteration: render one image, compare it, take a step."""
 
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
+from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training.clock import UNTIMED, Clock
@@ -17,6 +18,7 @@ from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors, geome
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.monitor import FiniteGuard
 from drivesplat.training.optimizers import DeviceSchedule, ModelOptimizers, make_optimizers, set_learning_rates
+from drivesplat.training.scans import TrainingScan, fits_scan, scan_index, scan_terms, scans_before
 from drivesplat.training.views import TrainingView
 
 
@@ -36,6 +38,7 @@ class Trainer:
     clock: Clock
     graphs: IterationGraphs
     schedule: DeviceSchedule
+    scans: list[TrainingScan] = field(default_factory=list)
     step: int = 0
 
     @classmethod
@@ -48,6 +51,7 @@ class Trainer:
         device: torch.device,
         priors: GeometryPriors = NO_PRIORS,
         clock: Clock = UNTIMED,
+        scans: Sequence[TrainingScan] = (),
     ) -> "Trainer":
         torch.manual_seed(seed)
         optimizers, known = make_optimizers(model), priors.to(device)
@@ -56,16 +60,25 @@ class Trainer:
         graphs, on_device = IterationGraphs(capture, device), DeviceSchedule(device)
         densifiers = [Densifier(part, settings, graphs.invalidate) for part in model.parts]
         return cls(
-            model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device
-        )
+            model, images, settings, seed, device, optimizers, densifiers, guard, known, clock, graphs, on_device,
+            list(scans),
+        )  # fmt: skip
 
-    def fit_one(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView]:
-        """The first half of an iteration: render a view, compare, step. Returns its loss terms, the picture and the
-        view. Without `with_picture` the iteration may be a replayed CUDA graph, and the picture is None."""
-        with self.clock.stage("data"):
-            number, view = self.images.number(self.step), self.images.at(self.step)
+    @property
+    def fits_scan(self) -> bool:
+        """Whether the next iteration fits a scan, unless a picture is wanted of it."""
+        return bool(self.scans) and fits_scan(self.step, self.settings.scans.share)
+
+    def fit_one(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView | None]:
+        """The first half of an iteration: render a view or a scan, compare, step. Returns its loss terms, the picture
+        and the view, both None after a scan. Without `with_picture` the iteration may be that of a scan or a replayed
+        CUDA graph, and the picture is None."""
         set_learning_rates(self.model, self.optimizers, self.step, self.settings)
         step, rates = self.schedule.update(self.step, self.optimizers)
+        if self.fits_scan and not with_picture:
+            return self.graphs.retry_without_graphs(lambda: self._learn_scan(step, rates)), None, None
+        with self.clock.stage("data"):
+            number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)
 
         def iteration() -> tuple[Terms, Picture]:
             return self._learn(view, step, rates)
@@ -97,6 +110,32 @@ class Trainer:
             loss = torch.stack(list(terms.values())).sum()
         if by_gradient:
             picture.info["means2d"].retain_grad()
+        return self._follow(loss, terms, step, rates), picture
+
+    def _learn_scan(self, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
+        """An iteration with a scan."""
+        stage, settings = self.clock.stage, self.settings.scans
+        scan = self.scans[scan_index(len(self.scans), self.step, settings.share, self.seed)]
+        self.model.zero_grad()
+        with stage("render"):
+            before = (scan.range - settings.sight_margin).clamp(min=0.0) if settings.sight_weight else None
+            picture = self.model.scan(scan.view, gaussians=self._scanned(scan.view.time), before=before)
+        with stage("loss"):
+            terms = scan_terms(picture, scan, self.model, self.settings)
+            loss = torch.stack(list(terms.values())).sum()
+        return self._follow(loss, terms, step, rates)
+
+    def _scanned(self, time: float) -> Gaussians:
+        """The model's Gaussians for a LiDAR; their geometry without gradient where scans must not change it."""
+        gaussians = self.model.gaussians_at(time, with_velocities=True, with_echoes=True)
+        if self.settings.scans.geometry:
+            return gaussians
+        fixed = ("means", "quats", "scales", "opacities")
+        return replace(gaussians, **{name: gaussians.tensors[name].detach() for name in fixed})
+
+    def _follow(self, loss: Tensor, terms: Terms, step: int | Tensor, rates: Mapping[str, Tensor] | None) -> Terms:
+        """The step down the gradient of a loss; returns its terms without gradients."""
+        stage = self.clock.stage
         with stage("backward"):
             loss.backward()
         with stage("checks"):
@@ -104,7 +143,12 @@ class Trainer:
             self.guard.watch(step, {**losses, **self._gradient_norms()})
         with stage("optimizer"):
             self.optimizers.step(rates)
-        return {name: value.detach() for name, value in terms.items()}, picture
+        return {name: value.detach() for name, value in terms.items()}
+
+    @property
+    def _image_step(self) -> int:
+        """The number of iterations so far that fitted an image."""
+        return self.step - (scans_before(self.step, self.settings.scans.share) if self.scans else 0)
 
     def _layout(self) -> Hashable:
         """Changes when captured iterations become invalid: image reduction, SH degree, and addresses of parameters."""

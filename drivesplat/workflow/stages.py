@@ -43,7 +43,7 @@ OF_ONE_SCENE = (
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 EDITS, TRAJECTORIES = "edits", "trajectories"
 """Kinds of drive folders, and the folders of a method in which they lie."""
-TRAINING_INPUTS = ("actors", "lidar_depth", "free_space")
+TRAINING_INPUTS = ("actors", "lidar_depth", "free_space", "scans")
 """Stages of a scene that only some methods train on."""
 
 
@@ -105,6 +105,7 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
         "actors": "actors" in stages_of_parts,
         "lidar_depth": train.depth_weight > 0,
         "free_space": train.floaters.free_space,
+        "scans": train.scans.share > 0,
     }
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 

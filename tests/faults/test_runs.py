@@ -48,7 +48,7 @@ MISTYPED = {
     "trian": {"iterations": 3},
     "train": {"iteration": 3, "iterations": -5},
     "sky": "blue",
-    "holdout": {"every_nth": 4, "offset": 4},
+    "holdout": {"every_nth": 4, "offset": 5},
 }
 
 

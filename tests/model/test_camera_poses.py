@@ -17,7 +17,8 @@ from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import View
 from drivesplat.scene.rigid import rigid
 from drivesplat.settings.device import DeviceSettings
-from drivesplat.settings.train import CameraPoseSettings, TrainJob, TrainSettings
+from drivesplat.settings.train import TrainJob, TrainSettings
+from drivesplat.settings.train_cameras import CameraPoseSettings
 from drivesplat.training.losses import loss_terms
 from drivesplat.training.optimizers import make_optimizers, set_learning_rates
 from drivesplat.training.resume_state import restore_model

@@ -1,0 +1,73 @@
+"""A LiDAR's revolution as a model sees it: a view of rays, and the scan that Gaussians give."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.errors import ResultError
+from drivesplat.model.gaussians import Gaussians
+from drivesplat.rasterization.scans import RayGrid, ScanMotion, rasterize_scan
+from drivesplat.scene.scan_record import RecordedScan
+
+NOTHING = 1e-6
+"""Alpha below which a ray has met nothing."""
+
+
+@dataclass(frozen=True)
+class ScanView:
+    """A revolution of a LiDAR at a `time` in seconds since the first image: the sensor's pose (metres) then, its rays
+    at their own times, its velocities (m/s, rad/s) in its own frame, and the standard deviations of a beam's footprint
+    in azimuth and elevation (radians)."""
+
+    sensor_to_world: Float[Tensor, "4 4"]
+    rays: RayGrid
+    linear: Float[Tensor, "3"]
+    angular: Float[Tensor, "3"]
+    time: float
+    beam_spread: tuple[float, float]
+
+    @property
+    def world_to_sensor(self) -> Float[Tensor, "4 4"]:
+        rotation_t = self.sensor_to_world[:3, :3].T
+        upper = torch.cat([rotation_t, -rotation_t @ self.sensor_to_world[:3, 3:]], dim=1)
+        return torch.cat([upper, self.sensor_to_world[3:]])
+
+
+@dataclass(frozen=True)
+class ScanPicture:
+    """What b beams and a firings measure of `gaussians`. `range` in metres, 0 where nothing is met; `returned`, the
+    probability of a return; `intensity` in [0, 1]; `alpha`, of all that is met, and `alpha_before`, of what is nearer
+    than given ranges (None: none were given)."""
+
+    gaussians: Gaussians
+    range: Float[Tensor, "b a"]
+    returned: Float[Tensor, "b a"]
+    intensity: Float[Tensor, "b a"]
+    alpha: Float[Tensor, "b a"]
+    alpha_before: Float[Tensor, "b a"] | None
+
+
+def view_of_scan(recorded: RecordedScan, beam_spread: tuple[float, float], device: torch.device) -> ScanView:
+    """A recorded scan as a view. `beam_spread` in radians."""
+    arrays = recorded.sensor_to_world, recorded.linear, recorded.angular
+    pose, linear, angular = (torch.from_numpy(array).float().to(device) for array in arrays)
+    return ScanView(pose, RayGrid.of(recorded.scan.rays, pose), linear, angular, recorded.seconds, beam_spread)
+
+
+def scan_picture(gaussians: Gaussians, view: ScanView, before: Float[Tensor, "b a"] | None = None) -> ScanPicture:
+    """The scan of Gaussians with echoes; with `alpha_before` the ranges `before` (metres). A ray that meets nothing is
+    not returned. Raises ResultError for Gaussians without echoes."""
+    if gaussians.echoes is None:
+        raise ResultError("the model was trained without LiDAR: train it with train.scans.share above 0")
+    toward = torch.nn.functional.normalize(gaussians.means.detach() - view.sensor_to_world[:3, 3], dim=-1)
+    logits = gaussians.echoes[:, 0] + torch.einsum("nd,ndc->nc", toward, gaussians.echoes[:, 1:])
+    rendering = rasterize_scan(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, torch.sigmoid(logits),
+        view.world_to_sensor, view.rays, beam_spread=view.beam_spread,
+        motion=ScanMotion(view.linear, view.angular, gaussians.velocities), before=before,
+    )  # fmt: skip
+    intensity, returned = rendering.values.unbind(dim=-1)
+    met = rendering.alpha.clamp(min=NOTHING)
+    return ScanPicture(gaussians, rendering.range, returned, intensity / met, rendering.alpha, rendering.alpha_before)

@@ -1,0 +1,33 @@
+"""Settings of the LiDAR in a training."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from drivesplat.settings import Settings
+
+Milliradians = Annotated[float, Field(ge=0, le=20)]
+
+
+class ScanTrainingSettings(Settings):
+    """Rendered LiDAR: Gaussians with an intensity and a probability to return a ray, fitted to recorded scans. Needs
+    strategy: mcmc. Defaults of the weights are those of SplatAD (Hess et al. 2025, arXiv 2411.16816)."""
+
+    share: float = Field(0.0, ge=0, lt=1)
+    """Fraction of the iterations that fit a scan in place of an image. 0 = LiDAR is not rendered."""
+    geometry: bool = True
+    """Scans also move and shape Gaussians. false = they fit intensities and returns alone, and images are rendered as
+    without LiDAR."""
+    range_weight: float = Field(0.1, ge=0)
+    """Loss weight of the mean absolute error of ranges (metres), without the worst 5 % of the rays."""
+    intensity_weight: float = Field(1.0, ge=0)
+    """Loss weight of the mean squared error of intensities, in [0, 1]."""
+    drop_weight: float = Field(0.1, ge=0)
+    """Loss weight of the binary cross entropy between the probability of a return and whether there is one."""
+    sight_weight: float = Field(0.1, ge=0)
+    """Loss weight of the mean alpha of what is nearer than a return by `sight_margin`: a ray that returns has passed
+    empty space."""
+    sight_margin: float = Field(0.8, ge=0, le=10)
+    """Distance before a return (metres) that need not be empty."""
+    beam_spread: tuple[Milliradians, Milliradians] = (0.3, 0.3)
+    """Standard deviation of a beam's footprint in azimuth and elevation (milliradians)."""

@@ -1,0 +1,116 @@
+"""Training with LiDAR scans: the recorded scans on the device, the iterations that fit them, and their loss."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.losses import IGNORED_DEPTHS, regularization
+from drivesplat.training.views import view_index
+
+CERTAIN = 1e-4
+"""Distance of probabilities from 0 and 1, for finite logarithms."""
+SCANS_SEED = 7919
+"""Added to the training's random seed: the order of scans is another one than that of images."""
+
+
+@dataclass(frozen=True)
+class TrainingScan:
+    """A recorded scan on the device: its view; which rays were `measured` and which `returned`; `range` in metres and
+    `intensity` in [0, 1] of those that returned (None: the sensor records none)."""
+
+    view: ScanView
+    measured: Bool[Tensor, "b a"]
+    returned: Bool[Tensor, "b a"]
+    range: Float[Tensor, "b a"]
+    intensity: Float[Tensor, "b a"] | None
+
+
+def load_scans(
+    recorded: Sequence[RecordedScan], settings: ScanTrainingSettings, device: torch.device
+) -> list[TrainingScan]:
+    """Recorded scans on the device, without those of which no ray was measured."""
+    spread = beam_spread(settings)
+    return [_loaded(scan, spread, device) for scan in recorded if scan.measured.any()]
+
+
+def beam_spread(settings: ScanTrainingSettings) -> tuple[float, float]:
+    """The standard deviations of a beam's footprint in azimuth and elevation, radians."""
+    azimuth, elevation = settings.beam_spread
+    return 1e-3 * azimuth, 1e-3 * elevation
+
+
+def _loaded(recorded: RecordedScan, spread: tuple[float, float], device: torch.device) -> TrainingScan:
+    scan = recorded.scan
+    measured, returned, ranges = (
+        torch.from_numpy(values).to(device) for values in (recorded.measured, scan.returned, scan.ranges)
+    )
+    intensity = None if scan.intensities is None else torch.from_numpy(scan.intensities).to(device)
+    return TrainingScan(view_of_scan(recorded, spread, device), measured, returned & measured, ranges, intensity)
+
+
+def initial_echo(recorded: Sequence[RecordedScan]) -> tuple[float, float]:
+    """The logits of the mean recorded intensity, and of the fraction of measured rays that returned; what meets a
+    surface mostly returns."""
+    intensities = [scan.scan.intensities[scan.scan.returned] for scan in recorded if scan.scan.intensities is not None]
+    every = np.concatenate(intensities) if intensities else np.empty(0)
+    return _logit(float(every.mean()) if len(every) else 0.5), _logit(0.9)
+
+
+def _logit(probability: float) -> float:
+    within = min(max(probability, 0.01), 0.99)
+    return math.log(within / (1.0 - within))
+
+
+def scans_before(step: int, share: float) -> int:
+    """The number of the first `step` iterations that fit a scan, evenly spread."""
+    return math.floor(step * share)
+
+
+def fits_scan(step: int, share: float) -> bool:
+    """Whether an iteration fits a scan in place of an image."""
+    return scans_before(step + 1, share) > scans_before(step, share)
+
+
+def scan_index(count: int, step: int, share: float, seed: int) -> int:
+    """The index of the scan of an iteration: a new seeded permutation every epoch."""
+    return view_index(count, scans_before(step, share), seed + SCANS_SEED)
+
+
+def scan_terms(
+    picture: ScanPicture, scan: TrainingScan, model: SplatModel, settings: TrainSettings
+) -> dict[str, Float[Tensor, ""]]:
+    """The weighted terms of the loss of a scan; rays that were not measured have no effect."""
+    weights = settings.scans
+    returned = scan.returned.float()
+    count = returned.sum().clamp(min=1.0)
+    certain = picture.returned.clamp(CERTAIN, 1.0 - CERTAIN)
+    surprise = -torch.where(scan.returned, torch.log(certain), torch.log1p(-certain))
+    terms = {
+        "scan_range": weights.range_weight * range_loss(picture.range, picture.alpha, scan),
+        "scan_drop": weights.drop_weight * (surprise * scan.measured).sum() / scan.measured.sum().clamp(min=1),
+    }
+    if scan.intensity is not None:
+        errors = (picture.intensity - scan.intensity).square()
+        terms["scan_intensity"] = weights.intensity_weight * (errors * returned).sum() / count
+    if picture.alpha_before is not None:
+        terms["scan_sight"] = weights.sight_weight * (picture.alpha_before * returned).sum() / count
+    return {**terms, **regularization(picture.gaussians, model, settings)}
+
+
+def range_loss(expected: Float[Tensor, "b a"], alpha: Float[Tensor, "b a"], scan: TrainingScan) -> Float[Tensor, ""]:
+    """Mean absolute error of the ranges of returns in metres, without the largest 5 % (SplatAD): rays that graze an
+    edge. A ray that meets nothing has none."""
+    met = scan.returned & (alpha > CERTAIN)
+    errors = torch.where(met, (expected - scan.range).abs(), 0.0)
+    kept = errors <= torch.quantile(errors[met], 1.0 - IGNORED_DEPTHS) if bool(met.any()) else met
+    return (errors * kept).sum() / (met & kept).sum().clamp(min=1)
