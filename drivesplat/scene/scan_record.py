@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64, Int16
 
 from drivesplat.io.array_file import read_typed_arrays
 from drivesplat.io.storage import Provenance
+from drivesplat.scene.rigid import apply
 from drivesplat.scene.scan import Scan
 
 RULE = "scans"
@@ -41,6 +42,21 @@ class RecordedScan:
     scan: Scan
     measured: Bool[np.ndarray, "b a"]
     objects: Int16[np.ndarray, "b a"]
+
+    def points(self) -> np.ndarray:
+        """The measured returns (n, 3) in world coordinates, metres, beam by beam."""
+        from scipy.spatial.transform import Rotation  # here: planning imports this module, and scipy takes long
+
+        chosen = self.scan.returned & self.measured
+        offsets = self.scan.rays.offsets_s[chosen].astype(np.float64)[:, None]
+        seen = self.scan.rays.directions()[chosen] * self.scan.ranges[chosen, None]
+        at_timestamp = Rotation.from_rotvec(offsets * self.angular).apply(seen) + offsets * self.linear
+        return apply(self.sensor_to_world, at_timestamp)
+
+    @property
+    def objects_met(self) -> np.ndarray:
+        """`objects` of `points` (n,)."""
+        return self.objects[self.scan.returned & self.measured]
 
 
 @dataclass(frozen=True)

@@ -29,5 +29,8 @@ class ScanTrainingSettings(Settings):
     empty space."""
     sight_margin: float = Field(0.8, ge=0, le=10)
     """Distance before a return (metres) that need not be empty."""
+    points: int = Field(100_000, ge=0, le=5_000_000)
+    """Maximum number of seed points from training scans, where no camera saw a surface: a LiDAR looks all around. The
+    limits on the number of Gaussians rise by their number. 0 = none."""
     beam_spread: tuple[Milliradians, Milliradians] = (0.3, 0.3)
     """Standard deviation of a beam's footprint in azimuth and elevation (milliradians)."""

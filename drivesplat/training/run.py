@@ -32,7 +32,7 @@ from drivesplat.training import resume_state
 from drivesplat.training.exposure_init import initial_gains
 from drivesplat.training.geometry_priors import GeometryPriors, geometry_priors
 from drivesplat.training.psnr_curves import CurveViews, evenly_spaced
-from drivesplat.training.scans import TrainingScan, initial_echo, load_scans
+from drivesplat.training.scans import TrainingScan, initial_echo, load_scans, with_scan_points
 from drivesplat.training.train import TrainingFolders, TrainingSummary, train
 from drivesplat.training.views import Guides, TrainingView, load_views
 
@@ -158,10 +158,14 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     """Loads the training images onto the device, builds an untrained model, and resolves the cap in the settings."""
     with explain_out_of_memory(lambda: 0):
         views = load_views(inputs.record, inputs.guides(job), device)
-    settings = job.train.model_copy(update={"cap_max": gaussian_cap(inputs.record, job.train)})
+    record, cap = inputs.record, gaussian_cap(inputs.record, job.train)
+    if job.train.scans.share:
+        record = with_scan_points(record, inputs.scans, job.train.scans, job.random_seed)
+    more = len(record.points) - len(inputs.record.points)
+    settings = job.train.model_copy(update={"cap_max": cap + more})
     exposed = inputs.exposed(job)
     init = ModelInit(
-        inputs.record,
+        record,
         inputs.actors,
         mean_sky_color(views),
         inputs.semantic_classes(job),

@@ -1,5 +1,6 @@
 """Training with LiDAR scans: the recorded scans on the device, the iterations that fit them, and their loss."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,11 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from drivesplat.lidar.sweeps import thin
 from drivesplat.model.scans import ScanPicture, ScanView, view_of_scan
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
+from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training.losses import IGNORED_DEPTHS, regularization
@@ -21,6 +25,8 @@ CERTAIN = 1e-4
 """Distance of probabilities from 0 and 1, for finite logarithms."""
 SCANS_SEED = 7919
 """Added to the training's random seed: the order of scans is another one than that of images."""
+SPACING, NEAR_SEEDS = 0.2, 0.5
+"""Edge in metres of the voxels that hold one seed point of scans each, and their least distance from other seeds."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,27 @@ def initial_echo(recorded: Sequence[RecordedScan]) -> tuple[float, float]:
     intensities = [scan.scan.intensities[scan.scan.returned] for scan in recorded if scan.scan.intensities is not None]
     every = np.concatenate(intensities) if intensities else np.empty(0)
     return _logit(float(every.mean()) if len(every) else 0.5), _logit(0.9)
+
+
+def with_scan_points(
+    record: TrainingRecord, recorded: Sequence[RecordedScan], settings: ScanTrainingSettings, seed: int
+) -> TrainingRecord:
+    """A training record with seed points of static surfaces that scans met and no other seed point is near, in the mean
+    colour of the others: cameras did not see most of them."""
+    returns = [scan.points()[scan.objects_met == NO_OBJECT] for scan in recorded]
+    points = np.concatenate([np.empty((0, 3)), *returns])
+    points = points[thin(points, SPACING)]
+    if len(record.points) and len(points):
+        points = points[cKDTree(record.points).query(points, workers=-1)[0] > NEAR_SEEDS]
+    if len(points) > settings.points:
+        points = points[np.sort(np.random.default_rng(seed).choice(len(points), settings.points, replace=False))]
+    color = record.points_rgb.mean(axis=0).round() if len(record.points_rgb) else np.full(3, 128.0)
+    colors = np.tile(color.astype(np.uint8), (len(points), 1))
+    return dataclasses.replace(
+        record,
+        points=np.concatenate([record.points, points.astype(record.points.dtype)]),
+        points_rgb=np.concatenate([record.points_rgb, colors]),
+    )
 
 
 def _logit(probability: float) -> float:

@@ -1,0 +1,117 @@
+"""LiDAR scans of a model: what its echoes give, seen along the rays of a sensor."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import actors_of, motion_through, round_gaussians, track_of
+from torch import nn
+
+from drivesplat.errors import ResultError
+from drivesplat.model.scans import ScanView, scan_picture, view_of_scan
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.rasterization.scans import RayGrid
+from drivesplat.scene.scan import Scan, ScanRays
+from drivesplat.scene.scan_record import RecordedScan
+
+SPREAD = (1e-3, 1e-3)
+PLACE = np.array([2.0, -1.0, 1.5])
+
+
+def turned(angle: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    pose[:3, 3] = PLACE
+    return pose
+
+
+def recorded(angle: float = 0.4, beams: int = 5, firings: int = 40, seconds: float = 1.0) -> RecordedScan:
+    """A sensor that looks all around, turned about the vertical; nothing returned."""
+    azimuths = np.linspace(-np.pi, np.pi, firings, endpoint=False, dtype=np.float32)[None].repeat(beams, axis=0)
+    elevations = np.linspace(-0.1, 0.1, beams, dtype=np.float32)[:, None].repeat(firings, axis=1)
+    empty = np.zeros((beams, firings), dtype=np.float32)
+    scan = Scan(ScanRays(azimuths, elevations, empty), empty > 0, empty)
+    none = np.full((beams, firings), -1, dtype=np.int16)
+    return RecordedScan(
+        "TOP", 0, seconds, 0, True, "train", turned(angle), np.zeros(3), np.zeros(3), scan, empty == 0, none
+    )
+
+
+def view(**changes) -> ScanView:
+    return view_of_scan(recorded(**changes), SPREAD, torch.device("cpu"))
+
+
+def walls(logits: tuple[float, float] = (-1.0, 2.0), slope: np.ndarray | None = None) -> SplatModel:
+    """A ring of Gaussians 10 m around the sensor, with echoes of these logits that grow along a direction."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 300, endpoint=False)
+    heights = np.linspace(-2.0, 2.0, 9)
+    ring = np.array([[10 * np.cos(a), 10 * np.sin(a), z] for a in angles for z in heights]) + PLACE
+    part = round_gaussians(ring, sizes=0.25, opacities=0.95)
+    echoes = torch.zeros(len(ring), 4, 2)
+    echoes[:, 0] = torch.tensor(logits)
+    if slope is not None:
+        echoes[:, 1:] = torch.from_numpy(slope).float()
+    part.params["echoes"] = nn.Parameter(echoes)
+    return SplatModel([part], None)
+
+
+def test_a_view_of_a_scan_has_its_pose_rays_and_motion():
+    found = view(angle=0.7)
+    np.testing.assert_allclose(found.world_to_sensor.numpy() @ turned(0.7), np.eye(4), atol=1e-6)
+    assert isinstance(found.rays, RayGrid) and found.rays.azimuths.shape == (5, 40)
+    assert found.time == 1.0 and found.beam_spread == SPREAD and not found.linear.any()
+
+
+def test_a_wall_around_the_sensor_returns_its_range_and_its_echo():
+    picture = walls().scan(view())
+    assert (picture.alpha > 0.99).all()
+    flat = 10.0 / torch.cos(view().rays.elevations)
+    assert (picture.range - flat).abs().median() < 0.15
+    expected = torch.sigmoid(torch.tensor(-1.0)).expand(5, 40)
+    torch.testing.assert_close(picture.intensity, expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(picture.returned, picture.alpha * torch.tensor(2.0).sigmoid(), atol=1e-4, rtol=0)
+
+
+def test_an_echo_depends_on_the_direction_in_the_world():
+    slope = np.array([[2.0, 0.0], [0.0, 0.0], [0.0, 0.0]])  # the intensity's logit grows along the world's x axis
+    picture = walls((0.0, 0.0), slope).scan(view(angle=0.4))
+    along_x = torch.cos(view().rays.elevations) * torch.cos(view().rays.azimuths + 0.4)
+    torch.testing.assert_close(picture.intensity, torch.sigmoid(2.0 * along_x), atol=0.03, rtol=0)
+
+
+def test_a_ray_that_meets_nothing_does_not_return():
+    model = walls()
+    model.parts[0].params["means"].data[:, 0] += 1000.0
+    picture = model.scan(view())
+    for values in (picture.range, picture.returned, picture.intensity, picture.alpha):
+        assert torch.equal(values, torch.zeros(5, 40))
+
+
+def test_the_echoes_of_an_actor_turn_with_it():
+    """Its side that returns more is another side of the world after it has turned by 90 degrees."""
+    motion = motion_through([0.0, 2.0], [[10.0, 0.0, 1.0]] * 2, [0.0, np.pi / 2])
+    actors = actors_of(track_of(motion), count=4, shaken=False)
+    echoes = torch.zeros(4, 4, 2)
+    echoes[:, 0], echoes[:, 1, 1] = 0.5, 3.0
+    actors.params["echoes"] = nn.Parameter(echoes)
+    before, after = actors.echoes(0.0), actors.echoes(2.0)
+    torch.testing.assert_close(before, echoes)
+    torch.testing.assert_close(after[:, 0], echoes[:, 0])
+    torch.testing.assert_close(after[:, 1:, 1], torch.tensor([0.0, 3.0, 0.0]).expand(4, 3), atol=1e-5, rtol=0)
+
+
+def test_alpha_before_a_range_is_that_of_what_is_nearer():
+    before = torch.full((5, 40), 12.0)
+    before[:, :20] = 5.0
+    picture = walls().scan(view(), before=before)
+    assert (picture.alpha_before[:, 20:] > 0.99).all() and (picture.alpha_before[:, :20] < 1e-3).all()
+    assert walls().scan(view()).alpha_before is None
+
+
+def test_a_model_trained_without_lidar_is_refused():
+    model = SplatModel([round_gaussians([[5.0, 0.0, 0.0]])], None)
+    with pytest.raises(ResultError, match=r"trained without LiDAR: train it with train\.scans\.share above 0"):
+        model.scan(view())
+    gaussians = walls().gaussians_at(0.0)
+    assert gaussians.echoes is None, "images need no echoes"
+    with pytest.raises(ResultError):
+        scan_picture(gaussians, view())

@@ -1,0 +1,245 @@
+"""Training with LiDAR scans: which iterations fit one, the loss, and what is learned."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.hand_made import round_gaussians
+from helpers.records import training_record_of
+from helpers.trainings import CPU, folders_of, guided_views, recorded_views, seed_points, settings_of, untrained
+from pydantic import ValidationError
+
+from drivesplat.model.background import Background
+from drivesplat.model.scans import ScanPicture
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.scene.scan import Scan, ScanRays
+from drivesplat.scene.scan_record import RecordedScan
+from drivesplat.settings.train import TrainSettings
+from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.scans import (
+    beam_spread,
+    fits_scan,
+    initial_echo,
+    load_scans,
+    scan_index,
+    scan_terms,
+    scans_before,
+    with_scan_points,
+)
+from drivesplat.training.train import train
+from drivesplat.training.trainer import Trainer
+
+WALL_AT = 6.0
+SHARE = ScanTrainingSettings(share=0.5)
+
+
+def scan_of_a_wall(x: float = 0.0, intensity: float = 0.3) -> RecordedScan:
+    """What a sensor at (x, 0, 0) that looks along z measures of a wall before the cameras of `recorded_views`; the last
+    fifth of the rays is dropped."""
+    azimuths, elevations = (
+        values.astype(np.float32) for values in np.meshgrid(np.linspace(-0.35, 0.35, 30), np.linspace(-0.2, 0.2, 12))
+    )
+    ranges = (WALL_AT / (np.cos(elevations) * np.cos(azimuths))).astype(np.float32)
+    returned = np.ones(ranges.shape, dtype=bool)
+    returned[:, 24:] = False
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]  # the sensor's x is the cameras' z
+    pose[0, 3] = x
+    values = np.full(ranges.shape, intensity, dtype=np.float32)
+    rays = ScanRays(azimuths, elevations, np.zeros_like(ranges))
+    scan = Scan(rays, returned, ranges * returned, values * returned)
+    nothing = np.full(ranges.shape, -1, dtype=np.int16)
+    return RecordedScan(
+        "TOP", 0, 0.0, 0, True, "train", pose, np.zeros(3), np.zeros(3), scan, np.ones_like(returned), nothing
+    )
+
+
+def picture_of(scan, **changes) -> ScanPicture:
+    """The rendering that equals a recorded scan, but for `changes`."""
+    gaussians = round_gaussians([[0.0, 0.0, 5.0]]).at(0.0)
+    ones = torch.ones_like(scan.range)
+    exact = {"range": scan.range, "returned": scan.returned.float(), "intensity": scan.intensity, "alpha": ones}
+    return ScanPicture(**{"gaussians": gaussians, **exact, "alpha_before": 0.0 * ones, **changes})
+
+
+def terms_of(picture: ScanPicture, scan, **weights) -> dict[str, float]:
+    settings = settings_of(opacity_reg=0.0, scale_reg=0.0, scans=ScanTrainingSettings(share=0.5, **weights))
+    model = SplatModel([round_gaussians([[0.0, 0.0, 5.0]])], None)
+    return {name: float(value) for name, value in scan_terms(picture, scan, model, settings).items()}
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.25, 1 / 3, 0.5, 0.9])
+def test_scans_are_spread_evenly_over_the_iterations(share):
+    fitted = [fits_scan(step, share) for step in range(300)]
+    assert sum(fitted) == math.floor(300 * share) == scans_before(300, share)
+    for start in range(0, 300, 30):
+        assert abs(sum(fitted[start : start + 30]) - 30 * share) <= 1
+
+
+def test_every_scan_is_taken_once_an_epoch_in_a_seeded_order():
+    steps = [step for step in range(80) if fits_scan(step, 0.25)]
+    taken = [scan_index(5, step, 0.25, seed=3) for step in steps]
+    for epoch in range(0, 20, 5):
+        assert sorted(taken[epoch : epoch + 5]) == [0, 1, 2, 3, 4]
+    assert taken == [scan_index(5, step, 0.25, seed=3) for step in steps]
+    assert taken != [scan_index(5, step, 0.25, seed=4) for step in steps]
+
+
+def test_every_image_is_taken_once_an_epoch_whatever_the_share():
+    settings = settings_of(scans=SHARE)
+    trainer = Trainer.begin(
+        with_echoes(settings), recorded_views(4), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SHARE, CPU)
+    )
+    numbers = []
+    for trainer.step in range(16):
+        if not trainer.fits_scan:
+            numbers.append(trainer.images.number(trainer._image_step))
+    assert len(numbers) == 8 and sorted(numbers[:4]) == sorted(numbers[4:]) == [0, 1, 2, 3]
+
+
+def test_an_exact_scan_has_no_loss():
+    (scan,) = load_scans([scan_of_a_wall()], SHARE, CPU)
+    terms = terms_of(picture_of(scan), scan)
+    assert set(terms) == {"scan_range", "scan_drop", "scan_intensity", "scan_sight"}
+    assert terms["scan_drop"] < 2e-5 and all(terms[name] == 0.0 for name in terms if name != "scan_drop")
+
+
+def test_each_term_measures_its_own_error():
+    (scan,) = load_scans([scan_of_a_wall()], SHARE, CPU)
+    weights = {"range_weight": 2.0, "intensity_weight": 3.0, "drop_weight": 5.0, "sight_weight": 7.0}
+    half, returns = 0.5 * torch.ones_like(scan.range), float(scan.returned.float().mean())
+    far = terms_of(picture_of(scan, range=scan.range + 0.25), scan, **weights)
+    assert far["scan_range"] == pytest.approx(0.5, rel=1e-5)
+    bright = terms_of(picture_of(scan, intensity=scan.intensity + 0.2), scan, **weights)
+    assert bright["scan_intensity"] == pytest.approx(3.0 * 0.04, rel=1e-5)
+    unsure = terms_of(picture_of(scan, returned=half), scan, **weights)
+    assert unsure["scan_drop"] == pytest.approx(5.0 * math.log(2.0), rel=1e-5)
+    veiled = terms_of(picture_of(scan, alpha_before=half), scan, **weights)
+    assert veiled["scan_sight"] == pytest.approx(3.5, rel=1e-5) and 0.7 < returns < 0.9
+
+
+def test_the_worst_ranges_are_ignored():
+    (scan,) = load_scans([scan_of_a_wall()], SHARE, CPU)
+    wild = scan.range.clone()
+    wild[0, 1:4] += 1000.0
+    assert terms_of(picture_of(scan, range=wild), scan)["scan_range"] == 0.0
+
+
+def test_rays_that_were_not_measured_have_no_effect():
+    unmeasured = np.zeros((12, 30), dtype=bool)
+    unmeasured[3:9] = True
+    (scan,) = load_scans([dataclasses.replace(scan_of_a_wall(), measured=~unmeasured)], SHARE, CPU)
+    rows = torch.from_numpy(unmeasured)
+    wrong = {name: torch.where(rows, 9.0, getattr(scan, name)) for name in ("range", "intensity")}
+    right, changed = picture_of(scan), picture_of(scan, returned=torch.where(rows, 0.3, scan.returned.float()), **wrong)
+    assert terms_of(changed, scan) == terms_of(right, scan)
+
+
+def test_a_scan_without_returns_or_intensity_has_a_finite_loss():
+    empty = scan_of_a_wall()
+    nothing = np.zeros((12, 30), dtype=np.float32)
+    (scan,) = load_scans([dataclasses.replace(empty, scan=Scan(empty.scan.rays, nothing > 0, nothing))], SHARE, CPU)
+    terms = terms_of(picture_of(scan, returned=nothing_met(scan), intensity=nothing_met(scan)), scan)
+    assert "scan_intensity" not in terms and all(math.isfinite(value) for value in terms.values())
+    assert load_scans([dataclasses.replace(empty, measured=nothing > 0)], SHARE, CPU) == []
+
+
+def nothing_met(scan) -> torch.Tensor:
+    return torch.zeros_like(scan.range)
+
+
+def with_echoes(settings: TrainSettings) -> SplatModel:
+    """The untrained model of `untrained`, with echoes."""
+    part = Background.from_points(*seed_points(), settings.gaussians, 1.0, echo=initial_echo([scan_of_a_wall()]))
+    return SplatModel([part], None)
+
+
+def test_initial_echoes_are_the_recorded_intensity_and_a_likely_return():
+    intensity, returned = (torch.tensor(logit).sigmoid().item() for logit in initial_echo([scan_of_a_wall()]))
+    assert intensity == pytest.approx(0.3, abs=1e-4) and returned == pytest.approx(0.9)
+    without = dataclasses.replace(scan_of_a_wall().scan, intensities=None)
+    unknown = initial_echo([dataclasses.replace(scan_of_a_wall(), scan=without)])
+    assert torch.tensor(unknown[0]).sigmoid().item() == pytest.approx(0.5)
+
+
+def test_the_beam_spread_is_in_radians():
+    assert beam_spread(ScanTrainingSettings(beam_spread=(0.5, 2.0))) == (0.0005, 0.002)
+
+
+def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):
+    settings = settings_of(iterations=240, scans=ScanTrainingSettings(share=0.5), opacity_reg=0.0, scale_reg=0.0)
+    model, recorded = with_echoes(settings), [scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)]
+    scans = load_scans(recorded, settings.scans, CPU)
+
+    summary = train(model, recorded_views(), settings, 0, CPU, folders_of(tmp_path, "a"), scans=scans)
+    with torch.no_grad():
+        picture = model.scan(scans[1].view)
+    known = scans[1].returned & (picture.alpha > 0.5)
+    assert summary.iterations == 240 and known.sum() > 0.9 * scans[1].returned.sum()
+    assert (picture.range - scans[1].range).abs()[known].median() < 0.2
+    assert (picture.intensity - scans[1].intensity).abs()[known].median() < 0.05
+    assert picture.returned[scans[1].returned].median() > 0.7 > 0.5 > picture.returned[~scans[1].returned].median()
+
+
+def test_scans_leave_the_geometry_alone_where_they_are_told_to():
+    settings = settings_of(scans=ScanTrainingSettings(share=0.5, geometry=False))
+    scans = load_scans([scan_of_a_wall()], settings.scans, CPU)
+    model = with_echoes(settings)
+    trainer = Trainer.begin(model, guided_views()[:2], settings, 0, CPU, scans=scans)
+    before = {name: value.detach().clone() for name, value in model.parts[0].params.items()}
+    trainer.step = 1
+    assert trainer.fits_scan
+    terms, picture, view = trainer.fit_one(with_picture=False)
+    assert picture is None and view is None and "scan_range" in terms
+    changed = {name for name, value in model.parts[0].params.items() if not torch.equal(value, before[name])}
+    assert changed == {"echoes"}
+
+
+def test_an_iteration_whose_picture_is_wanted_fits_an_image():
+    settings = settings_of(scans=SHARE)
+    trainer = Trainer.begin(
+        with_echoes(settings), guided_views(), settings, 0, CPU, scans=load_scans([scan_of_a_wall()], SHARE, CPU)
+    )
+    trainer.step = 1
+    terms, picture, view = trainer.fit_one(with_picture=True)
+    assert picture is not None and view is not None and "l1" in terms
+
+
+def test_scans_need_densification_by_mcmc():
+    with pytest.raises(ValidationError, match=r"scans\.share needs strategy: mcmc"):
+        TrainSettings(strategy="default", scans=SHARE)
+    assert untrained(settings_of()).parts[0].echoes(0.0) is None
+
+
+def test_seed_points_are_added_where_scans_alone_met_static_surfaces():
+    wall = scan_of_a_wall()
+    moving = np.full(wall.objects.shape, -1, dtype=np.int16)
+    moving[:6] = 0
+    wall = dataclasses.replace(wall, objects=moving, linear=np.array([0.0, 0.0, 5.0]))
+    known = np.array([[0.0, 0.0, WALL_AT]], dtype=np.float32)
+    record = training_record_of(2, points=known, points_rgb=np.array([[10, 20, 30]], dtype=np.uint8))
+    found = with_scan_points(record, [wall], ScanTrainingSettings(share=0.5), seed=0)
+    added = found.points[1:]
+    assert len(added) > 20 and np.array_equal(found.points[:1], known) and found.points.dtype == np.float32
+    np.testing.assert_allclose(added[:, 2], WALL_AT, atol=1e-4)
+    assert (added[:, 1] < 0.02).all(), "the lower half of the rays met something that moves"
+    assert np.linalg.norm(added - known, axis=1).min() > 0.5 and (found.points_rgb == [10, 20, 30]).all()
+    few = with_scan_points(record, [wall], ScanTrainingSettings(share=0.5, points=7), seed=0)
+    assert len(few.points) == 8 and np.isin(few.points[1:, 0], added[:, 0]).all()
+
+
+def test_the_points_of_a_scan_are_where_its_rays_met_them_at_their_own_times():
+    still = scan_of_a_wall(0.5)
+    rays = dataclasses.replace(still.scan.rays, offsets_s=np.full((12, 30), 0.1, dtype=np.float32))
+    moving = dataclasses.replace(
+        still, scan=dataclasses.replace(still.scan, rays=rays), linear=np.array([2.0, 0.0, 0.0]),
+        angular=np.array([0.0, 0.0, 0.5]),
+    )  # fmt: skip
+    turned, standing = moving.points(), still.points()
+    ranges = still.scan.ranges[still.scan.returned]
+    np.testing.assert_allclose(np.linalg.norm(standing - [0.5, 0.0, 0.0], axis=1), ranges, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(turned - [0.5, 0.0, 0.2], axis=1), ranges, rtol=1e-5)
+    left = still.scan.rays.azimuths[still.scan.returned]
+    np.testing.assert_allclose(np.arctan2(-(turned[:, 0] - 0.5), turned[:, 2] - 0.2), left + 0.05, atol=1e-4)
