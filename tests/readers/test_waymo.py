@@ -14,6 +14,8 @@ from PIL import Image
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.masks import make_masks
 from drivesplat.readers.sweeps import read_returns
+from drivesplat.readers.waymo.calibration import readout_middle
+from drivesplat.readers.waymo.segment import ImageRecord
 from drivesplat.readers.waymo.sweep_file import read_rays
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.rigid import apply
@@ -124,6 +126,9 @@ def test_cameras_keep_size_mount_and_readout(scenes, recorded):
     assert (left.name, left.width, left.height) == ("SIDE_LEFT", 96, 38)
     assert (front.readout_direction, left.readout_direction) == ("right", "down")
     assert front.readout_s == pytest.approx(READOUT_S, abs=1e-6) == left.readout_s
+    for scene in scenes.values():
+        middles = {frame.readout_middle_s for frame in scene.frames}
+        assert max(map(abs, middles)) < 0.05
     frame = next(frame for frame in scenes["v1"].frames if frame.camera == "SIDE_LEFT")
     with Image.open(frame.image_path) as image:
         assert image.size == (96, 38)
@@ -266,3 +271,13 @@ def test_class_maps_of_distorted_images_are_resampled_as_the_images(recorded, tm
     expected = np.rint(image[..., 0] / 10.0)
     inside = np.where(labels == NONE, 0, labels) == expected
     assert inside.mean() > 0.8 and (labels != np.where(classes == 0, NONE, classes)).any()
+
+
+@pytest.mark.parametrize(
+    ("pose_timestamp", "trigger", "done", "expected"),
+    [(10.0, 9.99, 10.03, 0.01), (10.0, 9.96, 10.0, -0.02), (10.0, 0.0, 10.03, 0.0), (10.0, 3.0, 3.04, 0.0),
+     (10.0, None, 10.03, 0.0)],
+)  # fmt: skip
+def test_the_middle_of_the_readout_counts_from_the_time_of_the_pose(pose_timestamp, trigger, done, expected):
+    image = ImageRecord(10_000_000, 1, None, pose_timestamp, 0.004, trigger, done)
+    assert readout_middle(image) == pytest.approx(expected)

@@ -68,6 +68,8 @@ def test_cameras_look_where_they_are_mounted(scene):
     assert np.linalg.norm(scene.origin) > 25_000
     for camera in scene.cameras:
         assert 0.043 < camera.readout_s < 0.045 and camera.readout_direction == "right"
+    middles = {frame.camera: round(1e3 * frame.readout_middle_s, 1) for frame in scene.frames}
+    assert min(middles.values()) == -4.4 and max(middles.values()) == 3.1, "milliseconds"
 
 
 def test_the_labels_have_sky_above_and_road_below(root, tmp_path):
