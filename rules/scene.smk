@@ -3,7 +3,8 @@
 # REQUIRED INPUTS: the tables, images and LiDAR of the dataset that the config names.
 # OUTPUTS: <results>/{scene}/scene.json, own_car.json, seed.ply, parser.pkl, masks/masks.json (and the PNGs beside it);
 # where poses are refined, scene_refined.json, poses.json and triangulated.npz; where a method asks for them, actors.npz,
-# lidar_depth.npz and free_space.npz. The scene of all rules after these (plan.scene) is the refined one where there is one.
+# lidar_depth.npz and free_space.npz; on request scans.npz. The scene of all rules after these (plan.scene) is the refined
+# one where there is one.
 
 
 rule extract:
@@ -245,3 +246,28 @@ rule free_space:
         code=plan.code("free_space"),
     script:
         "../workflow_scripts/free_space.py"
+
+
+rule scans:
+    """
+    Resolves the revolutions of all LiDARs into rays: direction, time, range, intensity, whether they returned, which
+    object they met, and which say nothing (the ego vehicle, skipped sectors).
+    """
+    input:
+        scene=plan.scene,
+    output:
+        scans="<results>/{scene}/scans.npz",
+    log:
+        "<logs>/{scene}/scans.log",
+    benchmark:
+        "<benchmarks>/{scene}/scans.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        settings=plan.settings("scans"),
+        code=plan.code("scans"),
+    script:
+        "../workflow_scripts/scans.py"

@@ -5,21 +5,22 @@ hole.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
 from drivesplat.scene.rigid import inverse, rigid
-from drivesplat.scene.scan import Scan, ScanRays
+from drivesplat.scene.scan import Scan, ScanRays, wrapped
 from drivesplat.scene.scene import Sweep
-from drivesplat.scene.sensors import Lidar, LidarReturns
+from drivesplat.scene.sensors import Lidar, LidarReturns, Spin
 
 SensorPoses = Callable[[np.ndarray], np.ndarray]
 """The poses (n, 4, 4) of the sensor in its frame at the sweep's timestamp, at offsets (n,) in seconds from it."""
+MIN_RANGE = 0.5
+"""Metres within which nothing is measured: some files give rays without a return the range 0."""
 STEPS = 6
 """Iterations to find the time and azimuth at which a spinning sensor met a return."""
 MAX_RESIDUAL = 1e-4
@@ -36,27 +37,6 @@ class SeenReturns(NamedTuple):
     azimuths: np.ndarray
     elevations: np.ndarray
     ranges: np.ndarray
-
-
-@dataclass(frozen=True)
-class Spin:
-    """How a sensor goes round where its returns have no times: a revolution takes `revolution_s` seconds and begins
-    `start_s` seconds after the sweep's timestamp at the azimuth `start_azimuth` (radians), clockwise seen from above or
-    not."""
-
-    revolution_s: float
-    start_s: float
-    start_azimuth: float
-    clockwise: bool = True
-
-    def fractions(self, azimuths: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """The fractions of a revolution after which the beams pass azimuths."""
-        turned = self.start_azimuth - azimuths if self.clockwise else azimuths - self.start_azimuth
-        return turned / (2.0 * np.pi) % 1.0
-
-    def offsets_s(self, azimuths: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Seconds after the sweep's timestamp at which the beams pass azimuths."""
-        return self.start_s + self.revolution_s * self.fractions(azimuths)
 
 
 def sensor_poses(sweep: Sweep, sweeps: Sequence[Sweep]) -> SensorPoses:
@@ -103,9 +83,10 @@ def scan_of(returns: LidarReturns, lidar: Lidar, poses: SensorPoses, spin: Spin 
 
     Beams are rings (without rings, the nearest of `lidar.beam_elevations`), firings `lidar.azimuth_steps` evenly spaced
     azimuths, or as many as the gaps between returns suggest, each beam with its own shift. The nearest of several
-    returns in one cell of this grid is kept. Its ray has its exact direction; holes have the grid's. Times are those of
-    the returns, or follow from `spin`; without either all rays leave at the sweep's timestamp. Of the two times that a
-    return near the beginning of the revolution may have, the one that suits its ring's elevation better is taken.
+    returns in one cell of this grid is kept; those within MIN_RANGE are none. Its ray has its exact direction; holes
+    have the grid's. Times are those of the returns, or follow from `spin`; without either all rays leave at the sweep's
+    timestamp. Of the two times that a return near the beginning of the revolution may have, the one that suits its
+    ring's elevation better is taken.
 
     Raises DatasetError where neither rings nor beam elevations are known, or nothing says how many firings there are.
 
@@ -124,7 +105,10 @@ def scan_of(returns: LidarReturns, lidar: Lidar, poses: SensorPoses, spin: Spin 
         >>> scan.ranges.astype(float).round(2).tolist()
         [[7.0, 0.0, 5.0, 6.0], [0.0, 0.0, 0.0, 8.04]]
     """
-    offsets, azimuths, elevations, ranges = _seen(returns, poses, spin)
+    seen = _seen(returns, poses, spin)
+    measured = seen.ranges >= MIN_RANGE
+    returns, seen = _chosen(returns, measured), SeenReturns(*(values[measured] for values in seen))
+    offsets, azimuths, elevations, ranges = seen
     rings, beams = _beams(returns, lidar, elevations)
     steps = lidar.azimuth_steps or _steps(lidar, azimuths, rings)
     phases = _phases(azimuths, rings, len(beams), steps)
@@ -150,9 +134,9 @@ def scan_of(returns: LidarReturns, lidar: Lidar, poses: SensorPoses, spin: Spin 
     )  # fmt: skip
 
 
-def wrapped(angles: np.ndarray) -> np.ndarray:
-    """Angles in radians from -π to below π, in their own type."""
-    return (angles + np.pi) % (2.0 * np.pi) - np.pi
+def _chosen(returns: LidarReturns, chosen: Bool[np.ndarray, " n"]) -> LidarReturns:
+    columns = (returns.points, returns.intensity, returns.rings, returns.offsets_s)
+    return LidarReturns(*(None if column is None else column[chosen] for column in columns))
 
 
 def _seen(returns: LidarReturns, poses: SensorPoses, spin: Spin | None) -> SeenReturns:

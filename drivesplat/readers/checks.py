@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from drivesplat.errors import DatasetError
 from drivesplat.readers.record_names import is_printable, named, shown, text_fault
 from drivesplat.scene.rigid import rigid
+from drivesplat.scene.sensors import Spin
 
 MAX_COORDINATE = 1e8
 """Maximum coordinate in metres of a position: map projections of the earth stay below 4.1e7."""
@@ -29,6 +30,8 @@ MAX_NAME, MAX_PATH = 255, 2000
 MAX_READOUT_S = 1.0
 MAX_STEPS = 1_000_000
 """Maximum readout time of an image, and number of firings of a beam per revolution."""
+MAX_SPIN = 10.0
+"""Maximum seconds of a revolution and of its start, and radians of the azimuth at which it begins."""
 EXACT = 1e-9
 """Deviation from orthogonality that is rounding."""
 
@@ -219,6 +222,15 @@ def checked_beams(elevations: Any, steps: Any, record: str) -> tuple[np.ndarray 
     if steps is not None and not (is_number(steps) and 1 <= steps <= MAX_STEPS and steps == int(steps)):
         raise DatasetError(f"{record}: its azimuth steps are {shown(steps)}; they must be a whole number above 0")
     return elevations, (None if steps is None else int(steps))
+
+
+def checked_spin(values: Any, record: str) -> Spin:
+    """A LiDAR's spin, of a list [revolution_s, start_s, start_azimuth]: seconds, seconds and radians, clockwise.
+    Raises DatasetError naming `record` for other values."""
+    numbers = checked_numbers(values, 3, MAX_SPIN, record, "spin", "seconds of a revolution and of its start, radians")
+    if numbers[0] <= 0.0:
+        raise DatasetError(f"{record}: a revolution takes {numbers[0]:g} s; it must take more than 0")
+    return Spin(*map(float, numbers))
 
 
 def require_none(faults: Iterable[str]) -> None:

@@ -7,8 +7,9 @@ from drivesplat.errors import DatasetError
 from drivesplat.readers.by_name import dataset_module
 from drivesplat.readers.drive_checks import returns_fault
 from drivesplat.readers.sweep_motion import compensated, motion_fault
+from drivesplat.scene.scan import Scan
 from drivesplat.scene.scene import Sweep, place_of
-from drivesplat.scene.sensors import LidarReturns
+from drivesplat.scene.sensors import LidarReturns, Spin
 
 SWEEP_FILE = "drivesplat.readers.*.sweep_file"
 """The module of a reader with `read_file` and `file_fault`."""
@@ -27,6 +28,19 @@ def read_returns(sweep: Sweep) -> LidarReturns:
             f"{_named(sweep, returns)}; restore it, or set {leave_out}lidar_seed.on_missing: warn to go on without it"
         )
     return returns
+
+
+def read_scan(sweep: Sweep, spin: Spin | None) -> Scan | None:
+    """All rays of a sweep, where its file holds them; None if it holds returns alone. `spin` gives the times of rays.
+    Raises DatasetError naming the sweep's token and path if the file is missing or damaged."""
+    read = getattr(_files(sweep), "read_scan", None)
+    if read is None:
+        return None
+    read_returns(sweep)
+    try:
+        return read(Path(sweep.path), spin)
+    except (OSError, KeyError, ValueError, IndexError) as error:
+        raise DatasetError(_named(sweep, f"is corrupt ({' '.join(str(error).split())[:200]})")) from error
 
 
 def sweep_fault(sweep: Sweep) -> str | None:

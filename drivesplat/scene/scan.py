@@ -6,7 +6,7 @@ Angles are in the sensor's own axes at the ray's own time: azimuth = atan2(y, x)
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
 
 @dataclass(frozen=True)
@@ -42,3 +42,23 @@ class Scan:
     def points(self) -> Float32[np.ndarray, "n 3"]:
         """The returns, beam by beam, in the sensor's frame at their own times."""
         return self.rays.directions()[self.returned] * self.ranges[self.returned, None]
+
+
+@dataclass(frozen=True)
+class RenderedScan:
+    """What a method says that the rays of a recorded scan return: `ranges` in metres, `drops`, the probability of no
+    return, and `intensities` in [0, 1], None where the method has none."""
+
+    ranges: Float[np.ndarray, "b a"]
+    drops: Float[np.ndarray, "b a"]
+    intensities: Float[np.ndarray, "b a"] | None = None
+
+    @property
+    def returned(self) -> Bool[np.ndarray, "b a"]:
+        """The rays that more probably return than not."""
+        return (self.drops < 0.5) & (self.ranges > 0.0)
+
+
+def wrapped(angles: np.ndarray) -> np.ndarray:
+    """Angles in radians from -π to below π, in their own type."""
+    return (angles + np.pi) % (2.0 * np.pi) - np.pi

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,35 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Spin:
+    """How a LiDAR goes round: a revolution takes `revolution_s` seconds and begins `start_s` seconds after the sweep's
+    timestamp at the azimuth `start_azimuth` (radians), clockwise seen from above or not."""
+
+    revolution_s: float
+    start_s: float
+    start_azimuth: float
+    clockwise: bool = True
+
+    def fractions(self, azimuths: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """The fractions of a revolution after which the beams pass azimuths."""
+        turned = self.start_azimuth - azimuths if self.clockwise else azimuths - self.start_azimuth
+        return turned / (2.0 * np.pi) % 1.0
+
+    def offsets_s(self, azimuths: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Seconds after the sweep's timestamp at which the beams pass azimuths."""
+        return self.start_s + self.revolution_s * self.fractions(azimuths)
+
+
+@dataclass(frozen=True)
 class Lidar:
     """A spinning LiDAR. `beam_elevations` in radians above the sensor's horizontal plane, in ring order;
-    `azimuth_steps` is the number of firings of a beam per revolution. None if unknown."""
+    `azimuth_steps` is the number of firings of a beam per revolution; `spin` gives the times of returns that have none
+    of their own. None if unknown."""
 
     name: str
     beam_elevations: Float64[np.ndarray, " b"] | None = None
     azimuth_steps: int | None = None
+    spin: Spin | None = None
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,13 @@ from drivesplat.settings.published import PublishedFigures
 from drivesplat.settings.refine_poses import RefinePosesSettings
 from drivesplat.settings.render import RenderSettings
 from drivesplat.settings.results_folder import ResultsFolder
+from drivesplat.settings.scans import ScanSettings
 from drivesplat.settings.train import SkyKind, TrainSettings
 from drivesplat.settings.world import CameraChannel
 
 DATASET_OVERRIDES = (
     "cameras", "eval_camera", "sweeps", "images", "holdout", "extract", "refine_poses", "lidar_seed", "actors",
-    "lidar_depth", "free_space", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
+    "lidar_depth", "free_space", "scans", "masks", "sky", "train", "render", "ghosts", "removal", "export", "device",
 )  # fmt: skip
 METHOD_OVERRIDES = ("sky", "train", "random_seed")
 
@@ -75,6 +76,7 @@ class Config(Settings):
     actors: ActorSeedSettings = ActorSeedSettings()
     lidar_depth: LidarDepthSettings = LidarDepthSettings()
     free_space: FreeSpaceSettings = FreeSpaceSettings()
+    scans: ScanSettings = ScanSettings()
     masks: MaskSettings = MaskSettings()
     sky: SkyKind = "cubemap"
     """Sky model behind the Gaussians: 'cubemap' (learned colours by direction), 'mask' (one learned colour, opacity
@@ -147,6 +149,8 @@ class Config(Settings):
                 raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")
         if self.eval_camera not in self.cameras:
             raise ValueError(self._no_eval_camera())
+        if self.scans.sweeps and not self.lidar_seed.sweeps:
+            raise ValueError("scans.sweeps needs lidar_seed.sweeps: true, which reads LiDAR between key frames")
         return self
 
     def _no_eval_camera(self) -> str:

@@ -26,6 +26,7 @@ from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
 from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob
+from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.workflow.film_names import no_such_edit, no_such_film, scene_edits
@@ -255,6 +256,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
     "lidar_depth": (LidarDepthJob, _lidar_depth),
     "free_space": (FreeSpaceJob, lambda at: _lidar(at, "own_car_radius", "box_margin")),
+    "scans": (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
     "scene_metrics": (Settings, _nothing),

@@ -64,6 +64,12 @@ def scan_pattern(lidar: WorldLidarSettings, revolutions_hz: int) -> ScanPattern:
     return ScanPattern(ELEVATIONS[lidar.beams], azimuths, offsets)
 
 
+def spin_of(revolutions_hz: int) -> list[float]:
+    """How a sensor that spins goes round, clockwise: seconds of a revolution, seconds after the sweep's timestamp at
+    which it begins, and the azimuth (radians from x to y) at which it does."""
+    return [1.0 / revolutions_hz, -1.0 / revolutions_hz, np.pi / 2.0 + 2.0 * np.pi * FORWARD]
+
+
 @dataclass(frozen=True)
 class Scan:
     """One revolution; all arrays (beams, steps). `range` without noise in metres, infinite where nothing is hit;

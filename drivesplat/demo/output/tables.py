@@ -5,7 +5,7 @@ Schema: https://www.nuscenes.org/nuscenes (nuScenes schema), as nuscenes-devkit 
 
 import numpy as np
 
-from drivesplat.demo.optics.lidar import scan_pattern
+from drivesplat.demo.optics.lidar import scan_pattern, spin_of
 from drivesplat.demo.optics.rig import DemoSensor, recording_sensors
 from drivesplat.demo.tokens import instance_token
 from drivesplat.readers.nuscenes.table_rows import TableRows, pose_columns
@@ -39,7 +39,8 @@ class NuScenesTables(TableRows):
         self._start_us = start_us
 
     def _sensor(self, sensor: DemoSensor, world: WorldSettings) -> None:
-        """`readout_s`, `readout_direction`, `beam_elevations` and `azimuth_steps` are additions to nuScenes' schema."""
+        """`readout_s`, `readout_direction`, `beam_elevations`, `azimuth_steps` and `spin` are additions to nuScenes'
+        schema."""
         modality = "camera" if sensor.is_camera else "lidar"
         self.add("sensor", token("sensor", sensor.channel), channel=sensor.channel, modality=modality)
         if sensor.is_camera:
@@ -53,6 +54,7 @@ class NuScenesTables(TableRows):
             steps = len(pattern.azimuths)
             details = {
                 "camera_intrinsic": [], "beam_elevations": pattern.elevations.tolist(), "azimuth_steps": steps,
+                **({"spin": spin_of(world.lidar_hz)} if world.lidar.spins else {}),
             }  # fmt: skip
         self.add(
             "calibrated_sensor", token("calibrated", sensor.channel), sensor_token=token("sensor", sensor.channel),

@@ -23,6 +23,7 @@ from drivesplat.readers.checks import (
     checked_pose,
     checked_readout,
     checked_size,
+    checked_spin,
     require_increasing,
 )
 from drivesplat.readers.drive_checks import chain, require_microseconds
@@ -32,7 +33,7 @@ from drivesplat.readers.nuscenes.scene_tables import damaged, read_scene_tables,
 from drivesplat.readers.record_names import named
 from drivesplat.scene.rigid import rigid
 from drivesplat.scene.scene import Frame, Scene, Sweep, Track
-from drivesplat.scene.sensors import Camera, Lidar
+from drivesplat.scene.sensors import Camera, Lidar, Spin
 from drivesplat.settings.extract import SceneSource
 
 READER = "nuscenes"
@@ -43,6 +44,8 @@ BEAM_ELEVATIONS = np.radians(np.linspace(-30.67, 10.67, 32))
 AZIMUTH_STEPS = 1085
 """Of the Velodyne HDL-32E at 20 Hz (user's manual): 32 beams in ring order, lowest first, which fire every 46.08
 microseconds. The number of firings per revolution varies by one or two."""
+SPIN = Spin(0.05, -0.05, np.pi)
+"""From the left, clockwise; the timestamp is that of the end (https://forum.nuscenes.org/t/245)."""
 
 
 def read(root: Path, source: SceneSource, scene_tables: Path | None = None) -> Scene:
@@ -101,11 +104,14 @@ def _camera(tables: Any, frame: Frame) -> Camera:
 
 
 def _lidar(tables: Any, sweep: Sweep) -> Lidar:
-    """The LiDAR of a sweep: nuScenes' own, unless a synthetic world states its beams."""
+    """The LiDAR of a sweep: nuScenes' own, unless a synthetic world states its beams and, where it spins, its spin."""
     sensor = _calibration(tables, sweep.token)
     record = named("calibrated_sensor", sensor["token"])
     elevations, steps = sensor.get("beam_elevations", BEAM_ELEVATIONS), sensor.get("azimuth_steps", AZIMUTH_STEPS)
-    return Lidar(LIDAR, *checked_beams(elevations, steps, record))
+    beams, spin = checked_beams(elevations, steps, record), SPIN
+    if "beam_elevations" in sensor:
+        spin = checked_spin(sensor["spin"], record) if "spin" in sensor else None
+    return Lidar(LIDAR, *beams, spin)
 
 
 def _calibration(tables: Any, sample_data: str) -> dict:

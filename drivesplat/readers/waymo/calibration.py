@@ -23,15 +23,17 @@ from drivesplat.readers.checks import (
     is_number,
 )
 from drivesplat.readers.waymo.names import CAMERAS, GLOBAL_SHUTTER, LASERS, READOUT_DIRECTIONS
-from drivesplat.readers.waymo.range_image import elevations
+from drivesplat.readers.waymo.range_image import column_azimuth, elevations
 from drivesplat.readers.waymo.segment import CameraRecord, ImageRecord, LaserRecord, camera_name, laser_name
 from drivesplat.scene.rigid import rigid
-from drivesplat.scene.sensors import Camera, Lidar
+from drivesplat.scene.sensors import Camera, Lidar, Spin
 
 FROM_OPENCV = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 """OpenCV's camera axes (x right, y down, z forward) to Waymo's."""
 MAX_INTRINSIC = 1e6
 HALF_PIXEL = 0.5
+REVOLUTION_S = 0.1
+"""Seconds of a revolution: frames come at 10 Hz, and each holds one."""
 SINGLE = 1e-6
 """Deviation of an angle that is the rounding of single precision."""
 
@@ -95,9 +97,15 @@ def readout_middle(image: ImageRecord) -> float:
 
 
 def lidar_of(laser: LaserRecord, shape: tuple[int, int] | None) -> Lidar:
-    """A laser whose range images have a `shape` (rows, columns), with the elevation of each row, the highest first."""
+    """A laser whose range images have a `shape` (rows, columns), with the elevation of each row, the highest first.
+
+    Times of returns are not published. TOP, whose pixels have poses, is taken to look ahead at the frame's pose.
+    """
     rows, columns = shape or (len(laser.inclinations), None)
-    return Lidar(LASERS[laser.number], *checked_beams(laser_elevations(laser, rows), columns, laser_name(laser.number)))
+    beams, spin = checked_beams(laser_elevations(laser, rows), columns, laser_name(laser.number)), None
+    if LASERS[laser.number] == "TOP":
+        spin = Spin(REVOLUTION_S, -0.5 * REVOLUTION_S, column_azimuth(0.0, laser_mount(laser)))
+    return Lidar(LASERS[laser.number], *beams, spin)
 
 
 def laser_elevations(laser: LaserRecord, rows: int) -> np.ndarray:

@@ -9,6 +9,7 @@ transform_utils.py, of github.com/waymo-research/waymo-open-dataset.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -43,8 +44,12 @@ def elevations(inclinations: np.ndarray, lowest: float, highest: float, rows: in
 
 def azimuths(columns: int, extrinsic: np.ndarray) -> np.ndarray:
     """The azimuth (columns,) of each column in the laser's frame."""
-    ratios = (columns - np.arange(columns) - 0.5) / columns
-    return np.pi * (2.0 * ratios - 1.0) - np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
+    return column_azimuth((np.arange(columns) + 0.5) / columns, extrinsic)
+
+
+def column_azimuth(fraction: Any, extrinsic: np.ndarray) -> Any:
+    """The azimuth in the laser's frame after a fraction of the columns, an array or one."""
+    return np.pi * (1.0 - 2.0 * fraction) - np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
 
 
 def directions(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:

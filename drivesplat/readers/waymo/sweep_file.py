@@ -9,8 +9,10 @@ import numpy as np
 from drivesplat.io.storage import atomic_write
 from drivesplat.readers.drive.sweep_file import file_fault, read_file
 from drivesplat.readers.waymo.range_image import Rays
+from drivesplat.scene.scan import Scan, ScanRays, wrapped
+from drivesplat.scene.sensors import Spin
 
-__all__ = ["file_fault", "read_file", "read_rays", "write_file"]
+__all__ = ["file_fault", "read_file", "read_rays", "read_scan", "write_file"]
 
 
 def write_file(
@@ -27,6 +29,20 @@ def read_rays(path: Path) -> Rays:
     with np.load(path, allow_pickle=False) as arrays:
         ranges = arrays["range"].astype(np.float64)
         return rays_of(arrays["azimuth"], arrays["elevation"], ranges)
+
+
+def read_scan(path: Path, spin: Spin | None) -> Scan:
+    """The scan of a sweep, with times that follow from `spin`; None: all rays leave at the sweep's timestamp. Raises
+    OSError, KeyError, ValueError or IndexError for a damaged file."""
+    with np.load(path, allow_pickle=False) as arrays:
+        azimuth, elevation, ranges, values = (arrays[n] for n in ("azimuth", "elevation", "range", "intensity"))
+    returned = np.isfinite(ranges)
+    offsets_s = np.zeros(len(azimuth)) if spin is None else spin.offsets_s(azimuth)
+    intensities = np.zeros(ranges.shape, dtype=np.float32)
+    intensities[returned] = values
+    grid = (wrapped(azimuth), elevation[:, None], offsets_s)
+    rays = ScanRays(*(np.broadcast_to(angles, ranges.shape).astype(np.float32) for angles in grid))
+    return Scan(rays, returned, np.where(returned, ranges, 0.0).astype(np.float32), intensities)
 
 
 def rays_of(azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray) -> Rays:

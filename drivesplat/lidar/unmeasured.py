@@ -1,0 +1,60 @@
+"""Rays of scans that say nothing about the scene: those that meet the ego vehicle, and those of skipped sectors."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from drivesplat.scene.scan import Scan
+
+AZIMUTH_BINS = 360
+"""Cells of azimuth in which the ego vehicle's returns are counted."""
+MIN_SECTOR = np.radians(5.0)
+"""Width of a sector without any return from which the sensor is taken to have skipped it."""
+
+
+def measured_rays(scans: Sequence[Scan], ego_radius: float) -> list[Bool[np.ndarray, "b a"]]:
+    """Whether each ray of the scans of one LiDAR says something about the scene.
+
+    Three kinds do not: rays whose return is within `ego_radius` metres (horizontally) of the sensor; holes of a beam
+    that has such returns within the same degree of azimuth in more than half of the scans; and all rays of a sector of
+    MIN_SECTOR or more without a single return.
+    """
+    near = [near_sensor(scan, ego_radius) for scan in scans]
+    beams = max((scan.rays.shape[0] for scan in scans), default=0)
+    counts = np.zeros((beams, AZIMUTH_BINS), dtype=np.int64)
+    for scan, close in zip(scans, near, strict=True):
+        met = np.zeros_like(counts, dtype=bool)
+        met[_cells(scan)[0][close], _cells(scan)[1][close]] = True
+        counts += met
+    often = counts > 0.5 * len(scans)
+    return [
+        ~close & ~(~scan.returned & often[_cells(scan)]) & ~skipped(scan)
+        for scan, close in zip(scans, near, strict=True)
+    ]
+
+
+def near_sensor(scan: Scan, radius: float) -> Bool[np.ndarray, "b a"]:
+    """The rays with a return within `radius` metres of the sensor, horizontally."""
+    return scan.returned & (scan.ranges * np.cos(scan.rays.elevations) <= radius)
+
+
+def skipped(scan: Scan) -> Bool[np.ndarray, "b a"]:
+    """The rays in sectors of MIN_SECTOR or more without any return; none of a scan without returns."""
+    empty = ~scan.returned.any(axis=0)
+    firings = len(empty)
+    out = np.zeros(firings, dtype=bool)
+    if empty.any() and not empty.all():
+        first = int(np.flatnonzero(~empty)[0])  # a sector that crosses the last firing is in one piece from here
+        rolled = np.roll(empty, -first)
+        edges = np.flatnonzero(np.diff(rolled.astype(np.int8), prepend=0, append=0))
+        for begin, end in edges.reshape(-1, 2):
+            out[(np.arange(begin, end) + first) % firings] = (end - begin) * 2.0 * np.pi >= MIN_SECTOR * firings
+    return np.broadcast_to(out, scan.rays.shape)
+
+
+def _cells(scan: Scan) -> tuple[Int[np.ndarray, "b a"], Int[np.ndarray, "b a"]]:
+    """The beam and the cell of azimuth of each ray."""
+    turns = (scan.rays.azimuths.astype(np.float64) + np.pi) / (2.0 * np.pi)
+    bins = np.floor(turns * AZIMUTH_BINS).astype(np.int64) % AZIMUTH_BINS
+    return np.broadcast_to(np.arange(bins.shape[0])[:, None], bins.shape), bins
