@@ -40,6 +40,7 @@ rule evaluate:
         summary="<results>/{scene}/{method}/train.json",
         parser="<results>/{scene}/parser.pkl",
         masks="<results>/{scene}/masks/masks.json",
+        scans=plan.training_input("scans"),
         lpips=plan.lpips_record,
     output:
         metrics="<results>/{scene}/{method}/eval.json",

@@ -10,6 +10,7 @@ from drivesplat.model.checkpoint import read_checkpoint
 from drivesplat.scene.images import write_image
 from drivesplat.scene.masks import read_masks_record
 from drivesplat.scene.prepared_drive import read_prepared_drive
+from drivesplat.scene.scan_record import read_scans
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.training.run import read_summary
 
@@ -19,9 +20,11 @@ with job(snakemake, dataset=("images", "sweeps")) as current:
     record, summary = read_masks_record(recording.masks), read_summary(files.summary)
     lpips = read_backbone(files.lpips[0]) if files.lpips else None
     truth = Path(files.truth[0]) if files.truth else None
-    inputs = EvaluationInputs(checkpoint, summary, recording, record, lpips, truth)
+    scans = read_scans(files.scans[0]) if files.scans else None
+    inputs = EvaluationInputs(checkpoint, summary, recording, record, lpips, truth, scans)
     digests = {"truth": sha256_file(truth)} if truth else {}
-    provenance = current.provenance(*upstream, checkpoint.provenance, inputs=digests)
+    upstream += [checkpoint.provenance] + ([scans.provenance] if scans else [])
+    provenance = current.provenance(*upstream, inputs=digests)
     evaluation = evaluate_method(inputs, current.settings(EvaluateJob), current.device())
     write_image(current.output.recorded, evaluation.sample.recorded)
     write_image(current.output.rendered, evaluation.sample.rendered)

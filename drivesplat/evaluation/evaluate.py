@@ -15,6 +15,7 @@ from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.lpips_map import load_lpips
 from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
+from drivesplat.evaluation.scan_evaluation import lidar_metrics
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
 from drivesplat.lidar.depth import depths_in, split_sweeps
@@ -27,6 +28,7 @@ from drivesplat.readers.truth import read_truth
 from drivesplat.scene.masks import MasksRecord
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import REGIONS, region_mask, region_masks
+from drivesplat.scene.scan_record import ScanRecords
 from drivesplat.scene.splits import HELD_OUT_GROUPS, NEIGHBOURHOOD_HZ
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
@@ -40,8 +42,8 @@ VEHICLE_FINDING_DB = 18.0
 @dataclass(frozen=True)
 class EvaluationInputs:
     """The inputs of an evaluation: the contents of checkpoint.npz, train.json, masks.json and LPIPS's backbone.json
-    (None if LPIPS is disabled), the recording, and the path `truth` of a synthetic world's truth.json (None for a
-    recorded drive)."""
+    (None if LPIPS is disabled), the recording, the path `truth` of a synthetic world's truth.json (None for a recorded
+    drive), and the content of scans.npz (None for a method that does not render LiDAR)."""
 
     checkpoint: TrainedCheckpoint
     summary: dict[str, Any]
@@ -49,6 +51,7 @@ class EvaluationInputs:
     masks_record: MasksRecord
     lpips_record: dict[str, Any] | None
     truth: Path | None
+    scans: ScanRecords | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,10 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
     with explain_out_of_memory(lambda: len(model)):
         depths = held_out_depths(inputs.recording, job.eval_camera, job.lidar)
         groups = evaluate_groups(model, inputs.recording, job.eval_camera, lpips_map, device, depths)
+        if inputs.scans is not None:
+            spread = inputs.checkpoint.job.train.scans.beam_spread_rad
+            lidar = lidar_metrics(model, inputs.recording.scene, inputs.scans, spread, device)
+            groups = {group: {**metrics, "lidar": lidar[group]} for group, metrics in groups.items()}
         against_truth = truth_metrics(model, inputs, job, lpips_map, device)
         sample = render_sample_pair(model, inputs.recording, job.eval_camera, device)
     record = {

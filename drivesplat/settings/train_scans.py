@@ -34,3 +34,9 @@ class ScanTrainingSettings(Settings):
     limits on the number of Gaussians rise by their number. 0 = none."""
     beam_spread: tuple[Milliradians, Milliradians] = (0.3, 0.3)
     """Standard deviation of a beam's footprint in azimuth and elevation (milliradians)."""
+
+    @property
+    def beam_spread_rad(self) -> tuple[float, float]:
+        """`beam_spread` in radians."""
+        azimuth, elevation = self.beam_spread
+        return 1e-3 * azimuth, 1e-3 * elevation

@@ -45,14 +45,8 @@ def load_scans(
     recorded: Sequence[RecordedScan], settings: ScanTrainingSettings, device: torch.device
 ) -> list[TrainingScan]:
     """Recorded scans on the device, without those of which no ray was measured."""
-    spread = beam_spread(settings)
+    spread = settings.beam_spread_rad
     return [_loaded(scan, spread, device) for scan in recorded if scan.measured.any()]
-
-
-def beam_spread(settings: ScanTrainingSettings) -> tuple[float, float]:
-    """The standard deviations of a beam's footprint in azimuth and elevation, radians."""
-    azimuth, elevation = settings.beam_spread
-    return 1e-3 * azimuth, 1e-3 * elevation
 
 
 def _loaded(recorded: RecordedScan, spread: tuple[float, float], device: torch.device) -> TrainingScan:

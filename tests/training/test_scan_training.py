@@ -19,7 +19,6 @@ from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
 from drivesplat.training.scans import (
-    beam_spread,
     fits_scan,
     initial_echo,
     load_scans,
@@ -165,7 +164,7 @@ def test_initial_echoes_are_the_recorded_intensity_and_a_likely_return():
 
 
 def test_the_beam_spread_is_in_radians():
-    assert beam_spread(ScanTrainingSettings(beam_spread=(0.5, 2.0))) == (0.0005, 0.002)
+    assert ScanTrainingSettings(beam_spread=(0.5, 2.0)).beam_spread_rad == (0.0005, 0.002)
 
 
 def test_a_training_with_scans_learns_ranges_intensities_and_drops(tmp_path):

@@ -1,0 +1,40 @@
+"""A method that renders LiDAR through the whole workflow."""
+
+import pytest
+from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
+
+pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("lidar_workflow")]
+SCANS = {"share": 0.4}
+METHODS = {
+    "vanilla": {"parts": ["background"]},
+    "with_lidar": {"parts": ["background", "actors"], "overrides": {"train": {"scans": SCANS}}},
+}
+EVAL = "results/0001/{}/eval.json"
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> WorkflowCopy:
+    folder = tmp_path_factory.mktemp("lidar") / "workflow"
+    made = WorkflowCopy.make(folder, methods=METHODS, train={**TINY_TRAINING, "iterations": 60})
+    done = made.run("results/0001/metrics.json")
+    assert done.returncode == 0, done.stdout
+    return made
+
+
+def test_metrics_have_lidar_for_the_method_that_renders_it(copy):
+    methods = copy.read("results/0001/metrics.json")["methods"]
+    for group in ("interpolation", "extrapolation"):
+        assert "lidar" not in methods["vanilla"][group]
+        lidar = methods["with_lidar"][group]["lidar"]
+        assert set(lidar) == {"all", "static", "moving_vehicle"}
+        assert lidar["all"]["rays"] > 1000 and lidar["all"]["returns"] > 500
+        assert 0.0 < lidar["all"]["range_error_median_m"] < 5.0 and 0.3 < lidar["all"]["drop_accuracy"] <= 1.0
+        assert methods["with_lidar"][group]["static"]["psnr"] > 10.0
+
+
+def test_a_changed_weight_of_scans_trains_that_method_alone_again(copy):
+    assert copy.planned("results/0001/metrics.json") == {}
+    copy.config["methods"]["with_lidar"]["overrides"]["train"]["scans"] = {**SCANS, "range_weight": 0.2}
+    copy.write_config()
+    planned = copy.planned("results/0001/metrics.json")
+    assert planned["train"] == 1 and "scans" not in planned and "lidar_seed" not in planned
