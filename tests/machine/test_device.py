@@ -77,6 +77,17 @@ def test_device_cpu_selects_the_cpu(no_gpu):
     assert choose_device(DeviceSettings.model_validate("cpu")) == torch.device("cpu")
 
 
+def test_the_cpu_computes_with_denormals_as_zero(no_gpu):
+    torch.set_flush_denormal(False)
+    small = torch.tensor([1e-39])
+    try:
+        assert float(small * 0.5) > 0.0
+        choose_device(DeviceSettings(kind="cpu"))
+        assert float(small * 0.5) == 0.0
+    finally:
+        torch.set_flush_denormal(False)
+
+
 def test_device_cpu_selects_the_cpu_even_with_a_gpu(a_gpu):
     assert choose_device(DeviceSettings(kind="cpu", min_free_gb=1000)) == torch.device("cpu")
 
