@@ -35,7 +35,7 @@ def finished(tmp_path_factory) -> WorkflowCopy:
         actors={"random_points": 200},
         train=TINY_TRAINING | {"iterations": 20},
     )
-    done = copy.run("results/0001/metrics.json", "results/0001/street/parts/parts.json")
+    done = copy.run("results/0001/metrics.json", "results/0001/street/parts/parts.json", "results/0001/scans.npz")
     assert done.returncode == 0, done.stdout
     return copy
 

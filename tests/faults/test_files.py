@@ -27,6 +27,7 @@ from drivesplat.readers.truth import read_truth
 from drivesplat.scene.actor_record import read_actors
 from drivesplat.scene.ego_mask import read_ego_mask
 from drivesplat.scene.masks import read_masks_record
+from drivesplat.scene.scan_record import read_scans
 from drivesplat.scene.scene import read_scene
 from drivesplat.scene.training_record import read_training_record
 from drivesplat.training.resume_state import resumable
@@ -51,6 +52,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "actors.npz": (read_actors, "actors"),
     "lidar_depth.npz": (read_lidar_depth, "lidar_depth"),
     "free_space.npz": (read_free_space, "free_space"),
+    "scans.npz": (read_scans, "scans"),
     "triangulated.npz": (read_triangulated, "refine_poses"),
     "checkpoint.npz": (read_checkpoint, "train"),
     "train.json": (read_summary, "train"),
@@ -138,6 +140,7 @@ def test_no_script_reads_results_but_by_a_reader_that_is_tested():
         "read_actors",
         "read_lidar_depth",
         "read_free_space",
+        "read_scans",
         "read_triangulated",
         "read_summary",
     }

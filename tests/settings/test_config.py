@@ -18,8 +18,8 @@ LOOKS = (
     "tracks", "film", "compare", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd",
     "export_viewer", "export_colmap", "export_spz", "export_sog",
 )  # fmt: skip
-OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "tracks", "compare")
-STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "train", "evaluate", *LOOKS)
+OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "scans", "tracks", "compare")
+STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "scans", "train", "evaluate", *LOOKS)
 PUBLISHED = {"source": "A paper", "url": "https://example.org", "scene": "0061", "method": "M", "psnr": 20.0}
 
 
@@ -347,15 +347,15 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         ),
         (at("sweeps", True), "extract evaluate"),
         (at("images.width", 320), "lidar_seed parser masks actors lidar_depth evaluate"),
-        (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth free_space evaluate film"),
-        (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth free_space evaluate film"),
-        (at("holdout.last_block", 0), "lidar_seed parser masks actors lidar_depth free_space evaluate film"),
+        (at("holdout.every_nth", 5), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
+        (at("holdout.offset", 3), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
+        (at("holdout.last_block", 0), "lidar_seed parser masks actors lidar_depth free_space scans evaluate film"),
         (at("extract.on_missing", "warn"), "extract"),
-        (at("lidar_seed.on_missing", "warn"), "lidar_seed"),
+        (at("lidar_seed.on_missing", "warn"), "lidar_seed scans"),
         (at("lidar_seed.sweeps", True), "extract lidar_seed"),
         (at("lidar_seed.points_file", "a.ply"), "lidar_seed"),
         (at("lidar_seed.voxel_size", 0.2), "lidar_seed"),
-        (at("lidar_seed.own_car_radius", 3), "lidar_seed actors lidar_depth free_space evaluate"),
+        (at("lidar_seed.own_car_radius", 3), "lidar_seed actors lidar_depth free_space scans evaluate"),
         (at("lidar_seed.box_margin", 0.3), "lidar_seed lidar_depth free_space evaluate"),
         (at("actors.humans", True), "actors"),
         (at("datasets.nuscenes.overrides", {"actors": {"max_points": 9}}), "actors"),
@@ -364,6 +364,8 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("masks.own_car", "auto_measured"), "own_car masks"),
         (at("lidar_depth.ray_spacing", [1, 1]), "lidar_depth evaluate"),
         (at("free_space.voxel", 1), "free_space"),
+        (at("scans.azimuth_steps", 1042), "scans"),
+        (at("scans.spin", None), "scans"),
         (at("train.floaters.free_space", True), "train"),
         (at("train.road.reach", 0.2), "train"),
         (at("sky", "none"), "train"),

@@ -401,3 +401,13 @@ EVERY_METHOD = ("", "street", "vanilla")
 def test_targets_concern_these_scenes_and_methods(targets, scenes, methods):
     expected = {(scene, method) for scene in scenes for method in methods}
     assert plan().scenes_and_methods(targets) == expected
+
+
+def test_scans_get_the_holdout_and_what_holds_for_all_lidar():
+    record = stage_record(
+        "scans", scans={"azimuth_steps": 90}, lidar_seed={"own_car_radius": 3.0, "on_missing": "warn"}
+    )
+    assert (record["scans"]["azimuth_steps"], record["own_car_radius"], record["on_missing"]) == (90, 3.0, "warn")
+    assert record["holdout"]["every_nth"] == 8 and record["scans"]["spin"] == "dataset"
+    spin = {"revolution_s": 0.1, "start_azimuth_deg": 180.0}
+    assert stage_record("scans", scans={"spin": spin})["scans"]["spin"] == {**spin, "clockwise": True, "timestamp": 1.0}
