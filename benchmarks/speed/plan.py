@@ -31,9 +31,10 @@ class SceneFiles:
     actors: tuple[str, ...]
     lidar_depth: tuple[str, ...]
     free_space: tuple[str, ...]
+    scans: tuple[str, ...] = ()
 
     def all(self) -> list[str]:
-        return [self.scene, self.parser, self.masks, *self.actors, *self.lidar_depth, *self.free_space]
+        return [self.scene, self.parser, self.masks, *self.actors, *self.lidar_depth, *self.free_space, *self.scans]
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ def files_for(run: SnakemakeRun, method: str) -> SceneFiles:
         tuple(plan.training_input("actors")(at)),
         tuple(plan.training_input("lidar_depth")(at)),
         tuple(plan.training_input("free_space")(at)),
+        tuple(plan.training_input("scans")(at)),
     )
 
 

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from drivesplat.scene.motion import Motion
 
-MAX_CACHED_TIMES = 8192
-"""Number of times whose states are cached. A training reuses those of its images: 1,440 for six cameras at 12 Hz over
-20 s. A state of 30 actors with 40 annotations each takes 6 kB, the full cache 50 MB."""
+MAX_CACHED_TIMES = 16384
+"""Number of times whose states are cached. A training reuses those of its images, 1,440 for six cameras at 12 Hz over
+20 s, and with a rolling shutter two more for each. A state of 30 actors with 40 annotations each takes 6 kB, the full
+cache 100 MB."""
 
 
 @dataclass(frozen=True)

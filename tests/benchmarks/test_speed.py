@@ -59,8 +59,9 @@ def test_our_recipe_has_the_settings_of_rule_train_except_length_and_seed(tmp_pa
     at = SimpleNamespace(scene="0061", method="street-77-seed5")
     assert json.loads(run.plan.settings("train")(at)) == task.train.model_dump(mode="json")
     assert (task.code, task.stage) == (run.plan.code("train"), "street-77-seed5/train")
-    assert [[*paths] for paths in (task.files.actors, task.files.lidar_depth, task.files.free_space)] == [
-        run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "free_space")
+    files = task.files
+    assert [[*paths] for paths in (files.actors, files.lidar_depth, files.free_space, files.scans)] == [
+        run.plan.training_input(stage)(at) for stage in ("actors", "lidar_depth", "free_space", "scans")
     ]
     assert {Path(path).name for path in targets_of(run)} == {
         "scene_refined.json", "parser.pkl", "masks.json", "actors.npz", "lidar_depth.npz"

@@ -24,7 +24,8 @@ log = logging.getLogger(__name__)
 Terms = dict[str, Tensor]
 T = TypeVar("T")
 MAX_IMAGES = 4096
-"""A training with more images captures nothing: graphs hold on to cached time states, and twice as many are cached."""
+"""A training with more images captures nothing: graphs hold on to cached time states, up to three for an image, and
+four times as many are cached."""
 
 
 @dataclass(frozen=True)
