@@ -1,5 +1,6 @@
 """A world that uses every output: 10 key frames a second, class maps, LiDAR truth, a held-out camera, an edit."""
 
+import dataclasses
 import json
 import shutil
 from collections import namedtuple
@@ -15,13 +16,16 @@ from drivesplat.demo.world import make_world
 from drivesplat.errors import ResultError
 from drivesplat.preprocess.extract import extract_scene
 from drivesplat.preprocess.masks import make_masks
+from drivesplat.preprocess.scans import scan_records
 from drivesplat.readers.truth import Truth, read_truth
 from drivesplat.scene.masks import mask_name
+from drivesplat.scene.scan import wrapped
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.splits import frame_groups, sweep_groups
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.images import HoldoutSettings
 from drivesplat.settings.masks import MaskJob
+from drivesplat.settings.scans import ScanSettings, ScansJob
 
 pytestmark = pytest.mark.slow
 
@@ -93,10 +97,11 @@ def test_at_10_hz_nothing_near_a_held_out_key_frame_is_trained_on(scene):
         assert groups(scene, holdout).count("excluded") >= 3
 
 
-def test_the_tables_state_shutter_and_beams(root, scene):
+def test_the_tables_state_shutter_beams_and_spin(root, scene, recorder):
     (camera,), (lidar,) = scene.cameras, scene.lidars
     assert (camera.readout_s, camera.readout_direction) == (0.03, "down")
-    assert lidar.azimuth_steps == 1085
+    assert lidar.azimuth_steps == 1085 and lidar.spin is not None
+    np.testing.assert_allclose(lidar.spin.offsets_s(np.pi / 2 - recorder.pattern.azimuths), recorder.pattern.offsets)
     np.testing.assert_allclose(np.degrees(lidar.beam_elevations), np.linspace(-30.67, 10.67, 32), atol=1e-9)
     sensors = {row["token"]: row for row in table(root, "sensor")}
     assert {row["channel"] for row in sensors.values()} == {"CAM_FRONT", "LIDAR_TOP"}
@@ -189,6 +194,40 @@ def test_scans_hold_every_ray_with_or_without_a_return(root, truth, recorder):
     pattern = np.load(root / "truth" / truth.pattern)
     np.testing.assert_array_equal(pattern["offsets"], recorder.pattern.offsets)
     assert (pattern["elevations"].shape, pattern["azimuths"].shape) == ((32,), (1085,))
+
+
+def test_the_stage_scans_finds_the_rays_of_the_truth_and_what_they_met(root, scene, truth):
+    """Which of them returned, their ranges within the noise, and the vehicles that they met. A few returns of a surface
+    lie outside of its box by the noise."""
+    job = ScansJob(scans=ScanSettings(), holdout=HoldoutSettings(), own_car_radius=0.0, on_missing="stop")
+    pattern, token = np.load(root / "truth" / truth.pattern), truth.scans[3].token
+    index = [sweep.token for sweep in scene.sweeps].index(token)
+    one = dataclasses.replace(scene, sweeps=(scene.sweeps[index - 1], scene.sweeps[index], scene.sweeps[index + 1]))
+    records = scan_records(one, job)
+    record, rays = records.scans[1], np.load(root / "truth" / truth.scans[3].file)
+    azimuths = np.angle(np.exp(1j * record.scan.rays.azimuths.astype(float)).mean(axis=0))
+    columns = np.abs(wrapped(azimuths[:, None] - (np.pi / 2 - pattern["azimuths"]))).argmin(axis=0)
+    returned = rays["returned"]
+    both = record.scan.returned[:, columns] & returned
+    assert (record.scan.returned[:, columns] != returned).mean() < 0.001, "where the revolution begins"
+    noise = (record.scan.ranges[:, columns] - rays["range"])[both]
+    assert np.abs(np.median(noise)) < 0.005 and np.median(np.abs(noise)) < 0.02
+    off = np.abs(record.scan.intensities[:, columns] - rays["intensity"])
+    assert (off[both] > 0.003).mean() < 0.001
+    numbers = {records.tracks.index(track): int(n) for n, track in truth.instances.items() if track in records.tracks}
+    found = np.vectorize(lambda i: numbers.get(i, 0))(record.objects[:, columns])
+    dynamic = [numbers[i] for i, t in enumerate(scene.tracks) if t.object_class.is_dynamic and i in numbers]
+    met = both & np.isin(rays["instance"], dynamic)
+    print(
+        "OFF",
+        (off[both] > 0.003).sum(),
+        (np.abs(noise) > 0.15).sum(),
+        "SHARE",
+        (found == rays["instance"])[met].mean(),
+        met.sum(),
+        ((found > 0) & ~met)[returned].sum(),
+    )
+    assert met.sum() > 300 and (found == rays["instance"])[met].mean() > 0.9
 
 
 def test_returns_lie_where_range_pattern_and_poses_say(root, truth, recorder):
