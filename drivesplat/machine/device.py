@@ -27,25 +27,27 @@ def choose_device(settings: DeviceSettings, min_free_gb: float | None = None) ->
     imported or run on it, or too little memory is free.
     """
     if settings.kind == "cpu" or (settings.kind == "any" and not torch.cuda.is_available()):
-        return _cpu()
+        return torch.device("cpu")
     try:
         _require_gpu(settings.min_free_gb if min_free_gb is None else min_free_gb)
     except DeviceError as error:
         if settings.kind != "any":
             raise
         log.warning("using the CPU: %s", error)
-        return _cpu()
+        return torch.device("cpu")
     if settings.max_gb is not None:
         total_gb = torch.cuda.get_device_properties().total_memory / 1e9
         torch.cuda.set_per_process_memory_fraction(min(1.0, settings.max_gb / total_gb))
     return torch.device("cuda")
 
 
-def _cpu() -> torch.device:
-    """The CPU, with denormal numbers as 0: moments of Adam whose parameters get no gradient for a thousand iterations
-    decay to denormals, with which a CPU computes many times slower. Threads that start later inherit this."""
+def flush_denormals() -> None:
+    """Lets the CPU compute with denormal numbers as 0, in this thread and in those that it starts later.
+
+    Moments of Adam whose parameters get no gradient for a thousand iterations decay to denormals, with which a CPU
+    computes many times slower. A training takes another course with it, since the smallest gradients are lost.
+    """
     torch.set_flush_denormal(True)
-    return torch.device("cpu")
 
 
 def _require_gpu(needed_gb: float) -> None:

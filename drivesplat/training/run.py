@@ -16,7 +16,7 @@ from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import Provenance, canonical_json, read_record, sha256_text, write_json
 from drivesplat.lidar.depth_record import PixelDepths, read_lidar_depth
 from drivesplat.lidar.free_space_record import FreeSpace, read_free_space
-from drivesplat.machine.device import choose_device, explain_out_of_memory
+from drivesplat.machine.device import choose_device, explain_out_of_memory, flush_denormals
 from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
 from drivesplat.model.splat_model import SplatModel
@@ -214,6 +214,8 @@ def run_training(
     started_by = os.getppid()
     with resume_state.training_lock(files.resume):
         device = choose_device(device_settings)
+        if job.train.scans.share:  # images never show some of the Gaussians that scans do
+            flush_denormals()
         begun = prepare(inputs, job, device)
         fingerprint = sha256_text(
             canonical_json([provenance[k] for k in ("settings_sha256", "code_sha256", "inputs_sha256")])
