@@ -1,6 +1,6 @@
 """The stage `evaluate`: renderings compared with held-out images, by region."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from drivesplat.errors import DatasetError
+from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.drive_summary import summarize_drive
 from drivesplat.evaluation.lpips_map import load_lpips
 from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
@@ -18,17 +19,18 @@ from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.scan_evaluation import lidar_metrics
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
+from drivesplat.io.storage import Provenance
 from drivesplat.lidar.depth import depths_in, split_sweeps
 from drivesplat.lidar.depth_record import PixelDepths
 from drivesplat.machine.device import explain_out_of_memory
-from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
+from drivesplat.model.checkpoint import TrainedCheckpoint, open_model, read_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.model.view import view_of
 from drivesplat.readers.truth import read_truth
-from drivesplat.scene.masks import MasksRecord
-from drivesplat.scene.prepared_drive import PreparedDrive
+from drivesplat.scene.masks import MasksRecord, read_masks_record
+from drivesplat.scene.prepared_drive import PreparedDrive, read_prepared_drive
 from drivesplat.scene.regions import REGIONS, region_mask, region_masks
-from drivesplat.scene.scan_record import ScanRecords
+from drivesplat.scene.scan_record import ScanRecords, read_scans
 from drivesplat.scene.splits import HELD_OUT_GROUPS, NEIGHBOURHOOD_HZ
 from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
@@ -52,6 +54,32 @@ class EvaluationInputs:
     lpips_record: dict[str, Any] | None
     truth: Path | None
     scans: ScanRecords | None = None
+
+
+def read_evaluation_inputs(
+    scene: str,
+    parser: str,
+    masks: str,
+    checkpoint: str,
+    summary: dict[str, Any],
+    lpips: Sequence[str],
+    truth: Sequence[str],
+    scans: Sequence[str],
+) -> tuple[EvaluationInputs, list[Provenance]]:
+    """Reads the inputs of an evaluation from files, the last three where given; `summary` is the content of train.json.
+    Returns them with the provenances of these files."""
+    recording, upstream = read_prepared_drive(scene, parser, masks)
+    trained, revolutions = read_checkpoint(checkpoint), [read_scans(path) for path in scans]
+    inputs = EvaluationInputs(
+        trained,
+        summary,
+        recording,
+        read_masks_record(recording.masks),
+        read_backbone(lpips[0]) if lpips else None,
+        Path(truth[0]) if truth else None,
+        next(iter(revolutions), None),
+    )
+    return inputs, [*upstream, trained.provenance, *(record.provenance for record in revolutions)]
 
 
 @dataclass(frozen=True)
