@@ -218,15 +218,6 @@ def test_the_stage_scans_finds_the_rays_of_the_truth_and_what_they_met(root, sce
     found = np.vectorize(lambda i: numbers.get(i, 0))(record.objects[:, columns])
     dynamic = [numbers[i] for i, t in enumerate(scene.tracks) if t.object_class.is_dynamic and i in numbers]
     met = both & np.isin(rays["instance"], dynamic)
-    print(
-        "OFF",
-        (off[both] > 0.003).sum(),
-        (np.abs(noise) > 0.15).sum(),
-        "SHARE",
-        (found == rays["instance"])[met].mean(),
-        met.sum(),
-        ((found > 0) & ~met)[returned].sum(),
-    )
     assert met.sum() > 300 and (found == rays["instance"])[met].mean() > 0.9
 
 
