@@ -17,8 +17,9 @@ def measured_rays(scans: Sequence[Scan], ego_radius: float) -> list[Bool[np.ndar
     """Whether each ray of the scans of one LiDAR says something about the scene.
 
     Three kinds do not: rays whose return is within `ego_radius` metres (horizontally) of the sensor; holes of a beam
-    that has such returns within the same degree of azimuth in more than half of the scans; and all rays of a sector of
-    MIN_SECTOR or more without a single return.
+    that has such returns within the same degree of azimuth in more than half of the scans, and of the beams below it,
+    which meet the ego vehicle too near to be measured; and all rays of a sector of MIN_SECTOR or more without a single
+    return.
     """
     near = [near_sensor(scan, ego_radius) for scan in scans]
     beams = max((scan.rays.shape[0] for scan in scans), default=0)
@@ -29,9 +30,17 @@ def measured_rays(scans: Sequence[Scan], ego_radius: float) -> list[Bool[np.ndar
         counts += met
     often = counts > 0.5 * len(scans)
     return [
-        ~close & ~(~scan.returned & often[_cells(scan)]) & ~skipped(scan)
+        ~close & ~(~scan.returned & _from_above(often, scan)[_cells(scan)]) & ~skipped(scan)
         for scan, close in zip(scans, near, strict=True)
     ]
+
+
+def _from_above(cells: Bool[np.ndarray, "beams bins"], scan: Scan) -> Bool[np.ndarray, "b bins"]:
+    """The cells of each beam of a scan, with those that are set for a beam above it."""
+    downwards = np.argsort(-np.median(scan.rays.elevations, axis=1), kind="stable")
+    out = np.empty((len(downwards), cells.shape[1]), dtype=bool)
+    out[downwards] = np.logical_or.accumulate(cells[downwards], axis=0)
+    return out
 
 
 def near_sensor(scan: Scan, radius: float) -> Bool[np.ndarray, "b a"]:

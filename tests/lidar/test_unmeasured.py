@@ -26,6 +26,15 @@ def test_returns_near_the_sensor_and_holes_among_them_say_nothing():
     assert np.argwhere(~third).tolist() == [[0, 10], [0, 11], [0, 12], [0, 13]]
 
 
+def test_holes_below_the_ego_vehicle_say_nothing_either():
+    """The roof is too near to be measured by the two lowest beams, which never return there."""
+    ranges = room()
+    ranges[2, 10:14] = 2.0
+    ranges[:2, 10:14] = ranges[3, 12] = ranges[:2, 40] = np.nan
+    for found in measured_rays(scans(ranges, ranges), ego_radius=2.5):
+        assert np.argwhere(~found).tolist() == [[beam, step] for beam in range(3) for step in range(10, 14)]
+
+
 def test_the_distance_is_horizontal():
     ranges = room()
     ranges[0, 5] = 2.6  # 20 degrees below: 2.44 m
