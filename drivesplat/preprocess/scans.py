@@ -17,11 +17,14 @@ from drivesplat.readers.sweeps import read_returns, read_scan
 from drivesplat.scene.scan import Scan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan, ScanRecords
 from drivesplat.scene.scene import Scene, Sweep, place_of
-from drivesplat.scene.sensors import Lidar, Spin
+from drivesplat.scene.sensors import Lidar, LidarReturns, Spin
 from drivesplat.scene.splits import Group, sweep_groups
 from drivesplat.settings.scans import ScanSettings, ScansJob
 
 log = logging.getLogger(__name__)
+
+MAX_DEVIATION = 0.005
+"""Share of the firings of a revolution by which one may have more or fewer."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +100,10 @@ def resolved_scan(sweep: Sweep, lidar: Lidar, poses: SensorPoses, settings: Scan
     spin = spin_of(lidar, settings)
     scan = read_scan(sweep, spin)
     if scan is None:
-        pattern = replace(lidar, azimuth_steps=settings.azimuth_steps or lidar.azimuth_steps)
         try:
-            scan = scan_of(read_returns(sweep), pattern, poses, spin)
+            returns = read_returns(sweep)
+            steps = settings.azimuth_steps or firings(returns, lidar.azimuth_steps)
+            scan = scan_of(returns, replace(lidar, azimuth_steps=steps), poses, spin)
         except DatasetError as error:
             raise DatasetError(
                 str(error) if sweep.path in str(error) else f"{place_of(sweep)}: LiDAR file {sweep.path}: {error}"
@@ -107,6 +111,18 @@ def resolved_scan(sweep: Sweep, lidar: Lidar, poses: SensorPoses, settings: Scan
     if not scan.returned.any():
         raise DatasetError(f"{place_of(sweep)}: LiDAR file {sweep.path} has no return of a ray")
     return scan
+
+
+def firings(returns: LidarReturns, stated: int | None) -> int | None:
+    """The firings of a revolution: those `stated` for the LiDAR, or, where the times of returns tell a number that
+    deviates by at most MAX_DEVIATION, that one, since sensors do not go round evenly."""
+    if stated is None or returns.offsets_s is None:
+        return stated
+    times = np.unique(returns.offsets_s)
+    if len(times) < 2:
+        return stated
+    counted = round(float((times[-1] - times[0]) / np.median(np.diff(times)))) + 1
+    return counted if abs(counted - stated) <= MAX_DEVIATION * stated else stated
 
 
 def _record(scene: Scene, found: FoundScan, measured: np.ndarray, boxes: TrackedBoxes) -> RecordedScan:

@@ -28,10 +28,10 @@ from helpers.waymo_files import write_v2
 from drivesplat.errors import ConfigError, DatasetError, ResultError
 from drivesplat.io.array_file import write_arrays
 from drivesplat.preprocess.extract import extract_scene
-from drivesplat.preprocess.scans import scan_records, spin_of
+from drivesplat.preprocess.scans import firings, scan_records, spin_of
 from drivesplat.scene.object_class import ObjectClass
 from drivesplat.scene.scan_record import NO_OBJECT, read_scans
-from drivesplat.scene.sensors import Lidar
+from drivesplat.scene.sensors import Lidar, LidarReturns
 from drivesplat.settings.config import load
 from drivesplat.settings.extract import SceneSource
 
@@ -161,6 +161,23 @@ def test_the_number_of_firings_may_be_set(tmp_path):
     assert record.scan.rays.shape == (len(BEAMS), STEPS // 2) and record.scan.returned.all()
     unknown = drive_of(tmp_path, [room()], lidar=Lidar("top"))
     assert scan_records(unknown, job()).scans[0].scan.rays.shape == (len(BEAMS), STEPS), "as gaps suggest"
+
+
+@pytest.mark.parametrize(
+    ("times", "stated", "expected"),
+    [
+        (np.arange(1084), 1085, 1084),
+        (np.delete(np.arange(1084), [7, 8, 500]), 1085, 1084),
+        (np.arange(1084), 1042, 1042),
+        (np.arange(1084), None, None),
+        (np.random.default_rng(0).uniform(0, 1084, 30_000), 1085, 1085),
+        (np.zeros(9), 1085, 1085),
+        (None, 1085, 1085),
+    ],
+)
+def test_a_revolution_has_the_firings_that_the_times_of_its_returns_tell(times, stated, expected):
+    offsets_s = None if times is None else 46.08e-6 * times
+    assert firings(LidarReturns(np.zeros((9, 3)), offsets_s=offsets_s), stated) == expected
 
 
 BAD = {
