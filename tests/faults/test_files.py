@@ -125,11 +125,12 @@ def test_a_resume_state_of_any_kind_executes_nothing(tmp_path, kind):
 
 
 def test_no_script_reads_results_but_by_a_reader_that_is_tested():
-    """`read_prepared_drive` and `read_inputs` are made of others."""
+    """`read_prepared_drive`, `read_inputs` and `read_evaluation_inputs` are made of others."""
     tested = {
         "read_json",
         "read_prepared_drive",
         "read_inputs",
+        "read_evaluation_inputs",
         "read_scene",
         "read_ego_mask",
         "read_masks_record",
