@@ -4,16 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesplat.scene.motion import Motion
+from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import in_box, moving_tracks
 
 CLEARANCE = 0.1
 """Height in metres above a box's floor up to which a return may belong to the road."""
-
-HALF_STEP = 0.02
-"""Half the time in seconds between the two poses that give a velocity."""
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,8 @@ from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
 from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGroup
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
-from drivesplat.scene.motion import Motion
+from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings
-
-HALF_STEP = 0.02
-"""Half the time in seconds between the two poses that give a velocity; some readout times of a camera."""
 
 
 def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
+from drivesplat.model.view import inverse
 from drivesplat.rasterization.scans import RayGrid, ScanMotion, rasterize_scan
 from drivesplat.scene.scan_record import RecordedScan
 
@@ -30,9 +31,7 @@ class ScanView:
 
     @property
     def world_to_sensor(self) -> Float[Tensor, "4 4"]:
-        rotation_t = self.sensor_to_world[:3, :3].T
-        upper = torch.cat([rotation_t, -rotation_t @ self.sensor_to_world[:3, 3:]], dim=1)
-        return torch.cat([upper, self.sensor_to_world[3:]])
+        return inverse(self.sensor_to_world)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,13 @@ class RollingShutter:
         return torch.stack([-self.motion[2, 1], self.motion[2, 0], -self.motion[1, 0]])
 
 
+def inverse(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """The inverse of a rigid transform."""
+    rotation_t = pose[:3, :3].T
+    upper = torch.cat([rotation_t, -rotation_t @ pose[:3, 3:]], dim=1)
+    return torch.cat([upper, torch.eye(4, device=upper.device, dtype=upper.dtype)[3:]])
+
+
 @dataclass(frozen=True)
 class View:
     """A camera at a time: `K` in continuous pixels, `time` in seconds since the first image. `camera` names the camera
@@ -44,9 +51,7 @@ class View:
     @cached_property
     def viewmat(self) -> Float[Tensor, "4 4"]:
         """World to camera."""
-        rotation_t = self.camera_to_world[:3, :3].T
-        upper = torch.cat([rotation_t, -rotation_t @ self.camera_to_world[:3, 3:]], dim=1)
-        return torch.cat([upper, torch.eye(4, device=upper.device, dtype=upper.dtype)[3:]])
+        return inverse(self.camera_to_world)
 
     @property
     def turning_by_line(self) -> Float[Tensor, "6"] | None:

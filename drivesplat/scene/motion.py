@@ -15,6 +15,10 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from drivesplat.scene.scene import Scene, Track
 from drivesplat.scene.tracks import runs
 
+HALF_STEP = 0.02
+"""Half the time in seconds between the two poses that give the velocity of a moving object; some readout times of a
+camera."""
+
 
 @dataclass(frozen=True)
 class Motion:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from gsplat import DefaultStrategy
+from helpers.agreement import differing
 from helpers.random_gaussians import Scene, random_scene
 from helpers.reference_rasterizer import rasterize_reference
 
@@ -56,16 +57,8 @@ def seen_and_gradients(scene: Scene, backend: str, **options) -> dict[str, torch
 
 def disagreements(scene: Scene, bound: float = AGREEMENT, **options) -> dict[str, float]:
     """The results that differ from the reference by more than `bound`, and their errors."""
-    expected = seen_and_gradients(scene, "reference", **options)
-    found = seen_and_gradients(scene, "cpu", **options)
-    errors = {}
-    for name, truth in expected.items():
-        assert found[name].shape == truth.shape and found[name].dtype == truth.dtype, name
-        error = float((found[name] - truth).abs().max()) if truth.numel() else 0.0
-        limit = bound * float(truth.abs().max()) if truth.numel() else 0.0
-        if not error <= limit:
-            errors[name] = error
-    return errors
+    found, expected = (seen_and_gradients(scene, backend, **options) for backend in ("cpu", "reference"))
+    return differing(found, expected, bound)
 
 
 @contextmanager

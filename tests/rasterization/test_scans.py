@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.agreement import differing
 from helpers.random_scans import ScanScene, even_rays, random_scan, uneven_rays
 
 from drivesplat.kernels.numba import scan_tiles
@@ -38,16 +39,8 @@ def seen_and_gradients(scene: ScanScene, backend: str = "cpu", **options) -> dic
 
 def disagreements(scene: ScanScene, bound: float = AGREEMENT, **options) -> dict[str, float]:
     """The results that differ from the reference by more than `bound`, and their errors."""
-    expected = seen_and_gradients(scene, "reference", **options)
-    found = seen_and_gradients(scene, "cpu", **options)
-    errors = {}
-    for name, truth in expected.items():
-        assert found[name].shape == truth.shape and found[name].dtype == truth.dtype, name
-        error = float((found[name] - truth).abs().max()) if truth.numel() else 0.0
-        limit = bound * float(truth.abs().max()) if truth.numel() else 0.0
-        if not error <= limit:
-            errors[name] = error
-    return errors
+    found, expected = (seen_and_gradients(scene, backend, **options) for backend in ("cpu", "reference"))
+    return differing(found, expected, bound)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -15,6 +15,7 @@ import numpy as np
 from drivesplat.kernels.cache import callee, kernel
 from drivesplat.kernels.numba.layout import MIN_ALPHA
 from drivesplat.kernels.numba.threads import parallel_for
+from drivesplat.kernels.numba.tiles import TileLists
 from drivesplat.kernels.scan_borders import ScanBorders
 
 MAX_ENTRIES = 4_000_000
@@ -42,23 +43,6 @@ class ScanSplats:
     order: np.ndarray
     shapes: np.ndarray
     values: np.ndarray
-
-
-@dataclass(frozen=True)
-class ScanLists:
-    """The Gaussians of tiles `first` to `last` (excluded), in rows of tiles.
-
-    Those of tile t are `ranks[offsets[t - first] : offsets[t - first + 1]]`, as rows of ScanSplats, front to back.
-    Entry i has place `slots[i]` in a numbering by Gaussian; those of Gaussian r are
-    `slot_offsets[r]` to `slot_offsets[r + 1]` (excluded).
-    """
-
-    first: int
-    last: int
-    offsets: np.ndarray
-    ranks: np.ndarray
-    slots: np.ndarray
-    slot_offsets: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -116,7 +100,7 @@ def by_range(
     return ScanSplats(order, shapes, values[order])
 
 
-def scan_lists(splats: ScanSplats, arcs: Arcs, first: int = 0, last: int | None = None) -> Iterator[ScanLists]:
+def scan_lists(splats: ScanSplats, arcs: Arcs, first: int = 0, last: int | None = None) -> Iterator[TileLists]:
     """The lists of a scan's tiles, window by window."""
     last = arcs.tiles if last is None else last
     counts = np.zeros(len(splats.order), np.int64)
@@ -132,7 +116,7 @@ def scan_lists(splats: ScanSplats, arcs: Arcs, first: int = 0, last: int | None 
     parallel_for(_fill, len(counts), CHUNK, splats.shapes, *arcs.arguments, first, last, slot_offsets, tile_of, rank_of)
     slots = np.argsort(tile_of, kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(tile_of, minlength=last - first))])
-    yield ScanLists(first, last, offsets, rank_of[slots], slots.astype(np.int32), slot_offsets)
+    yield TileLists(first, last, offsets, rank_of[slots], slots.astype(np.int32), slot_offsets)
 
 
 def wrapped(angles: np.ndarray) -> np.ndarray:

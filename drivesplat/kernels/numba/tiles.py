@@ -51,9 +51,9 @@ class Splats:
 
 @dataclass(frozen=True)
 class TileLists:
-    """The Gaussians of tiles `first` to `last` (excluded), in rows of tiles.
+    """The Gaussians of tiles `first` to `last` (excluded) of an image or a LiDAR scan, in rows of tiles.
 
-    Those of tile t are `ranks[offsets[t - first] : offsets[t - first + 1]]`, as rows of Splats, front to back.
+    Those of tile t are `ranks[offsets[t - first] : offsets[t - first + 1]]`, as rows of `shapes`, front to back.
     Entry i has place `slots[i]` in a numbering by Gaussian; those of Gaussian r are
     `slot_offsets[r]` to `slot_offsets[r + 1]` (excluded).
     """
