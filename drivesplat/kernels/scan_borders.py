@@ -1,5 +1,6 @@
 """The tiles of a LiDAR scan and their borders, taken from the rays themselves: beams are not evenly spaced."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -8,16 +9,25 @@ from torch import Tensor
 
 from drivesplat.kernels.scan_projection import wrapped
 
-FIRINGS, BEAMS = 32, 8
-"""Size of a tile in firings and beams."""
+
+class TileSize(NamedTuple):
+    """The rays of a tile: `beams` times `firings`."""
+
+    beams: int
+    firings: int
+
+
+ON_CPU, ON_GPU = TileSize(beams=8, firings=32), TileSize(beams=1, firings=64)
+BINS = 4096
+"""Intervals of azimuth in which `ColumnTable` looks up columns."""
 
 
 class ScanBorders(NamedTuple):
-    """Borders in radians of a scan's tiles, in `rows` of 8 beams and `columns` of 32 firings.
+    """Borders in radians of a scan's tiles, in `rows` of k beams and `columns` of firings.
 
     Rays of a tile lie within `half_widths` of the azimuth `centers`, also across ±π. `order` lists the columns of each
-    row by ascending centre. Elevations lie between `lows` and `highs` of the row; those of a tile's beam k between
-    `beam_lows` and `beam_highs` [:, :, k].
+    row by ascending centre. Elevations lie between `lows` and `highs` of the row; those of a tile's beam i between
+    `beam_lows` and `beam_highs` [:, :, i].
     """
 
     centers: Float[Tensor, "rows columns"]
@@ -25,14 +35,49 @@ class ScanBorders(NamedTuple):
     order: Int[Tensor, "rows columns"]
     lows: Float[Tensor, " rows"]
     highs: Float[Tensor, " rows"]
-    beam_lows: Float[Tensor, "rows columns 8"]
-    beam_highs: Float[Tensor, "rows columns 8"]
+    beam_lows: Float[Tensor, "rows columns k"]
+    beam_highs: Float[Tensor, "rows columns k"]
 
 
-def scan_borders(azimuths: Float[Tensor, "b a"], elevations: Float[Tensor, "b a"]) -> ScanBorders:
+class ColumnTable(NamedTuple):
+    """The columns of tiles that an interval of azimuths may reach, by the bins in which it begins and ends.
+
+    `columns` lists each row's columns by ascending azimuth. Their places in it are counted on from turn to turn; those
+    reached from bin i on begin at `first` [:, i], and those reached up to bin j end with `last` [:, j], which is one
+    below where there is none. Rows lie between elevations `lows` and `highs` (radians).
+    """
+
+    columns: Int[Tensor, "rows columns"]
+    first: Int[Tensor, "rows bins"]
+    last: Int[Tensor, "rows bins"]
+    lows: Float[Tensor, " rows"]
+    highs: Float[Tensor, " rows"]
+
+
+def column_table(azimuths: Float[Tensor, "b a"], elevations: Float[Tensor, "b a"], size: TileSize) -> ColumnTable:
+    """The table of a scan of at least one ray; azimuths within ±π."""
+    borders = scan_borders(azimuths, elevations, size)
+    centers = borders.centers.gather(1, borders.order)
+    widths, count = borders.half_widths.gather(1, borders.order), centers.shape[1]
+    turns = torch.arange(-1, 2, device=azimuths.device) * 2.0 * math.pi
+    centers = (centers[:, None] + turns[:, None]).flatten(1)  # three turns
+    widths = widths.repeat(1, 3)
+    # columns may lie within each other, as where a revolution is longer than a turn: make both borders ascend
+    lows = (centers - widths).flip(1).cummin(dim=1).values.flip(1)
+    highs = (centers + widths).cummax(dim=1).values
+    edges = torch.linspace(-math.pi, math.pi, BINS + 1, dtype=centers.dtype, device=centers.device)
+    rows = len(centers)
+    first = torch.searchsorted(highs, edges[:-1].expand(rows, -1).contiguous()) - count
+    last = torch.searchsorted(lows, edges[1:].expand(rows, -1).contiguous(), right=True) - 1 - count
+    return ColumnTable(
+        borders.order.int(), first.int(), last.int(), borders.lows.to(elevations), borders.highs.to(elevations)
+    )
+
+
+def scan_borders(azimuths: Float[Tensor, "b a"], elevations: Float[Tensor, "b a"], size: TileSize) -> ScanBorders:
     """The borders, in float64, of a scan of at least one ray; azimuths within ±π."""
-    azimuths, elevations = _in_tiles(azimuths.double()), _in_tiles(elevations.double())
-    middle = azimuths[:, :, BEAMS // 2, FIRINGS // 2, None, None]
+    azimuths, elevations = _in_tiles(azimuths.double(), size), _in_tiles(elevations.double(), size)
+    middle = azimuths[:, :, size.beams // 2, size.firings // 2, None, None]
     around = wrapped(azimuths - middle)
     low, high = around.amin(dim=(2, 3)), around.amax(dim=(2, 3))
     centers = wrapped(middle[..., 0, 0] + 0.5 * (low + high))
@@ -43,10 +88,10 @@ def scan_borders(azimuths: Float[Tensor, "b a"], elevations: Float[Tensor, "b a"
     )  # fmt: skip
 
 
-def _in_tiles(rays: Float[Tensor, "b a"]) -> Float[Tensor, "rows columns 8 32"]:
+def _in_tiles(rays: Float[Tensor, "b a"], size: TileSize) -> Float[Tensor, "rows columns k f"]:
     """Values of rays by tile; incomplete tiles repeat the last beam and firing."""
     b, a = rays.shape
-    rows, columns = -(-b // BEAMS), -(-a // FIRINGS)
-    beam = torch.arange(rows * BEAMS, device=rays.device).clamp(max=b - 1)
-    firing = torch.arange(columns * FIRINGS, device=rays.device).clamp(max=a - 1)
-    return rays[beam][:, firing].reshape(rows, BEAMS, columns, FIRINGS).transpose(1, 2)
+    rows, columns = -(-b // size.beams), -(-a // size.firings)
+    beam = torch.arange(rows * size.beams, device=rays.device).clamp(max=b - 1)
+    firing = torch.arange(columns * size.firings, device=rays.device).clamp(max=a - 1)
+    return rays[beam][:, firing].reshape(rows, size.beams, columns, size.firings).transpose(1, 2)

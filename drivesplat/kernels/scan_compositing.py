@@ -2,11 +2,13 @@
 
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.kernels.scan_borders import scan_borders
-from drivesplat.kernels.scan_projection import ScannedGaussians, wrapped
+from drivesplat.kernels import triton_support
+from drivesplat.kernels.scan_part import ScanPart
+from drivesplat.kernels.scan_projection import ScannedGaussians
 
 
 class CompositedScan(NamedTuple):
@@ -22,18 +24,16 @@ class CompositedScan(NamedTuple):
 
 
 def composite_scan(
-    gaussians: ScannedGaussians,
-    values: Float[Tensor, "n v"],
-    azimuths: Float[Tensor, "b a"],
-    elevations: Float[Tensor, "b a"],
-    until: Float[Tensor, "b a"],
+    gaussians: ScannedGaussians, values: Float[Tensor, "n v"], part: ScanPart, until: Float[Tensor, "b a"]
 ) -> CompositedScan:
-    """Composites Gaussians along rays (radians), in numba on the CPU. Tensors on a GPU are copied there and back."""
+    """Composites Gaussians along the rays of a part, in Triton on a GPU and in numba elsewhere. Where Triton cannot be
+    used, or for float64, tensors on a GPU are copied to the CPU and back."""
+    if triton_support.usable_for(values) and values.dtype == torch.float32:
+        from drivesplat.kernels.triton.scan_compositing import ScanCompositing
+
+        return CompositedScan(*ScanCompositing.apply(*gaussians, values, part, until))
     from drivesplat.kernels.numba.scan_compositing import ScanCompositing
 
-    device = gaussians.means2d.device
-    azimuths, elevations = wrapped(azimuths).cpu(), elevations.cpu()
-    inputs = [tensor.cpu() for tensor in (*gaussians, values)]
-    borders = scan_borders(azimuths, elevations)
-    composited = ScanCompositing.apply(*inputs, azimuths, elevations, until.cpu(), borders)
-    return CompositedScan(*(tensor.to(device) for tensor in composited))
+    inputs, rays = [tensor.cpu() for tensor in (*gaussians, values)], part.on_cpu
+    composited = ScanCompositing.apply(*inputs, rays.within, rays.elevations, until.cpu(), rays.borders)
+    return CompositedScan(*(tensor.to(values.device) for tensor in composited))

@@ -14,12 +14,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from drivesplat.kernels import triton_support
+
 MIN_ALPHA = 1.0 / 255.0
 """Minimum alpha: smaller contributions are not drawn."""
 MIN_RANGE = 0.2
 """Gaussians nearer to the sensor (metres) are skipped."""
-MAX_ELEVATION = math.radians(80.0)
-"""Gaussians nearer to the poles are skipped: azimuths, and so the linearisation, degenerate there."""
+SINE_OF_POLES = math.sin(math.radians(80.0))
+"""Gaussians nearer to the poles, by the sine of their elevation, are skipped: azimuths, and so the linearisation,
+degenerate there."""
 MAX_DEVIATIONS = 3.0
 """Maximum correction of the range within a Gaussian, in standard deviations of the range along its plane within its
 footprint, which the beams widen. Standard deviations of its own range alone would cut off the plane of the road, where
@@ -54,6 +57,27 @@ class FiringTimes(NamedTuple):
     azimuths: Float[Tensor, " a"]
     offsets_s: Float[Tensor, " a"]
 
+    def between(self) -> tuple[Float[Tensor, " c"], Float[Tensor, " d"]]:
+        """The azimuths (radians) between neighbouring firings of revolution after revolution, a + 1 of them, and the
+        offsets of the a + 2 firings around them."""
+        first, last = slice(0, 1), slice(-1, None)
+        around = [self.azimuths[last] - 2.0 * math.pi, self.azimuths, self.azimuths[first] + 2.0 * math.pi]
+        azimuths, offsets_s = (
+            torch.cat(around),
+            torch.cat([self.offsets_s[last], self.offsets_s, self.offsets_s[first]]),
+        )
+        return 0.5 * (azimuths[1:] + azimuths[:-1]), offsets_s
+
+
+class Revolution(NamedTuple):
+    """The motion while a sensor's beams revolve: when which azimuth fires; the velocity (m/s) and the angular velocity
+    (rad/s) of the sensor in its own frame at the timestamp; and the velocities (m/s) of Gaussians in the world."""
+
+    firings: FiringTimes
+    linear: Float[Tensor, "3"]
+    angular: Float[Tensor, "3"]
+    velocities: Float[Tensor, "n 3"] | None
+
 
 class Placement(NamedTuple):
     """Where Gaussians are in the sensor's frame, and how they lie: centres (3, n) in metres, and axes (3, 3, n): the
@@ -63,7 +87,30 @@ class Placement(NamedTuple):
     axes: Float[Tensor, "3 3 n"]
 
 
-def placed(
+def scanned(
+    means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"],
+    opacities: Float[Tensor, " n"], world_to_sensor: Float[Tensor, "4 4"], revolution: Revolution | None,
+    beam_spread: tuple[float, float], max_range: float,
+) -> ScannedGaussians:  # fmt: skip
+    """Gaussians as a LiDAR sees them, with `revolution` where they are when the beams pass them.
+
+    `beam_spread` are the standard deviations (radians) of the beams' footprint in azimuth and elevation, which
+    Gaussians are widened by. The times are taken as constants: gradients treat a Gaussian as if it always met the
+    beams at the same time. In Triton on a GPU, unless the gradient of the pose is wanted, in torch elsewhere.
+    """
+    if triton_support.usable_for(means) and means.dtype == torch.float32 and not world_to_sensor.requires_grad:
+        from drivesplat.kernels.triton.scan_projection import ScanProjection, sensor_motion
+
+        motion = sensor_motion(world_to_sensor, revolution)
+        projected = ScanProjection.apply(means, quats, scales, opacities, motion, beam_spread, max_range)
+        return ScannedGaussians(*projected, opacities)
+    gaussians = _placed(means, quats, scales, world_to_sensor)
+    if revolution is not None:
+        gaussians = _at_firing(gaussians, revolution, world_to_sensor)
+    return _project(gaussians, opacities, beam_spread, max_range)
+
+
+def _placed(
     means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"],
     world_to_sensor: Float[Tensor, "4 4"],
 ) -> Placement:  # fmt: skip
@@ -81,25 +128,20 @@ def placed(
     return Placement(rotation @ means.T + translation, axes)
 
 
-def at_firing(
-    gaussians: Placement, firings: FiringTimes, linear: Float[Tensor, "3"], angular: Float[Tensor, "3"],
-    velocities: Float[Tensor, "n 3"] | None, world_to_sensor: Float[Tensor, "4 4"],
-) -> Placement:  # fmt: skip
-    """The Gaussians in the sensor's frame at the times at which the beams pass them.
-
-    The sensor moves with `linear` (m/s) and turns with `angular` (rad/s), both in its frame at the sweep's timestamp;
-    Gaussians move with `velocities` (m/s in world coordinates). The times are taken as constants: gradients treat a
-    Gaussian as if it always met the beams at the same time.
-    """
+def _at_firing(gaussians: Placement, revolution: Revolution, world_to_sensor: Float[Tensor, "4 4"]) -> Placement:
+    """The Gaussians in the sensor's frame at the times at which the beams pass them."""
     with torch.no_grad():
-        relative = -linear[:, None].expand_as(gaussians.centers)
-        if velocities is not None:
-            relative = relative + world_to_sensor[:3, :3] @ velocities.T
-        offsets = gaussians.centers.new_zeros(gaussians.centers.shape[1])
+        relative = -revolution.linear[:, None].expand_as(gaussians.centers)
+        if revolution.velocities is not None:
+            relative = relative + world_to_sensor[:3, :3] @ revolution.velocities.T
+        offsets, (middles, known) = (
+            gaussians.centers.new_zeros(gaussians.centers.shape[1]),
+            revolution.firings.between(),
+        )
         for _ in range(FIRING_STEPS):
-            x, y = _turned(_turns(-angular, offsets)[:2], gaussians.centers + relative * offsets)
-            offsets = _offsets_at(firings, _atan2(y, x))
-        turns, moved = _turns(-angular, offsets), relative * offsets
+            x, y = _turned(_turns(-revolution.angular, offsets)[:2], gaussians.centers + relative * offsets)
+            offsets = known[torch.searchsorted(middles, _atan2(y, x))]
+        turns, moved = _turns(-revolution.angular, offsets), relative * offsets
     axes = torch.stack([_turned(turns, axis) for axis in gaussians.axes.unbind(1)], dim=1)
     return Placement(_turned(turns, gaussians.centers + moved), axes)
 
@@ -109,14 +151,6 @@ def firing_times(azimuths: Float[Tensor, "b a"], offsets_s: Float[Tensor, "b a"]
     mean = torch.atan2(azimuths.sin().sum(dim=0), azimuths.cos().sum(dim=0))
     order = mean.argsort()
     return FiringTimes(mean[order], offsets_s.median(dim=0).values[order])
-
-
-def _offsets_at(firings: FiringTimes, azimuths: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """The offsets of the firings nearest to the azimuths."""
-    first, last = slice(0, 1), slice(-1, None)
-    known, offsets = firings.azimuths, torch.cat([firings.offsets_s[last], firings.offsets_s, firings.offsets_s[first]])
-    around = torch.cat([known[last] - 2.0 * math.pi, known, known[first] + 2.0 * math.pi])
-    return offsets[torch.searchsorted(0.5 * (around[1:] + around[:-1]), azimuths)]
 
 
 def _length(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
@@ -150,15 +184,14 @@ def _turned(turns: Float[Tensor, "rows 3 n"], vectors: Float[Tensor, "3 n"]) -> 
     return turns[:, 0] * vectors[0] + turns[:, 1] * vectors[1] + turns[:, 2] * vectors[2]
 
 
-def project_scan(
+def _project(
     gaussians: Placement, opacities: Float[Tensor, " n"], beam_spread: tuple[float, float], max_range: float
 ) -> ScannedGaussians:
-    """Projects Gaussians in the sensor's frame to azimuth, elevation and range. `beam_spread` are the standard
-    deviations (radians) of the beams' footprint in azimuth and elevation, which Gaussians are widened by."""
+    """Projects Gaussians in the sensor's frame to azimuth, elevation and range."""
     with torch.no_grad():
         distance = _length(gaussians.centers)
         sine = gaussians.centers[2] / distance.clamp(min=MIN_RANGE)
-        seen = (distance >= MIN_RANGE) & (distance <= max_range) & (sine.abs() <= math.sin(MAX_ELEVATION))
+        seen = (distance >= MIN_RANGE) & (distance <= max_range) & (sine.abs() <= SINE_OF_POLES)
         elsewhere = gaussians.centers.new_tensor([1.0, 0.0, 0.0])[:, None]
     x, y, z = torch.where(seen, gaussians.centers, elsewhere).unbind()
     across_squared = x * x + y * y

@@ -1,13 +1,15 @@
 """The rasterization of LiDAR scans, on any device, and its result."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from drivesplat.kernels.scan_compositing import CompositedScan, composite_scan
-from drivesplat.kernels.scan_projection import ScannedGaussians, at_firing, firing_times, placed, project_scan
+from drivesplat.kernels.scan_part import ScanPart
+from drivesplat.kernels.scan_projection import Revolution, ScannedGaussians, scanned
 from drivesplat.scene.scan import ScanRays
 
 MAX_RANGE = 200.0
@@ -26,6 +28,31 @@ class RayGrid:
     def of(cls, rays: ScanRays, like: Tensor) -> "RayGrid":
         """The rays with the device and type of `like`."""
         return cls(*(torch.from_numpy(array).to(like) for array in (rays.azimuths, rays.elevations, rays.offsets_s)))
+
+    @cached_property
+    def whole(self) -> ScanPart:
+        """All rays."""
+        return ScanPart(self.azimuths, self.elevations, self.offsets_s)
+
+    @cached_property
+    def halves(self) -> "Halves":
+        """The rays of the first and of the second half of a revolution, by time; without an empty half."""
+        order = self.offsets_s.median(dim=0).values.argsort(stable=True)
+        places = [half for half in order.tensor_split(2) if len(half)]
+        rays = (self.azimuths, self.elevations, self.offsets_s)
+        return Halves(
+            [ScanPart(*(values[:, half] for values in rays)) for half in places], places, torch.cat(places).argsort()
+        )
+
+
+@dataclass(frozen=True)
+class Halves:
+    """The halves of a revolution as `parts`, the firings that each has in the scan, and the places of all firings of
+    the scan in the halves one after the other."""
+
+    parts: list[ScanPart]
+    firings: list[Int[Tensor, " _"]]
+    places: Int[Tensor, " a"]
 
 
 @dataclass(frozen=True)
@@ -125,30 +152,18 @@ def rasterize_scan(
     """
     if rays.azimuths.numel() == 0:
         raise ValueError(f"a scan needs rays; this one has {rays.azimuths.shape[0]} beams x {rays.azimuths.shape[1]}")
-    gaussians = placed(means, quats, scales, world_to_sensor)
     until = torch.zeros_like(rays.azimuths) if before is None else before
-    parts = [slice(None)] if motion is None else _halves(rays.offsets_s)
-    projected, composited = [], []
-    for part in parts:
-        azimuths, elevations, offsets_s = (t[:, part] for t in (rays.azimuths, rays.elevations, rays.offsets_s))
-        moved = gaussians
-        if motion is not None:
-            firings = firing_times(azimuths, offsets_s)
-            moved = at_firing(gaussians, firings, motion.linear, motion.angular, motion.velocities, world_to_sensor)
-        projected.append(project_scan(moved, opacities, beam_spread, max_range))
-        composited.append(composite_scan(projected[-1], values, azimuths, elevations, until[:, part]))
-    range_sum, alpha, nearer, out, median = composited[0] if motion is None else _joined(composited, parts)
+    gaussians = means, quats, scales, opacities, world_to_sensor
+    if motion is None:
+        projected = [scanned(*gaussians, None, beam_spread, max_range)]
+        composited = composite_scan(projected[0], values, rays.whole, until)
+    else:
+        projected, scans = [], []
+        for part, firings in zip(rays.halves.parts, rays.halves.firings, strict=True):
+            revolution = Revolution(part.firings, motion.linear, motion.angular, motion.velocities)
+            projected.append(scanned(*gaussians, revolution, beam_spread, max_range))
+            scans.append(composite_scan(projected[-1], values, part, until[:, firings]))
+        composited = CompositedScan(*(torch.cat(t, dim=1)[:, rays.halves.places] for t in zip(*scans, strict=True)))
+    range_sum, alpha, nearer, out, median = composited
     expected = range_sum / alpha.clamp(min=1e-10)
     return ScanRendering(expected, median, alpha, out, None if before is None else nearer, tuple(projected))
-
-
-def _halves(offsets_s: Float[Tensor, "b a"]) -> list[Int[Tensor, " _"]]:
-    """The firings of the first and of the second half of a revolution, by time; without an empty one."""
-    order = offsets_s.median(dim=0).values.argsort(stable=True)
-    return [half for half in order.tensor_split(2) if len(half)]
-
-
-def _joined(composited: list[CompositedScan], parts: list[Int[Tensor, " _"]]) -> CompositedScan:
-    """The scan whose firings `parts` names."""
-    places = torch.cat(parts).argsort()
-    return CompositedScan(*(torch.cat(tensors, dim=1)[:, places] for tensors in zip(*composited, strict=True)))

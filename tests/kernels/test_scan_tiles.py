@@ -7,13 +7,12 @@ from helpers.random_scans import ScanScene, even_rays, random_scan
 
 from drivesplat.kernels.numba import scan_tiles
 from drivesplat.kernels.numba.tiles import TileLists
-from drivesplat.kernels.scan_borders import scan_borders
 from drivesplat.rasterization import RayGrid
 
 
 def _lists_of(scene: ScanScene) -> TileLists:
     arrays = [tensor.numpy() for tensor in scene.render().gaussians[0]]
-    arcs = scan_tiles.Arcs.of(scan_borders(scene.rays.azimuths, scene.rays.elevations))
+    arcs = scan_tiles.Arcs.of(scene.rays.whole.borders)
     (lists,) = scan_tiles.scan_lists(scan_tiles.by_range(*arrays, scene.values.numpy(), arcs), arcs)
     return lists
 
@@ -39,5 +38,5 @@ def test_gaussians_that_no_ray_may_meet_are_not_sorted():
     scene.world_to_sensor, scene.scales = torch.eye(4).double(), torch.full((4, 3), 1e-2, dtype=torch.float64)
     scene.means = torch.tensor([[-9.0, 1.0, 0.0], [9.0, 1.0, 0.0], [5.0, 0.0, 3.0], [5.0, 0.0, -4.0]]).double()
     arrays = [tensor.numpy() for tensor in scene.render().gaussians[0]]
-    arcs = scan_tiles.Arcs.of(scan_borders(ahead.azimuths, ahead.elevations))
+    arcs = scan_tiles.Arcs.of(ahead.whole.borders)
     assert scan_tiles.by_range(*arrays, scene.values.numpy(), arcs).order.tolist() == [1]

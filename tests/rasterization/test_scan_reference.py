@@ -166,7 +166,7 @@ def test_a_road_of_flat_gaussians_has_its_true_ranges_at_any_incidence(incidence
     assert (rendering.median_range - truth).abs().max() < 0.01
     flat = rendering.gaussians[0]._replace(slopes=torch.zeros_like(rendering.gaussians[0].slopes))
     rays = scene.rays
-    found = composite_scan(flat, scene.values, rays.azimuths, rays.elevations, torch.zeros_like(rays.azimuths))
+    found = composite_scan(flat, scene.values, rays.whole, torch.zeros_like(rays.azimuths))
     without = (found.range_sum / found.alpha - truth).abs()
     assert without.median() > 0.08
 

@@ -228,9 +228,7 @@ def test_gradients_of_projected_gaussians_are_those_of_finite_differences():
 
     def seen(values: torch.Tensor, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         gaussians = projected._replace(**dict(zip(names, tensors, strict=True)), range_limits=limits)
-        return composite_scan(gaussians, values, rays.azimuths, rays.elevations, torch.full_like(rays.azimuths, 7.0))[
-            :4
-        ]
+        return composite_scan(gaussians, values, rays.whole, torch.full_like(rays.azimuths, 7.0))[:4]
 
     free = seen(scene.values, *inputs)[0]
     limits = limits * 1e6

@@ -19,8 +19,7 @@ from drivesplat.kernels.numba.pixels import (
     fast_callee,
     gaussian_alpha,
 )
-from drivesplat.kernels.numba.scan_tiles import SLACK, span, wrap
-from drivesplat.kernels.scan_borders import BEAMS, FIRINGS
+from drivesplat.kernels.numba.scan_tiles import BEAMS, FIRINGS, SLACK, span, wrap
 
 RAYS = BEAMS * FIRINGS
 X, Y, TRANSMITTANCE, WEIGHT, UNTIL = range(5)

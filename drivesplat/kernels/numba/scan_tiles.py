@@ -16,8 +16,9 @@ from drivesplat.kernels.cache import callee, kernel
 from drivesplat.kernels.numba.layout import MIN_ALPHA
 from drivesplat.kernels.numba.threads import parallel_for
 from drivesplat.kernels.numba.tiles import TileLists
-from drivesplat.kernels.scan_borders import ScanBorders
+from drivesplat.kernels.scan_borders import ON_CPU, ScanBorders
 
+BEAMS, FIRINGS = ON_CPU
 MAX_ENTRIES = 4_000_000
 """Maximum number of entries in a window: 32 MB of lists; the backward pass adds 48 bytes per entry for two float32
 values."""

@@ -1,0 +1,53 @@
+"""The rays of a LiDAR scan that are rendered together, and what follows from them alone."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from drivesplat.kernels.scan_borders import ON_CPU, ON_GPU, ColumnTable, ScanBorders, column_table, scan_borders
+from drivesplat.kernels.scan_projection import FiringTimes, wrapped
+
+
+@dataclass(frozen=True)
+class ScanPart:
+    """b beams and a firings: azimuths and elevations in radians, and times in seconds since the timestamp. What
+    follows from them is computed once: a view that is rendered again need not repeat it."""
+
+    azimuths: Float[Tensor, "b a"]
+    elevations: Float[Tensor, "b a"]
+    offsets_s: Float[Tensor, "b a"]
+
+    @cached_property
+    def within(self) -> Float[Tensor, "b a"]:
+        """The azimuths within ±π."""
+        return wrapped(self.azimuths)
+
+    @cached_property
+    def firings(self) -> FiringTimes:
+        """The mean azimuth and the median time of each firing, by ascending azimuth."""
+        mean = torch.atan2(self.azimuths.sin().sum(dim=0), self.azimuths.cos().sum(dim=0))
+        order = mean.argsort()
+        return FiringTimes(mean[order], self.offsets_s.median(dim=0).values[order])
+
+    @cached_property
+    def on_cpu(self) -> "ScanPart":
+        """The same on the CPU."""
+        return self if self.azimuths.device.type == "cpu" else ScanPart(*(rays.cpu() for rays in self.rays))
+
+    @cached_property
+    def borders(self) -> ScanBorders:
+        """The borders of tiles for the CPU."""
+        return scan_borders(self.within, self.elevations, ON_CPU)
+
+    @cached_property
+    def columns(self) -> ColumnTable:
+        """The columns of tiles for the GPU."""
+        return column_table(self.within, self.elevations, ON_GPU)
+
+    @property
+    def rays(self) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"], Float[Tensor, "b a"]]:
+        """Azimuths, elevations and times."""
+        return self.azimuths, self.elevations, self.offsets_s

@@ -1,0 +1,153 @@
+"""Lists of the Gaussians that reach each tile of a LiDAR scan, front to back.
+
+A tile lists a Gaussian where the ellipse alpha = 1/255 meets the row of tiles within the azimuths of the tile, or next
+to them by less than a bin of `ColumnTable`: compositing decides by ray. The determinant of a conic is that of its first
+entry and the variance of elevation, which the radius tells: as the difference of products it would cancel for needles.
+"""
+
+import math
+from typing import no_type_check
+
+import torch
+import triton
+import triton.language as tl
+
+from drivesplat.kernels.capacity import capacity_for
+from drivesplat.kernels.scan_borders import BINS, ColumnTable
+from drivesplat.kernels.scan_projection import MIN_ALPHA, ScannedGaussians
+from drivesplat.kernels.triton.tiles import TileLists
+from drivesplat.kernels.triton.vectors import around
+
+BLOCK = 128
+"""Gaussians per program."""
+FAINTEST = tl.constexpr(MIN_ALPHA)
+SLACK = tl.constexpr(1e-5)
+"""Margin of ellipses in radians, larger than rounding errors of azimuths."""
+MARGIN = tl.constexpr(1.001)
+"""Factor of radii, larger than rounding errors."""
+PER_RADIAN, WHOLE = tl.constexpr(BINS / (2.0 * math.pi)), tl.constexpr(math.pi)
+LAST_BIN = tl.constexpr(BINS - 1)
+
+
+@torch.no_grad()
+def scan_lists(gaussians: ScannedGaussians, table: ColumnTable) -> TileLists:
+    """The lists of all tiles of a scan: those of a row by ascending azimuth, row after row, as one camera. Where the
+    planned capacity (`drivesplat.kernels.capacity`) is too small, the farthest Gaussians are left out."""
+    seen = tuple(
+        tensor.contiguous() for tensor in (gaussians.means2d, gaussians.conics, gaussians.radii, gaussians.opacities)
+    )
+    count, (rows, columns) = len(gaussians.ranges), table.columns.shape
+    tiles, device = rows * columns, gaussians.ranges.device
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    nearness, blocks = torch.empty_like(gaussians.ranges), (triton.cdiv(count, BLOCK),)
+    arcs = (table.first, table.last, table.lows, table.highs)
+    if count:
+        _count_tiles[blocks](
+            *seen, gaussians.ranges.contiguous(), *arcs, counts, nearness, count, rows, columns, BINS, BLOCK
+        )
+    nearest = torch.argsort(nearness, stable=True)
+    ends = torch.cumsum(counts[nearest], dim=0, dtype=torch.int32)
+    capacity = capacity_for(ends[-1]) if count else 0
+    kind = torch.int16 if tiles < torch.iinfo(torch.int16).max else torch.int32
+    keys = torch.full((capacity,), tiles, dtype=kind, device=device)
+    ids = torch.empty(capacity, dtype=torch.int32, device=device)
+    if count:
+        _list[blocks](*seen, *arcs, counts, nearest, ends, keys, ids, capacity, count, rows, columns, BINS, BLOCK)
+    keys, order = torch.sort(keys, stable=True)
+    each_tile = torch.arange(tiles + 1, dtype=kind, device=device)
+    return TileLists(ids, order, torch.searchsorted(keys, each_tile, out_int32=True), (1, rows, columns))
+
+
+@triton.jit
+@no_type_check
+def _ellipse(means2d, conics, radii, opacities, i, valid):
+    """Centres, first two entries of conics, determinants, the quadratic forms at the edges, radii, and the mask of
+    those that are drawn."""
+    wide = tl.load(radii + 2 * i, mask=valid, other=0.0)
+    high = tl.load(radii + 2 * i + 1, mask=valid, other=0.0)
+    opacity = tl.load(opacities + i, mask=valid, other=0.0)
+    valid &= (wide > 0.0) & (high > 0.0) & (opacity >= FAINTEST)
+    x = tl.load(means2d + 2 * i, mask=valid, other=0.0)
+    y = tl.load(means2d + 2 * i + 1, mask=valid, other=0.0)
+    a = tl.load(conics + 3 * i, mask=valid, other=1.0)
+    b = tl.load(conics + 3 * i + 1, mask=valid, other=0.0)
+    c = tl.load(conics + 3 * i + 2, mask=valid, other=1.0)
+    reach = 2.0 * tl.log(tl.where(valid, opacity, 1.0) / FAINTEST)
+    safe = tl.where(valid, high, 1.0)
+    determinant = a * reach / (safe * safe)
+    return x, y, a, b, c, determinant, reach + 1e-3, wide * MARGIN, high * MARGIN, valid
+
+
+@triton.jit
+@no_type_check
+def _reached(
+    row, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS: tl.constexpr
+):
+    """The place of the first column of a row that Gaussians reach, and the number of such columns."""
+    low, top = tl.load(lows + row) - SLACK - y, tl.load(highs + row) + SLACK - y
+    valid &= (low <= high + SLACK) & (top >= -high - SLACK)
+    low, top = tl.maximum(low, -high), tl.minimum(top, high)
+    valid &= low <= top
+    shown = valid & (determinant > 0.0) & (a > 0.0) & (c > 0.0)
+    safe_a, safe_c = tl.where(shown, a, 1.0), tl.where(shown, c, 1.0)
+    safe = tl.where(shown, determinant, 1.0)
+    tilt = b * tl.sqrt(reach / (safe_c * safe))  # elevation of the leftmost point; that of the rightmost is -tilt
+    at_right, at_left = tl.maximum(tl.minimum(-tilt, top), low), tl.maximum(tl.minimum(tilt, top), low)
+    right = (tl.sqrt(tl.maximum(a * reach - safe * at_right * at_right, 0.0)) - b * at_right) / safe_a + SLACK
+    left = (-tl.sqrt(tl.maximum(a * reach - safe * at_left * at_left, 0.0)) - b * at_left) / safe_a - SLACK
+    bound = tl.minimum(wide, WHOLE) + SLACK
+    left, right = tl.where(shown, tl.maximum(left, -bound), -bound), tl.where(shown, tl.minimum(right, bound), bound)
+    valid &= left <= right
+    begin, end = around(x + left), around(x + left) + (right - left)
+    turns = tl.where(end >= WHOLE, 1, 0)
+    end -= 2.0 * WHOLE * turns.to(tl.float32)
+    from_bin = tl.minimum(tl.maximum(((begin + WHOLE) * PER_RADIAN).to(tl.int32), 0), LAST_BIN)
+    to_bin = tl.minimum(tl.maximum(((end + WHOLE) * PER_RADIAN).to(tl.int32), 0), LAST_BIN)
+    start = tl.load(first + row * BINS + from_bin, mask=valid, other=0)
+    stop = tl.load(last + row * BINS + to_bin, mask=valid, other=-1) + columns * turns
+    found = tl.minimum(tl.maximum(stop - start + 1, 0), columns)
+    found = tl.where(right - left >= 2.0 * WHOLE - 4.0 * SLACK, columns, found)
+    return start, tl.where(valid, found, 0)
+
+
+@triton.jit(do_not_specialize=["count", "rows", "columns"])
+@no_type_check
+def _count_tiles(
+    means2d, conics, radii, opacities, ranges, first, last, lows, highs, counts, nearness, count, rows, columns,
+    BINS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """The number of tiles that each Gaussian reaches, and its sort key: its range, or infinity for none."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    x, y, a, b, c, determinant, reach, wide, high, valid = _ellipse(means2d, conics, radii, opacities, i, i < count)
+    found = tl.zeros((BLOCK,), tl.int32)
+    for row in range(rows):
+        found += _reached(
+            row, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS
+        )[1]
+    tl.store(counts + i, found, mask=i < count)
+    tl.store(nearness + i, tl.load(ranges + i, mask=found > 0, other=float("inf")), mask=i < count)
+
+
+@triton.jit(do_not_specialize=["capacity", "count", "rows", "columns"])
+@no_type_check
+def _list(
+    means2d, conics, radii, opacities, first, last, lows, highs, counts, nearest, ends, keys, ids, capacity, count,
+    rows, columns, BINS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes the Gaussians, from the nearest to the farthest, to the entries of all tiles that they reach."""
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    i = tl.load(nearest + place, mask=place < count, other=0)
+    tiles = tl.load(counts + i, mask=place < count, other=0)
+    end = tl.load(ends + place, mask=place < count, other=0)
+    free, end = end - tiles, tl.minimum(end, capacity)
+    x, y, a, b, c, determinant, reach, wide, high, valid = _ellipse(means2d, conics, radii, opacities, i, tiles > 0)
+    for row in range(rows):
+        start, found = _reached(
+            row, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS
+        )
+        for step in range(tl.max(found, 0)):
+            column = (start + step + columns) % columns
+            fits = (step < found) & (free + step < end)
+            tl.store(keys + free + step, row * columns + column, mask=fits)
+            tl.store(ids + free + step, i.to(tl.int32), mask=fits)
+        free += found
