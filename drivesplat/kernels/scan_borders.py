@@ -17,7 +17,7 @@ class TileSize(NamedTuple):
     firings: int
 
 
-ON_CPU, ON_GPU = TileSize(beams=8, firings=32), TileSize(beams=1, firings=64)
+ON_CPU, ON_GPU = TileSize(beams=8, firings=32), TileSize(beams=1, firings=32)
 BINS = 4096
 """Intervals of azimuth in which `ColumnTable` looks up columns."""
 

@@ -308,6 +308,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from drivesplat.kernels.triton import adam, chunks, color_difference, cube_map, exploration, placement, probe
 from drivesplat.kernels.triton import regularizers, tiles, time_varying_colors, view_colors
+from drivesplat.kernels.triton import scan_chunks, scan_compositing, scan_gradients, scan_projection, scan_tiles
 
 FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index": "*i64", "owner": "*i64",
               "ids": "*i32", "order": "*i64", "offsets": "*i32", "firsts": "*i32", "starts": "*i32", "exists": "*i1",
@@ -315,8 +316,17 @@ FLOATS, IN = "*fp32", {"pixels": "*u8", "hidden": "*i1", "moving": "*i1", "index
 NUMBERS = dict.fromkeys(("height", "values", "width", "resolution", "count", "seed"), "i32")
 NUMBERS |= dict.fromkeys(("tiles", "per_camera", "across", "steps", "capacity", "each"), "i32")
 NUMBERS |= dict.fromkeys(("c1", "c2", "strength", "eps"), "fp32")
+NUMBERS |= dict.fromkeys(("rows", "columns", "beams", "firings"), "i32")
+NUMBERS |= dict.fromkeys(("spread_a", "spread_e", "max_range"), "fp32")
+IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
 SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.COLUMNS}
+
+RAYS = {"columns": "*i32", "values": FLOATS}
+SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
+SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS}) | {scan_chunks._copy: RAYS}
+SCAN |= dict.fromkeys((scan_compositing._pass, scan_compositing._composite, scan_compositing._join), RAYS)
+SCAN |= dict.fromkeys((scan_gradients.remain, scan_gradients.add_gradients), RAYS)
 
 def compiled(kernel, **constants):
     kinds = {name: "constexpr" if name in constants else {**IN, **NUMBERS}.get(name, FLOATS)
@@ -325,6 +335,7 @@ def compiled(kernel, **constants):
         kinds["pixels"] = "i32"
     if kernel in (adam._step, chunks._split, chunks._composite, chunks._composite_backward):
         kinds["values"] = FLOATS
+    kinds |= {name: kind for name, kind in SCAN.get(kernel, {}).items() if name in kinds}
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
     source = ASTSource(fn=kernel, signature=kinds, constexprs=places)
     assert triton.compile(source, target=GPUTarget("cuda", 80, 32)).asm["cubin"], kernel
@@ -338,11 +349,23 @@ compiled(regularizers._sums, BLOCK=regularizers.BLOCK)
 compiled(regularizers._spread, BLOCK=regularizers.BLOCK)
 compiled(tiles._count_tiles, BLOCK=tiles.BLOCK)
 compiled(tiles._list, BLOCK=tiles.BLOCK)
-compiled(chunks._count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
+compiled(chunks.count_chunks, LENGTH=chunks.LENGTH, BLOCK=chunks.BLOCK)
 for kernel in (chunks._split, chunks._sum_copies):
     compiled(kernel, CHANNELS=3, LENGTH=chunks.LENGTH)
 for kernel in (chunks._composite, chunks._composite_backward):
     compiled(kernel, CHANNELS=3, WIDTH=4)
+for motion in (True, False):
+    compiled(scan_projection._project, WITH_MOTION=motion, MOVING=motion, STEPS=4, BLOCK=scan_projection.BLOCK)
+    compiled(scan_projection._project_backward, WITH_MOTION=motion, MOVING=motion, BLOCK=scan_projection.BLOCK)
+compiled(scan_tiles._count_tiles, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
+compiled(scan_tiles._list, BINS=scan_tiles.BINS, BLOCK=scan_tiles.BLOCK)
+compiled(scan_chunks._copy, CHANNELS=2, BLOCK=scan_chunks.BLOCK)
+compiled(scan_compositing._pass, GROUP=scan_compositing.GROUP)
+compiled(scan_compositing._arrive, JOINED=scan_compositing.JOINED)
+compiled(scan_compositing._composite, CHANNELS=2, WIDTH=2, GROUP=scan_compositing.GROUP)
+for kernel in (scan_compositing._join, scan_gradients.remain):
+    compiled(kernel, CHANNELS=2, JOINED=scan_compositing.JOINED)
+compiled(scan_gradients.add_gradients, CHANNELS=2, GROUP=scan_compositing.GROUP_BACKWARD)
 compiled(exploration._move, BLOCK=exploration.BLOCK)
 compiled(cube_map._blend, BLOCK=cube_map.BLOCK)
 compiled(cube_map._gradients, BLOCK=cube_map.BLOCK)

@@ -57,7 +57,7 @@ class _Split(torch.autograd.Function):
         starts, firsts = lists.ids.new_empty(chunks, 1, 1), lists.ids.new_empty(tiles + 1)
         exists = torch.empty(chunks, 1, 1, dtype=torch.bool, device=means.device)
         copies = [means.new_empty(capacity, width) for width in (2, 3, values.shape[-1])] + [means.new_empty(capacity)]
-        _count_chunks[(1,)](lists.offsets, firsts, tiles, LENGTH, BLOCK)
+        count_chunks[(1,)](lists.offsets, firsts, tiles, LENGTH, BLOCK)
         _split[(chunks,)](
             *given, *lists[:3], firsts, *copies, starts, exists,
             tiles, down * across, across, tiles.bit_length(), values.shape[-1], LENGTH,
@@ -110,7 +110,7 @@ class _Join(torch.autograd.Function):
 
 @triton.jit(do_not_specialize=["tiles"])
 @no_type_check
-def _count_chunks(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.constexpr):
+def count_chunks(offsets, firsts, tiles, LENGTH: tl.constexpr, BLOCK: tl.constexpr):
     """Writes the first chunk of every tile, and after them the number of chunks."""
     found = 0
     for begin in range(0, tiles, BLOCK):

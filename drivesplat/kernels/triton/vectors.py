@@ -12,16 +12,44 @@ TAN_EIGHTH = tl.constexpr(math.tan(math.pi / 8.0))
 
 @triton.jit
 @no_type_check
-def dot(ax, ay, az, bx, by, bz):
+def dot(p, q):
     """The inner product of two vectors."""
-    return ax * bx + ay * by + az * bz
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
 @triton.jit
 @no_type_check
-def cross(ax, ay, az, bx, by, bz):
+def cross(p, q):
     """The cross product of two vectors."""
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+
+
+@triton.jit
+@no_type_check
+def scaled(factor, p):
+    """A vector times a number."""
+    return factor * p[0], factor * p[1], factor * p[2]
+
+
+@triton.jit
+@no_type_check
+def added(p, q):
+    """The sum of two vectors."""
+    return p[0] + q[0], p[1] + q[1], p[2] + q[2]
+
+
+@triton.jit
+@no_type_check
+def turned(rows, p):
+    """A vector by the rows of a matrix."""
+    return dot(rows[0], p), dot(rows[1], p), dot(rows[2], p)
+
+
+@triton.jit
+@no_type_check
+def turned_back(rows, p):
+    """A vector by the columns of a matrix, given its rows."""
+    return added(scaled(p[0], rows[0]), added(scaled(p[1], rows[1]), scaled(p[2], rows[2])))
 
 
 @triton.jit
@@ -53,34 +81,36 @@ def around(angle):
 def rotation_rows(w, x, y, z):
     """The rows of the rotation matrix of a unit quaternion."""
     return (
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
-    )  # fmt: skip
-
-
-@triton.jit
-@no_type_check
-def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
-    """The gradient of a unit quaternion by that of the rows of its rotation matrix."""
-    return (
-        2.0 * (x * (g7 - g5) + y * (g2 - g6) + z * (g3 - g1)),
-        2.0 * (y * (g1 + g3) + z * (g2 + g6) + w * (g7 - g5) - 2.0 * x * (g4 + g8)),
-        2.0 * (x * (g1 + g3) + z * (g5 + g7) + w * (g2 - g6) - 2.0 * y * (g0 + g8)),
-        2.0 * (x * (g2 + g6) + y * (g5 + g7) + w * (g3 - g1) - 2.0 * z * (g0 + g4)),
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
 
 
 @triton.jit
 @no_type_check
-def turn_rows(x, y, z, seconds):
+def rotation_gradient(w, x, y, z, rows):
+    """The gradient of a unit quaternion by that of the rows of its rotation matrix."""
+    wx, wy, wz = rows[2][1] - rows[1][2], rows[0][2] - rows[2][0], rows[1][0] - rows[0][1]
+    xy, xz, yz = rows[0][1] + rows[1][0], rows[0][2] + rows[2][0], rows[1][2] + rows[2][1]
+    return (
+        2.0 * (x * wx + y * wy + z * wz),
+        2.0 * (y * xy + z * xz + w * wx - 2.0 * x * (rows[1][1] + rows[2][2])),
+        2.0 * (x * xy + z * yz + w * wy - 2.0 * y * (rows[0][0] + rows[2][2])),
+        2.0 * (x * xz + y * yz + w * wz - 2.0 * z * (rows[0][0] + rows[1][1])),
+    )
+
+
+@triton.jit
+@no_type_check
+def turn_rows(velocity, seconds):
     """The rows of the rotation by an angular velocity over times, after Rodrigues."""
-    speed = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-12)
-    x, y, z = x / speed, y / speed, z / speed
+    speed = tl.maximum(tl.sqrt(dot(velocity, velocity)), 1e-12)
+    x, y, z = scaled(1.0 / speed, velocity)
     s, c = tl.sin(speed * seconds), tl.cos(speed * seconds)
     k = 1.0 - c
     return (
-        c + k * x * x, k * x * y - s * z, k * x * z + s * y,
-        k * x * y + s * z, c + k * y * y, k * y * z - s * x,
-        k * x * z - s * y, k * y * z + s * x, c + k * z * z,
-    )  # fmt: skip
+        (c + k * x * x, k * x * y - s * z, k * x * z + s * y),
+        (k * x * y + s * z, c + k * y * y, k * y * z - s * x),
+        (k * x * z - s * y, k * y * z + s * x, c + k * z * z),
+    )
