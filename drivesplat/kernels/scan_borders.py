@@ -19,7 +19,7 @@ class TileSize(NamedTuple):
 
 ON_CPU, ON_GPU = TileSize(beams=8, firings=32), TileSize(beams=1, firings=32)
 BINS = 4096
-"""Intervals of azimuth in which `ColumnTable` looks up columns."""
+"""Intervals of azimuth in which `TileTable` looks up tiles."""
 
 
 class ScanBorders(NamedTuple):
@@ -39,39 +39,46 @@ class ScanBorders(NamedTuple):
     beam_highs: Float[Tensor, "rows columns k"]
 
 
-class ColumnTable(NamedTuple):
-    """The columns of tiles that an interval of azimuths may reach, by the bins in which it begins and ends.
+class TileTable(NamedTuple):
+    """The tiles that an ellipse may reach, by its elevations and by the bins of azimuth in which it begins and ends.
 
-    `columns` lists each row's columns by ascending azimuth. Their places in it are counted on from turn to turn; those
-    reached from bin i on begin at `first` [:, i], and those reached up to bin j end with `last` [:, j], which is one
-    below where there is none. Rows lie between elevations `lows` and `highs` (radians).
+    Rows of tiles are listed by ascending elevation, and the tiles of a row by ascending azimuth: `tiles` are their
+    numbers in the scan. Rows that an interval of elevations reaches begin with the first whose `highs` is not below
+    it, and end with the last whose `lows` is not above it (radians). Places in a row are counted on from turn to turn;
+    those reached from bin i on begin at `first` [:, i], and those reached up to bin j end with `last` [:, j], which is
+    one below where there is none.
     """
 
-    columns: Int[Tensor, "rows columns"]
+    tiles: Int[Tensor, "rows columns"]
     first: Int[Tensor, "rows bins"]
     last: Int[Tensor, "rows bins"]
     lows: Float[Tensor, " rows"]
     highs: Float[Tensor, " rows"]
 
 
-def column_table(azimuths: Float[Tensor, "b a"], elevations: Float[Tensor, "b a"], size: TileSize) -> ColumnTable:
+def tile_table(azimuths: Float[Tensor, "b a"], elevations: Float[Tensor, "b a"], size: TileSize) -> TileTable:
     """The table of a scan of at least one ray; azimuths within ±π."""
     borders = scan_borders(azimuths, elevations, size)
-    centers = borders.centers.gather(1, borders.order)
-    widths, count = borders.half_widths.gather(1, borders.order), centers.shape[1]
+    rows = (borders.lows + borders.highs).argsort()
+    centers, widths, order = (values[rows] for values in (borders.centers, borders.half_widths, borders.order))
+    count = centers.shape[1]
     turns = torch.arange(-1, 2, device=azimuths.device) * 2.0 * math.pi
-    centers = (centers[:, None] + turns[:, None]).flatten(1)  # three turns
-    widths = widths.repeat(1, 3)
-    # columns may lie within each other, as where a revolution is longer than a turn: make both borders ascend
-    lows = (centers - widths).flip(1).cummin(dim=1).values.flip(1)
-    highs = (centers + widths).cummax(dim=1).values
+    centers = (centers.gather(1, order)[:, None] + turns[:, None]).flatten(1)  # three turns
+    widths = widths.gather(1, order).repeat(1, 3)
+    lows, highs = _ascending(centers - widths, centers + widths)
     edges = torch.linspace(-math.pi, math.pi, BINS + 1, dtype=centers.dtype, device=centers.device)
-    rows = len(centers)
-    first = torch.searchsorted(highs, edges[:-1].expand(rows, -1).contiguous()) - count
-    last = torch.searchsorted(lows, edges[1:].expand(rows, -1).contiguous(), right=True) - 1 - count
-    return ColumnTable(
-        borders.order.int(), first.int(), last.int(), borders.lows.to(elevations), borders.highs.to(elevations)
-    )
+    first = torch.searchsorted(highs, edges[:-1].expand(len(rows), -1).contiguous()) - count
+    last = torch.searchsorted(lows, edges[1:].expand(len(rows), -1).contiguous(), right=True) - 1 - count
+    bottoms, tops = _ascending(borders.lows[rows], borders.highs[rows])
+    tiles = rows[:, None] * count + order
+    return TileTable(tiles.int(), first.int(), last.int(), bottoms.to(elevations), tops.to(elevations))
+
+
+def _ascending(
+    lows: Float[Tensor, "*n"], highs: Float[Tensor, "*n"]
+) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
+    """Intervals whose ends ascend. Some lie within others, as where a revolution is longer than a turn: these grow."""
+    return lows.flip(-1).cummin(dim=-1).values.flip(-1), highs.cummax(dim=-1).values
 
 
 def scan_borders(azimuths: Float[Tensor, "b a"], elevations: Float[Tensor, "b a"], size: TileSize) -> ScanBorders:

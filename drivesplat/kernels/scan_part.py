@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from drivesplat.kernels.scan_borders import ON_CPU, ON_GPU, ColumnTable, ScanBorders, column_table, scan_borders
+from drivesplat.kernels.scan_borders import ON_CPU, ON_GPU, ScanBorders, TileTable, scan_borders, tile_table
 from drivesplat.kernels.scan_projection import FiringTimes, wrapped
 
 
@@ -43,9 +43,9 @@ class ScanPart:
         return scan_borders(self.within, self.elevations, ON_CPU)
 
     @cached_property
-    def columns(self) -> ColumnTable:
-        """The columns of tiles for the GPU."""
-        return column_table(self.within, self.elevations, ON_GPU)
+    def tiles(self) -> TileTable:
+        """The table of tiles for the GPU."""
+        return tile_table(self.within, self.elevations, ON_GPU)
 
     @property
     def rays(self) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"], Float[Tensor, "b a"]]:

@@ -19,6 +19,7 @@ from drivesplat.poses.adjustment import Priors, bundle_adjust, observations_of, 
 from drivesplat.poses.corrections import Corrections, apply_corrections
 from drivesplat.poses.features import detect_features, match_features
 from drivesplat.poses.from_images import estimate_poses
+from drivesplat.poses.readout import RollingFeatures
 from drivesplat.poses.refinement_record import Refinement, record_header
 from drivesplat.poses.rig import RigImages, from_pycolmap
 from drivesplat.poses.triangulated import Observations, no_points, triangulated_points
@@ -69,7 +70,8 @@ def refine_from_matches(
 ) -> Refinement:
     """Refines recorded poses, with images and features in `start` and matches in `database`."""
     scene, priors = images.scene, priors_of(images, job.refine_poses)
-    unadjusted, reconstruction = _adjust_in_rounds(start, priors, database, job, threads)
+    rolling = RollingFeatures.of(images, start)
+    unadjusted, reconstruction = _adjust_in_rounds(start, rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
     corrections = _corrections(images, observations, poses_of(reconstruction))
     trial = _trial(unadjusted, priors, job, threads) if len(observations.positions) else None
@@ -89,8 +91,9 @@ def estimate_from_matches(
     Raises DatasetError where the drive does not determine the poses."""
     estimate = estimate_poses(images, database, job, threads)
     scene = apply_corrections(images.scene, estimate.corrections)
-    priors = priors_of(RigImages.of(scene, images.indices, images.ego_mask), job.refine_poses)
-    _, reconstruction = _adjust_in_rounds(with_poses(start, priors.given), priors, database, job, threads)
+    placed = RigImages.of(scene, images.indices, images.ego_mask)
+    priors, rolling = priors_of(placed, job.refine_poses), RollingFeatures.of(placed, start)
+    _, reconstruction = _adjust_in_rounds(with_poses(start, priors.given), rolling, priors, database, job, threads)
     observations = observations_of(reconstruction)
     corrections = _corrections(images, observations, poses_of(reconstruction))
     measured = _record(images, observations, corrections.at(images.timestamps), None)
@@ -103,12 +106,19 @@ def estimate_from_matches(
 
 
 def _adjust_in_rounds(
-    start: pycolmap.Reconstruction, priors: Priors, database: Path, job: RefinePosesJob, threads: int
+    start: pycolmap.Reconstruction,
+    rolling: RollingFeatures,
+    priors: Priors,
+    database: Path,
+    job: RefinePosesJob,
+    threads: int,
 ) -> tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]:
     """Rounds of triangulation and bundle adjustment: before and after the last adjustment."""
     reconstruction = start
+    rolling.move_to_timestamp(reconstruction)
     for _ in range(job.refine_poses.rounds):
         reconstruction = triangulate(reconstruction, database, job, threads)
+        rolling.move_to_timestamp(reconstruction)
         unadjusted = pycolmap.Reconstruction(reconstruction)
         bundle_adjust(reconstruction, priors, job.refine_poses.robust_pixels, threads)
     return unadjusted, reconstruction

@@ -322,7 +322,7 @@ IN |= {"first": "*i32", "last": "*i32", "sorted_ids": "*i32"}
 NUMBERS |= {f"{name}{i}": "fp32" for name in ("beta", "rest", "log_beta") for i in (1, 2)}
 SIZES = {"TAPS": 11, "ROWS": color_difference.ROWS, "COLUMNS": color_difference.COLUMNS}
 
-RAYS = {"columns": "*i32", "values": FLOATS}
+RAYS = {"numbers": "*i32", "values": FLOATS}
 SCAN = dict.fromkeys((scan_projection._project, scan_projection._project_backward), {"offsets": FLOATS})
 SCAN |= dict.fromkeys((scan_tiles._count_tiles, scan_tiles._list), {"radii": FLOATS}) | {scan_chunks._copy: RAYS}
 SCAN |= dict.fromkeys((scan_compositing._pass, scan_compositing._composite, scan_compositing._join), RAYS)

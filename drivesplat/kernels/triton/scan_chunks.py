@@ -120,10 +120,10 @@ def chunk_of(chunk, offsets, firsts, tiles, steps):
 
 @triton.jit
 @no_type_check
-def rays_of(tile, columns, beams, firings, across):
+def rays_of(tile, numbers, beams, firings, across):
     """The indices of a tile's rays, and which of them are in the scan."""
-    ray = tl.arange(0, RAYS)
-    beam, firing = tile // across * BEAMS + ray // FIRINGS, tl.load(columns + tile) * FIRINGS + ray % FIRINGS
+    ray, number = tl.arange(0, RAYS), tl.load(numbers + tile)
+    beam, firing = number // across * BEAMS + ray // FIRINGS, number % across * FIRINGS + ray % FIRINGS
     return beam * firings + firing, (beam < beams) & (firing < firings)
 
 

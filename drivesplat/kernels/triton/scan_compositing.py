@@ -55,35 +55,35 @@ class ScanCompositing(torch.autograd.Function):
         opacities: Tensor, values: Tensor, part: ScanPart, until: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         gaussians = ScannedGaussians(means2d, ranges, conics, slopes, range_limits, radii, opacities)
-        chunks = chunks_of(gaussians, values, scan_lists(gaussians, part.columns))
-        rays, columns = [t.contiguous() for t in (part.within, part.elevations, until)], part.columns.columns
+        chunks = chunks_of(gaussians, values, scan_lists(gaussians, part.tiles))
+        rays, numbers = [t.contiguous() for t in (part.within, part.elevations, until)], part.tiles.tiles
         shape, channels = part.azimuths.shape, values.shape[1]
-        sizes, width = (*shape, columns.shape[1], channels), triton.next_power_of_2(max(channels, 1))
+        sizes, width = (*shape, numbers.shape[1], channels), triton.next_power_of_2(max(channels, 1))
         passes, middles = (values.new_empty(chunks.count, RAYS.value) for _ in range(2))
         sums = values.new_empty(chunks.count, SUMS.value + channels, RAYS.value)
         whole, out = [values.new_empty(shape) for _ in range(4)], values.new_empty(*shape, channels)
-        _pass[(chunks.count,)](*chunks, columns, *rays[:2], passes, *chunks.sizes, *sizes[:3], GROUP, num_warps=1)
+        _pass[(chunks.count,)](*chunks, numbers, *rays[:2], passes, *chunks.sizes, *sizes[:3], GROUP, num_warps=1)
         _arrive[(chunks.tiles,)](chunks.firsts, passes, JOINED, num_warps=1)
         _composite[(chunks.count,)](
-            *chunks, columns, *rays, passes, sums, middles, *chunks.sizes, *sizes, width, GROUP, num_warps=1
+            *chunks, numbers, *rays, passes, sums, middles, *chunks.sizes, *sizes, width, GROUP, num_warps=1
         )
-        _join[(chunks.tiles,)](chunks.firsts, columns, sums, middles, *whole, out, *sizes, JOINED, num_warps=1)
+        _join[(chunks.tiles,)](chunks.firsts, numbers, sums, middles, *whole, out, *sizes, JOINED, num_warps=1)
         range_sum, alpha, before, median = whole
         ctx.chunks, ctx.sizes, ctx.count = chunks, sizes, len(ranges)
-        ctx.save_for_backward(columns, *rays, passes, sums, range_sum, alpha, before, out)
+        ctx.save_for_backward(numbers, *rays, passes, sums, range_sum, alpha, before, out)
         ctx.mark_non_differentiable(median)
         return range_sum, alpha, before, out, median
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        columns, azimuths, elevations, until, passes, sums, *rendered = ctx.saved_tensors
+        numbers, azimuths, elevations, until, passes, sums, *rendered = ctx.saved_tensors
         chunks, sizes = ctx.chunks, ctx.sizes
         v_rendered, rest = [gradient.contiguous() for gradient in gradients[:4]], torch.empty_like(passes)
-        remain[(chunks.tiles,)](chunks.firsts, columns, sums, *rendered, *v_rendered, rest, *sizes, JOINED, num_warps=1)
+        remain[(chunks.tiles,)](chunks.firsts, numbers, sums, *rendered, *v_rendered, rest, *sizes, JOINED, num_warps=1)
         v_gaussians = [passes.new_zeros(ctx.count, *width) for width in ((2,), (), (3,), (2,), (), (sizes[3],))]
         add_gradients[(chunks.count,)](
-            *chunks, columns, azimuths, elevations, until, passes, rest, *v_rendered, *v_gaussians, *chunks.sizes,
+            *chunks, numbers, azimuths, elevations, until, passes, rest, *v_rendered, *v_gaussians, *chunks.sizes,
             *sizes, GROUP_BACKWARD, num_warps=1,
         )  # fmt: skip
         v_means2d, v_ranges, v_conics, v_slopes, v_opacities, v_values = v_gaussians
@@ -93,14 +93,14 @@ class ScanCompositing(torch.autograd.Function):
 @triton.jit(do_not_specialize=SIZES)
 @no_type_check
 def _pass(
-    entries, ids, offsets, firsts, columns, azimuths, elevations, passes, capacity, tiles, steps, beams, firings,
+    entries, ids, offsets, firsts, numbers, azimuths, elevations, passes, capacity, tiles, steps, beams, firings,
     across, GROUP: tl.constexpr,
 ):  # fmt: skip
     """Writes the transmittance of each chunk."""
     chunk = tl.program_id(0)
     tile, place, end = chunk_of(chunk, offsets, firsts, tiles, steps)
     if tile >= 0:
-        ray, inside = rays_of(tile, columns, beams, firings, across)
+        ray, inside = rays_of(tile, numbers, beams, firings, across)
         azimuth = tl.load(azimuths + ray, mask=inside, other=0.0)[None, :]
         elevation = tl.load(elevations + ray, mask=inside, other=0.0)[None, :]
         left = tl.where(inside, 1.0, 0.0)
@@ -135,14 +135,14 @@ def _arrive(firsts, passes, JOINED: tl.constexpr):
 @triton.jit(do_not_specialize=SIZES)
 @no_type_check
 def _composite(
-    entries, ids, offsets, firsts, columns, azimuths, elevations, until, passes, sums, middles, capacity, tiles, steps,
+    entries, ids, offsets, firsts, numbers, azimuths, elevations, until, passes, sums, middles, capacity, tiles, steps,
     beams, firings, across, CHANNELS: tl.constexpr, WIDTH: tl.constexpr, GROUP: tl.constexpr,
 ):  # fmt: skip
     """Writes the sums of each chunk, and the median range where it lies in the chunk."""
     chunk = tl.program_id(0)
     tile, place, end = chunk_of(chunk, offsets, firsts, tiles, steps)
     if tile >= 0:
-        ray, inside = rays_of(tile, columns, beams, firings, across)
+        ray, inside = rays_of(tile, numbers, beams, firings, across)
         own = tl.arange(0, RAYS)
         left = tl.where(inside, tl.load(passes + chunk * RAYS + own), 0.0)
         azimuth = tl.load(azimuths + ray, mask=inside, other=0.0)[None, :]
@@ -193,12 +193,12 @@ def _total(source, chunk, last, STRIDE: tl.constexpr, JOINED: tl.constexpr):
 @triton.jit(do_not_specialize=SIZES[3:])
 @no_type_check
 def _join(
-    firsts, columns, sums, middles, range_sum, alpha, before, median, out, beams, firings, across,
+    firsts, numbers, sums, middles, range_sum, alpha, before, median, out, beams, firings, across,
     CHANNELS: tl.constexpr, JOINED: tl.constexpr,
 ):  # fmt: skip
     """Adds the sums of the chunks of a tile."""
     tile = tl.program_id(0)
-    ray, inside = rays_of(tile, columns, beams, firings, across)
+    ray, inside = rays_of(tile, numbers, beams, firings, across)
     chunk, last = tl.load(firsts + tile), tl.load(firsts + tile + 1)
     tl.store(range_sum + ray, _total(sums, chunk, last, (SUMS + CHANNELS) * RAYS, JOINED), mask=inside)
     tl.store(alpha + ray, _total(sums + RAYS, chunk, last, (SUMS + CHANNELS) * RAYS, JOINED), mask=inside)

@@ -31,12 +31,12 @@ from drivesplat.kernels.triton.scan_chunks import (
 @triton.jit(do_not_specialize=SIZES[3:])
 @no_type_check
 def remain(
-    firsts, columns, sums, range_sum, alpha, before, out, v_range_sum, v_alpha, v_before, v_out, rest, beams, firings,
+    firsts, numbers, sums, range_sum, alpha, before, out, v_range_sum, v_alpha, v_before, v_out, rest, beams, firings,
     across, CHANNELS: tl.constexpr, JOINED: tl.constexpr,
 ):  # fmt: skip
     """Writes the remaining sum in front of each chunk of a tile."""
     tile = tl.program_id(0)
-    ray, inside = rays_of(tile, columns, beams, firings, across)
+    ray, inside = rays_of(tile, numbers, beams, firings, across)
     by_range = tl.load(v_range_sum + ray, mask=inside, other=0.0)
     by_alpha = tl.load(v_alpha + ray, mask=inside, other=0.0)
     by_nearer = tl.load(v_before + ray, mask=inside, other=0.0)
@@ -72,7 +72,7 @@ def _add(target, value, mask):
 @triton.jit(do_not_specialize=SIZES)
 @no_type_check
 def add_gradients(
-    entries, ids, offsets, firsts, columns, azimuths, elevations, until, passes, rests, v_range_sum, v_alpha, v_before,
+    entries, ids, offsets, firsts, numbers, azimuths, elevations, until, passes, rests, v_range_sum, v_alpha, v_before,
     v_out, v_means2d, v_ranges, v_conics, v_slopes, v_opacities, v_values, capacity, tiles, steps, beams, firings,
     across, CHANNELS: tl.constexpr, GROUP: tl.constexpr,
 ):  # fmt: skip
@@ -80,7 +80,7 @@ def add_gradients(
     chunk = tl.program_id(0)
     tile, place, end = chunk_of(chunk, offsets, firsts, tiles, steps)
     if tile >= 0:
-        ray, inside = rays_of(tile, columns, beams, firings, across)
+        ray, inside = rays_of(tile, numbers, beams, firings, across)
         azimuth = tl.load(azimuths + ray, mask=inside, other=0.0)[None, :]
         elevation = tl.load(elevations + ray, mask=inside, other=0.0)[None, :]
         border = tl.load(until + ray, mask=inside, other=0.0)[None, :]

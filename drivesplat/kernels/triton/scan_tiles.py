@@ -1,7 +1,7 @@
 """Lists of the Gaussians that reach each tile of a LiDAR scan, front to back.
 
 A tile lists a Gaussian where the ellipse alpha = 1/255 meets the row of tiles within the azimuths of the tile, or next
-to them by less than a bin of `ColumnTable`: compositing decides by ray. The determinant of a conic is that of its first
+to them by less than a bin of `TileTable`: compositing decides by ray. The determinant of a conic is that of its first
 entry and the variance of elevation, which the radius tells: as the difference of products it would cancel for needles.
 """
 
@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 
 from drivesplat.kernels.capacity import capacity_for
-from drivesplat.kernels.scan_borders import BINS, ColumnTable
+from drivesplat.kernels.scan_borders import BINS, TileTable
 from drivesplat.kernels.scan_projection import MIN_ALPHA, ScannedGaussians
 from drivesplat.kernels.triton.tiles import TileLists
 from drivesplat.kernels.triton.vectors import around
@@ -30,21 +30,20 @@ LAST_BIN = tl.constexpr(BINS - 1)
 
 
 @torch.no_grad()
-def scan_lists(gaussians: ScannedGaussians, table: ColumnTable) -> TileLists:
+def scan_lists(gaussians: ScannedGaussians, table: TileTable) -> TileLists:
     """The lists of all tiles of a scan: those of a row by ascending azimuth, row after row, as one camera. Where the
     planned capacity (`drivesplat.kernels.capacity`) is too small, the farthest Gaussians are left out."""
     seen = tuple(
         tensor.contiguous() for tensor in (gaussians.means2d, gaussians.conics, gaussians.radii, gaussians.opacities)
     )
-    count, (rows, columns) = len(gaussians.ranges), table.columns.shape
+    count, (rows, columns) = len(gaussians.ranges), table.tiles.shape
     tiles, device = rows * columns, gaussians.ranges.device
     counts = torch.empty(count, dtype=torch.int32, device=device)
     nearness, blocks = torch.empty_like(gaussians.ranges), (triton.cdiv(count, BLOCK),)
+    sizes = (rows, columns, rows.bit_length())
     arcs = (table.first, table.last, table.lows, table.highs)
     if count:
-        _count_tiles[blocks](
-            *seen, gaussians.ranges.contiguous(), *arcs, counts, nearness, count, rows, columns, BINS, BLOCK
-        )
+        _count_tiles[blocks](*seen, gaussians.ranges.contiguous(), *arcs, counts, nearness, count, *sizes, BINS, BLOCK)
     nearest = torch.argsort(nearness, stable=True)
     ends = torch.cumsum(counts[nearest], dim=0, dtype=torch.int32)
     capacity = capacity_for(ends[-1]) if count else 0
@@ -52,7 +51,7 @@ def scan_lists(gaussians: ScannedGaussians, table: ColumnTable) -> TileLists:
     keys = torch.full((capacity,), tiles, dtype=kind, device=device)
     ids = torch.empty(capacity, dtype=torch.int32, device=device)
     if count:
-        _list[blocks](*seen, *arcs, counts, nearest, ends, keys, ids, capacity, count, rows, columns, BINS, BLOCK)
+        _list[blocks](*seen, *arcs, counts, nearest, ends, keys, ids, capacity, count, *sizes, BINS, BLOCK)
     keys, order = torch.sort(keys, stable=True)
     each_tile = torch.arange(tiles + 1, dtype=kind, device=device)
     return TileLists(ids, order, torch.searchsorted(keys, each_tile, out_int32=True), (1, rows, columns))
@@ -80,12 +79,28 @@ def _ellipse(means2d, conics, radii, opacities, i, valid):
 
 @triton.jit
 @no_type_check
+def _rows(y, high, valid, lows, highs, rows, steps):
+    """The first row that Gaussians reach by their elevation, and the number of such rows: by binary searches."""
+    first, first_end = tl.zeros_like(y).to(tl.int32), tl.zeros_like(y).to(tl.int32) + rows
+    end, end_end = first, first_end
+    for _ in range(steps):
+        middle = (first + first_end) // 2
+        is_below = (first < first_end) & (tl.load(highs + middle, mask=middle < rows, other=0.0) + SLACK < y - high)
+        first, first_end = tl.where(is_below, middle + 1, first), tl.where(is_below, first_end, middle)
+        middle = (end + end_end) // 2
+        reached = (end < end_end) & (tl.load(lows + middle, mask=middle < rows, other=0.0) - SLACK <= y + high)
+        end, end_end = tl.where(reached, middle + 1, end), tl.where(reached, end_end, middle)
+    return first, tl.where(valid, end - first, 0)
+
+
+@triton.jit
+@no_type_check
 def _reached(
     row, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS: tl.constexpr
 ):
-    """The place of the first column of a row that Gaussians reach, and the number of such columns."""
-    low, top = tl.load(lows + row) - SLACK - y, tl.load(highs + row) + SLACK - y
-    valid &= (low <= high + SLACK) & (top >= -high - SLACK)
+    """The place of the first column that Gaussians reach in their `row`, and the number of such columns."""
+    low = tl.load(lows + row, mask=valid, other=0.0) - SLACK - y
+    top = tl.load(highs + row, mask=valid, other=0.0) + SLACK - y
     low, top = tl.maximum(low, -high), tl.minimum(top, high)
     valid &= low <= top
     shown = valid & (determinant > 0.0) & (a > 0.0) & (c > 0.0)
@@ -110,29 +125,31 @@ def _reached(
     return start, tl.where(valid, found, 0)
 
 
-@triton.jit(do_not_specialize=["count", "rows", "columns"])
+@triton.jit(do_not_specialize=["count", "rows", "columns", "steps"])
 @no_type_check
 def _count_tiles(
     means2d, conics, radii, opacities, ranges, first, last, lows, highs, counts, nearness, count, rows, columns,
-    BINS: tl.constexpr, BLOCK: tl.constexpr,
+    steps, BINS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The number of tiles that each Gaussian reaches, and its sort key: its range, or infinity for none."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     x, y, a, b, c, determinant, reach, wide, high, valid = _ellipse(means2d, conics, radii, opacities, i, i < count)
+    row, reached = _rows(y, high, valid, lows, highs, rows, steps)
     found = tl.zeros((BLOCK,), tl.int32)
-    for row in range(rows):
+    for step in range(tl.max(reached, 0)):
+        valid = step < reached
         found += _reached(
-            row, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS
+            row + step, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS
         )[1]
     tl.store(counts + i, found, mask=i < count)
     tl.store(nearness + i, tl.load(ranges + i, mask=found > 0, other=float("inf")), mask=i < count)
 
 
-@triton.jit(do_not_specialize=["capacity", "count", "rows", "columns"])
+@triton.jit(do_not_specialize=["capacity", "count", "rows", "columns", "steps"])
 @no_type_check
 def _list(
     means2d, conics, radii, opacities, first, last, lows, highs, counts, nearest, ends, keys, ids, capacity, count,
-    rows, columns, BINS: tl.constexpr, BLOCK: tl.constexpr,
+    rows, columns, steps, BINS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the Gaussians, from the nearest to the farthest, to the entries of all tiles that they reach."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -141,13 +158,15 @@ def _list(
     end = tl.load(ends + place, mask=place < count, other=0)
     free, end = end - tiles, tl.minimum(end, capacity)
     x, y, a, b, c, determinant, reach, wide, high, valid = _ellipse(means2d, conics, radii, opacities, i, tiles > 0)
-    for row in range(rows):
+    row, reached = _rows(y, high, valid, lows, highs, rows, steps)
+    for step in range(tl.max(reached, 0)):
+        valid = step < reached
         start, found = _reached(
-            row, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS
+            row + step, x, y, a, b, c, determinant, reach, wide, high, valid, first, last, lows, highs, columns, BINS
         )
-        for step in range(tl.max(found, 0)):
-            column = (start + step + columns) % columns
-            fits = (step < found) & (free + step < end)
-            tl.store(keys + free + step, row * columns + column, mask=fits)
-            tl.store(ids + free + step, i.to(tl.int32), mask=fits)
+        for ahead in range(tl.max(found, 0)):
+            column = (start + ahead + columns) % columns
+            fits = (ahead < found) & (free + ahead < end)
+            tl.store(keys + free + ahead, (row + step) * columns + column, mask=fits)
+            tl.store(ids + free + ahead, i.to(tl.int32), mask=fits)
         free += found
