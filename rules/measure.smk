@@ -2,7 +2,8 @@
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl, masks/.
 # OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;
-# <results>/{scene}/metrics.json; resources/lpips/backbone.json.
+# <results>/{scene}/metrics.json; where a method renders LiDAR <results>/{scene}/scan_baselines.json;
+# resources/lpips/backbone.json.
 
 
 rule lpips_backbone:
@@ -65,12 +66,38 @@ rule evaluate:
         "../workflow_scripts/evaluate.py"
 
 
+rule scan_baselines:
+    """
+    Measures held-out LiDAR scans made from other scans without a model: what a method that renders LiDAR has to beat.
+    """
+    input:
+        scene=plan.scene,
+        scans="<results>/{scene}/scans.npz",
+    output:
+        baselines="<results>/{scene}/scan_baselines.json",
+    log:
+        "<logs>/{scene}/scan_baselines.log",
+    benchmark:
+        "<benchmarks>/{scene}/scan_baselines.tsv"
+    conda:
+        "../envs/drivesplat.yaml"
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        settings=plan.settings("scan_baselines"),
+        code=plan.code("scan_baselines"),
+    script:
+        "../workflow_scripts/scan_baselines.py"
+
+
 rule scene_metrics:
     """
-    Combines the measurements of all methods of a scene.
+    Combines the measurements of all methods of a scene, with the baselines of LiDAR scans where a method renders them.
     """
     input:
         evals=expand("<results>/{{scene}}/{method}/eval.json", method=plan.config.methods),
+        baselines=plan.scan_baselines,
     output:
         metrics=report(
             "<results>/{scene}/metrics.json",

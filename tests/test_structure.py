@@ -107,8 +107,11 @@ def test_imports_are_found_in_every_form():
     assert longest_chain({"x": {"y"}, "y": {"z"}, "z": set(), "w": {"z"}}) == ["x", "y", "z"]
 
 
-JSON_DOCUMENTS = {"read_backbone", "read_evaluations", "read_record", "read_summary", "read_scene_tables"}
-"""Readers of JSON for users (train.json, eval.json, backbone.json), of the dataset's tables, and the one they share."""
+JSON_DOCUMENTS = {
+    "read_backbone", "read_baselines", "read_evaluations", "read_record", "read_summary", "read_scene_tables",
+}  # fmt: skip
+"""Readers of JSON for users (train.json, eval.json, backbone.json, scan_baselines.json), of the dataset's tables, and
+the one they share."""
 
 
 def test_readers_of_intermediates_return_typed_records():

@@ -16,8 +16,14 @@ def read_evaluations(paths: Iterable[str]) -> dict[str, dict[str, Any]]:
     return {Path(path).parent.name: read_record(path, "evaluate", *keys) for path in paths}
 
 
-def side_by_side(evals: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The content of metrics.json, without provenance, from the eval.json of every method by name.
+def read_baselines(path: str) -> dict[str, Any]:
+    """The content of a scan_baselines.json. Raises ResultError if it is invalid."""
+    return read_record(path, "scan_baselines", "baselines", "provenance")
+
+
+def side_by_side(evals: dict[str, dict[str, Any]], baselines: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The content of metrics.json, without provenance, from the eval.json of every method by name and, where methods
+    render LiDAR, the content of scan_baselines.json.
 
     Raises ResultError if two methods were measured under different protocols: their figures do not compare.
     """
@@ -36,4 +42,5 @@ def side_by_side(evals: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "protocol": first["protocol"],
         "drive": first["drive"],
         "methods": {name: record["result"] for name, record in evals.items()},
+        **({"lidar_baselines": baselines["baselines"]} if baselines else {}),
     }

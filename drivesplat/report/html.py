@@ -10,6 +10,7 @@ from drivesplat.evaluation.published_fixes import GHOSTS_DOCUMENT, PUBLISHED_FIX
 from drivesplat.io.html_page import filled_page
 from drivesplat.report import page
 from drivesplat.report.gaps import summary_sentences
+from drivesplat.report.lidar import page_table
 from drivesplat.report.media import MethodMedia, data_url, difference_position, read_image
 from drivesplat.report.plot import gap_plot
 from drivesplat.report.tables import pixels_label, scene_label
@@ -68,6 +69,7 @@ def report_page(
             _table("Moving vehicles and static pixels: PSNR in dB", REGION_FIGURES, []),
             _table("Whole images, with the cost of training", WHOLE_IMAGE_FIGURES, COSTS),
         ],
+        lidar=page_table(report["lidar"]),
         publications=_publications(report["published"]),
         published_columns=PUBLISHED_FIGURES,
         scenes=scenes,

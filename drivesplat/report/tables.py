@@ -7,6 +7,7 @@ import pandas as pd
 
 from drivesplat.io.storage import atomic_write
 from drivesplat.report.gaps import COLUMNS, REGIONS
+from drivesplat.report.lidar import LIDAR_COLUMNS, REGION_NAMES, page_table
 from drivesplat.scene.splits import HELD_OUT_GROUPS
 from drivesplat.settings.published import MEAN
 
@@ -22,9 +23,15 @@ def figures_of(report: dict[str, Any]) -> pd.DataFrame:
 
 
 def write_figures(path: str | Path, report: dict[str, Any]) -> None:
-    """Writes the figures of a report as CSV; missing ones are empty cells. Published figures of whole images follow, in
-    the same columns, with their source; so do the measured means that they are compared with."""
+    """Writes the figures of a report as CSV; missing ones are empty cells. Where methods render LiDAR, LIDAR_COLUMNS
+    follow, and rows of the baselines. Published figures of whole images follow, in the same columns, with their source;
+    so do the measured means that they are compared with."""
     table = figures_of(report)
+    if report["lidar"]["rows"]:
+        names = ["scene", "dataset", "method"]
+        scans = pd.DataFrame(report["lidar"]["rows"], dtype=object)
+        shown, of_baselines = [*names, *LIDAR_COLUMNS], scans["baseline"].astype(bool)
+        table = pd.concat([table.merge(scans.loc[~of_baselines, shown], how="left"), scans.loc[of_baselines, shown]])
     if report["published"]:
         shown = [row for row in report["published"] if row["region"] == "all"]
         added = [_csv_row(row) for row in shown if not row["measured"] or row["scene"] == MEAN]
@@ -49,6 +56,29 @@ def gap_table(report: dict[str, Any]) -> str:
 def whole_image_table(report: dict[str, Any]) -> str:
     """PSNR, SSIM and LPIPS of whole images in both groups, Gaussians and training time, and the means over scenes."""
     return _as_text(report, ["psnr", "ssim", "lpips"], COSTS)
+
+
+def lidar_tables(report: dict[str, Any]) -> list[str]:
+    """A heading and a table of rendered LiDAR, of all rays in both groups: a line per scene and method or baseline, and
+    the means over scenes. Empty where no method renders LiDAR."""
+    table = page_table(report["lidar"])
+    columns = [column for column in table["columns"] if column["of"][1] != "rays"]
+    lines = [
+        [item["scene"] or "mean", item["method"], *(_cell(item["figures"][c["key"]], c["form"]) for c in columns)]
+        for item in (*table["rows"], *table["means"])
+        if item["region"] == REGION_NAMES["all"]
+    ]
+    firsts = [f"{column['of'][0][:6]}. " if column["kind"] == "first" else "" for column in columns]
+    titles = [column["title"].partition(",")[0].rstrip(" ↑↓") for column in columns]
+    heads = [first + title for first, title in zip(firsts, titles, strict=True)]
+    text = pd.DataFrame(lines, columns=[*NAMES, *heads], dtype=object).to_string(index=False)
+    title = "LiDAR, all rays of held-out scans (range: median error in cm; drops in %; Chamfer in m)"
+    return [title, text] if lines else []
+
+
+def _cell(value: Any, form: str) -> str:
+    number = value["mean"] if isinstance(value, dict) else value
+    return "-" if number is None else form.format(number)
 
 
 def published_tables(report: dict[str, Any]) -> list[str]:

@@ -15,7 +15,7 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.world import CameraChannel
-from drivesplat.workflow.stages import refines_poses, training_inputs
+from drivesplat.workflow.stages import SCAN_BASELINES, SCANS, refines_poses, training_inputs
 
 
 def unwritable_results(config: Config, error: OSError) -> DriveSplatError:
@@ -161,6 +161,15 @@ class Inputs:
             return [f"{self.config.results_dir}/{wildcards.scene}/{stage}.npz"] if stage in taken else []
 
         return result
+
+    def renders_lidar(self, scene: str, method: str) -> bool:
+        """Whether a method renders the LiDAR of a scene."""
+        return SCANS in training_inputs(self.config, scene, method)
+
+    def scan_baselines(self, wildcards: Any) -> list[str]:
+        """The baselines of a scene's LiDAR scans, if any method renders them."""
+        rendered = any(self.renders_lidar(wildcards.scene, method) for method in self.config.methods)
+        return [f"{self.config.results_dir}/{wildcards.scene}/{SCAN_BASELINES}.json"] if rendered else []
 
     def actors(self, wildcards: Any) -> list[str]:
         """The actors of a scene, if any method has them."""

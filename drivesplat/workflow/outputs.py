@@ -14,6 +14,8 @@ from drivesplat.workflow.stages import (
     EDITS,
     METHOD_STAGES,
     OF_ONE_SCENE,
+    SCAN_BASELINES,
+    SCANS,
     SIDE_BY_SIDE,
     TRAJECTORIES,
     scene_stages,
@@ -132,7 +134,8 @@ class Outputs(Inputs):
     def metrics_stages(self, scene: str) -> dict[str, Any]:
         """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
         methods = self.evaluation_stages(scene, self.config.methods)
-        return {**methods, SIDE_BY_SIDE: self._stage(SIDE_BY_SIDE, scene)}
+        combined = (*([SCAN_BASELINES] if SCANS in methods else []), SIDE_BY_SIDE)
+        return {**methods, **{stage: self._stage(stage, scene) for stage in combined}}
 
     def evaluation_stages(self, scene: str, methods: Iterable[str]) -> dict[str, Any]:
         """The settings and code that every eval.json of `methods` should come from, by the names of the stages."""

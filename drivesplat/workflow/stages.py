@@ -44,7 +44,9 @@ OF_ONE_SCENE = (
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 EDITS, TRAJECTORIES = "edits", "trajectories"
 """Kinds of drive folders, and the folders of a method in which they lie."""
-TRAINING_INPUTS = ("actors", "lidar_depth", "free_space", "scans")
+SCANS, SCAN_BASELINES = "scans", "scan_baselines"
+"""The stages of a scene's LiDAR scans, and of the figures that methods which render them have to beat."""
+TRAINING_INPUTS = ("actors", "lidar_depth", "free_space", SCANS)
 """Stages of a scene that only some methods train on."""
 
 
@@ -106,7 +108,7 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
         "actors": "actors" in stages_of_parts,
         "lidar_depth": train.depth_weight > 0,
         "free_space": train.floaters.free_space,
-        "scans": train.scans.share > 0,
+        SCANS: train.scans.share > 0,
     }
     return [stage for stage in TRAINING_INPUTS if taken[stage]]
 
@@ -256,7 +258,8 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "actors": (ActorSeedJob, lambda at: _lidar(at, "own_car_radius")),
     "lidar_depth": (LidarDepthJob, _lidar_depth),
     "free_space": (FreeSpaceJob, lambda at: _lidar(at, "own_car_radius", "box_margin")),
-    "scans": (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
+    SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
+    SCAN_BASELINES: (Settings, _nothing),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
     "scene_metrics": (Settings, _nothing),

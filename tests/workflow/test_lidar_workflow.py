@@ -32,6 +32,18 @@ def test_metrics_have_lidar_for_the_method_that_renders_it(copy):
         assert methods["with_lidar"][group]["static"]["psnr"] > 10.0
 
 
+def test_metrics_have_the_baselines_of_the_same_rays(copy):
+    metrics = copy.read("results/0001/metrics.json")
+    rendered = metrics["methods"]["with_lidar"]
+    assert set(metrics["lidar_baselines"]) == {"nearest_scan", "neighbouring_scans"}
+    for baseline in metrics["lidar_baselines"].values():
+        for group in ("interpolation", "extrapolation"):
+            found, own = baseline[group]["all"], rendered[group]["lidar"]["all"]
+            assert (found["rays"], found["returns"]) == (own["rays"], own["returns"])
+            assert 0.0 < found["range_error_median_m"] < 5.0
+    assert {"scans", "scan_baselines"} < metrics["provenance"]["stages"].keys()
+
+
 def test_a_changed_weight_of_scans_trains_that_method_alone_again(copy):
     assert copy.planned("results/0001/metrics.json") == {}
     copy.config["methods"]["with_lidar"]["overrides"]["train"]["scans"] = {**SCANS, "range_weight": 0.2}

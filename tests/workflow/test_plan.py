@@ -89,6 +89,10 @@ def test_depth_follows_the_overrides_of_dataset_and_method():
             {"mine": {"parts": ACTORS, "overrides": {"train": {"depth_weight": 0}}}},
             {"a1": {"actors"}, "b1": {"actors"}},
         ),
+        (
+            {"vanilla": {}, "lidar": {"overrides": {"train": {"scans": {"share": 0.3}, "depth_weight": 0}}}},
+            {"a1": {"scans", "scan_baselines"}, "b1": {"scans", "scan_baselines", "lidar_depth"}},
+        ),
     ],
 )
 def test_a_report_expects_them_where_a_method_of_the_scene_takes_them(methods, more):
@@ -210,6 +214,13 @@ def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
     of_scene = {*SCENE_STAGES} - {"scene_metrics"}
     assert made.evaluation_stages("a1", ["vanilla"]).keys() == {*of_scene, "vanilla/train", "vanilla/evaluate"}
     assert made.evaluation_stages("a1", ["mine"]).keys() == {*of_scene, "actors", "mine/train", "mine/evaluate"}
+
+
+def test_baselines_of_scans_are_measured_where_a_method_renders_lidar():
+    made = plan(b={"train": {"scans": {"share": 0.3}}})
+    found = {scene: made.scan_baselines(SimpleNamespace(scene=scene)) for scene in ("a1", "b1")}
+    assert found == {"a1": [], "b1": ["elsewhere/b1/scan_baselines.json"]}
+    assert "scan_baselines" not in made.evaluation_stages("b1", ["vanilla"]), "no eval.json depends on them"
 
 
 def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
