@@ -1,11 +1,11 @@
-# Pictures and films of trained methods: trajectories, ghosts of moving vehicles, removal of a vehicle.
+# Pictures and films of trained methods: trajectories, ghosts of moving vehicles, removal of a vehicle, LiDAR scans.
 #
 # REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, scene.json, parser.pkl, masks/; actors.npz if a method has
-# actors.
+# actors, scans.npz if it renders LiDAR.
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png, compare.mp4 and compare.json;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
 # ghost_panel.png and .json;
-# with_car.png, without_car.png, removal.png and removal.json.
+# with_car.png, without_car.png, removal.png and removal.json; of methods that render LiDAR lidar.png.
 
 
 rule tracks:
@@ -229,3 +229,40 @@ rule remove_actor:
         code=plan.code("remove_actor"),
     script:
         "../workflow_scripts/remove_actor.py"
+
+
+rule lidar_picture:
+    """
+    Draws a LiDAR scan of each held-out group, recorded and rendered: range image, error, intensity and drop.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+        scans="<results>/{scene}/scans.npz",
+    output:
+        picture=report(
+            "<results>/{scene}/{method}/lidar.png",
+            caption="../report/lidar_picture.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "LiDAR: held-out scans"},
+        ),
+    log:
+        "<logs>/{scene}/{method}/lidar_picture.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/lidar_picture.tsv"
+    wildcard_constraints:
+        method=plan.known(plan.methods_with_lidar),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=4)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=15,
+    params:
+        settings=plan.settings("lidar_picture"),
+        code=plan.code("lidar_picture"),
+    script:
+        "../workflow_scripts/lidar_picture.py"

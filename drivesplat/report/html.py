@@ -109,8 +109,8 @@ def _comparison(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _looks(row: dict[str, Any], media: MethodMedia) -> dict[str, Any]:
-    """The images of a method on a scene, embedded: pairs to compare, each starting where they differ, and the ghost
-    panel; and its links."""
+    """The images of a method on a scene, embedded: pairs to compare, each starting where they differ, the ghost panel,
+    and LiDAR scans; and its links."""
     pairs = (
         ("recorded", "rendered", "recorded", row["method"], _where(row["shown"])),
         ("with_car", "without_car", "with vehicle", "without vehicle", "with and without a vehicle"),
@@ -122,8 +122,10 @@ def _looks(row: dict[str, Any], media: MethodMedia) -> dict[str, Any]:
             start = f"{100 * difference_position(under, over):.1f}"
             images = {"under": data_url(under), "over": data_url(over)}
             comparisons.append({"left": left, "right": right, "what": what, "start": start, **images})
-    panel = data_url(read_image(media.images["panel"])) if "panel" in media.images else None
-    return {"comparisons": comparisons, "panel": panel, "links": media.links}
+    panel, lidar = (
+        data_url(read_image(media.images[name])) if name in media.images else None for name in ("panel", "lidar")
+    )
+    return {"comparisons": comparisons, "panel": panel, "lidar": lidar, "links": media.links}
 
 
 def _where(shown: dict[str, Any] | None) -> str:

@@ -14,7 +14,7 @@ from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.settings.report import PICTURES
 
 MAX_WIDTH = 1280
-"""Pixels; larger images are reduced."""
+"""Pixels; wider images are reduced."""
 QUALITY = 85
 COMPARISON_SIZE = 100
 """Columns and rows at which two images are compared."""
@@ -68,7 +68,7 @@ def difference_position(first: Image.Image, second: Image.Image) -> float:
 def data_url(picture: Image.Image) -> str:
     """An RGB image as a JPEG data URL."""
     reduced = picture.copy()
-    reduced.thumbnail((MAX_WIDTH, MAX_WIDTH), Image.Resampling.LANCZOS)
+    reduced.thumbnail((MAX_WIDTH, reduced.height), Image.Resampling.LANCZOS)
     written = io.BytesIO()
     reduced.save(written, format="JPEG", quality=QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(written.getvalue()).decode()

@@ -9,7 +9,9 @@ HELD_OUT_PAIR = {"recorded": "held_out_recorded.png", "rendered": "held_out_rend
 """One held-out image, recorded and rendered, written by the evaluation of a method."""
 LOOKS = {"panel": "ghost_panel.png", "with_car": "with_car.png", "without_car": "without_car.png"}
 """Further images of a method."""
-PICTURES = {**HELD_OUT_PAIR, **LOOKS}
+LIDAR_LOOKS = {"lidar": "lidar.png"}
+"""Those of a method that renders LiDAR."""
+PICTURES = {**HELD_OUT_PAIR, **LOOKS, **LIDAR_LOOKS}
 """Images that the report shows of a method on a scene, and their paths in its folder."""
 
 

@@ -25,6 +25,9 @@ from drivesplat.workflow.stages import (
 
 SCRIPTS = "workflow_scripts"
 LOOKS = ("ghost_panel.png", "removal.png")
+LIDAR = "lidar"
+"""The name of the picture and of the film of LiDAR scans of a method that renders them."""
+LIDAR_LOOKS = (f"{LIDAR}.png",)
 EXPORTS: dict[ExportFormat, tuple[str, ...]] = {
     "ply": ("splat.ply", "parts/parts.json"),
     "usd": ("scene.usdz",),
@@ -65,14 +68,24 @@ class Outputs(Inputs):
     @property
     def all_trajectories(self) -> list[str]:
         """The names of all films of any scene."""
-        first = (dataset.scenes[0] for dataset in self.config.datasets.values() if dataset.scenes)
-        films = (for_scene(self.config, scene).render.trajectories for scene in first)
+        films = (for_scene(self.config, scene).render.trajectories for scene in self._first_scenes)
         return list(dict.fromkeys(name for trajectories in films for name in trajectories))
+
+    @property
+    def _first_scenes(self) -> list[str]:
+        """A scene of each dataset: settings of a dataset are those of all of its scenes."""
+        return [dataset.scenes[0] for dataset in self.config.datasets.values() if dataset.scenes]
 
     @property
     def methods_with_actors(self) -> list[str]:
         """The methods with parts for moving objects: those that can be edited and shown part by part."""
         return [name for name, method in self.config.all_methods.items() if method.moving_parts]
+
+    @property
+    def methods_with_lidar(self) -> list[str]:
+        """The methods that render the LiDAR of any scene."""
+        methods = self.config.all_methods
+        return [name for name in methods if any(self.renders_lidar(scene, name) for scene in self._first_scenes)]
 
     def metrics(self, _: Any = None) -> list[str]:
         """The metrics.json of the batch's scenes."""
@@ -106,7 +119,7 @@ class Outputs(Inputs):
     def looks(self, _: Any = None) -> list[str]:
         """The pictures of the batch's scenes and methods."""
         tracks = [f"{self.config.results_dir}/{scene}/tracks.png" for scene in self.config.batch_scenes]
-        return [*tracks, *self.of_methods(lambda *_: LOOKS)]
+        return [*tracks, *self.of_methods(lambda *at: (*LOOKS, *(LIDAR_LOOKS if self.renders_lidar(*at) else ())))]
 
     def exports(self, _: Any = None) -> list[str]:
         """The exported files of the batch's scenes and methods, in the formats of the settings."""

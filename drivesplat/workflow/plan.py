@@ -23,7 +23,7 @@ from drivesplat.workflow.film_names import no_such_edit, no_such_film, scene_edi
 from drivesplat.workflow.gpus import any_gpu
 from drivesplat.workflow.inputs import unwritable_results
 from drivesplat.workflow.named_tracks import refuse_wrong_tracks, track_references
-from drivesplat.workflow.outputs import PARTS_FILM, SCRIPTS, Outputs
+from drivesplat.workflow.outputs import LIDAR, PARTS_FILM, SCRIPTS, Outputs
 from drivesplat.workflow.report_plan import ReportPlan
 from drivesplat.workflow.stages import (
     EDITS,
@@ -157,6 +157,9 @@ class Plan(Outputs):
         if len(path) > 2 and path[0] in (EDITS, TRAJECTORIES):
             self._refuse_unknown_drive(scene, method, path)
             return
+        if path in ([f"{LIDAR}.png"], [f"{LIDAR}.mp4"], [f"{LIDAR}.json"]):
+            self._refuse_without_lidar(scene, method)
+            return
         edit = Path(path[-1]).stem if len(path) == 2 and path[0] in ("edits", "quad") else None
         film = path[0].removesuffix(".mp4").removesuffix(".cameras.json") if len(path) == 1 else path[-1]
         trajectory = for_scene(self.config, scene).render.trajectories.get(film)
@@ -192,6 +195,14 @@ class Plan(Outputs):
             able = ", ".join(name for name in self.methods_with_actors if name in self.config.methods) or "none"
             raise ConfigError(
                 f"method {method!r} knows no actors that could be edited or shown apart; those do: {able}"
+            )
+
+    def _refuse_without_lidar(self, scene: str, method: str) -> None:
+        if not self.renders_lidar(scene, method):
+            able = ", ".join(name for name in self.config.methods if self.renders_lidar(scene, name)) or "none"
+            raise ConfigError(
+                f"method {method!r} renders no LiDAR of scene {scene} (train.scans.share is 0); those do: {able} "
+                "(docs/lidar.md; presets/lidar.yaml adds street_lidar)"
             )
 
     def _refuse_unknown_edit(self, scene: str, edit: str) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
-from drivesplat.settings.report import HELD_OUT_PAIR, LOOKS, ReportJob
+from drivesplat.settings.report import HELD_OUT_PAIR, LIDAR_LOOKS, LOOKS, ReportJob
 from drivesplat.workflow.outputs import Outputs
 
 EVERYTHING = "all"
@@ -56,7 +56,7 @@ class ReportPlan:
     def pictures(self, _: Any = None) -> list[str]:
         """The pictures that its page shows. Every metrics.json comes with a pair of held-out images."""
         with_figures = self._plan.of_methods(lambda *_: HELD_OUT_PAIR.values(), self.scenes)
-        looks = self._plan.of_methods(lambda *_: LOOKS.values(), self.scenes)
+        looks = self._plan.of_methods(self._looks, self.scenes)
         return [*(_present(with_figures) if self._alone else with_figures), *self._shown(looks)]
 
     def links(self, _: Any = None) -> list[str]:
@@ -77,6 +77,9 @@ class ReportPlan:
             published=config.published,
         )
         return canonical_json(job.model_dump(mode="json"))
+
+    def _looks(self, scene: str, method: str) -> list[str]:
+        return [*LOOKS.values(), *(LIDAR_LOOKS.values() if self._plan.renders_lidar(scene, method) else ())]
 
     def _shown(self, files: list[str]) -> list[str]:
         return files if self._everything else _present(files)

@@ -260,6 +260,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "free_space": (FreeSpaceJob, lambda at: _lidar(at, "own_car_radius", "box_margin")),
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),
+    "lidar_picture": (Settings, _nothing),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
     "scene_metrics": (Settings, _nothing),

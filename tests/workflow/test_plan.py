@@ -13,13 +13,14 @@ from helpers import REPOSITORY
 from drivesplat.errors import ConfigError, DatasetError
 from drivesplat.readers.datasets import layout
 from drivesplat.settings.config import load
-from drivesplat.settings.report import HELD_OUT_PAIR, PICTURES
+from drivesplat.settings.report import HELD_OUT_PAIR, LIDAR_LOOKS, PICTURES
 from drivesplat.workflow import inputs
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.stages import ALL_SCENE_STAGES, SCENE_STAGES, TRAINING_INPUTS, refines_poses, stage_settings
 
 ACTORS = ["background", "actors"]
 HELD = {"train": {"depth_weight": 0.01}}
+LIDAR = {"train": {"scans": {"share": 0.3}}}
 KEPT_OUT = {"train": {"floaters": {"free_space": True}}}
 
 
@@ -90,7 +91,7 @@ def test_depth_follows_the_overrides_of_dataset_and_method():
             {"a1": {"actors"}, "b1": {"actors"}},
         ),
         (
-            {"vanilla": {}, "lidar": {"overrides": {"train": {"scans": {"share": 0.3}, "depth_weight": 0}}}},
+            {"vanilla": {}, "lidar": {"overrides": LIDAR}},
             {"a1": {"scans", "scan_baselines"}, "b1": {"scans", "scan_baselines", "lidar_depth"}},
         ),
     ],
@@ -217,10 +218,24 @@ def test_figures_come_from_all_stages_but_the_one_that_puts_them_side_by_side():
 
 
 def test_baselines_of_scans_are_measured_where_a_method_renders_lidar():
-    made = plan(b={"train": {"scans": {"share": 0.3}}})
+    made = plan(b=LIDAR)
     found = {scene: made.scan_baselines(SimpleNamespace(scene=scene)) for scene in ("a1", "b1")}
     assert found == {"a1": [], "b1": ["elsewhere/b1/scan_baselines.json"]}
     assert "scan_baselines" not in made.evaluation_stages("b1", ["vanilla"]), "no eval.json depends on them"
+
+
+def test_pictures_of_scans_are_those_of_methods_that_render_lidar():
+    """By the settings of the method, and of the dataset."""
+    made = plan(methods={"vanilla": {}, "street": None, "scans": {"overrides": LIDAR}}, b=LIDAR)
+    assert made.methods_with_lidar == ["vanilla", "scans"]
+    expected = {"a1/scans", "a2/scans", "b1/scans", "b1/vanilla"}
+    for files in (made.looks(), made.report([]).pictures()):
+        assert {
+            path.removeprefix("elsewhere/").removesuffix("/lidar.png") for path in files if "lidar" in path
+        } == expected
+    made.refuse_unknown(["elsewhere/a1/scans/lidar.png", "elsewhere/b1/vanilla/lidar.png"])
+    with pytest.raises(ConfigError, match=r"method 'vanilla' renders no LiDAR of scene a1 .* those do: scans \("):
+        made.refuse_unknown(["elsewhere/a1/vanilla/lidar.png"])
 
 
 def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
@@ -278,7 +293,7 @@ def test_the_film_of_all_methods_is_left_out_where_the_settings_say_so_and_can_b
 def test_a_report_waits_for_what_is_asked_for_with_it(targets, scenes, seen, wanted):
     report = plan().report(targets)
     assert len(report.metrics()) == scenes and report.wanted == wanted
-    assert len(report.pictures()) == 2 * scenes * (len(PICTURES) if seen else len(HELD_OUT_PAIR))
+    assert len(report.pictures()) == 2 * scenes * (len(PICTURES) - len(LIDAR_LOOKS) if seen else len(HELD_OUT_PAIR))
     assert bool(report.links()) == seen
 
 
