@@ -5,7 +5,8 @@
 # OUTPUTS: <results>/{scene}/tracks.csv and tracks.png, compare.mp4 and compare.json;
 # <results>/{scene}/{method}/{trajectory}.mp4 and {trajectory}.cameras.json, of methods with actors parts.mp4 likewise;
 # ghost_panel.png and .json;
-# with_car.png, without_car.png, removal.png and removal.json; of methods that render LiDAR lidar.png.
+# with_car.png, without_car.png, removal.png and removal.json; of methods that render LiDAR lidar.png, lidar.mp4 and
+# lidar.json.
 
 
 rule tracks:
@@ -266,3 +267,41 @@ rule lidar_picture:
         code=plan.code("lidar_picture"),
     script:
         "../workflow_scripts/lidar_picture.py"
+
+
+rule lidar_film:
+    """
+    Shows all LiDAR scans of the drive, recorded and rendered, as range images and from above, with the error, as a film.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+        scans="<results>/{scene}/scans.npz",
+    output:
+        film=report(
+            "<results>/{scene}/{method}/lidar.mp4",
+            caption="../report/lidar_film.rst",
+            category="Scene {scene}",
+            subcategory="{method}",
+            labels={"what": "film: LiDAR scans"},
+        ),
+        figures="<results>/{scene}/{method}/lidar.json",
+    log:
+        "<logs>/{scene}/{method}/lidar_film.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/lidar_film.tsv"
+    wildcard_constraints:
+        method=plan.known(plan.methods_with_lidar),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("lidar_film"),
+        code=plan.code("lidar_film"),
+    script:
+        "../workflow_scripts/lidar_film.py"

@@ -142,8 +142,9 @@ class Config(Settings):
         for kind, names in (("method", self.methods), ("trajectory", self.render.trajectories)):
             for name in names:
                 require_name(name, kind)
-        if "parts" in self.render.trajectories:
-            raise ValueError("a trajectory cannot be called 'parts': the name is kept for the film of a method's parts")
+        for name, film in (("parts", "a method's parts"), ("lidar", "LiDAR scans")):
+            if name in self.render.trajectories:
+                raise ValueError(f"a trajectory cannot be called {name!r}: the name is kept for the film of {film}")
         for scene in self.subjects:
             if scene not in owners:
                 raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")

@@ -47,6 +47,9 @@ class RenderSettings(Settings):
     compare: bool = True
     """Make compare.mp4 with the films of a scene: its recorded images beside the renderings of all methods. It can
     always be asked for by its name."""
+    lidar: bool = True
+    """Make lidar.mp4 with the films of methods that render LiDAR: recorded scans beside rendered ones. It can always be
+    asked for by its name."""
     edited_frames: bool = False
     """Also write the frames of edited drives as PNG, at full size, with labels in the JSON file."""
     trajectories: dict[str, TrajectorySettings] = Field(default_factory=_default_trajectories)
@@ -88,5 +91,12 @@ class CompareJob(Settings):
     """All settings that determine the film of recorded images beside the renderings of methods."""
 
     eval_camera: str
+    crf: int
+    captions: bool
+
+
+class LidarFilmJob(Settings):
+    """All settings that determine the film of recorded LiDAR scans beside rendered ones."""
+
     crf: int
     captions: bool

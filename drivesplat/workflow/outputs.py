@@ -93,7 +93,7 @@ class Outputs(Inputs):
 
     def films(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
         """The films of every method of `scenes`, by default the batch's, of the parts of methods with moving objects,
-        and of all methods side by side."""
+        of LiDAR scans, and of all methods side by side."""
         chosen = self.config.batch_scenes if scenes is None else list(scenes)
         compared = [scene for scene in chosen if for_scene(self.config, scene).render.compare]
         of_methods = self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], chosen)
@@ -136,10 +136,11 @@ class Outputs(Inputs):
 
     def _film_names(self, scene: str, method: str) -> list[str]:
         """The films of a method; those of some of its parts only if it has actors."""
-        trajectories = for_scene(self.config, scene).render.trajectories
+        settings = for_scene(self.config, scene).render
+        lidar = [LIDAR] if settings.lidar and self.renders_lidar(scene, method) else []
         if method in self.methods_with_actors:
-            return [*trajectories, PARTS_FILM]
-        return [name for name, trajectory in trajectories.items() if trajectory.parts == "all"]
+            return [*settings.trajectories, PARTS_FILM, *lidar]
+        return [*(name for name, trajectory in settings.trajectories.items() if trajectory.parts == "all"), *lidar]
 
     def _edit_names(self, scene: str, method: str) -> Iterable[str]:
         return scene_edits(self.config, scene) if method in self.methods_with_actors else ()

@@ -25,7 +25,7 @@ from drivesplat.settings.lidar_depth import LidarDepthJob
 from drivesplat.settings.lidar_seed import SeedJob
 from drivesplat.settings.masks import EgoMaskJob, EgoMaskSearch, MaskJob
 from drivesplat.settings.refine_poses import LidarRays, RefinePosesJob
-from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob
+from drivesplat.settings.render import CompareJob, EditJob, FilmFormat, FilmJob, LidarFilmJob
 from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
@@ -210,7 +210,7 @@ def _drive(at: Place) -> dict[str, Any]:
     return {**chosen, "width": at.config.export.drive_width}
 
 
-def _compare(at: Place) -> dict[str, Any]:
+def _encoding(at: Place) -> dict[str, Any]:
     return {name: getattr(at.config.render, name) for name in ("crf", "captions")}
 
 
@@ -261,6 +261,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     SCANS: (ScansJob, lambda at: _lidar(at, "own_car_radius", "on_missing")),
     SCAN_BASELINES: (Settings, _nothing),
     "lidar_picture": (Settings, _nothing),
+    "lidar_film": (LidarFilmJob, _encoding),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
     "scene_metrics": (Settings, _nothing),
@@ -268,7 +269,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "tracks": (TracksJob, _nothing),
     "film": (FilmJob, _film),
     "film_parts": (FilmFormat, _format),
-    "compare": (CompareJob, _compare),
+    "compare": (CompareJob, _encoding),
     "edit": (EditJob, _edit),
     "quad": (EditJob, _quad),
     "drive_folder": (DriveJob, _drive),

@@ -4,20 +4,19 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 from helpers.scan_drives import BEAMS, KEY_FRAME_US, STEPS, recorded, room, scene_of, track_of
 
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.scan_metrics import scan_metrics
-from drivesplat.inspection import trained_lidar
 from drivesplat.inspection.lidar_picture import draw_held_out_scans, figures_label, sample_scans, scan_label
-from drivesplat.inspection.trained_lidar import TrainedLidar, heading, main_scans
-from drivesplat.model.splat_model import SplatModel
+from drivesplat.inspection.trained_lidar import heading, main_scans
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, ScanRecords
 
-DRIVING = track_of("car", [(5.0 * i, 0.0, 0.0) for i in range(8)])
-SCENE = dataclasses.replace(scene_of([], DRIVING), key_frame_timestamps=np.arange(8) * KEY_FRAME_US)
+SCENE = dataclasses.replace(
+    scene_of([], track_of("car", [(5.0 * i, 0.0, 0.0) for i in range(8)])),
+    key_frame_timestamps=np.arange(8) * KEY_FRAME_US,
+)
 GROUPS = ("train", "interpolation", "train", "interpolation", "interpolation", "extrapolation", "extrapolation")
 
 
@@ -72,15 +71,8 @@ def test_the_lidar_with_most_rays_is_shown_in_order_of_time():
     assert [one.sample_index for one in main_scans(ScanRecords([*small, *large], []))] == [1, 2, 3]
 
 
-@pytest.fixture
-def lidar(monkeypatch) -> TrainedLidar:
-    """A model that renders every scan 10 cm too far."""
-    rendered = RenderedScan(room(12.1), np.zeros(room().shape), np.full(room().shape, 0.4))
-    monkeypatch.setattr(trained_lidar, "rendered_scan", lambda *_: rendered)
-    return TrainedLidar(SplatModel([], None), SCENE, drive(), (1e-3, 1e-3), torch.device("cpu"))
-
-
-def test_the_picture_has_a_scan_of_each_group_with_its_figures(lidar):
+def test_the_picture_has_a_scan_of_each_group_with_its_figures(lidar_of):
+    lidar = lidar_of(drive())
     figure = draw_held_out_scans(lidar, "mine")
     assert figure.get_suptitle() == "Scene hand · mine · top"
     titles = [part.get_suptitle() for part in figure.subfigs]
@@ -89,8 +81,7 @@ def test_the_picture_has_a_scan_of_each_group_with_its_figures(lidar):
     assert all("range off by 10.0 cm" in title for title in titles)
 
 
-def test_a_rendering_with_nan_is_refused(lidar, monkeypatch):
-    broken = RenderedScan(room(np.nan), np.zeros(room().shape))
-    monkeypatch.setattr(trained_lidar, "rendered_scan", lambda *_: broken)
+def test_a_rendering_with_nan_is_refused(lidar_of):
+    lidar = lidar_of(drive(), RenderedScan(room(np.nan), np.zeros(room().shape)))
     with pytest.raises(ResultError, match=r"LiDAR scan contains NaN or Inf; delete checkpoint\.npz"):
         draw_held_out_scans(lidar, "mine")

@@ -16,10 +16,10 @@ from drivesplat.workflow.stages import SCENE_STAGES, TRAINING_INPUTS, stage_sett
 
 LOOKS = (
     "tracks", "film", "compare", "ghost_panel", "remove_actor", "far_gaussians", "export", "export_usd",
-    "export_viewer", "export_colmap", "export_spz", "export_sog",
+    "export_viewer", "export_colmap", "export_spz", "export_sog", "lidar_picture", "lidar_film",
 )  # fmt: skip
-OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "scans", "tracks", "compare")
-STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "scans", "train", "evaluate", *LOOKS)
+OF_SCENES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "tracks", "compare")
+STAGES = (*SCENE_STAGES, *TRAINING_INPUTS, "scan_baselines", "train", "evaluate", *LOOKS)
 PUBLISHED = {"source": "A paper", "url": "https://example.org", "scene": "0061", "method": "M", "psnr": 20.0}
 
 
@@ -140,6 +140,8 @@ def refusal(values: dict[str, Any]) -> str:
         ("datasets.nuscenes.scenes", ["../0061"], ["scene", "../0061"]),
         ("methods", {"my method": {}}, ["method", "my method", "letters"]),
         ("methods", {"logs": {}}, ["method", "logs"]),
+        ("render.trajectories", {"lidar": {}}, ["trajectory", "'lidar'", "LiDAR scans"]),
+        ("render.trajectories", {"parts": {}}, ["trajectory", "'parts'", "a method's parts"]),
     ],
 )
 def test_an_invalid_value_is_reported_in_one_line_with_key_value_and_range(defaults, path, value, words):
@@ -380,6 +382,9 @@ def test_key_order_and_written_out_defaults_do_not_change_the_settings_of_a_stag
         (at("lpips.timeout_s", 5), ""),
         (at("render.fps", 60), "film"),
         (at("render.width", 64), "film"),
+        (at("render.crf", 20), "film compare lidar_film"),
+        (at("render.captions", False), "film compare lidar_film"),
+        (at("render.lidar", False), ""),
         (at("render.trajectories.original.lateral", 1.0), "film"),
         (at("render.trajectories.aside", {"lateral": -1.0}), ""),
         (at("subjects", {"0061": {"key_frame": 3}}), "ghost_panel remove_actor"),

@@ -3,6 +3,8 @@
 import pytest
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
+from drivesplat.io.video import read_footage
+
 pytestmark = [pytest.mark.workflow, pytest.mark.slow, pytest.mark.xdist_group("lidar_workflow")]
 SCANS = {"share": 0.4}
 METHODS = {
@@ -42,6 +44,22 @@ def test_metrics_have_the_baselines_of_the_same_rays(copy):
             assert (found["rays"], found["returns"]) == (own["rays"], own["returns"])
             assert 0.0 < found["range_error_median_m"] < 5.0
     assert {"scans", "scan_baselines"} < metrics["provenance"]["stages"].keys()
+
+
+def test_scans_become_a_picture_a_film_and_a_table_of_the_report(copy):
+    folder = "results/0001/with_lidar"
+    done = copy.run(f"{folder}/lidar.png", f"{folder}/lidar.mp4")
+    assert done.returncode == 0, done.stdout
+    done = copy.run("report")
+    assert done.returncode == 0 and "LiDAR, all rays of held-out scans" in done.stdout, done.stdout
+    film, page = copy.read(f"{folder}/lidar.json"), (copy.folder / "results/gap_report.html").read_text()
+    assert film["frames"] == len(copy.read("results/0001/scene.json")["sweeps"])
+    assert read_footage(copy.folder / folder / "lidar.mp4").frames == film["frames"]
+    assert {"scans", "with_lidar/train"} < film["provenance"]["stages"].keys()
+    assert 'alt="LiDAR scans"' in page and 'href="0001/with_lidar/lidar.mp4"' in page
+    assert copy.read("results/gap_report.json")["lidar"]["rows"][0]["method"] == "with_lidar"
+    refused = copy.run("results/0001/vanilla/lidar.mp4")
+    assert refused.returncode != 0 and "renders no LiDAR of scene 0001" in refused.stdout
 
 
 def test_a_changed_weight_of_scans_trains_that_method_alone_again(copy):

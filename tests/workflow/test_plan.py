@@ -238,6 +238,20 @@ def test_pictures_of_scans_are_those_of_methods_that_render_lidar():
         made.refuse_unknown(["elsewhere/a1/vanilla/lidar.png"])
 
 
+def test_films_of_scans_are_those_of_methods_that_render_lidar_and_can_be_left_out():
+    """They can be asked for by name then, too."""
+    methods = {"vanilla": {}, "street": None, "scans": {"overrides": LIDAR}}
+    made = plan(methods=methods, b={"render": {"lidar": False}})
+    expected = {f"elsewhere/{scene}/scans/lidar.mp4" for scene in ("a1", "a2")}
+    assert {path for path in made.films() if "lidar" in path} == expected <= set(made.report([]).links())
+    made.refuse_unknown([*expected, "elsewhere/b1/scans/lidar.mp4", "elsewhere/b1/scans/lidar.json"])
+    with pytest.raises(ConfigError, match=r"method 'vanilla' renders no LiDAR of scene a1"):
+        made.refuse_unknown(["elsewhere/a1/vanilla/lidar.mp4"])
+    none = plan(methods={"vanilla": {}})
+    with pytest.raises(ConfigError, match=r"those do: none \(docs/lidar\.md; presets/lidar\.yaml"):
+        none.refuse_unknown(["elsewhere/a1/vanilla/lidar.mp4"])
+
+
 def test_films_of_some_parts_are_those_of_methods_with_moving_parts():
     made = plan(render={"trajectories": {"original": {}, "objects": {"parts": "moving"}}})
     films = {path.split("/", 2)[2] for path in made.films()}
