@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ from drivesplat.io.storage import read_json
 from drivesplat.provenance.file_digests import checked_digest
 from drivesplat.scene.scene_warnings import DARK
 
-OUTPUTS = ("original.mp4", "lateral_2m.mp4", "parts.mp4", "ghost_panel.png", "removal.png", "viewer.html")
+OUTPUTS = (
+    "original.mp4", "lateral_2m.mp4", "parts.mp4", "lidar.mp4", "lidar.png", "ghost_panel.png", "removal.png",
+    "viewer.html",
+)  # fmt: skip
 COMPARE_FILM = "compare.mp4"
 MIN_NOVEL_DISTANCE = 0.1
 """Metres. At nuScenes' focal length a smaller step moves a point 10 m away by less than a dozen pixels."""
@@ -27,6 +31,9 @@ def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
             gap = method[group].get("gap_db")
             if (static := _psnr(method[group], "static")) is not None:
                 lines.append(f"{name}, frames {where}: {_with_moving_vehicles(static, method[group], gap)}")
+            if regions := method[group].get("lidar"):
+                others = {other: groups[group] for other, groups in metrics.get("lidar_baselines", {}).items()}
+                lines.append(f"{name}, LiDAR scans {where}: {_scans_with_baselines(regions, others)}")
         for offset, view in method.get("lateral", {}).items():
             if found := _lateral_figures(view):
                 metres, side = abs(float(offset)), "left" if float(offset) > 0 else "right"
@@ -84,6 +91,25 @@ def _lateral_figures(view: dict[str, Any]) -> list[str]:
     if depth := view.get("depth"):
         found.append(f"depth off by {depth['median_relative_error']:.1%} in the median".replace("%", " %"))
     return found
+
+
+def _scans_with_baselines(regions: dict[str, Any], others: dict[str, dict[str, Any]]) -> str:
+    """The figures of all rays of held-out scans, and those of the baselines `others` in brackets."""
+    forms = "range off by {:.1f} cm in the median", "intensity by {:.3f}", "{:.1f} % of returns and drops right"
+    own = _scan_figures(regions, forms)
+    compared = {name: _scan_figures(other, ("{:.1f} cm", "{:.3f}", "{:.1f} %")) for name, other in others.items()}
+    beside = "; ".join(f"{name.replace('_', ' ')}: {figures}" for name, figures in compared.items() if figures)
+    return (own or f"no figures, {regions['all'].get('unavailable')}") + (f" ({beside})" if beside else "")
+
+
+def _scan_figures(regions: dict[str, Any], forms: Iterable[str]) -> str:
+    """Median error of range in cm, error of intensity, and drop accuracy in percent, those that are not null."""
+    values = (regions["all"][key] for key in ("range_error_median_m", "intensity_rmse", "drop_accuracy"))
+    return ", ".join(
+        form.format(scale * value)
+        for form, scale, value in zip(forms, (100.0, 1.0, 100.0), values, strict=True)
+        if value is not None
+    )
 
 
 def _with_moving_vehicles(static: float, group: dict[str, Any], gap: float | None) -> str:

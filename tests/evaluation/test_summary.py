@@ -117,3 +117,22 @@ def test_the_command_prints_the_summary_and_names_a_missing_file(tmp_path):
     file.write_text(json.dumps({"methods": {"vanilla": method(interpolation=group(27.1, 16.0))}}))
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert "a gap of 11.1 dB" in done.stdout
+
+
+def test_rendered_scans_are_compared_with_the_baselines():
+    def regions(median: float | None, drops: float | None) -> dict:
+        figures = {"range_error_median_m": median, "intensity_rmse": median, "drop_accuracy": drops, "rays": 9}
+        return {"all": figures if drops is not None else {**figures, "unavailable": "fewer than 100 measured rays"}}
+
+    nothing = regions(None, None)
+    groups = {name: {"gap_db": None, "lidar": one} for name, one in
+              (("interpolation", regions(0.031, 0.981)), ("extrapolation", nothing))}  # fmt: skip
+    baseline = {"interpolation": regions(0.059, 0.72), "extrapolation": nothing}
+    metrics = {"methods": {"mine": {**method(), **groups}}, "lidar_baselines": {"nearest_scan": baseline}}
+    lines = sentences(metrics, "m.json")
+    assert (
+        "mine, LiDAR scans between training frames: range off by 3.1 cm in the median, intensity by 0.031, 98.1 % of "
+        "returns and drops right (nearest scan: 5.9 cm, 0.059, 72.0 %)"
+    ) in lines
+    assert "mine, LiDAR scans beyond the last training frame: no figures, fewer than 100 measured rays" in lines
+    assert not any("LiDAR" in line for line in sentences({"methods": {"vanilla": method()}}, "m.json"))
