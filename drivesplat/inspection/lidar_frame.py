@@ -145,7 +145,8 @@ class LidarFrames:
         titles = ("From above, recorded", "From above, rendered", "Error of range, from above")
         for place, name in zip(VIEWS, titles, strict=True):
             self._rings(_panel(figure, place, name))
-        heights = (self.heights.vmin, 0.0, self.heights.vmax)
+        low, high = float(self.heights.vmin), float(self.heights.vmax)
+        heights = sorted({low, min(max(0.0, low), high), high})
         for place in VIEWS[:2]:
             _bar(figure, _below(place), HEIGHT_COLORS, self.heights, heights, "{:+.0f} m")
         _bar(figure, _below(VIEWS[2]), ERROR_COLORS, ERRORS, (0.01, 0.1, 1.0, 10.0), "{:g} m")

@@ -115,6 +115,8 @@ def test_all_frames_have_the_scales_of_the_drive():
     scans = [recorded(room(radius)) for radius in (12.0, 55.0)]
     frames = LidarFrames(scans, None, "")
     assert frames.reach == 60.0 and frames.heights.vmin == np.floor(-55.0 * np.sin(np.radians(20.0)))
+    below = LidarFrames([recorded(alone((0, AHEAD), (1, AHEAD)))], None, "")
+    assert (below.heights.vmin, below.heights.vmax) == (-5.0, 0.0)
     assert LidarFrames([recorded(room(300.0))], None, "").reach == 100.0
     assert LidarFrames([recorded(alone())], None, "").reach == 20.0, "also where nothing returns"
 
