@@ -253,7 +253,7 @@ rule lidar_picture:
     benchmark:
         "<benchmarks>/{scene}/{method}/lidar_picture.tsv"
     wildcard_constraints:
-        method=plan.known(plan.methods_with_lidar),
+        method=plan.known(plan.methods_with_lidar_in_any_scene),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=4)
@@ -291,7 +291,7 @@ rule lidar_film:
     benchmark:
         "<benchmarks>/{scene}/{method}/lidar_film.tsv"
     wildcard_constraints:
-        method=plan.known(plan.methods_with_lidar),
+        method=plan.known(plan.methods_with_lidar_in_any_scene),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=8)

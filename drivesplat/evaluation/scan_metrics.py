@@ -41,7 +41,7 @@ def scan_metrics(
     the same scan and region, and back; points are in the sensor's frame at their rays' times. Without `chamfer`, which
     takes most of the time, it is None.
     """
-    pooled = {region: _Pool(chamfer) for region in SCAN_REGIONS}
+    pooled = {region: ScanPool(chamfer) for region in SCAN_REGIONS}
     for recorded, rendered in scans:
         if rendered.ranges.shape != recorded.scan.rays.shape:
             raise ValueError(f"a rendered scan of {rendered.ranges.shape} rays for one of {recorded.scan.rays.shape}")
@@ -64,10 +64,10 @@ def scan_regions(scene: Scene, recorded: RecordedScan) -> dict[str, Bool[np.ndar
     }
 
 
-class _Pool:
+class ScanPool:
     """What the scans of a group add up to in a region."""
 
-    def __init__(self, chamfer: bool) -> None:
+    def __init__(self, chamfer: bool = True) -> None:
         self.chamfer = chamfer
         self.rays = self.returns = self.right_drops = 0
         self.errors: list[np.ndarray] = []

@@ -227,7 +227,7 @@ def test_baselines_of_scans_are_measured_where_a_method_renders_lidar():
 def test_pictures_of_scans_are_those_of_methods_that_render_lidar():
     """By the settings of the method, and of the dataset."""
     made = plan(methods={"vanilla": {}, "street": None, "scans": {"overrides": LIDAR}}, b=LIDAR)
-    assert made.methods_with_lidar == ["vanilla", "scans"]
+    assert made.methods_with_lidar_in_any_scene == ["vanilla", "scans"]
     expected = {"a1/scans", "a2/scans", "b1/scans", "b1/vanilla"}
     for files in (made.looks(), made.report([]).pictures()):
         assert {
