@@ -103,9 +103,9 @@ def rasterize_scan(
     Projection and compositing follow SplatAD (CVPR 2025): Gaussians are linearised in azimuth, elevation and range, and
     composited front to back by the range of their centres. A ray meets a Gaussian at range + slopes · offset: on the
     plane of a flat Gaussian, within three standard deviations of the range in its footprint. Gaussians nearer than
-    0.2 m, farther than `max_range`, or within 10° of the sensor's axis are skipped. The CPU composites, in float32 or
-    float64, in as many threads as torch uses and with results that do not depend on their number. Gradients reach the
-    first six arguments.
+    0.2 m, farther than `max_range`, or within 10° of the sensor's axis are skipped. The CPU composites in float32 or
+    float64, in as many threads as torch uses and with results that do not depend on their number; a GPU in float32, in
+    Triton. Gradients reach the first six arguments.
 
     With `motion` a Gaussian is where it is when the beams pass its centre. All rays share that time, and gradients
     treat it as constant. The halves of the revolution are rendered one after the other: where it begins and ends, a
