@@ -1,6 +1,6 @@
 # Measures trained methods on held-out images.
 #
-# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl, masks/.
+# REQUIRED INPUTS: <results>/{scene}/{method}/checkpoint.npz, parser.pkl; with cameras masks/, without scans.npz.
 # OUTPUTS: <results>/{scene}/{method}/eval.json, held_out_recorded.png and held_out_rendered.png beside it;
 # <results>/{scene}/metrics.json; where a method renders LiDAR <results>/{scene}/scan_baselines.json;
 # resources/lpips/backbone.json.
@@ -51,6 +51,8 @@ rule evaluate:
         "<logs>/{scene}/{method}/evaluate.log",
     benchmark:
         "<benchmarks>/{scene}/{method}/evaluate.tsv"
+    wildcard_constraints:
+        scene=plan.known(plan.scenes(cameras=True)),
     conda:
         "../envs/drivesplat.yaml"
     threads: plan.threads(on_gpu=4)
@@ -91,12 +93,45 @@ rule scan_baselines:
         "../workflow_scripts/scan_baselines.py"
 
 
+rule evaluate_scans:
+    """
+    Measures the held-out LiDAR scans of a scene without cameras.
+    """
+    input:
+        scene=plan.scene,
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        summary="<results>/{scene}/{method}/train.json",
+        parser="<results>/{scene}/parser.pkl",
+        scans="<results>/{scene}/scans.npz",
+    output:
+        metrics="<results>/{scene}/{method}/eval.json",
+    log:
+        "<logs>/{scene}/{method}/evaluate_scans.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/evaluate_scans.tsv"
+    wildcard_constraints:
+        scene=plan.known(plan.scenes(cameras=False)),
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=4)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=30,
+    params:
+        settings=plan.settings("evaluate_scans"),
+        code=plan.code("evaluate_scans"),
+    script:
+        "../workflow_scripts/evaluate_scans.py"
+
+
 rule scene_metrics:
     """
     Combines the measurements of all methods of a scene, with the baselines of LiDAR scans where a method renders them.
     """
     input:
-        evals=expand("<results>/{{scene}}/{method}/eval.json", method=plan.config.methods),
+        evals=plan.evals,
         baselines=plan.scan_baselines,
     output:
         metrics=report(

@@ -121,11 +121,12 @@ rule lidar_seed:
 
 rule parser:
     """
-    Combines cameras, splits and seed into the dictionary of gsplat's example trainer.
+    Combines cameras, splits and seed into the dictionary of gsplat's example trainer. Scenes without cameras have the
+    splits alone.
     """
     input:
         scene=plan.scene,
-        seed="<results>/{scene}/seed.ply",
+        seed=plan.of_images("seed.ply"),
     output:
         parser="<results>/{scene}/parser.pkl",
     log:
@@ -176,7 +177,7 @@ rule actors:
     """
     input:
         scene=plan.scene,
-        own_car="<results>/{scene}/own_car.json",
+        own_car=plan.of_images("own_car.json"),
     output:
         actors="<results>/{scene}/actors.npz",
     log:

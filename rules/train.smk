@@ -1,18 +1,19 @@
 # The training of one method on one scene.
 #
-# REQUIRED INPUTS: <results>/{scene}/parser.pkl and masks/masks.json; actors.npz, lidar_depth.npz and free_space.npz
-# if the method has actors, is supervised with LiDAR depth, and keeps Gaussians out of empty space.
+# REQUIRED INPUTS: <results>/{scene}/parser.pkl and, of scenes with cameras, masks/masks.json; actors.npz,
+# lidar_depth.npz, free_space.npz and scans.npz if the method has actors, is supervised with LiDAR depth, keeps Gaussians
+# out of empty space, and renders LiDAR.
 # OUTPUTS: <results>/{scene}/{method}/checkpoint.npz and train.json; tensorboard/ beside them. While a training
 # runs, resume/ holds its resume checkpoint; no rule declares it, so that Snakemake does not delete it.
 
 
 rule train:
     """
-    Fits Gaussians to the training images; resumes an interrupted training of the same settings, code and inputs.
+    Fits Gaussians to training images and LiDAR scans; resumes an interrupted training of the same settings, code and inputs.
     """
     input:
         parser="<results>/{scene}/parser.pkl",
-        masks="<results>/{scene}/masks/masks.json",
+        masks=plan.of_images("masks/masks.json"),
         actors=plan.training_input("actors"),
         lidar_depth=plan.training_input("lidar_depth"),
         free_space=plan.training_input("free_space"),

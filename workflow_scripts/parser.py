@@ -11,7 +11,7 @@ from drivesplat.settings.images import ParserJob
 
 with job(snakemake) as current:
     scene = read_scene(current.input.scene)
-    seed = read_ply(current.input.seed, rule="lidar_seed")
+    seed = read_ply(current.input.seed[0], rule="lidar_seed") if current.input.seed else None
     record = training_record(scene, seed, current.settings(ParserJob))
-    provenance = current.provenance(scene.provenance, seed.note["provenance"])
+    provenance = current.provenance(scene.provenance, *([seed.note["provenance"]] if seed else []))
     write_training_record(current.output.parser, dataclasses.replace(record, provenance=provenance))

@@ -8,8 +8,8 @@ from drivesplat.training.run import TrainingFiles, read_inputs, run_training
 
 with job(snakemake, dataset=("images",)) as current:
     files = current.input
-    wanted = ([*paths] for paths in (files.actors, files.lidar_depth, files.free_space, files.scans))
-    inputs, upstream = read_inputs(files.parser, files.masks, *wanted)
+    wanted = ([*paths] for paths in (files.masks, files.actors, files.lidar_depth, files.free_space, files.scans))
+    inputs, upstream = read_inputs(files.parser, *wanted)
     made = TrainingFiles(Path(current.output.checkpoint), Path(current.output.summary))
     provenance = current.provenance(*upstream)
     run_training(inputs, current.settings(TrainJob), current.device(), made, provenance, current.name)

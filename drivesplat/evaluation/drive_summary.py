@@ -8,7 +8,9 @@ import numpy as np
 from drivesplat.evaluation.metrics import psnr
 from drivesplat.scene.prepared_drive import PreparedDrive
 from drivesplat.scene.regions import region_mask
+from drivesplat.scene.scene import Scene
 from drivesplat.scene.scene_warnings import REC_709, duration, max_displacement, standing_time
+from drivesplat.scene.splits import HELD_OUT_GROUPS
 
 
 def summarize_drive(recording: PreparedDrive, camera: str, measured: dict[str, list[int]]) -> dict[str, Any]:
@@ -21,6 +23,12 @@ def summarize_drive(recording: PreparedDrive, camera: str, measured: dict[str, l
     groups = {group: _group(recording, camera, images) if images else None for group, images in measured.items()}
     times = {"seconds": duration(scene), "standing_s": standing_time(scene)}
     return {"moved_m": max_displacement(scene), **times, **groups}
+
+
+def summarize_swept_drive(scene: Scene) -> dict[str, Any]:
+    """The `drive` of the metrics.json of a scene without cameras: as `summarize_drive`, without figures of images."""
+    times = {"seconds": duration(scene), "standing_s": standing_time(scene)}
+    return {"moved_m": max_displacement(scene), **times, **dict.fromkeys(HELD_OUT_GROUPS)}
 
 
 def _group(recording: PreparedDrive, camera: str, images: list[int]) -> dict[str, float | None]:

@@ -24,7 +24,9 @@ MIN_NOVEL_DISTANCE = 0.1
 def sentences(metrics: dict[str, Any], path: str | Path) -> list[str]:
     """A sentence for each method and group of held-out frames, for comparisons with truth, and for output files."""
     lines = _caveats(metrics["drive"]) if "drive" in metrics else []
-    if not any(_psnr(method[group], "static") for method in metrics["methods"].values() for group in GROUP_PLACES):
+    if not metrics.get("protocol", {"cameras": True})["cameras"]:
+        lines.append("The scene has no camera, so there are figures of LiDAR alone")
+    elif not any(_psnr(method[group], "static") for method in metrics["methods"].values() for group in GROUP_PLACES):
         lines.append("No image is held out (holdout), so there are no figures of held-out images")
     for name, method in metrics["methods"].items():
         for group, where in GROUP_PLACES.items():

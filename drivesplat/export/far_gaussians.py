@@ -66,7 +66,7 @@ def find_far(model: SplatModel, views: Sequence[View], max_distance: float, prov
     Static Gaussians are measured from the world's origin; those of objects from the centre of their box, and removed.
     Positions that are NaN or Inf are not considered: exports drop them.
     """
-    reach = reach_of(views, max_distance)
+    reach = reach_of(torch.stack([view.camera_to_world[:3, 3] for view in views]), max_distance)
     distances = torch.cat([part.params["means"].double().norm(dim=1) for part in model.parts])
     far = distances.isfinite() & (distances > reach)
     rows = far.nonzero()[:, 0]

@@ -44,12 +44,14 @@ class ModelInit:
     echo: tuple[float, float] | None = None
 
 
-def gaussian_cap(record: TrainingRecord, settings: TrainSettings) -> int:
-    """The maximum number of Gaussians for a scene's training images: `cap_max`, or fewer for images with few pixels."""
+def gaussian_cap(record: TrainingRecord, settings: TrainSettings, rays: int = 0) -> int:
+    """The maximum number of Gaussians for a scene's training images: `cap_max`, or fewer for images with few pixels.
+    Without images the measured `rays` of its training scans count in place of pixels."""
     if not settings.pixels_per_gaussian:
         return settings.cap_max
     pixels = int(record.image_sizes[record.splits["train"]].prod(axis=1).sum())
-    return max(1, min(settings.cap_max, int(pixels / settings.pixels_per_gaussian)))
+    measured = pixels if len(record.image_sizes) else rays
+    return max(1, min(settings.cap_max, int(measured / settings.pixels_per_gaussian)))
 
 
 def build_model(init: ModelInit, parts: tuple[PartName, ...], sky: SkyKind, settings: TrainSettings) -> SplatModel:

@@ -1,21 +1,19 @@
 """The distance from the world's origin within which Gaussians lie; what is farther away is the sky's."""
 
-from collections.abc import Sequence
-
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from drivesplat.model.part import Part
-from drivesplat.model.view import View
 
 INSIDE = 1.0 - 1e-5
 """The share of the distance up to which positions are moved, so that they stay within it despite rounding."""
 
 
-def reach_of(views: Sequence[View], max_distance: float) -> float:
+def reach_of(sensors: Float[Tensor, "n 3"], max_distance: float) -> float:
     """The distance (metres) from the world's origin within which Gaussians lie: `max_distance`, or on a long drive half
-    of it beyond the farthest camera."""
-    cameras = [float(view.camera_to_world[:3, 3].norm()) for view in views]
-    return max([max_distance, *(distance + 0.5 * max_distance for distance in cameras)])
+    of it beyond the farthest of the training's `sensors`."""
+    return max(max_distance, float(sensors.norm(dim=1).max()) + 0.5 * max_distance)
 
 
 @torch.no_grad()

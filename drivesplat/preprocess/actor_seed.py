@@ -32,7 +32,8 @@ UNSEEN = 127
 
 
 def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MASK) -> ActorRecords:
-    """The actors of a scene, without provenance. Dynamic objects that no training image shows are left out."""
+    """The actors of a scene, without provenance. Dynamic objects that no training image shows are left out, in a scene
+    without images those that no training sweep meets."""
     sweeps = returns_of(scene, job.holdout, job.own_car_radius)
     order = {track.id: i for i, track in enumerate(scene.tracks)}
     seeds = []
@@ -47,10 +48,12 @@ def actors_record(scene: Scene, job: ActorSeedJob, ego_mask: EgoMask = NO_EGO_MA
     for view in prefetch(lambda frame: actor_view(scene, frame, job, ego_mask), frames):
         for seed in seeds:
             seed.add_view(view)
-    unseen = [seed.dynamic_object.track.id for seed in seeds if not seed.seen]
+    kept = [seed for seed in seeds if (seed.seen if scene.frames else seed.lidar > 0)]
+    unseen = [seed.dynamic_object.track.id for seed in seeds if seed not in kept]
     if unseen:
-        log.info("%d dynamic tracks that no training image shows are left out: %s", len(unseen), ", ".join(unseen))
-    actors = [seed.record() for seed in seeds if seed.seen]
+        where = "training image shows" if scene.frames else "training sweep meets"
+        log.info("%d dynamic tracks that no %s are left out: %s", len(unseen), where, ", ".join(unseen))
+    actors = [seed.record() for seed in kept]
     for actor in actors:
         log.info("%s: %d points, %d of them from LiDAR", actor.id, len(actor.points), actor.lidar_points)
     return ActorRecords(actors)
@@ -117,7 +120,7 @@ class Seed:
     def __init__(self, dynamic_object: DynamicObject, part: PartName, points: np.ndarray, lidar: int):
         self.dynamic_object, self._part = dynamic_object, part
         self.seen, self.pixels = False, 0
-        self._points, self._lidar = points, lidar
+        self._points, self.lidar = points, lidar
         self._colors = np.zeros((len(points), 3), dtype=np.uint8)
         self._distances = np.full(len(points), np.inf)
 
@@ -154,7 +157,7 @@ class Seed:
             motion=self.dynamic_object.motion,
             points=self._points.astype(np.float32),
             points_rgb=np.where(shown[:, None], self._colors, mean).astype(np.uint8),
-            lidar_points=self._lidar,
+            lidar_points=self.lidar,
             pixels=self.pixels,
             part=self._part,
         )

@@ -25,18 +25,23 @@ MAX_NAMED = 10
 def extract_scene(
     source: SceneSource, root: Path, scene_tables: Path | None = None, results: Path | None = None
 ) -> Scene:
-    """Reads and checks a scene and decodes each of its images once. Logs warnings about properties of the drive that
-    affect its metrics.
+    """Reads and checks a scene and decodes each of its images once; without cameras it has sweeps alone. Logs warnings
+    about properties of the drive that affect its metrics.
 
     `root` holds the folder of tables, `scene_tables` the scene's extract of them (None: the reader finds it).
     Recordings that are no files of their own are written into the scene's folder `results`, and images of distorted
     cameras resampled into its folder `undistorted`. Raises DatasetError naming the token and path of the fault.
     """
     scene = reader(source.reader).read(root, source, scene_tables)
-    if not scene.frames:
+    if source.cameras and not scene.frames:
         raise DatasetError(
             f"scene {source.scene}: it has no image of {', '.join(source.cameras)}; name cameras that have some "
-            "(cameras); nothing is trained or measured on LiDAR alone yet"
+            "(cameras), or none (cameras: [] and eval_camera: null) to train on LiDAR alone (docs/lidar.md)"
+        )
+    if not scene.frames and not scene.sweeps:
+        raise DatasetError(
+            f"scene {source.scene}: it has no LiDAR sweep, and the settings name no camera (cameras: []); name cameras "
+            "to train on images"
         )
     files = unpacker(source.reader)
     if files is not None:
@@ -51,7 +56,7 @@ def extract_scene(
     if len(bad) > MAX_NAMED:
         log.warning("%d more of %d images are missing or corrupt; left out", len(bad) - MAX_NAMED, len(scene.frames))
     kept = tuple(frame for frame, fault in zip(scene.frames, faults, strict=True) if not fault)
-    if not kept:
+    if scene.frames and not kept:
         raise DatasetError(
             f"scene {source.scene}: none of its {len(scene.frames)} images can be read (first: "
             f"{scene.frames[0].image_path})"

@@ -10,34 +10,37 @@ from drivesplat.io.point_cloud import PointCloud
 from drivesplat.scene.images import continuous_intrinsics, target_size
 from drivesplat.scene.scene import Scene
 from drivesplat.scene.shutter import shutters
-from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames
+from drivesplat.scene.splits import Group, frame_groups, held_out_key_frames, sweep_groups
 from drivesplat.scene.training_record import SceneInfo, SeedInfo, TrainingRecord
 from drivesplat.settings.images import ParserJob
 
+NO_SEED = PointCloud(np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint8), {})
+"""The seed points of a scene without images: trainings take theirs from scans."""
 
-def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingRecord:
-    """The training record of a scene and its seed points, without provenance. Raises DatasetError where no training
-    image is left."""
+
+def training_record(scene: Scene, seed: PointCloud | None, job: ParserJob) -> TrainingRecord:
+    """The training record of a scene and its seed points (None: there are no images that could give them colours),
+    without provenance. Raises DatasetError where no training image is left, in a scene without images no sweep."""
     frames = scene.frames
     sizes = [target_size(frame, job.images) for frame in frames]
     cameras = list(dict.fromkeys(frame.camera for frame in frames))
-    groups = np.array(frame_groups(scene, job.holdout))
+    groups = np.array(frame_groups(scene, job.holdout), dtype=str)
     splits = {group: np.flatnonzero(groups == group) for group in get_args(Group)}
-    if len(splits["train"]) == 0:
+    centers = _training_positions(scene, job)
+    if len(centers) == 0:
         raise DatasetError(
-            f"scene {scene.name}: no training image is left; "
+            f"scene {scene.name}: no training {'image' if frames else 'sweep'} is left; "
             "hold out fewer key frames (holdout.every_nth, holdout.last_block)"
         )
-    camera_to_world = np.stack([frame.camera_to_world for frame in frames])
-    centers = camera_to_world[splits["train"], :3, 3]
     readout_s, velocities = _rolling_shutters(scene)
+    seed = NO_SEED if seed is None else seed
     return TrainingRecord(
-        Ks=np.stack([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)]),
-        camtoworlds=camera_to_world,
-        ego_to_world=np.stack([frame.ego_to_world for frame in frames]),
+        Ks=_stacked([continuous_intrinsics(frame, size) for frame, size in zip(frames, sizes, strict=True)], 3, 3),
+        camtoworlds=_stacked([frame.camera_to_world for frame in frames], 4, 4),
+        ego_to_world=_stacked([frame.ego_to_world for frame in frames], 4, 4),
         image_paths=[frame.image_path for frame in frames],
         image_names=[Path(frame.image_path).name for frame in frames],
-        image_sizes=np.array(sizes, dtype=np.int64),
+        image_sizes=np.array(sizes, dtype=np.int64).reshape(-1, 2),
         camera_names=cameras,
         camera_indices=np.array([cameras.index(frame.camera) for frame in frames], dtype=np.int64),
         timestamps=np.array([frame.timestamp for frame in frames], dtype=np.int64),
@@ -61,6 +64,21 @@ def training_record(scene: Scene, seed: PointCloud, job: ParserJob) -> TrainingR
         readout_s=readout_s,
         camera_velocities=velocities,
     )
+
+
+def _training_positions(scene: Scene, job: ParserJob) -> np.ndarray:
+    """The positions (n, 3) of the cameras of training images, in a scene without images of the LiDARs of training
+    sweeps."""
+    if scene.frames:
+        chosen = zip(scene.frames, frame_groups(scene, job.holdout), strict=True)
+        return _stacked([frame.camera_to_world[:3, 3] for frame, group in chosen if group == "train"], 3)
+    swept = zip(scene.sweeps, sweep_groups(scene, job.holdout), strict=True)
+    return _stacked([sweep.sensor_to_world[:3, 3] for sweep, group in swept if group == "train"], 3)
+
+
+def _stacked(values: list[np.ndarray], *shape: int) -> np.ndarray:
+    """Arrays of a `shape` along a new first axis, which may be empty."""
+    return np.stack(values) if values else np.empty((0, *shape))
 
 
 def _rolling_shutters(scene: Scene) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -91,10 +91,8 @@ def jumps(scene: Scene) -> list[str]:
     """A sentence for every track with a speed above MAX_SPEED between two annotations (at most MAX_NAMED), and for the
     ego vehicle. These are warnings, since annotations and positions have errors."""
     found, tracks = [], []
-    for camera in dict.fromkeys(frame.camera for frame in scene.frames):
-        frames = sorted((f for f in scene.frames if f.camera == camera), key=lambda frame: frame.timestamp)
-        times = np.array([frame.timestamp for frame in frames])
-        where = _jump(times, np.stack([frame.ego_to_world[:3, 3] for frame in frames]))
+    for times, positions in _ego_paths(scene):
+        where = _jump(times, positions)
         if where:
             found.append(f"the ego vehicle jumps, {where}: check its poses, that they are metres, and their times")
             break
@@ -104,6 +102,16 @@ def jumps(scene: Scene) -> list[str]:
             tracks.append(f"track {track.id} ({track.category}) jumps, {where}: check its boxes")
     more = [f"{len(tracks) - MAX_NAMED} more tracks jump"] if len(tracks) > MAX_NAMED else []
     return [*found, *tracks[:MAX_NAMED], *more]
+
+
+def _ego_paths(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Times (n,) in microseconds and positions (n, 3) of the ego vehicle, by camera; without images of each LiDAR."""
+    recorded = [(frame.camera, frame.timestamp, frame.ego_to_world) for frame in scene.frames]
+    if not recorded:
+        recorded = [(sweep.lidar, sweep.timestamp, sweep.sensor_to_world) for sweep in scene.sweeps]
+    for sensor in dict.fromkeys(name for name, _, _ in recorded):
+        own = sorted(((time, pose) for name, time, pose in recorded if name == sensor), key=lambda item: item[0])
+        yield np.array([time for time, _ in own]), np.stack([pose[:3, 3] for _, pose in own])
 
 
 def _jump(timestamps: np.ndarray, positions: np.ndarray) -> str | None:

@@ -92,7 +92,8 @@ def _mismatches(record: dict[str, Any], expected: dict[str, Any], measured: dict
         return ["not in the config"]
     reasons = differences(expected[scene], record["provenance"]["stages"])
     own = _comparable(record)
-    other = next(iter(measured), None)
+    alike = (scene for scene, entries in measured.items() if bool(entries["cameras"]) == bool(own["cameras"]))
+    other = next(alike, None)
     unlike = [key for key in _COMPARABLE if other is not None and measured[other][key] != own[key]]
     if unlike:
         reasons.append(f"its protocol differs from that of scene {other}: {', '.join(unlike)}")
@@ -103,7 +104,8 @@ _COMPARABLE = ("cameras", "eval_camera", "width", "height", "sweeps", "holdout",
 
 
 def _comparable(record: dict[str, Any]) -> dict[str, Any]:
-    """The entries of a protocol that must be equal for figures to be comparable. A scene that kept its poses because
+    """The entries of a protocol that must be equal for figures to be comparable; scenes without cameras have figures of
+    LiDAR alone and are compared among each other. A scene that kept its poses because
     refinement was rejected (see `protocol.poses`) is comparable with refined ones, one with poses from images not."""
     own = {key: record["protocol"][key] for key in _COMPARABLE}
     refined = "refine_poses" in record["provenance"]["stages"] and own["poses"] != "images"

@@ -40,6 +40,10 @@ class MasksRecord:
     provenance: Provenance = field(default_factory=dict)
 
 
+NO_MASKS = MasksRecord({}, 0, "boxes", "heuristic", 0.0, False, 0, {}, None)
+"""The record of a scene without images."""
+
+
 def read_masks_record(folder: Path) -> MasksRecord:
     """Reads masks.json. Raises ResultError that names the file and its rule if it is invalid."""
     path = folder / "masks.json"

@@ -61,10 +61,10 @@ class Config(Settings):
     method: `methods: {street: null}` in a file laid over this one."""
     ablation: AblationSettings = AblationSettings()
     """Ablation of a method. Only `snakemake results/{scene}/ablation.csv` trains it."""
-    cameras: tuple[str, ...] = Field(("CAM_FRONT",), min_length=1)
-    """Cameras to train on."""
-    eval_camera: str = "CAM_FRONT"
-    """The camera whose held-out images are evaluated. Must be one of `cameras`."""
+    cameras: tuple[str, ...] = ("CAM_FRONT",)
+    """Cameras to train on. [] = none: only methods that render LiDAR are trained and measured (docs/lidar.md)."""
+    eval_camera: str | None = "CAM_FRONT"
+    """The camera whose held-out images are evaluated. Must be one of `cameras`; without any, null or left out."""
     sweeps: bool = False
     """Train on images between key frames, too, except those within half a key-frame interval of a held-out key frame.
     For LiDAR between key frames see lidar_seed.sweeps. docs/real_logs.md"""
@@ -148,15 +148,21 @@ class Config(Settings):
         for scene in self.subjects:
             if scene not in owners:
                 raise ValueError(f"subjects names scene {scene!r}, which is in no dataset")
-        if self.eval_camera not in self.cameras:
+        if self.cameras and self.eval_camera not in self.cameras:
             raise ValueError(self._no_eval_camera())
+        if not self.cameras and self.eval_camera not in (None, type(self).model_fields["eval_camera"].default):
+            raise ValueError(
+                f"eval_camera {self.eval_camera} is set, but cameras is empty: nothing is measured on images; write "
+                "eval_camera: null beside cameras: []"
+            )
         if self.scans.sweeps and not self.lidar_seed.sweeps:
             raise ValueError("scans.sweeps needs lidar_seed.sweeps: true, which reads LiDAR between key frames")
         return self
 
     def _no_eval_camera(self) -> str:
         """The message where `eval_camera` is not among `cameras`: perhaps since one of these is misspelled."""
-        message = f"eval_camera {self.eval_camera} is not among cameras ({', '.join(self.cameras)})"
+        chosen = self.eval_camera or "null"
+        message = f"eval_camera {chosen} is not among cameras ({', '.join(self.cameras)})"
         known = get_args(CameraChannel)
         for camera in self.cameras:
             if camera not in known and suggestion(camera, known):

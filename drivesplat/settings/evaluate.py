@@ -36,3 +36,9 @@ class EvaluateJob(Settings):
     lpips: bool
     removal: RemovalSettings | None
     """Only for synthetic worlds: recorded drives have no ground truth without the vehicle."""
+
+
+class EvaluateScansJob(Settings):
+    """All settings that determine one eval.json of a scene without cameras."""
+
+    holdout: HoldoutSettings

@@ -13,8 +13,9 @@ class ScanTrainingSettings(Settings):
     """Rendered LiDAR: Gaussians with an intensity and a probability to return a ray, fitted to recorded scans. Needs
     strategy: mcmc. Defaults of the weights are those of SplatAD (Hess et al. 2025, arXiv 2411.16816)."""
 
-    share: float = Field(0.0, ge=0, lt=1)
-    """Fraction of the iterations that fit a scan in place of an image. 0 = LiDAR is not rendered."""
+    share: float = Field(0.0, ge=0, le=1)
+    """Fraction of the iterations that fit a scan in place of an image. 0 = LiDAR is not rendered. Without cameras every
+    iteration fits a scan where it is above 0."""
     geometry: bool = True
     """Scans also move and shape Gaussians. false = they fit intensities and returns alone, and images are rendered as
     without LiDAR."""

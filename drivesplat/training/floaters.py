@@ -11,13 +11,13 @@ from drivesplat.model.part import Part
 from drivesplat.training.sparse_grid import SparseGrid
 
 LARGEST_STEP = 15.0
-"""Maximum distance in metres between consecutive camera positions that a path connects."""
+"""Maximum distance in metres between consecutive positions that a path connects."""
 PAIRS = 2**21
 """Number of pairs of points and segments per batch: 25 MB an array."""
 
 
-def camera_path(centers: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Starts and ends of the segments between consecutive camera positions, in time order.
+def sensor_path(centers: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """Starts and ends of the segments between consecutive positions of cameras or LiDARs, in time order.
 
     An isolated position is a segment of length 0.
     """
@@ -43,8 +43,8 @@ def near_path(
 
 @dataclass(frozen=True)
 class EmptySpace:
-    """Space known to be empty: within `radius` metres (0: none) of the camera path from `starts` to `ends` (m, 3), and
-    the cells of `free` in world metres (None: none)."""
+    """Space known to be empty: within `radius` metres (0: none) of the path of sensors from `starts` to `ends` (m, 3),
+    and the cells of `free` in world metres (None: none)."""
 
     starts: Float[Tensor, "m 3"]
     ends: Float[Tensor, "m 3"]

@@ -21,7 +21,7 @@ from drivesplat.model.build import ModelInit, build_model, gaussian_cap
 from drivesplat.model.checkpoint import TrainedCheckpoint, write_checkpoint
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.actor_record import ActorRecord, read_actors
-from drivesplat.scene.masks import read_classes, read_labels, read_masks_record, read_sky_mask
+from drivesplat.scene.masks import NO_MASKS, read_classes, read_labels, read_masks_record, read_sky_mask
 from drivesplat.scene.regions import LABELS, region_mask
 from drivesplat.scene.scan_record import RecordedScan, read_scans
 from drivesplat.scene.splits import HELD_OUT_GROUPS
@@ -39,14 +39,14 @@ from drivesplat.training.views import Guides, TrainingView, load_views
 
 @dataclass(frozen=True)
 class TrainingInputs:
-    """The inputs of a training: the training record, the folder of masks, the records of actors and of LiDAR depth
-    (empty where the method does not use them), the number of semantic `classes` in the user's maps (0: none), the
-    cameras that see the ego vehicle, `sky_known` (False where no sky was found, so that sky masks say nothing), and the
-    record of free space (None where the method does not use it), and the LiDAR scans of the training split (empty where
-    the method does not render LiDAR)."""
+    """The inputs of a training: the training record, the folder of masks (None: there are no images), the records of
+    actors and of LiDAR depth (empty where the method does not use them), the number of semantic `classes` in the user's
+    maps (0: none), the cameras that see the ego vehicle, `sky_known` (False where no sky was found, so that sky masks
+    say nothing), and the record of free space (None where the method does not use it), and the LiDAR scans of the
+    training split (empty where the method does not render LiDAR)."""
 
     record: TrainingRecord
-    masks: Path
+    masks: Path | None
     actors: list[ActorRecord]
     lidar_depth: list[PixelDepths]
     classes: int = 0
@@ -93,22 +93,23 @@ class TrainingInputs:
 
     def _image(self, index: int) -> tuple[Path, str, int, tuple[int, int]]:
         """What the masks of an image are read by."""
+        assert self.masks is not None
         at = int(self.record.timestamps[index])
         return self.masks, self.record.camera_name(index), at, self.record.image_size(index)
 
 
 def read_inputs(
     parser: str,
-    masks: str,
+    masks: Sequence[str],
     actors: Sequence[str],
     lidar_depth: Sequence[str],
     free_space: Sequence[str],
     scans: Sequence[str] = (),
 ) -> tuple[TrainingInputs, list[Provenance]]:
-    """Reads the inputs of a training from the files of the parser, of masks and, where given, of actors, LiDAR depth,
-    free space and scans; returns them with the provenances of these files."""
-    folder = Path(masks).parent
-    record, made = read_training_record(parser), read_masks_record(folder)
+    """Reads the inputs of a training from the files of the parser and, where given, of masks, actors, LiDAR depth, free
+    space and scans; returns them with the provenances of these files."""
+    record, folder = read_training_record(parser), next((Path(path).parent for path in masks), None)
+    made = NO_MASKS if folder is None else read_masks_record(folder)
     moving = [read_actors(path) for path in actors]
     depths = [read_lidar_depth(path) for path in lidar_depth]
     spaces = [read_free_space(path) for path in free_space]
@@ -125,7 +126,7 @@ def read_inputs(
         [scan for it in revolutions for scan in it.of_group("train")],
     )
     others = (*moving, *depths, *spaces, *revolutions)
-    upstream = [record.provenance, made.provenance, *(it.provenance for it in others)]
+    upstream = [record.provenance, *([] if folder is None else [made.provenance]), *(it.provenance for it in others)]
     return inputs, upstream
 
 
@@ -158,7 +159,8 @@ def prepare(inputs: TrainingInputs, job: TrainJob, device: torch.device) -> Prep
     """Loads the training images onto the device, builds an untrained model, and resolves the cap in the settings."""
     with explain_out_of_memory(lambda: 0):
         views = load_views(inputs.record, inputs.guides(job), device)
-    record, cap = inputs.record, gaussian_cap(inputs.record, job.train)
+    rays = sum(int(scan.measured.sum()) for scan in inputs.scans)
+    record, cap = inputs.record, gaussian_cap(inputs.record, job.train, rays)
     if job.train.scans.share:
         record = with_scan_points(record, inputs.scans, job.train.scans, job.random_seed)
     more = len(record.points) - len(inputs.record.points)
@@ -251,7 +253,8 @@ def _times_by_camera(views: list[TrainingView]) -> dict[str, list[float]]:
 
 
 def mean_sky_color(views: list[TrainingView]) -> np.ndarray:
-    """The mean colour (3,) in [0, 1] of the sky pixels of the training images, of all pixels where there are none."""
+    """The mean colour (3,) in [0, 1] of the sky pixels of the training images, of all pixels where there are none; grey
+    without images."""
     sums, count = np.zeros(3), 0
     for view in views:
         if view.sky is not None:
@@ -259,4 +262,5 @@ def mean_sky_color(views: list[TrainingView]) -> np.ndarray:
             count += int(view.sky.sum())
     if count:
         return sums / count
-    return np.mean([view.target().mean(dim=(0, 1)).double().cpu().numpy() for view in views], axis=0)
+    means = [view.target().mean(dim=(0, 1)).double().cpu().numpy() for view in views]
+    return np.mean(means, axis=0) if means else np.full(3, 0.5)

@@ -20,7 +20,7 @@ from drivesplat.model.splat_model import Picture, SplatModel
 from drivesplat.settings.train import TrainSettings
 from drivesplat.training import resume_state
 from drivesplat.training.clock import ITERATION, UNTIMED, Clock
-from drivesplat.training.floaters import EmptySpace, camera_path, fade_floaters
+from drivesplat.training.floaters import EmptySpace, fade_floaters, sensor_path
 from drivesplat.training.geometry_priors import NO_PRIORS, GeometryPriors
 from drivesplat.training.monitor import Monitor
 from drivesplat.training.psnr_curves import CurveViews, curve_psnrs
@@ -186,10 +186,9 @@ class TrainingRun:
 
 def _iterate(run: TrainingRun, monitor: Monitor) -> None:
     trainer, settings = run.trainer, run.trainer.settings
-    views = [view.view for view in trainer.images.views]
-    path = camera_path(torch.stack([view.camera_to_world[:3, 3] for view in views]))
-    empty = EmptySpace(*path, settings.floaters.radius, trainer.priors.free)
-    reach = math.inf if settings.max_distance is None else reach_of(views, settings.max_distance)
+    sensors = trainer.sensor_positions
+    empty = EmptySpace(*sensor_path(sensors), settings.floaters.radius, trainer.priors.free)
+    reach = math.inf if settings.max_distance is None else reach_of(sensors, settings.max_distance)
     while trainer.step < settings.iterations:
         with trainer.clock.stage(ITERATION):
             with_picture = _due(trainer.step + 1, settings.image_every, settings)

@@ -4,6 +4,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels import torch_private
@@ -65,17 +66,24 @@ class Trainer:
         )  # fmt: skip
 
     @property
+    def sensor_positions(self) -> Float[Tensor, "n 3"]:
+        """The positions (world metres) of the training cameras, without images those of the LiDAR, in the order of the
+        recordings."""
+        cameras = [view.view.camera_to_world[:3, 3] for view in self.images.views]
+        return torch.stack(cameras or [scan.view.sensor_to_world[:3, 3] for scan in self.scans])
+
+    @property
     def fits_scan(self) -> bool:
-        """Whether the next iteration fits a scan, unless a picture is wanted of it."""
+        """Whether the next iteration fits a scan, unless a picture is wanted of it and there are images."""
         return bool(self.scans) and fits_scan(self.step, self.settings.scans.share)
 
     def fit_one(self, with_picture: bool = True) -> tuple[Terms, Picture | None, TrainingView | None]:
         """The first half of an iteration: render a view or a scan, compare, step. Returns its loss terms, the picture
         and the view, both None after a scan. Without `with_picture` the iteration may be that of a scan or a replayed
-        CUDA graph, and the picture is None."""
+        CUDA graph, and the picture is None; without images every iteration is that of a scan."""
         set_learning_rates(self.model, self.optimizers, self.step, self.settings)
         step, rates = self.schedule.update(self.step, self.optimizers)
-        if self.fits_scan and not with_picture:
+        if self.fits_scan and not (with_picture and self.images.views):
             return self.graphs.retry_without_graphs(lambda: self._learn_scan(step, rates)), None, None
         with self.clock.stage("data"):
             number, view = self.images.number(self._image_step), self.images.at(self.step, self._image_step)

@@ -1,7 +1,7 @@
 """Input functions of rules: the files to read depend on the config."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, Literal, get_args
@@ -16,6 +16,7 @@ from drivesplat.settings.evaluate import BACKBONE, BACKBONE_RECORD
 from drivesplat.settings.names import suggestion
 from drivesplat.settings.world import CameraChannel
 from drivesplat.workflow.stages import SCAN_BASELINES, SCANS, refines_poses, training_inputs
+from drivesplat.workflow.without_cameras import has_cameras
 
 
 def unwritable_results(config: Config, error: OSError) -> DriveSplatError:
@@ -94,14 +95,21 @@ class Inputs:
             self._folders[name] = folder
         return self._folders[name]
 
-    def refuse_unknown_cameras(self, name: str, cameras: Iterable[str]) -> None:
+    def refuse_unknown_cameras(self, name: str, cameras: Sequence[str]) -> None:
         """Raises ConfigError, with the cameras that a dataset has, if `cameras` names another one."""
         dataset = self.config.datasets[name]
+        if not cameras:
+            return
         if dataset.world:
             known = list(dataset.world.cameras or get_args(CameraChannel))
         else:
             known = layout(dataset.reader).camera_names(Path(self._root(name)), dataset.version)
         for camera in cameras:
+            if not known:
+                raise ConfigError(
+                    f"dataset {name} has no camera, but cameras names {camera}; write cameras: [] and "
+                    f"eval_camera: null into datasets.{name}.overrides to train on LiDAR alone (docs/lidar.md)"
+                )
             if camera not in known:
                 meant = suggestion(camera, known)
                 raise ConfigError(
@@ -152,6 +160,16 @@ class Inputs:
         for path in self.points_file(SimpleNamespace(scene=scene)):
             if Path(path).exists() and not Path(path).is_file():
                 raise ConfigError(f"lidar_seed.points_file {path} is no regular file; name a PLY file of points")
+
+    def of_images(self, name: str) -> Callable[[Any], list[str]]:
+        """The function of wildcards that gives a scene's result `name`, which is made from images: none without
+        cameras."""
+
+        def result(wildcards: Any) -> list[str]:
+            there = has_cameras(self.config, wildcards.scene)
+            return [f"{self.config.results_dir}/{wildcards.scene}/{name}"] if there else []
+
+        return result
 
     def training_input(self, stage: str) -> Callable[[Any], list[str]]:
         """The function of wildcards that gives the result of one of TRAINING_INPUTS, if the training reads it."""

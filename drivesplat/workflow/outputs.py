@@ -12,16 +12,17 @@ from drivesplat.workflow.film_names import scene_edits
 from drivesplat.workflow.inputs import Inputs
 from drivesplat.workflow.stages import (
     EDITS,
-    METHOD_STAGES,
     OF_ONE_SCENE,
     SCAN_BASELINES,
     SCANS,
     SIDE_BY_SIDE,
     TRAJECTORIES,
+    method_stages,
     scene_stages,
     stage_settings,
     training_inputs,
 )
+from drivesplat.workflow.without_cameras import has_cameras, scene_methods
 
 SCRIPTS = "workflow_scripts"
 LOOKS = ("ghost_panel.png", "removal.png")
@@ -95,8 +96,8 @@ class Outputs(Inputs):
         """The films of every method of `scenes`, by default the batch's, of the parts of methods with moving objects,
         of LiDAR scans, and of all methods side by side."""
         chosen = self.config.batch_scenes if scenes is None else list(scenes)
-        compared = [scene for scene in chosen if for_scene(self.config, scene).render.compare]
-        of_methods = self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], chosen)
+        compared = [scene for scene in self._with_cameras(chosen) if for_scene(self.config, scene).render.compare]
+        of_methods = self.of_methods(lambda *at: [f"{film}.mp4" for film in self._film_names(*at)], chosen, False)
         return [*(f"{self.config.results_dir}/{scene}/{COMPARE_FILM}" for scene in compared), *of_methods]
 
     def edits(self, _: Any = None, scenes: Iterable[str] | None = None) -> list[str]:
@@ -118,8 +119,13 @@ class Outputs(Inputs):
 
     def looks(self, _: Any = None) -> list[str]:
         """The pictures of the batch's scenes and methods."""
-        tracks = [f"{self.config.results_dir}/{scene}/tracks.png" for scene in self.config.batch_scenes]
-        return [*tracks, *self.of_methods(lambda *at: (*LOOKS, *(LIDAR_LOOKS if self.renders_lidar(*at) else ())))]
+        shown = self._with_cameras(self.config.batch_scenes)
+        tracks = [f"{self.config.results_dir}/{scene}/tracks.png" for scene in shown]
+        return [*tracks, *self.of_methods(self._look_names, cameras=False)]
+
+    def _look_names(self, scene: str, method: str) -> list[str]:
+        of_images = LOOKS if has_cameras(self.config, scene) else ()
+        return [*of_images, *(LIDAR_LOOKS if self.renders_lidar(scene, method) else ())]
 
     def exports(self, _: Any = None) -> list[str]:
         """The exported files of the batch's scenes and methods, in the formats of the settings."""
@@ -127,17 +133,38 @@ class Outputs(Inputs):
             lambda scene, _: [name for kind in for_scene(self.config, scene).export.formats for name in EXPORTS[kind]]
         )
 
-    def of_methods(self, names: Callable[[str, str], Iterable[str]], scenes: Iterable[str] | None = None) -> list[str]:
+    def of_methods(
+        self,
+        names: Callable[[str, str], Iterable[str]],
+        scenes: Iterable[str] | None = None,
+        cameras: bool = True,
+    ) -> list[str]:
         """The files below the folders of all methods of `scenes`, by default the batch's; `names` gives those of one
-        scene and method."""
-        results, methods = self.config.results_dir, self.config.methods
-        chosen = self.config.batch_scenes if scenes is None else scenes
-        return [f"{results}/{s}/{m}/{name}" for s in chosen for m in methods for name in names(s, m)]
+        scene and method. With `cameras` without those that have no camera."""
+        results, chosen = self.config.results_dir, self.config.batch_scenes if scenes is None else scenes
+        shown = self._with_cameras(chosen) if cameras else chosen
+        places = ((scene, method) for scene in shown for method in scene_methods(self.config, scene))
+        return [f"{results}/{scene}/{method}/{name}" for scene, method in places for name in names(scene, method)]
+
+    def scenes(self, cameras: bool) -> list[str]:
+        """All scenes with `cameras`, or all without."""
+        return [scene for scene in self.config.scenes if has_cameras(self.config, scene) == cameras]
+
+    def _with_cameras(self, scenes: Iterable[str]) -> list[str]:
+        return [scene for scene in scenes if has_cameras(self.config, scene)]
+
+    def evals(self, wildcards: Any) -> list[str]:
+        """The eval.json of every method of a scene."""
+        folder = f"{self.config.results_dir}/{wildcards.scene}"
+        return [f"{folder}/{method}/eval.json" for method in scene_methods(self.config, wildcards.scene)]
 
     def _film_names(self, scene: str, method: str) -> list[str]:
-        """The films of a method; those of some of its parts only if it has actors."""
+        """The films of a method; those of some of its parts only if it has actors, those of images only of scenes with
+        cameras."""
         settings = for_scene(self.config, scene).render
         lidar = [LIDAR] if settings.lidar and self.renders_lidar(scene, method) else []
+        if not has_cameras(self.config, scene):
+            return lidar
         if method in self.methods_with_actors:
             return [*settings.trajectories, PARTS_FILM, *lidar]
         return [*(name for name, trajectory in settings.trajectories.items() if trajectory.parts == "all"), *lidar]
@@ -147,7 +174,7 @@ class Outputs(Inputs):
 
     def metrics_stages(self, scene: str) -> dict[str, Any]:
         """The settings and code that a scene's metrics.json should come from, by the names of the stages."""
-        methods = self.evaluation_stages(scene, self.config.methods)
+        methods = self.evaluation_stages(scene, scene_methods(self.config, scene))
         combined = (*([SCAN_BASELINES] if SCANS in methods else []), SIDE_BY_SIDE)
         return {**methods, **{stage: self._stage(stage, scene) for stage in combined}}
 
@@ -156,7 +183,8 @@ class Outputs(Inputs):
         taken = {stage for method in methods for stage in training_inputs(self.config, scene, method)}
         made = (*scene_stages(self.config, scene), *sorted(taken))
         stages = {(stage, None): stage for stage in made if stage != SIDE_BY_SIDE}
-        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in METHOD_STAGES}
+        own = method_stages(self.config, scene)
+        stages |= {(stage, method): f"{method}/{stage}" for method in methods for stage in own}
         return {name: self._stage(stage, scene, method) for (stage, method), name in stages.items()}
 
     def _stage(self, stage: str, scene: str, method: str | None = None) -> dict[str, Any]:

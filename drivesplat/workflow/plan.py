@@ -30,6 +30,7 @@ from drivesplat.workflow.stages import (
     TRAJECTORIES,
     idle_variants,
 )
+from drivesplat.workflow.without_cameras import refuse_image_results, require_methods, scene_methods
 
 ABLATION_FILES = ("ablation.json", "ablation.csv")
 
@@ -125,6 +126,8 @@ class Plan(Outputs):
                 continue
             self.config.dataset_of(scene)
             self._refuse_unknown_method(rest)
+            films = (*for_scene(self.config, scene).render.trajectories, PARTS_FILM)
+            refuse_image_results(self.config, scene, rest, films)
             if rest[0] in ABLATION_FILES:
                 self._refuse_idle_variants(scene)
             if len(rest) > 1:
@@ -216,12 +219,14 @@ class Plan(Outputs):
 
     def refuse_absent_data(self, targets: list[str]) -> None:
         """Raises DatasetError if the dataset of a target's scene is not at the configured path, ConfigError if it lacks
-        one of the cameras, or if the points file is no file."""
+        one of the cameras, if the scene has neither cameras nor a method that renders LiDAR, or if the points file is
+        no file."""
         needing = [target for target in targets if target != DOWNLOAD]
         for scene in self._scenes_of(needing) if needing or not targets else ():
             of_scene = SimpleNamespace(scene=scene)
             _ = self.tables(of_scene), self.scene_tables(of_scene)
             name = self.config.dataset_of(scene)
+            require_methods(self.config, scene)
             self.refuse_unknown_cameras(name, for_scene(self.config, scene).cameras)
             self.refuse_special_points_file(scene)
             if self.config.datasets[name].world:
@@ -244,10 +249,12 @@ class Plan(Outputs):
                 continue
             if scene in self.config.scenes:
                 of_all = rest == ["metrics.json"]
-                methods = [method for method in self.config.methods if of_all or method in rest[:1]]
+                own = scene_methods(self.config, scene)
+                methods = [method for method in own if of_all or method in rest[:1]]
                 pairs |= {(scene, method) for method in ("", *methods)}
             else:
-                pairs |= {(one, method) for one in self.config.batch_scenes for method in ("", *self.config.methods)}
+                batch = self.config.batch_scenes
+                pairs |= {(one, method) for one in batch for method in ("", *scene_methods(self.config, one))}
         return pairs
 
     def _scene_of(self, target: str) -> str | None:

@@ -7,6 +7,7 @@ from drivesplat.errors import ConfigError
 from drivesplat.io.storage import canonical_json
 from drivesplat.settings.report import HELD_OUT_PAIR, LIDAR_LOOKS, LOOKS, ReportJob
 from drivesplat.workflow.outputs import Outputs
+from drivesplat.workflow.without_cameras import has_cameras
 
 EVERYTHING = "all"
 REPORT_RULES = ("gap_report", "report")
@@ -56,7 +57,7 @@ class ReportPlan:
     def pictures(self, _: Any = None) -> list[str]:
         """The pictures that its page shows. Every metrics.json comes with a pair of held-out images."""
         with_figures = self._plan.of_methods(lambda *_: HELD_OUT_PAIR.values(), self.scenes)
-        looks = self._plan.of_methods(self._looks, self.scenes)
+        looks = self._plan.of_methods(self._looks, self.scenes, cameras=False)
         return [*(_present(with_figures) if self._alone else with_figures), *self._shown(looks)]
 
     def links(self, _: Any = None) -> list[str]:
@@ -79,7 +80,8 @@ class ReportPlan:
         return canonical_json(job.model_dump(mode="json"))
 
     def _looks(self, scene: str, method: str) -> list[str]:
-        return [*LOOKS.values(), *(LIDAR_LOOKS.values() if self._plan.renders_lidar(scene, method) else ())]
+        of_images = LOOKS.values() if has_cameras(self._plan.config, scene) else ()
+        return [*of_images, *(LIDAR_LOOKS.values() if self._plan.renders_lidar(scene, method) else ())]
 
     def _shown(self, files: list[str]) -> list[str]:
         return files if self._everything else _present(files)

@@ -15,7 +15,7 @@ from drivesplat.settings.ablation import AblationJob
 from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
-from drivesplat.settings.evaluate import EvaluateJob
+from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
 from drivesplat.settings.export import DriveJob, ExportJob, FarJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
@@ -30,6 +30,13 @@ from drivesplat.settings.scans import ScansJob
 from drivesplat.settings.train import STAGE_OF_PART, TrainJob
 from drivesplat.settings.world import WorldJob
 from drivesplat.workflow.film_names import no_such_edit, no_such_film, scene_edits
+from drivesplat.workflow.without_cameras import (
+    CAMERA_STAGES,
+    LIDAR_METHOD_STAGES,
+    LIDAR_SCENE_STAGES,
+    has_cameras,
+    no_camera,
+)
 
 SCENE_STAGES = ("extract", "own_car", "lidar_seed", "parser", "masks", "scene_metrics")
 METHOD_STAGES = ("train", "evaluate")
@@ -70,11 +77,14 @@ class Place:
 def stage_settings(config: Config, stage: str, scene: str, method: str | None = None, film: str | None = None) -> str:
     """The canonical JSON of all settings of a stage, for a scene and, where given, a method and a film.
 
-    Raises ValueError for an unknown stage, ConfigError for an unknown scene.
+    Raises ValueError for an unknown stage, ConfigError for an unknown scene, and for one without the cameras that the
+    stage needs.
     """
     if stage not in _STAGES:
         raise ValueError(f"no stage is called {stage!r}; add it to _STAGES in drivesplat/workflow/stages.py")
     there, dataset = for_scene(config, scene, method), config.dataset_of(scene)
+    if not there.cameras and stage in CAMERA_STAGES:
+        raise ConfigError(f"{no_camera(scene)}: the stage {stage} needs images")
     place = Place(there, dataset, scene if stage in OF_ONE_SCENE else "", method or "", film or "")
     return canonical_json(_record(stage, place).model_dump(mode="json"))
 
@@ -92,12 +102,21 @@ def refines_poses(config: Config, scene: str) -> bool:
 
 def _refines(at: Place) -> bool:
     enabled, world = at.config.refine_poses.enabled, at.dataset.world
+    if not at.config.cameras:
+        return False
     return (world is None or world.pose_noise) if enabled == "auto" else enabled
 
 
 def scene_stages(config: Config, scene: str) -> tuple[str, ...]:
     """The stages of a scene behind its metrics.json."""
+    if not has_cameras(config, scene):
+        return LIDAR_SCENE_STAGES
     return ALL_SCENE_STAGES if refines_poses(config, scene) else SCENE_STAGES
+
+
+def method_stages(config: Config, scene: str) -> tuple[str, ...]:
+    """The stages of each method behind a scene's metrics.json."""
+    return METHOD_STAGES if has_cameras(config, scene) else LIDAR_METHOD_STAGES
 
 
 def training_inputs(config: Config, scene: str, method: str) -> list[str]:
@@ -106,7 +125,7 @@ def training_inputs(config: Config, scene: str, method: str) -> list[str]:
     stages_of_parts = {STAGE_OF_PART[part] for part in config.all_methods[method].moving_parts}
     taken = {
         "actors": "actors" in stages_of_parts,
-        "lidar_depth": train.depth_weight > 0,
+        "lidar_depth": train.depth_weight > 0 and has_cameras(config, scene),
         "free_space": train.floaters.free_space,
         SCANS: train.scans.share > 0,
     }
@@ -167,6 +186,9 @@ def _lidar(at: Place, *names: str) -> dict[str, Any]:
 def _training(at: Place) -> dict[str, Any]:
     config, method = at.config, at.config.all_methods[at.method]
     train = config.train.for_parts(method.parts)
+    if not config.cameras:
+        scans = train.scans.model_copy(update={"share": float(train.scans.share > 0)})
+        return {"parts": method.parts, "sky": "none", "train": train.model_copy(update={"scans": scans})}
     reference = config.eval_camera if train.exposure.kind != "none" and len(config.cameras) > 1 else None
     return {"parts": method.parts, "train": train, "reference_camera": reference}
 
@@ -264,6 +286,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "lidar_film": (LidarFilmJob, _encoding),
     "train": (TrainJob, _training),
     "evaluate": (EvaluateJob, _evaluation),
+    "evaluate_scans": (EvaluateScansJob, _nothing),
     "scene_metrics": (Settings, _nothing),
     "ablation": (AblationJob, lambda at: dict(at.config.ablation.job)),
     "tracks": (TracksJob, _nothing),

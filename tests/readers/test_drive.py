@@ -439,7 +439,7 @@ def lidar_alone(content, folder, tmp_path) -> Path:
     return mine
 
 
-def test_lidar_alone_is_read_for_later(lidar_alone, recorded):
+def test_lidar_alone_is_read(lidar_alone, recorded):
     """Its key frames are the sweeps, and its world begins at the first one."""
     scene = read(lidar_alone, source())
     assert scene.frames == scene.cameras == () and [lidar.name for lidar in scene.lidars] == ["LIDAR_TOP"]
@@ -451,18 +451,35 @@ def test_lidar_alone_is_read_for_later(lidar_alone, recorded):
     assert len(scene.tracks) == len(recorded.tracks)
 
 
-def test_lidar_alone_is_refused_by_the_stages_of_images_and_by_planning(lidar_alone):
+def test_lidar_alone_is_refused_where_the_settings_name_cameras(lidar_alone):
     with pytest.raises(DatasetError, match=r"scene 0001: it has no image of CAM_FRONT; name cameras that") as stopped:
         extract_scene(source(), lidar_alone)
     assert "\n" not in str(stopped.value)
-    with pytest.raises(DatasetError, match="have no cameras: LiDAR alone can be checked and read"):
-        camera_names(lidar_alone.parent, "")
+    assert camera_names(lidar_alone.parent, "") == [], "planning refuses them"
+
+
+def test_without_cameras_a_drive_is_extracted_from_its_sweeps(lidar_alone, folder):
+    """Of a drive with images, too, whose key frames are then those of its images."""
+    alone = extract_scene(source(cameras=()), lidar_alone)
+    assert alone.frames == () and len(alone.sweeps) == len(alone.key_frame_timestamps) > 3 and alone.dataset == "mine"
+    beside_images, with_images = extract_scene(source(cameras=()), folder), extract_scene(source(), folder)
+    assert beside_images.frames == beside_images.cameras == ()
+    assert [sweep.token for sweep in beside_images.sweeps] == [sweep.token for sweep in with_images.sweeps]
+    np.testing.assert_array_equal(beside_images.key_frame_timestamps, with_images.key_frame_timestamps)
+
+
+def test_a_drive_without_sweeps_is_refused_without_cameras(content, folder, tmp_path):
+    without = {key: value for key, value in content.items() if key not in ("sweeps", "lidars")}
+    (tmp_path / "drive.json").write_text(json.dumps(without), encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"scene 0001: it has no LiDAR sweep, and the settings name no camera") as it:
+        extract_scene(source(cameras=()), tmp_path)
+    assert "\n" not in str(it.value)
 
 
 def test_lidar_alone_is_checked_and_drawn_from_above(lidar_alone, capsys):
     assert main(["check", str(lidar_alone)]) == 0
     said = capsys.readouterr().out
-    assert "no images: such a drive can be read, but nothing is trained or measured on it yet" in said
+    assert "no images: methods that render LiDAR are trained and measured with cameras: []" in said
     pixels = np.asarray(Image.open(lidar_alone / "check.png"))
     assert pixels.shape == (960, 960, 3) and (pixels == (255, 90, 0)).all(axis=2).sum() > 100
     assert (pixels[20:].max(axis=2) > 0).sum() > 1000, "returns"

@@ -124,7 +124,7 @@ def refusal(values: dict[str, Any]) -> str:
         ("render.fps", 0, ["render.fps", "0", "greater than or equal to 1"]),
         ("random_seed", -1, ["random_seed", "-1", "greater than or equal to 0"]),
         ("results_dir", "", ["results_dir", "at least 1"]),
-        ("cameras", [], ["cameras", "at least 1"]),
+        ("eval_camera", None, ["eval_camera", "null", "CAM_FRONT"]),
         ("images.width", 8, ["images.width", "8", "greater than or equal to 16"]),
         ("methods.vanilla.parts", ["backgruond"], ["methods.vanilla.parts", "backgruond", "background"]),
         ("methods.vanilla.parts", ["actors"], ["methods.vanilla.parts", "lacks 'background'", "add it"]),

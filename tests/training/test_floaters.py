@@ -6,7 +6,7 @@ import torch
 
 from drivesplat.model.background import Background
 from drivesplat.settings.train import DefaultSettings, GaussianSettings, McmcSettings
-from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, camera_path, fade_floaters, near_path
+from drivesplat.training.floaters import LARGEST_STEP, EmptySpace, fade_floaters, near_path, sensor_path
 from drivesplat.training.sparse_grid import SparseGrid
 
 
@@ -40,17 +40,17 @@ def test_near_a_segment_is_a_capsule(point, near):
 def test_a_path_joins_consecutive_positions():
     centers = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
     between = torch.tensor([[2.5, 0.2, 0.0], [7.5, 0.2, 0.0]])
-    assert near_path(between, *camera_path(centers), 0.5).all()
+    assert near_path(between, *sensor_path(centers), 0.5).all()
 
 
 def test_a_path_does_not_join_positions_far_apart():
     centers = torch.tensor([[0.0, 0.0, 0.0], [LARGEST_STEP + 1.0, 0.0, 0.0], [LARGEST_STEP + 3.0, 0.0, 0.0]])
     points = torch.tensor([[8.0, 0.0, 0.0], [LARGEST_STEP + 2.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
-    assert near_path(points, *camera_path(centers), 0.5).tolist() == [False, True, True]
+    assert near_path(points, *sensor_path(centers), 0.5).tolist() == [False, True, True]
 
 
 def test_a_lone_position_is_a_path():
-    starts, ends = camera_path(torch.tensor([[1.0, 2.0, 3.0]]))
+    starts, ends = sensor_path(torch.tensor([[1.0, 2.0, 3.0]]))
     assert near_path(torch.tensor([[1.2, 2.0, 3.0], [2.2, 2.0, 3.0]]), starts, ends, 0.5).tolist() == [True, False]
 
 
@@ -58,7 +58,7 @@ def test_only_floaters_near_the_path_fade_and_the_rest_stays():
     positions = np.array([[0.0, 0.3, 0.0], [2.0, 0.0, 0.5], [2.0, 3.0, 0.0], [9.0, 0.0, 0.0]])
     part = Background.from_points(positions, np.full((4, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     before = {name: value.detach().clone() for name, value in part.params.items()}
-    fade_floaters(part, EmptySpace(*camera_path(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])), 1.0))
+    fade_floaters(part, EmptySpace(*sensor_path(torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])), 1.0))
     opacities = part.at(0.0).opacities.detach()
     assert (opacities[:2] < 1e-3).all()
     torch.testing.assert_close(opacities[2:], torch.tensor([0.6, 0.6]))
@@ -68,7 +68,7 @@ def test_only_floaters_near_the_path_fade_and_the_rest_stays():
 
 def test_a_faded_gaussian_is_under_what_the_strategies_take_for_dead():
     part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
-    fade_floaters(part, EmptySpace(*camera_path(torch.zeros(1, 3)), 1.0))
+    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 1.0))
     opacity = float(part.at(0.0).opacities.detach())
     assert opacity < min(McmcSettings().min_opacity, DefaultSettings().prune_opacity)
 
@@ -77,14 +77,14 @@ def test_fading_never_brightens():
     part = Background.from_points(np.zeros((2, 3)), np.full((2, 3), 0.5), GaussianSettings(), 1.0)
     with torch.no_grad():
         part.params["opacities"].copy_(torch.tensor([-30.0, 2.0]))
-    fade_floaters(part, EmptySpace(*camera_path(torch.zeros(1, 3)), 1.0))
+    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 1.0))
     assert float(part.params["opacities"].detach()[0]) == -30.0
 
 
 def test_a_faded_parameter_can_still_learn():
     part = Background.from_points(np.zeros((1, 3)), np.full((1, 3), 0.5), GaussianSettings(), 1.0)
     before = part.params["opacities"]
-    fade_floaters(part, EmptySpace(*camera_path(torch.zeros(1, 3)), 1.0))
+    fade_floaters(part, EmptySpace(*sensor_path(torch.zeros(1, 3)), 1.0))
     assert part.params["opacities"] is before and before.requires_grad and before.is_leaf
 
 
@@ -102,12 +102,12 @@ def test_gaussians_fade_whose_centres_lie_in_space_proven_empty(radius, faded):
     part = Background.from_points(positions, np.full((5, 3), 0.5), GaussianSettings(init_opacity=0.6), 1.0)
     with torch.no_grad():
         part.params["scales"][3:] += 5.0
-    fade_floaters(part, EmptySpace(*camera_path(torch.tensor([[0.0, 0.0, 0.0]])), radius, free_cells()))
+    fade_floaters(part, EmptySpace(*sensor_path(torch.tensor([[0.0, 0.0, 0.0]])), radius, free_cells()))
     opacities = part.at(0.0).opacities.detach()
     assert (opacities < 1e-3).nonzero()[:, 0].tolist() == faded
 
 
 def test_nothing_is_known_to_be_empty_without_a_radius_and_free_space():
-    path = camera_path(torch.zeros(1, 3))
+    path = sensor_path(torch.zeros(1, 3))
     assert not EmptySpace(*path, 0.0).known
     assert EmptySpace(*path, 1.0).known and EmptySpace(*path, 0.0, free_cells()).known

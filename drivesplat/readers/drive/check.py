@@ -20,7 +20,7 @@ from drivesplat.settings.extract import SceneSource
 
 WIDTH = 960
 """Width of an image in the picture."""
-NO_IMAGES = "no images: such a drive can be read, but nothing is trained or measured on it yet"
+NO_IMAGES = "no images: methods that render LiDAR are trained and measured with cameras: [] (docs/lidar.md)"
 MAX_DEPTH = 60.0
 """Metres at which the colour of returns ends."""
 OTHER_TIMES = (-1_500_000, 1_500_000)

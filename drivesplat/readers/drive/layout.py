@@ -38,8 +38,7 @@ def table_files(root: Path, version: str, scene: str) -> list[Path]:
 
 
 def camera_names(root: Path, version: str) -> list[str]:
-    """The names of the cameras of all drive folders. Raises DatasetError where none has any, or a drive.json is no
-    drive."""
+    """The names of the cameras of all drive folders. Raises DatasetError where a drive.json is no drive."""
     names: dict[str, None] = {}
     for file in [root / FILE, *sorted(root.glob(f"*/{FILE}"))]:
         if file.is_file():
@@ -50,9 +49,4 @@ def camera_names(root: Path, version: str) -> list[str]:
                     f"{file} names no cameras ({type(error).__name__}: {str(error)[:200]}); "
                     f"`python -m drivesplat.readers.drive check {file.parent}` lists all of its faults"
                 ) from error
-    if not names:
-        raise DatasetError(
-            f"the drives in {root} have no cameras: LiDAR alone can be checked and read, but nothing is trained or "
-            "measured on it yet; docs/own_data.md says how to add images"
-        )
     return list(names)

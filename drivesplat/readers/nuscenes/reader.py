@@ -169,7 +169,7 @@ def _ego_pose(tables: Any, data: dict) -> np.ndarray:
 
 
 def _origin(tables: Any, sample: dict, cameras: tuple[str, ...]) -> np.ndarray:
-    channel = LIDAR if LIDAR in sample["data"] else cameras[0]
+    channel = LIDAR if LIDAR in sample["data"] or not cameras else cameras[0]
     return _ego_pose(tables, _key_data(tables, sample, channel))[:3, 3].copy()
 
 

@@ -25,6 +25,7 @@ from drivesplat.workflow.costs.table import FILES, costs_in_words, finding, writ
 from drivesplat.workflow.overridden import without_effect
 from drivesplat.workflow.plan import Plan
 from drivesplat.workflow.snakemake_records import drop_foreign_records
+from drivesplat.workflow.without_cameras import methods_left_out
 
 COSTS, ESTIMATE = "costs", "estimate"
 """Targets that run no job: the first updates and prints costs.csv, the second prints the estimate."""
@@ -40,11 +41,14 @@ class RunCosts:
         self._ended: threading.Event | None = None
 
     def report_settings_without_effect(self) -> None:
-        """Prints each setting that an override replaces for the scenes and methods of the targets. Called at planning,
-        so that `snakemake -n` and a run with nothing to do print them, too."""
+        """Prints each setting that an override replaces for the scenes and methods of the targets, and methods that
+        scenes without cameras leave out. Called at planning, so that `snakemake -n` and a run with nothing to do print
+        them, too."""
         wanted = [target for target in self._targets if target not in (COSTS, ESTIMATE)]
         if wanted or COSTS not in self._targets:
-            for sentence in without_effect(self._plan.config, self._plan.scenes_and_methods(wanted)):
+            places = self._plan.scenes_and_methods(wanted)
+            absent = methods_left_out(self._plan.config, (scene for scene, _ in places))
+            for sentence in (*without_effect(self._plan.config, places), *absent):
                 _say(sentence)
 
     def report_foreign_records(self) -> None:

@@ -1,0 +1,161 @@
+"""Planning of scenes without cameras: what they have, and what is refused in one sentence."""
+
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from helpers import REPOSITORY
+
+from drivesplat.demo.optics.rig import recording_sensors
+from drivesplat.errors import ConfigError, DatasetError
+from drivesplat.settings.config import load
+from drivesplat.settings.world import WorldJob
+from drivesplat.workflow.plan import Plan
+from drivesplat.workflow.stages import TRAINING_INPUTS, refines_poses, stage_settings
+from drivesplat.workflow.without_cameras import CAMERA_STAGES, methods_left_out, require_methods
+
+ALONE = {"cameras": [], "eval_camera": None}
+METHODS = {
+    "vanilla": {},
+    "street": {"parts": ["background", "actors"]},
+    "with_lidar": {
+        "parts": ["background", "actors"],
+        "overrides": {"train": {"depth_weight": 0.01, "scans": {"share": 0.25}}},
+    },
+}
+
+
+def settings(**values: Any) -> dict[str, Any]:
+    """Scene a1 with a camera beside a2 without one."""
+    datasets = {"a": {"scenes": ["a1"]}, "b": {"scenes": ["a2"], "overrides": ALONE}}
+    return {"datasets": datasets, "methods": METHODS, "results_dir": "there", **values}
+
+
+def plan(**values: Any) -> Plan:
+    return Plan(settings(**values), str(REPOSITORY))
+
+
+def at(scene: str, method: str = "with_lidar") -> SimpleNamespace:
+    return SimpleNamespace(scene=scene, method=method)
+
+
+def test_a_batch_measures_it_by_the_methods_that_render_lidar_and_shows_its_scans_alone():
+    made = plan()
+    assert made.metrics() == ["there/a1/metrics.json", "there/a2/metrics.json"]
+    assert made.evals(at("a1")) == [f"there/a1/{method}/eval.json" for method in METHODS]
+    assert made.evals(at("a2")) == ["there/a2/with_lidar/eval.json"]
+    report = made.report([])
+    shown = [*made.films(), *made.looks(), *made.exports(), *made.drives(), *made.edits(), *report.pictures()]
+    of_alone = {path for path in (*shown, *report.links()) if "/a2/" in path}
+    assert of_alone == {"there/a2/with_lidar/lidar.png", "there/a2/with_lidar/lidar.mp4"}
+    assert "there/a1/vanilla/ghost_panel.png" in shown and "there/a1/street/original.mp4" in shown
+    assert made.scenes(cameras=True) == ["a1"] and made.scenes(cameras=False) == ["a2"]
+
+
+def test_its_training_takes_no_result_of_images_and_fits_scans_alone():
+    made = plan()
+    assert made.of_images("masks/masks.json")(at("a1")) == ["there/a1/masks/masks.json"]
+    assert made.of_images("masks/masks.json")(at("a2")) == []
+    taken = {scene: [i for i in TRAINING_INPUTS if made.training_input(i)(at(scene))] for scene in ("a1", "a2")}
+    assert taken == {"a1": ["actors", "lidar_depth", "scans"], "a2": ["actors", "scans"]}
+    with_image, alone = (json.loads(made.settings("train")(at(scene))) for scene in ("a1", "a2"))
+    assert (with_image["train"]["scans"]["share"], with_image["sky"]) == (0.25, "cubemap")
+    assert (alone["train"]["scans"]["share"], alone["sky"], alone["reference_camera"]) == (1.0, "none", None)
+
+
+def test_the_report_expects_its_own_stages():
+    expected = json.loads(plan().report([]).settings())["expected"]
+    own = {"extract", "parser", "actors", "scans", "scan_baselines", "scene_metrics"}
+    assert expected["a2"].keys() >= {*own, "with_lidar/train", "with_lidar/evaluate_scans"}
+    assert not {stage for stage in expected["a2"] if stage.split("/")[-1] in CAMERA_STAGES or "street" in stage}
+    assert "with_lidar/evaluate_scans" not in expected["a1"] and "street/evaluate" in expected["a1"]
+
+
+def test_its_poses_are_not_refined_from_images_that_it_lacks():
+    config = load(settings(refine_poses={"enabled": True}))
+    assert refines_poses(config, "a1") and not refines_poses(config, "a2")
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("vanilla/eval.json", "and method 'vanilla' renders images alone; those that render LiDAR: with_lidar"),
+        ("street/checkpoint.npz", "and method 'street' renders images alone"),
+        ("with_lidar/original.mp4", ": with_lidar/original.mp4 needs images; docs/lidar.md"),
+        ("with_lidar/parts.mp4", ": with_lidar/parts.mp4 needs images"),
+        ("with_lidar/original.cameras.json", ": with_lidar/original.cameras.json needs images"),
+        ("with_lidar/ghost_panel.png", ": with_lidar/ghost_panel.png needs images"),
+        ("with_lidar/removal.png", ": with_lidar/removal.png needs images"),
+        ("with_lidar/held_out_rendered.png", ": with_lidar/held_out_rendered.png needs images"),
+        ("with_lidar/edits/away.mp4", ": with_lidar/edits/away.mp4 needs images"),
+        ("with_lidar/quad/away.mp4", ": with_lidar/quad/away.mp4 needs images"),
+        ("with_lidar/trajectories/original/drive/drive.json", "drive.json needs images"),
+        ("with_lidar/splat.ply", ": with_lidar/splat.ply needs images"),
+        ("with_lidar/colmap/images.txt", "images.txt needs images"),
+        ("masks/masks.json", ": masks/masks.json needs images"),
+        ("seed.ply", ": seed.ply needs images"),
+        ("compare.mp4", ": compare.mp4 needs images"),
+        ("ablation.csv", ": ablation.csv needs images"),
+    ],
+)
+def test_a_result_that_needs_images_is_refused_by_name(target, words):
+    made = plan(ablation={"of": "with_lidar"})
+    with pytest.raises(ConfigError) as refused:
+        made.refuse_unknown([f"there/a2/{target}"])
+    assert str(refused.value).startswith("scene a2 has no camera (cameras: [])") and words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_what_it_has_is_not_refused():
+    made = plan()
+    of_scene = ("scene.json", "parser.pkl", "actors.npz", "scans.npz", "scan_baselines.json", "metrics.json")
+    of_method = ("checkpoint.npz", "train.json", "eval.json", "lidar.png", "lidar.mp4")
+    made.refuse_unknown([f"there/a2/{name}" for name in (*of_scene, *(f"with_lidar/{name}" for name in of_method))])
+
+
+@pytest.mark.parametrize("stage", CAMERA_STAGES)
+def test_stages_of_images_have_no_settings_there(stage):
+    """Whoever asks for their results: also another workflow, whose targets are unknown."""
+    with pytest.raises(ConfigError, match=rf"^scene a2 has no camera .*the stage {stage} needs images$"):
+        stage_settings(load(settings()), stage, "a2", "with_lidar", "original")
+
+
+def test_without_a_method_that_renders_lidar_it_is_refused_with_the_remedy():
+    images_alone = load(settings(methods={"vanilla": {}}))
+    require_methods(images_alone, "a1")
+    with pytest.raises(ConfigError, match=r"scene a2 has no camera .*no method renders LiDAR; .*presets/lidar.yaml"):
+        require_methods(images_alone, "a2")
+
+
+def test_planning_names_the_methods_that_it_leaves_out():
+    config = load(settings())
+    (sentence,) = methods_left_out(config, ["a1", "a2"])
+    assert sentence.startswith("dataset b has no camera") and sentence.endswith("left out there (vanilla, street)")
+    assert methods_left_out(config, ["a1"]) == []
+
+
+def test_a_camera_of_a_dataset_without_any_is_refused_with_the_remedy(tmp_path):
+    (tmp_path / "drive.json").write_text('{"lidars": {"top": {}}}', encoding="utf-8")
+    mine = {"reader": "drive", "dataroot": str(tmp_path), "scenes": ["m1"]}
+    values = {"results_dir": str(tmp_path / "results"), "methods": METHODS}
+    made = Plan({"datasets": {"m": mine}, **values}, str(REPOSITORY))
+    with pytest.raises(ConfigError, match=r"dataset m has no camera, but cameras names CAM_FRONT; write cameras: \[\]"):
+        made.refuse_absent_data([])
+    Plan({"datasets": {"m": {**mine, "overrides": ALONE}}, **values}, str(REPOSITORY)).refuse_absent_data([])
+    gone = {**mine, "dataroot": str(tmp_path / "gone"), "overrides": ALONE}
+    with pytest.raises(DatasetError, match="drive folder not found"):
+        Plan({"datasets": {"m": gone}, **values}, str(REPOSITORY)).refuse_absent_data([])
+
+
+def test_a_synthetic_world_without_cameras_records_lidar_alone():
+    world = {"dataroot": "resources/w", "scenes": ["w"], "world": {}, "overrides": ALONE}
+    made = Plan({"datasets": {"w": world}, "methods": METHODS, "results_dir": "there"}, str(REPOSITORY))
+    settings = WorldJob.model_validate_json(made.world_settings("w"))
+    assert [sensor.channel for sensor in recording_sensors(settings.world)] == ["LIDAR_TOP"]
+
+
+def test_an_evaluated_camera_without_cameras_is_refused_and_the_default_is_none():
+    assert load({"cameras": []}).cameras == ()
+    with pytest.raises(ConfigError, match=r"eval_camera CAM_BACK is set, but cameras is empty.*eval_camera: null"):
+        load({"cameras": [], "eval_camera": "CAM_BACK"})
