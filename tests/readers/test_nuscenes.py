@@ -81,6 +81,15 @@ def test_lidar_sweeps_have_the_lidar_poses_of_the_tiny_drive(tiny_root):
         assert sweep.is_key_frame and Path(sweep.path).is_file()
 
 
+def test_without_cameras_a_scene_has_its_sweeps_and_boxes_alone(tiny_root):
+    alone, with_images = (extract_scene(source(cameras=cameras), tiny_root) for cameras in ((), ("CAM_FRONT",)))
+    assert alone.frames == alone.cameras == () and alone.lidars[0].name == "LIDAR_TOP"
+    for name in ("sweeps", "tracks"):
+        assert len(getattr(alone, name)) == len(getattr(with_images, name)) > 0
+    np.testing.assert_array_equal(alone.origin, with_images.origin)
+    np.testing.assert_array_equal(alone.key_frame_timestamps, with_images.key_frame_timestamps)
+
+
 def test_names_and_times_of_the_scene_match_the_tables(tiny_root):
     scene = extract_scene(source(), tiny_root)
     assert (scene.name, scene.dataset, scene.version, scene.poses) == ("0001", "tiny", "v1.0-mini", "nuscenes")

@@ -112,6 +112,14 @@ def test_both_versions_give_one_scene(scenes, tmp_path):
         assert Path(one.path).read_bytes() == Path(other.path).read_bytes()
 
 
+@pytest.mark.parametrize("version", VERSIONS)
+def test_without_cameras_a_segment_has_its_sweeps_and_boxes_alone(version, roots, scenes, tmp_path):
+    alone = extract_scene(source(version=version, cameras=()), roots[version], results=tmp_path)
+    assert alone.frames == alone.cameras == ()
+    for name in ("sweeps", "tracks", "key_frame_timestamps"):
+        assert len(getattr(alone, name)) == len(getattr(scenes[version], name)) > 0
+
+
 def test_classes_are_those_that_waymo_has(scenes):
     kinds = {track.category: track.object_class for track in scenes["v2"].tracks}
     assert kinds == {

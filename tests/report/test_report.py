@@ -473,3 +473,25 @@ def test_a_missing_scene_has_the_reason_from_its_logs(tmp_path, write, logs, why
     (missing,) = report["missing"]
     assert missing["scene"] == "0103" and missing["why"].startswith(why)
     assert report["partial"] is True
+
+
+def test_a_scene_without_cameras_stands_beside_scenes_with_one(write):
+    """Its figures of images are null, and its protocol is compared with that of scenes without cameras alone."""
+    nothing = dict.fromkeys(group(24.0))
+    alone = {"cameras": [], "eval_camera": None, "width": None, "height": None}
+    lidar = {"with_lidar": method(nothing, nothing)}
+    records = [metrics("0061", {"vanilla": VANILLA_A}), metrics("a1", lidar, **alone), metrics("a2", lidar, **alone)]
+    other = metrics("a3", lidar, **alone, holdout={"every_nth": 5, "offset": 4, "last_block": 0})
+    made = {
+        name: stages(methods)
+        for name, methods in (("0061", ("vanilla",)), *((f"a{i}", ("with_lidar",)) for i in (1, 2, 3)))
+    }
+    job = report_job(made)
+    report = gap_report([write(record) for record in (*records, other)], job, NO_LOGS)
+    assert [row["scene"] for row in report["rows"]] == ["0061", "a1", "a2"]
+    assert all(value is None for name, value in report["rows"][1].items() if name.startswith(("inter", "extra")))
+    assert report["left_out"] == [{"scene": "a3", "why": "its protocol differs from that of scene a1: holdout"}]
+    assert {mean["method"]: mean["figures"]["interpolation_static"] and 1 for mean in report["means"]} == {
+        "vanilla": 1, "with_lidar": None
+    }  # fmt: skip
+    assert "with_lidar" in console_table(report)

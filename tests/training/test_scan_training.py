@@ -8,16 +8,18 @@ import pytest
 import torch
 from helpers.hand_made import round_gaussians
 from helpers.records import training_record_of
-from helpers.trainings import CPU, folders_of, guided_views, recorded_views, seed_points, settings_of, untrained
+from helpers.trainings import CPU, folders_of, guided_views, job_of, recorded_views, seed_points, settings_of, untrained
 from pydantic import ValidationError
 
 from drivesplat.model.background import Background
+from drivesplat.model.build import gaussian_cap
 from drivesplat.model.scans import ScanPicture
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.scene.scan import Scan, ScanRays
 from drivesplat.scene.scan_record import RecordedScan
 from drivesplat.settings.train import TrainSettings
 from drivesplat.settings.train_scans import ScanTrainingSettings
+from drivesplat.training.run import TrainingInputs, prepare
 from drivesplat.training.scans import (
     fits_scan,
     initial_echo,
@@ -242,3 +244,41 @@ def test_the_points_of_a_scan_are_where_its_rays_met_them_at_their_own_times():
     np.testing.assert_allclose(np.linalg.norm(turned - [0.5, 0.0, 0.2], axis=1), ranges, rtol=1e-5)
     left = still.scan.rays.azimuths[still.scan.returned]
     np.testing.assert_allclose(np.arctan2(-(turned[:, 0] - 0.5), turned[:, 2] - 0.2), left + 0.05, atol=1e-4)
+
+
+def without_images() -> TrainingInputs:
+    """Scans of a wall from three places, and no image."""
+    record = training_record_of(0, points=np.empty((0, 3), np.float32), points_rgb=np.empty((0, 3), np.uint8))
+    scans = [scan_of_a_wall(x) for x in (-0.5, 0.0, 0.5)]
+    return TrainingInputs(record, None, [], [], sky_known=False, scans=scans)
+
+
+def test_without_images_every_iteration_fits_a_scan(tmp_path):
+    """Also those that would show a picture; the seed is that of scans, and the path that is kept empty the LiDAR's."""
+    changes = {"iterations": 30, "image_every": 10, "psnr_every": 10, "log_every": 10, "pixels_per_gaussian": 20}
+    job = job_of(**changes, scans=ScanTrainingSettings(share=1.0))
+    begun = prepare(without_images(), job, CPU)
+    assert begun.views == [] and not any(begun.curves.values()) and len(begun.model) > 100
+    scan = begun.scans[1]
+
+    @torch.no_grad()
+    def share_and_error() -> tuple[float, float]:
+        """The mean probability of the recorded returns, and the median error of their ranges."""
+        picture, there = begun.model.scan(scan.view), scan.returned
+        return float(picture.returned[there].mean()), float((picture.range - scan.range)[there].abs().median())
+
+    before, _ = share_and_error()
+    trained = train(begun.model, [], begun.settings, 0, CPU, folders_of(tmp_path, "a"), scans=begun.scans)
+    after, error = share_and_error()
+    assert trained.iterations == 30 and after > before + 0.1 and error < 0.05
+    trainer = Trainer.begin(begun.model, [], begun.settings, 0, CPU, scans=begun.scans)
+    np.testing.assert_allclose(trainer.sensor_positions[:, 0], [-0.5, 0.0, 0.5])
+
+
+def test_without_images_rays_limit_the_number_of_gaussians_as_pixels_do():
+    inputs = without_images()
+    rays = sum(int(scan.measured.sum()) for scan in inputs.scans)
+    assert gaussian_cap(inputs.record, settings_of(cap_max=10_000, pixels_per_gaussian=20.0), rays) == rays // 20
+    assert gaussian_cap(inputs.record, settings_of(cap_max=10_000, pixels_per_gaussian=0.0), rays) == 10_000
+    beside_images = training_record_of(2, image_sizes=np.tile([64, 48], (2, 1)))
+    assert gaussian_cap(beside_images, settings_of(cap_max=10_000, pixels_per_gaussian=20.0), rays) == 2 * 64 * 48 // 20
