@@ -130,7 +130,7 @@ class Plan(Outputs):
             refuse_image_results(self.config, scene, rest, films)
             if rest[0] in ABLATION_FILES:
                 self._refuse_idle_variants(scene)
-            if len(rest) > 1:
+            if len(rest) > 1 and rest[0] in self.config.all_methods:
                 self._refuse_unknown_film(scene, rest[0], rest[1:])
 
     def _refuse_unknown_method(self, path: list[str]) -> None:
