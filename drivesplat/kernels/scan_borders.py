@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from drivesplat.kernels.scan_projection import wrapped
+from drivesplat.kernels.scanned_gaussians import wrapped
 
 
 class TileSize(NamedTuple):

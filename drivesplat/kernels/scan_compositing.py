@@ -8,7 +8,7 @@ from torch import Tensor
 
 from drivesplat.kernels import triton_support
 from drivesplat.kernels.scan_part import ScanPart
-from drivesplat.kernels.scan_projection import ScannedGaussians
+from drivesplat.kernels.scanned_gaussians import ScannedGaussians
 
 
 class CompositedScan(NamedTuple):

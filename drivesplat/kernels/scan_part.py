@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from drivesplat.kernels.scan_borders import ON_CPU, ON_GPU, ScanBorders, TileTable, scan_borders, tile_table
-from drivesplat.kernels.scan_projection import FiringTimes, wrapped
+from drivesplat.kernels.scanned_gaussians import FiringTimes, wrapped
 
 
 @dataclass(frozen=True)

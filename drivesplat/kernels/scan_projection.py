@@ -6,7 +6,6 @@ T = J W R S (scales S, rotation R, world to sensor W) and T's rows a, e and d, t
 has the determinant |a × e|², which neither cancels nor turns negative as xx yy - xy² does for needles in float32.
 """
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -15,68 +14,19 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from drivesplat.kernels import triton_support
+from drivesplat.kernels.scanned_gaussians import (
+    FIRING_STEPS,
+    MAX_DEVIATIONS,
+    MIN_ALPHA,
+    MIN_RANGE,
+    MIN_SINE_SQUARED,
+    SINE_OF_POLES,
+    Revolution,
+    ScannedGaussians,
+)
 
-MIN_ALPHA = 1.0 / 255.0
-"""Minimum alpha: smaller contributions are not drawn."""
-MIN_RANGE = 0.2
-"""Gaussians nearer to the sensor (metres) are skipped."""
-SINE_OF_POLES = math.sin(math.radians(80.0))
-"""Gaussians nearer to the poles, by the sine of their elevation, are skipped: azimuths, and so the linearisation,
-degenerate there."""
-MAX_DEVIATIONS = 3.0
-"""Maximum correction of the range within a Gaussian, in standard deviations of the range along its plane within its
-footprint, which the beams widen. Standard deviations of its own range alone would cut off the plane of the road, where
-beams graze it, and shift it towards the sensor."""
-MIN_SINE_SQUARED = 1e-8
-"""Gaussians seen as a line, where the squared sine between a and e is smaller, have no slope."""
-FIRING_STEPS = 4
-"""Iterations to find the time at which a moving Gaussian meets the spinning beams; each reduces the error by the ratio
-of the Gaussian's angular velocity to the sensor's."""
 SERIAL = 32768
 """Number of values up to which torch uses one thread."""
-
-
-class ScannedGaussians(NamedTuple):
-    """n Gaussians as a LiDAR sees them: `means2d`, azimuth and elevation in radians; `ranges` in metres; `conics`, the
-    upper triangles of inverse covariances of azimuth and elevation; `slopes`, metres of range by radian of azimuth and
-    of elevation, which correct the range of a ray by at most `range_limits` metres; `radii`, the reach in radians, 0
-    for Gaussians that are skipped; `opacities`."""
-
-    means2d: Float[Tensor, "n 2"]
-    ranges: Float[Tensor, " n"]
-    conics: Float[Tensor, "n 3"]
-    slopes: Float[Tensor, "n 2"]
-    range_limits: Float[Tensor, " n"]
-    radii: Float[Tensor, "n 2"]
-    opacities: Float[Tensor, " n"]
-
-
-class FiringTimes(NamedTuple):
-    """When each azimuth fires: `azimuths` (a,) in radians, ascending within ±π, and their `offsets_s` (a,)."""
-
-    azimuths: Float[Tensor, " a"]
-    offsets_s: Float[Tensor, " a"]
-
-    def between(self) -> tuple[Float[Tensor, " c"], Float[Tensor, " d"]]:
-        """The azimuths (radians) between neighbouring firings of revolution after revolution, a + 1 of them, and the
-        offsets of the a + 2 firings around them."""
-        first, last = slice(0, 1), slice(-1, None)
-        around = [self.azimuths[last] - 2.0 * math.pi, self.azimuths, self.azimuths[first] + 2.0 * math.pi]
-        azimuths, offsets_s = (
-            torch.cat(around),
-            torch.cat([self.offsets_s[last], self.offsets_s, self.offsets_s[first]]),
-        )
-        return 0.5 * (azimuths[1:] + azimuths[:-1]), offsets_s
-
-
-class Revolution(NamedTuple):
-    """The motion while a sensor's beams revolve: when which azimuth fires; the velocity (m/s) and the angular velocity
-    (rad/s) of the sensor in its own frame at the timestamp; and the velocities (m/s) of Gaussians in the world."""
-
-    firings: FiringTimes
-    linear: Float[Tensor, "3"]
-    angular: Float[Tensor, "3"]
-    velocities: Float[Tensor, "n 3"] | None
 
 
 class Placement(NamedTuple):
@@ -146,13 +96,6 @@ def _at_firing(gaussians: Placement, revolution: Revolution, world_to_sensor: Fl
     return Placement(_turned(turns, gaussians.centers + moved), axes)
 
 
-def firing_times(azimuths: Float[Tensor, "b a"], offsets_s: Float[Tensor, "b a"]) -> FiringTimes:
-    """The mean azimuth and the median time of each firing of a scan."""
-    mean = torch.atan2(azimuths.sin().sum(dim=0), azimuths.cos().sum(dim=0))
-    order = mean.argsort()
-    return FiringTimes(mean[order], offsets_s.median(dim=0).values[order])
-
-
 def _length(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, " n"]:
     return (vectors * vectors).sum(dim=0).sqrt()
 
@@ -162,11 +105,6 @@ def _atan2(y: Float[Tensor, " n"], x: Float[Tensor, " n"]) -> Float[Tensor, " n"
     if y.is_cuda:
         return torch.atan2(y, x)
     return torch.cat([torch.atan2(*part) for part in zip(y.split(SERIAL), x.split(SERIAL), strict=True)])
-
-
-def wrapped(angles: Tensor) -> Tensor:
-    """Angles in radians within ±π."""
-    return angles - 2.0 * math.pi * torch.round(angles / (2.0 * math.pi))
 
 
 def _turns(angular: Float[Tensor, "3"], seconds: Float[Tensor, " n"]) -> Float[Tensor, "3 3 n"]:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from drivesplat.kernels.scan_compositing import CompositedScan, composite_scan
 from drivesplat.kernels.scan_part import ScanPart
-from drivesplat.kernels.scan_projection import Revolution, ScannedGaussians, scanned
+from drivesplat.kernels.scan_projection import scanned
+from drivesplat.kernels.scanned_gaussians import Revolution, ScannedGaussians
 from drivesplat.scene.scan import ScanRays
 
 MAX_RANGE = 200.0

@@ -14,7 +14,7 @@ from helpers import REPOSITORY
 from drivesplat.errors import ResultError
 from drivesplat.evaluation.backbone import read_backbone
 from drivesplat.evaluation.lpips_map import load_alexnet
-from drivesplat.evaluation.scene_metrics import read_evaluations
+from drivesplat.evaluation.scene_metrics import read_baselines, read_evaluations
 from drivesplat.export.far_gaussians import read_far
 from drivesplat.export.splat_ply import read_splat_ply
 from drivesplat.io.point_cloud import read_ply
@@ -57,6 +57,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "checkpoint.npz": (read_checkpoint, "train"),
     "train.json": (read_summary, "train"),
     "eval.json": (lambda path: read_evaluations([str(path)]), "evaluate"),
+    "scan_baselines.json": (lambda path: read_baselines(str(path)), "scan_baselines"),
     "truth.json": (read_truth, "demo_world"),
     "backbone.json": (read_backbone, "lpips_backbone"),
     "alexnet.pth": (alexnet, "lpips_backbone"),
@@ -125,12 +126,14 @@ def test_a_resume_state_of_any_kind_executes_nothing(tmp_path, kind):
 
 
 def test_no_script_reads_results_but_by_a_reader_that_is_tested():
-    """`read_prepared_drive`, `read_inputs` and `read_evaluation_inputs` are made of others."""
+    """`read_prepared_drive`, `read_inputs`, `read_evaluation_inputs` and `read_scan_evaluation_inputs` are made of
+    others."""
     tested = {
         "read_json",
         "read_prepared_drive",
         "read_inputs",
         "read_evaluation_inputs",
+        "read_scan_evaluation_inputs",
         "read_scene",
         "read_ego_mask",
         "read_masks_record",
@@ -145,7 +148,7 @@ def test_no_script_reads_results_but_by_a_reader_that_is_tested():
         "read_triangulated",
         "read_summary",
     }
-    tested |= {"read_checkpoint", "read_evaluations", "read_backbone", "read_far"}
+    tested |= {"read_checkpoint", "read_evaluations", "read_baselines", "read_backbone", "read_far"}
     used = {
         name.name
         for path in (REPOSITORY / "workflow_scripts").glob("*.py")

@@ -10,7 +10,7 @@ import torch
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from torch import Tensor
 
-from drivesplat.kernels.scan_projection import ScannedGaussians
+from drivesplat.kernels.scanned_gaussians import ScannedGaussians
 from drivesplat.rasterization import RayGrid, ScanMotion, ScanRendering
 
 MAX_ALPHA = 0.999

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from drivesplat.kernels.scan_borders import ON_GPU
-from drivesplat.kernels.scan_projection import MIN_ALPHA, ScannedGaussians
+from drivesplat.kernels.scanned_gaussians import MIN_ALPHA, ScannedGaussians
 from drivesplat.kernels.triton.chunks import count_chunks
 from drivesplat.kernels.triton.tiles import TileLists
 from drivesplat.kernels.triton.vectors import around

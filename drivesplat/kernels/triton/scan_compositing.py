@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from drivesplat.kernels.scan_part import ScanPart
-from drivesplat.kernels.scan_projection import ScannedGaussians
+from drivesplat.kernels.scanned_gaussians import ScannedGaussians
 from drivesplat.kernels.triton.scan_chunks import (
     MAX_ALPHA,
     MIN_TRANSMITTANCE,

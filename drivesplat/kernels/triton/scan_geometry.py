@@ -5,7 +5,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from drivesplat.kernels.scan_projection import MIN_RANGE, MIN_SINE_SQUARED, SINE_OF_POLES
+from drivesplat.kernels.scanned_gaussians import MIN_RANGE, MIN_SINE_SQUARED, SINE_OF_POLES
 from drivesplat.kernels.triton.rows import three, unit
 from drivesplat.kernels.triton.vectors import (
     added,

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesplat.kernels.scan_projection import FIRING_STEPS, MAX_DEVIATIONS, MIN_ALPHA, Revolution
+from drivesplat.kernels.scanned_gaussians import FIRING_STEPS, MAX_DEVIATIONS, MIN_ALPHA, Revolution
 from drivesplat.kernels.triton.rows import store_quaternion, store_three, three, unit
 from drivesplat.kernels.triton.scan_geometry import (
     at_timestamp,

@@ -14,7 +14,7 @@ import triton.language as tl
 
 from drivesplat.kernels.capacity import capacity_for
 from drivesplat.kernels.scan_borders import BINS, TileTable
-from drivesplat.kernels.scan_projection import MIN_ALPHA, ScannedGaussians
+from drivesplat.kernels.scanned_gaussians import MIN_ALPHA, ScannedGaussians
 from drivesplat.kernels.triton.tiles import TileLists
 from drivesplat.kernels.triton.vectors import around
 
