@@ -21,6 +21,7 @@ from drivesplat.rendering.frames import film_frames
 from drivesplat.rendering.panels import Panels
 from drivesplat.rendering.trajectory import film_path
 from drivesplat.scene.images import write_png
+from drivesplat.scene.motion import HALF_STEP
 from drivesplat.scene.rigid import inverse
 from drivesplat.scene.scene import Scene
 from drivesplat.settings.device import DeviceSettings
@@ -109,13 +110,15 @@ def edited_drive(scene: Scene, model: SplatModel, job: EditJob, where: str) -> E
 
 
 def actor_placements(actors: Sequence[EditedActor], seconds: np.ndarray) -> list[list[ActorPlacement]]:
-    """The actors present at each of `seconds` (n,), with their poses."""
+    """The actors present at each of `seconds` (n,), with their poses then and HALF_STEP before and after."""
     result: list[list[ActorPlacement]] = [[] for _ in seconds]
     for actor in actors:
-        poses = actor.poses(seconds) if actor.edited else None
+        poses = [actor.poses(seconds + step) for step in (0.0, -HALF_STEP, HALF_STEP)] if actor.edited else []
         for number in np.flatnonzero(actor.present(seconds)):
-            pose = poses[number] if poses is not None else None
-            result[number].append(ActorPlacement(actor.source, pose, actor.scale, actor.color_matrix))
+            pose, *around = (of_time[number] for of_time in poses) if poses else (None,)
+            result[number].append(
+                ActorPlacement(actor.source, pose, actor.scale, actor.color_matrix, tuple(around) or None)
+            )
     return result
 
 

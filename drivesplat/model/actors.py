@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -19,6 +18,7 @@ from drivesplat.kernels import torch_private
 from drivesplat.kernels.placement import LocalGaussians, ObjectPoses, of_owners, place
 from drivesplat.kernels.quaternions import about_vertical, left_factor, rotation_matrix
 from drivesplat.kernels.time_varying_colors import colors_in_object, colors_in_world
+from drivesplat.model.actor_placements import placement_sets, with_placements
 from drivesplat.model.gaussians import Gaussians, concatenate, recolored
 from drivesplat.model.harmonics import rotation_of_harmonics
 from drivesplat.model.parameters import init_params, learning_rates, make_parameters
@@ -26,21 +26,6 @@ from drivesplat.model.part import ActorPlacement, Part, PartDefinition, RigidGro
 from drivesplat.model.timeline import ActorTrack, Timeline, TimeState
 from drivesplat.scene.motion import HALF_STEP, Motion
 from drivesplat.settings.train import ActorSettings, GaussianSettings, TrackSettings
-
-
-def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:
-    """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
-    quats, translations, sizes = poses.quats.clone(), poses.translations.clone(), poses.sizes.clone()
-    presence = torch.zeros_like(poses.presence)
-    for placement in placements:
-        i, pose = ids.index(placement.source), placement.object_to_world
-        presence[i], sizes[i] = poses.presence[i], placement.scale
-        if pose is not None:
-            presence[i] = 1.0
-            turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
-            quats[i] = torch.from_numpy(turned).to(quats)
-            translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
-    return ObjectPoses(quats, translations, sizes, presence)
 
 
 class Actors(Part):
@@ -121,14 +106,24 @@ class Actors(Part):
 
     @torch.no_grad()
     def velocities(self, time: float) -> Float[Tensor, "n 3"]:
-        states = self.time_state(time - HALF_STEP), self.time_state(time + HALF_STEP)
-        before, after = (self._positions(self.poses(state)) for state in states)
-        return (after - before) / (2.0 * HALF_STEP)
+        return self._velocities(*self._poses_beside(time))
 
     def echoes(self, time: float) -> Float[Tensor, "n 4 2"] | None:
-        if "echoes" not in self.params:
-            return None
-        own, turns = self.params["echoes"], rotation_matrix(self.poses(self.time_state(time)).quats.detach())
+        return self._echoes(self.poses(self.time_state(time))) if "echoes" in self.params else None
+
+    def _poses_beside(self, time: float) -> tuple[ObjectPoses, ObjectPoses]:
+        """The poses HALF_STEP seconds before and after a time."""
+        return self.poses(self.time_state(time - HALF_STEP)), self.poses(self.time_state(time + HALF_STEP))
+
+    def _velocities(self, before: ObjectPoses, after: ObjectPoses) -> Float[Tensor, "n 3"]:
+        """The velocities of its Gaussians, m/s, by poses HALF_STEP seconds before and after; 0 for actors that are
+        absent then."""
+        there = of_owners(before.presence * after.presence, self._owns)[:, None]
+        return there * (self._positions(after) - self._positions(before)) / (2.0 * HALF_STEP)
+
+    def _echoes(self, poses: ObjectPoses) -> Float[Tensor, "n 4 2"]:
+        """The echoes of actors at these poses along directions in the world."""
+        own, turns = self.params["echoes"], rotation_matrix(poses.quats.detach())
         turned = of_owners(turns, self._owns) @ own[:, 1:]
         return torch.cat([own[:, :1], turned], dim=1)
 
@@ -139,17 +134,52 @@ class Actors(Part):
         return place(local, poses, p["owner"], self._owns)[0]
 
     def with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
-        state, known = self.time_state(time), [track.id for track in self.timeline.tracks]
-        poses = self.poses(state)
-        first, copies = [], []
-        for placement in (placement for placement in placements if placement.source in known):
-            repeated = placement.source in {other.source for other in first}
-            (copies if repeated else first).append(placement)
-        sets = [self._recolored(self.placed(state, with_placements(poses, known, first)), first)]
-        for placement in copies:  # few: transforming all actors for each copy costs little
-            placed = self._recolored(self.placed(state, with_placements(poses, known, [placement])), [placement])
-            sets.append(placed[self.params["owner"] == known.index(placement.source)])
+        state, known = self.time_state(time), self._known
+        poses, sets = self.poses(state), []
+        for chosen, rows in self._sets(placements):  # few: transforming all actors for each copy costs little
+            own = [placements[i] for i in chosen]
+            sets.append(self._recolored(self.placed(state, with_placements(poses, known, own)), own)[rows])
         return concatenate(sets)
+
+    @torch.no_grad()
+    def velocities_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Float[Tensor, "m 3"]:
+        recorded, sets = self._poses_beside(time), []
+        for chosen, rows in self._sets(placements):
+            beside = [
+                with_placements(poses, self._known, [placements[i].beside(number) for i in chosen])
+                for number, poses in enumerate(recorded)
+            ]
+            sets.append(self._velocities(*beside)[rows])
+        return torch.cat(sets)
+
+    def echoes_with_placements(
+        self, time: float, placements: Sequence[ActorPlacement]
+    ) -> Float[Tensor, "m 4 2"] | None:
+        if "echoes" not in self.params:
+            return None
+        poses, known = self.poses(self.time_state(time)), self._known
+        placed = (
+            (with_placements(poses, known, [placements[i] for i in chosen]), rows)
+            for chosen, rows in self._sets(placements)
+        )
+        return torch.cat([self._echoes(of_set)[rows] for of_set, rows in placed])
+
+    def placement_of_rows(self, placements: Sequence[ActorPlacement]) -> Int[Tensor, " m"]:
+        numbers, known = [], self._known
+        for chosen, rows in self._sets(placements):
+            of_actors = self.params["owner"].new_full((len(known),), -1)
+            for i in chosen:
+                of_actors[known.index(placements[i].source)] = i
+            numbers.append(of_actors[self.params["owner"]][rows])
+        return torch.cat(numbers)
+
+    def _sets(self, placements: Sequence[ActorPlacement]) -> list[tuple[list[int], slice | Bool[Tensor, " n"]]]:
+        return placement_sets(self._known, self.params["owner"], placements)
+
+    @property
+    def _known(self) -> list[str]:
+        """The ids of its tracks."""
+        return [track.id for track in self.timeline.tracks]
 
     def _recolored(self, gaussians: Gaussians, placements: Sequence[ActorPlacement]) -> Gaussians:
         """All rows of `gaussians`, those of placements with a colour matrix in its colours."""
@@ -207,7 +237,7 @@ class Actors(Part):
         self.fade((self.params["means"].abs() > of_owners(self._reach, self._owns)).any(dim=1))
 
     def of_track(self, track_id: str) -> Bool[Tensor, " n"] | None:
-        known = [track.id for track in self.timeline.tracks]
+        known = self._known
         return self.params["owner"] == known.index(track_id) if track_id in known else None
 
     @torch.no_grad()

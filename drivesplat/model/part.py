@@ -6,11 +6,11 @@ Each part owns its parameters, their learning rates and its densification. A met
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from drivesplat.model.gaussians import Gaussians
@@ -26,12 +26,18 @@ FADED = 1e-4
 class ActorPlacement:
     """An edited pose of an object at one time: the Gaussians of the track `source`, scaled by `scale` about the box
     centre, at `object_to_world` (4, 4) in world metres (None: the recorded pose), their RGB colours mapped by
-    `color_matrix` (3, 3) (None: as trained)."""
+    `color_matrix` (3, 3) (None: as trained). `around` are the poses HALF_STEP seconds before and after an edited one,
+    which give velocities; None: the object stands."""
 
     source: str
     object_to_world: np.ndarray | None = None
     scale: float = 1.0
     color_matrix: np.ndarray | None = None
+    around: tuple[np.ndarray, np.ndarray] | None = None
+
+    def beside(self, number: int) -> "ActorPlacement":
+        """The placement HALF_STEP seconds before (0) or after (1)."""
+        return self if self.around is None else replace(self, object_to_world=self.around[number])
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,22 @@ class Part(nn.Module, ABC):
         """As `at`, with objects at `placements`: an object without a placement is absent; further placements of one
         object are appended as extra rows."""
         return self.at(time)
+
+    def velocities_with_placements(
+        self, time: float, placements: Sequence[ActorPlacement]
+    ) -> Float[Tensor, "m 3"] | None:
+        """The `velocities` of all rows of `with_placements`."""
+        return self.velocities(time)
+
+    def echoes_with_placements(
+        self, time: float, placements: Sequence[ActorPlacement]
+    ) -> Float[Tensor, "m 4 2"] | None:
+        """The `echoes` of all rows of `with_placements`."""
+        return self.echoes(time)
+
+    def placement_of_rows(self, placements: Sequence[ActorPlacement]) -> Int[Tensor, " m"]:
+        """The index of the placement that each row of `with_placements` belongs to; -1 for none."""
+        return torch.full((self.row_count,), -1, device=self.params["means"].device)
 
     @abstractmethod
     def learning_rates(self) -> dict[str, float]:

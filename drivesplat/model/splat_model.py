@@ -6,7 +6,7 @@ from itertools import accumulate
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from drivesplat.errors import ResultError
@@ -88,9 +88,24 @@ class SplatModel(nn.Module):
         """As `gaussians_at`, by the parts' time states."""
         return concatenate([part.at_time_state(state) for part, state in zip(self.parts, states, strict=True)])
 
-    def gaussians_with_placements(self, time: float, placements: Sequence[ActorPlacement]) -> Gaussians:
+    def gaussians_with_placements(
+        self,
+        time: float,
+        placements: Sequence[ActorPlacement],
+        with_velocities: bool = False,
+        with_echoes: bool = False,
+    ) -> Gaussians:
         """As `gaussians_at`, with objects at `placements` and no others: see `Part.with_placements`."""
-        return concatenate([part.with_placements(time, placements) for part in self.parts])
+        found = []
+        for part in self.parts:
+            velocities = part.velocities_with_placements(time, placements) if with_velocities else None
+            echoes = part.echoes_with_placements(time, placements) if with_echoes else None
+            found.append(replace(part.with_placements(time, placements), velocities=velocities, echoes=echoes))
+        return concatenate(found)
+
+    def placement_of_rows(self, placements: Sequence[ActorPlacement]) -> Int[Tensor, " m"]:
+        """The index of the placement of each row of `gaussians_with_placements`; -1 for none."""
+        return torch.cat([part.placement_of_rows(placements) for part in self.parts])
 
     def rigid_groups(self, time: float) -> dict[str, RigidGroup]:
         """The rigid groups of all parts: see `Part.rigid_groups`. Raises ResultError where two have the same name."""

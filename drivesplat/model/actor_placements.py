@@ -1,0 +1,41 @@
+"""Edited poses of the actors of a model, and the rows of Gaussians that they give."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Int
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from drivesplat.kernels.placement import ObjectPoses
+from drivesplat.model.part import ActorPlacement
+
+
+def with_placements(poses: ObjectPoses, ids: Sequence[str], placements: Sequence[ActorPlacement]) -> ObjectPoses:
+    """The poses of the actors `ids` with `placements` applied; an actor without a placement is absent."""
+    quats, translations, sizes = poses.quats.clone(), poses.translations.clone(), poses.sizes.clone()
+    presence = torch.zeros_like(poses.presence)
+    for placement in placements:
+        i, pose = ids.index(placement.source), placement.object_to_world
+        presence[i], sizes[i] = poses.presence[i], placement.scale
+        if pose is not None:
+            presence[i] = 1.0
+            turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+            quats[i] = torch.from_numpy(turned).to(quats)
+            translations[i] = torch.from_numpy(pose[:3, 3]).to(translations)
+    return ObjectPoses(quats, translations, sizes, presence)
+
+
+def placement_sets(
+    ids: Sequence[str], owner: Int[Tensor, " n"], placements: Sequence[ActorPlacement]
+) -> list[tuple[list[int], slice | Bool[Tensor, " n"]]]:
+    """The sets of Gaussians of the actors `ids` that placements give, in order: the indices of the placements of each
+    set, and which of the n Gaussians it has. The first has all Gaussians, with the first placement of each actor; each
+    further placement of an actor is a set of its Gaussians alone. `owner` is the actor of every Gaussian."""
+    own = [i for i, placement in enumerate(placements) if placement.source in ids]
+    first = {placements[i].source: i for i in reversed(own)}
+    copies = (i for i in own if first[placements[i].source] != i)
+    return [
+        (sorted(first.values()), slice(None)),
+        *(([i], owner == ids.index(placements[i].source)) for i in copies),
+    ]
