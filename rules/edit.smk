@@ -4,7 +4,8 @@
 # named by datasets.<name>.edits, is read while planning: a changed edit reruns, its neighbours in the file do not.
 # OUTPUTS: <results>/{scene}/{method}/edits/{edit}.mp4, {edit}.png and {edit}.json; {edit}/ with frames, where wanted;
 # <results>/{scene}/{method}/quad/{edit}.mp4 and {edit}.json, on request; likewise
-# <results>/{scene}/{method}/edits/{edit}/drive/ and trajectories/{trajectory}/drive/, with drive.json.
+# <results>/{scene}/{method}/edits/{edit}/drive/ and trajectories/{trajectory}/drive/, with drive.json; and scans/ beside
+# drive/, with scans.json, of methods that render LiDAR.
 
 
 rule edit:
@@ -120,3 +121,36 @@ rule drive_folder:
         code=plan.code("drive_folder"),
     script:
         "../workflow_scripts/drive_folder.py"
+
+
+rule scan_folder:
+    """
+    Renders the LiDAR scans of an edited drive, or of one beside the recorded path: the recorded rays from where the
+    sensor now is, with ranges, intensities, drops, and the object that each return belongs to.
+    """
+    input:
+        checkpoint="<results>/{scene}/{method}/checkpoint.npz",
+        scene=plan.scene,
+        scans="<results>/{scene}/scans.npz",
+    output:
+        scans="<results>/{scene}/{method}/{kind}/{drive}/scans/scans.json",
+    log:
+        "<logs>/{scene}/{method}/scan_folder_{kind}_{drive}.log",
+    benchmark:
+        "<benchmarks>/{scene}/{method}/scan_folder_{kind}_{drive}.tsv"
+    wildcard_constraints:
+        kind="edits|trajectories",
+        drive="[^/]+",
+    conda:
+        "../envs/drivesplat.yaml"
+    threads: plan.threads(on_gpu=8)
+    resources:
+        gpu=plan.gpus,
+        device=plan.device,
+        mem_mb=8000,
+        runtime=60,
+    params:
+        settings=plan.settings("scan_folder"),
+        code=plan.code("scan_folder"),
+    script:
+        "../workflow_scripts/scan_folder.py"

@@ -47,12 +47,12 @@ class EgoEdit:
                 )
         return cls(scene, steps, begin)
 
-    def within(self, frames: Sequence[Frame], times: np.ndarray) -> np.ndarray:
+    def within(self, frames: Sequence[Frame], times: np.ndarray, until: float = 0.0) -> np.ndarray:
         """Whether the vehicle at `times` (n,) in seconds is on the part of its path in which the camera that took
-        `frames` recorded: (n,) bool."""
+        `frames` recorded, or before it was there at the second `until`: (n,) bool."""
         clock = recorded_time(self.steps, self.begin, times)
         first, last = (self.scene.seconds(frames[i].timestamp) for i in (0, -1))
-        return (clock >= first - MAX_LEAD) & (clock <= last + 1e-9)
+        return (clock >= first - MAX_LEAD) & (clock <= max(last, until) + 1e-9)
 
     def poses(self, frames: Sequence[Frame], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Camera to world and ego to world (n, 4, 4) at `times` (n,) in seconds, of the camera that took `frames`."""

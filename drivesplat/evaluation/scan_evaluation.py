@@ -18,11 +18,7 @@ def rendered_scan(
     model: SplatModel, recorded: RecordedScan, beam_spread: tuple[float, float], device: torch.device
 ) -> RenderedScan:
     """What the rays of a recorded scan return, by a model. `beam_spread` in radians."""
-    picture = model.scan(view_of_scan(recorded, beam_spread, device))
-    ranges, drops, intensities = (
-        values.cpu().numpy() for values in (picture.range, 1.0 - picture.returned, picture.intensity)
-    )
-    return RenderedScan(ranges, drops, intensities)
+    return model.scan(view_of_scan(recorded, beam_spread, device)).rendered()
 
 
 def lidar_metrics(

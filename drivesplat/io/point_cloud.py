@@ -1,6 +1,7 @@
 """Coloured points as PLY files, with a JSON note on their origin in the header."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,17 @@ class PointCloud:
 
 
 def write_ply(path: str | Path, points: PointCloud) -> None:
-    columns = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    vertices = np.rec.fromarrays([*points.positions.T, *points.colors.T], dtype=columns)
+    names = ("x", "y", "z", "red", "green", "blue")
+    columns = (*points.positions.T.astype(np.float32), *points.colors.T.astype(np.uint8))
+    write_vertices(path, dict(zip(names, columns, strict=True)), points.note)
+
+
+def write_vertices(path: str | Path, columns: Mapping[str, np.ndarray], note: Mapping[str, Any]) -> None:
+    """Writes vertices with a property for each of `columns`, (n,) in its own type, and the note."""
+    vertices = np.rec.fromarrays([*columns.values()], dtype=[(name, c.dtype) for name, c in columns.items()])
     element = PlyElement.describe(vertices, "vertex")
     with atomic_write(path) as file:
-        PlyData([element], byte_order="<", comments=[_NOTE + canonical_json(points.note)]).write(file)
+        PlyData([element], byte_order="<", comments=[_NOTE + canonical_json(note)]).write(file)
 
 
 def read_ply(path: str | Path, rule: str) -> PointCloud:

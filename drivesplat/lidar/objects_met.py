@@ -1,5 +1,6 @@
 """The objects that LiDAR returns lie in, each at its own time."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,9 +24,10 @@ class TrackedBoxes:
     motions: list[Motion]
 
     @classmethod
-    def of_scene(cls, scene: Scene) -> "TrackedBoxes":
-        """The boxes of a scene."""
-        chosen = [i for i, track in enumerate(scene.tracks) if track.object_class.is_dynamic]
+    def of_scene(cls, scene: Scene, without: Collection[str] = ()) -> "TrackedBoxes":
+        """The boxes of a scene, but those of the tracks `without`."""
+        wanted = (track.object_class.is_dynamic and track.id not in without for track in scene.tracks)
+        chosen = [i for i, is_wanted in enumerate(wanted) if is_wanted]
         tracks = [scene.tracks[i] for i in chosen]
         return cls(chosen, [track.size for track in tracks], [Motion.of_track(scene, track) for track in tracks])
 

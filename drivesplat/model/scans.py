@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from drivesplat.errors import ResultError
 from drivesplat.model.gaussians import Gaussians
 from drivesplat.model.view import inverse
-from drivesplat.rasterization.scans import RayGrid, ScanMotion, rasterize_scan
+from drivesplat.rasterization.scans import RayGrid, ScanMotion, ScanRendering, rasterize_scan
+from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import RecordedScan
 
 NOTHING = 1e-6
@@ -47,6 +48,11 @@ class ScanPicture:
     alpha: Float[Tensor, "b a"]
     alpha_before: Float[Tensor, "b a"] | None
 
+    def rendered(self) -> RenderedScan:
+        """The same as arrays."""
+        tensors = (self.range, 1.0 - self.returned, self.intensity)
+        return RenderedScan(*(values.detach().cpu().numpy() for values in tensors))
+
 
 def view_of_scan(recorded: RecordedScan, beam_spread: tuple[float, float], device: torch.device) -> ScanView:
     """A recorded scan as a view. `beam_spread` in radians."""
@@ -62,11 +68,25 @@ def scan_picture(gaussians: Gaussians, view: ScanView, before: Float[Tensor, "b 
         raise ResultError("the model was trained without LiDAR: train it with train.scans.share above 0")
     toward = torch.nn.functional.normalize(gaussians.means.detach() - view.sensor_to_world[:3, 3], dim=-1)
     logits = gaussians.echoes[:, 0] + torch.einsum("nd,ndc->nc", toward, gaussians.echoes[:, 1:])
-    rendering = rasterize_scan(
-        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, torch.sigmoid(logits),
-        view.world_to_sensor, view.rays, beam_spread=view.beam_spread,
-        motion=ScanMotion(view.linear, view.angular, gaussians.velocities), before=before,
-    )  # fmt: skip
+    rendering = _rasterized(gaussians, view, torch.sigmoid(logits), before)
     intensity, returned = rendering.values.unbind(dim=-1)
     met = rendering.alpha.clamp(min=NOTHING)
     return ScanPicture(gaussians, rendering.range, returned, intensity / met, rendering.alpha, rendering.alpha_before)
+
+
+def group_met(gaussians: Gaussians, view: ScanView, groups: Int[Tensor, " n"]) -> Int[Tensor, "b a"]:
+    """The one of `groups`, numbers from -1, whose Gaussians contribute most to each ray; -1 where nothing is met."""
+    numbers, own = groups.unique(return_inverse=True)
+    shares = torch.nn.functional.one_hot(own, len(numbers)).to(gaussians.means)
+    rendering = _rasterized(gaussians, view, shares)
+    return numbers[rendering.values.argmax(dim=-1)].where(rendering.alpha > NOTHING, -1)
+
+
+def _rasterized(
+    gaussians: Gaussians, view: ScanView, values: Float[Tensor, "n v"], before: Float[Tensor, "b a"] | None = None
+) -> ScanRendering:
+    return rasterize_scan(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, values,
+        view.world_to_sensor, view.rays, beam_spread=view.beam_spread,
+        motion=ScanMotion(view.linear, view.angular, gaussians.velocities), before=before,
+    )  # fmt: skip

@@ -64,15 +64,17 @@ class TruthView:
 
 @dataclass(frozen=True)
 class TruthScan:
-    """A LiDAR scan: the token of its sample_data, its key frame, offset and edit as of a view, and the name of an .npz
-    file. Its arrays (beams, steps), one entry per ray of the pattern: `range` without noise in metres (float32,
-    infinite without a hit), `intensity` in [0, 1], `instance` as in instance images, `returned`."""
+    """A LiDAR scan: the token of its sample_data, its key frame, offset, edit and the instance that it is `without` as
+    of a view, and the name of an .npz file. Its arrays (beams, steps), one entry per ray of the pattern: `range`
+    without noise in metres (float32, infinite without a hit), `intensity` in [0, 1], `instance` as in instance images,
+    `returned`."""
 
     token: str
     key_frame: int
     left_m: float
     edit: str | None
     file: str
+    without: str | None = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,17 @@ class Truth:
     def without_leading(self, camera: str) -> TruthView | None:
         """The view of a camera without the vehicle ahead."""
         return next((view for view in self._of(camera) if view.without is not None), None)
+
+    def scans_of(self, left_m: float = 0.0, without: str | None = None) -> dict[str, TruthScan]:
+        """The scans of the drive as it was, from so far to the left and without that instance, by the token of their
+        sample_data."""
+        wanted = (scan for scan in self.scans if scan.edit is None and scan.without == without)
+        return {scan.token: scan for scan in wanted if scan.left_m == left_m}
+
+    @property
+    def left_of_scans(self) -> list[float]:
+        """How far to the left of the recorded path (metres) there are scans of the drive as it was."""
+        return list(dict.fromkeys(scan.left_m for scan in self.scans if scan.left_m and scan.edit is None))
 
     def _of(self, camera: str) -> Iterator[TruthView]:
         return (view for view in self.views if view.camera == camera and view.edit is None)

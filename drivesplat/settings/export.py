@@ -10,6 +10,7 @@ from drivesplat.settings.images import HoldoutSettings, ImageSettings
 from drivesplat.settings.render import TrajectorySettings
 
 ExportFormat = Literal["ply", "usd", "viewer", "colmap", "spz", "sog"]
+ScanFormat = Literal["npz", "ply", "pcd.bin"]
 
 MAX_DISTANCE = 1000.0
 """Metres from the origin of the world beyond which no export holds a Gaussian: what lies there is the sky's."""
@@ -36,9 +37,13 @@ class ExportSettings(Settings):
     """Width in pixels of the recorded images in viewer.html, one JPEG per key frame, about 30 KB each at 640. 0 = none.
     """
 
-    @field_validator("formats")
+    scan_formats: tuple[ScanFormat, ...] = Field(("npz", "ply"), min_length=1)
+    """Files of rendered LiDAR scans: 'npz' (all rays), 'ply' (returns in world coordinates) and 'pcd.bin' (returns as
+    nuScenes has them). They are made on request. docs/lidar.md"""
+
+    @field_validator("formats", "scan_formats")
     @classmethod
-    def _once(cls, value: tuple[ExportFormat, ...]) -> tuple[ExportFormat, ...]:
+    def _once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(dict.fromkeys(value))
 
 
@@ -79,5 +84,15 @@ class DriveJob(Settings):
     images: ImageSettings
     holdout: HoldoutSettings
     width: int | None = None
+    edit: Edit | None = None
+    trajectory: TrajectorySettings | None = None
+
+
+class ScanFolderJob(Settings):
+    """All settings that determine one folder of rendered scans: the `edit` of its drive, or the `trajectory` beside the
+    recorded one."""
+
+    eval_camera: str
+    formats: tuple[ScanFormat, ...]
     edit: Edit | None = None
     trajectory: TrajectorySettings | None = None

@@ -14,8 +14,8 @@ from drivesplat.settings.track_references import EditReference, TrackReferences
 from drivesplat.workflow.film_names import scene_edits
 from drivesplat.workflow.stages import EDITS
 
-RULES_OF_EDITS = ("edit", "quad", "drive_folder")
-"""Rules that render an edit; the last also renders trajectories, which name no tracks."""
+RULES_OF_EDITS = ("edit", "quad", "drive_folder", "scan_folder")
+"""Rules that render an edit; the last two also render trajectories, which name no tracks."""
 RULES_OF_SUBJECT = ("ghost_panel", "remove_actor")
 """Rules that show the vehicle that `subjects` names."""
 FILES_OF_SUBJECT = ("ghost_panel", "removal", "with_car", "without_car")
@@ -94,7 +94,7 @@ def refuse_wrong_tracks(config: Config, jobs: Iterable[Any], scene_file: Callabl
 
 
 def _edit_of(wildcards: Any) -> str | None:
-    """The edit that a job renders; None for the drive folder of a trajectory."""
+    """The edit that a job renders; None for the folder of a trajectory."""
     if getattr(wildcards, "kind", EDITS) != EDITS:
         return None
     return wildcards.drive if hasattr(wildcards, "drive") else wildcards.edit

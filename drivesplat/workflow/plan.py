@@ -175,11 +175,18 @@ class Plan(Outputs):
             raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", film))
 
     def _refuse_unknown_drive(self, scene: str, method: str, path: list[str]) -> None:
-        """Raises ConfigError if `path` below a method's folder is not the drive.json of an edit or a trajectory."""
+        """Raises ConfigError if `path` below a method's folder is not the drive.json or the scans.json of an edit or a
+        trajectory, or if the method renders no scans."""
         kind, name, *rest = path
-        if rest == ["drive"]:
+        if rest in (["drive"], ["scans"]):
             folder = "/".join([self.config.results_dir, scene, method, *path])
-            raise ConfigError(f"{folder} is a folder; ask for the file {folder}/drive.json")
+            raise ConfigError(f"{folder} is a folder; ask for the file {folder}/{rest[0]}.json")
+        if rest[:1] == ["scans"] and method not in self.methods_with_lidar(scene):
+            able = [name for name in self.methods_with_lidar(scene) if name in self.config.methods]
+            raise ConfigError(
+                f"method {method!r} does not render LiDAR, so it has no scans; those do: {', '.join(able) or 'none'} "
+                "(train.scans.share above 0, as in presets/lidar.yaml)"
+            )
         if kind == EDITS:
             self._refuse_without_actors(method)
             self._refuse_unknown_edit(scene, name)
@@ -189,8 +196,8 @@ class Plan(Outputs):
             raise ConfigError(no_such_film(for_scene(self.config, scene), f"scene {scene}", name))
         if trajectories[name].parts != "all":
             raise ConfigError(
-                f"trajectory {name!r} shows the {trajectories[name].parts} parts alone; a drive folder shows all: "
-                "choose another trajectory"
+                f"trajectory {name!r} shows the {trajectories[name].parts} parts alone; drive folders and scans "
+                "show all: choose another trajectory"
             )
 
     def _refuse_without_actors(self, method: str) -> None:

@@ -16,7 +16,7 @@ from drivesplat.settings.actor_seed import ActorSeedJob
 from drivesplat.settings.config import Config, for_scene
 from drivesplat.settings.dataset import DatasetSettings
 from drivesplat.settings.evaluate import EvaluateJob, EvaluateScansJob
-from drivesplat.settings.export import DriveJob, ExportJob, FarJob, SplatJob, ViewerJob
+from drivesplat.settings.export import DriveJob, ExportJob, FarJob, ScanFolderJob, SplatJob, ViewerJob
 from drivesplat.settings.extract import SceneSource
 from drivesplat.settings.free_space import FreeSpaceJob
 from drivesplat.settings.images import ParserJob
@@ -47,10 +47,11 @@ SIDE_BY_SIDE = "scene_metrics"
 """The stage that combines eval.json files; none of them depends on it."""
 OF_ONE_SCENE = (
     "demo_world", "extract", "edit", "quad", "ghost_panel", "remove_actor", "export_viewer", "drive_folder",
+    "scan_folder",
 )  # fmt: skip
 """Stages whose settings depend on the scene itself; all others have the same for all scenes of a dataset."""
 EDITS, TRAJECTORIES = "edits", "trajectories"
-"""Kinds of drive folders, and the folders of a method in which they lie."""
+"""Kinds of folders of drives and of scans, and the folders of a method in which they lie."""
 SCANS, SCAN_BASELINES = "scans", "scan_baselines"
 """The stages of a scene's LiDAR scans, and of the figures that methods which render them have to beat."""
 TRAINING_INPUTS = ("actors", "lidar_depth", "free_space", SCANS)
@@ -59,9 +60,9 @@ TRAINING_INPUTS = ("actors", "lidar_depth", "free_space", SCANS)
 
 @dataclass(frozen=True)
 class Place:
-    """The dataset, scene, method and film (trajectory or edit; of a drive folder with its kind, 'edits/…') of a job,
-    empty where it has none, and the config that applies to it. `scene` is also empty for stages that are not in
-    OF_ONE_SCENE."""
+    """The dataset, scene, method and film (trajectory or edit; of a folder of a drive or of scans with its kind,
+    'edits/…') of a job, empty where it has none, and the config that applies to it. `scene` is also empty for stages
+    that are not in OF_ONE_SCENE."""
 
     config: Config
     dataset_name: str
@@ -225,11 +226,18 @@ def _edit(at: Place) -> dict[str, Any]:
     return {**_quad(at), "frames": at.config.render.edited_frames}
 
 
-def _drive(at: Place) -> dict[str, Any]:
+def _edit_or_trajectory(at: Place) -> dict[str, Any]:
     kind, _, name = at.film.partition("/")
     of_film = replace(at, film=name)
-    chosen = {"edit": _quad(of_film)["edit"]} if kind == EDITS else {"trajectory": _film(of_film)["trajectory"]}
-    return {**chosen, "width": at.config.export.drive_width}
+    return {"edit": _quad(of_film)["edit"]} if kind == EDITS else {"trajectory": _film(of_film)["trajectory"]}
+
+
+def _drive(at: Place) -> dict[str, Any]:
+    return {**_edit_or_trajectory(at), "width": at.config.export.drive_width}
+
+
+def _scan_folder(at: Place) -> dict[str, Any]:
+    return {**_edit_or_trajectory(at), "formats": at.config.export.scan_formats}
 
 
 def _encoding(at: Place) -> dict[str, Any]:
@@ -296,6 +304,7 @@ _STAGES: dict[str, tuple[type[Settings], Callable[[Place], dict[str, Any]]]] = {
     "edit": (EditJob, _edit),
     "quad": (EditJob, _quad),
     "drive_folder": (DriveJob, _drive),
+    "scan_folder": (ScanFolderJob, _scan_folder),
     "ghost_panel": (PanelJob, _subject),
     "remove_actor": (RemovalJob, _subject),
     "far_gaussians": (FarJob, lambda at: {"max_distance": at.config.export.max_distance}),

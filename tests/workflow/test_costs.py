@@ -54,6 +54,10 @@ def trained(results: Path, scene: str, method: str, seconds: float, **more: Any)
             "0103/street/drive_folder_edits_stop.tsv",
             JobId("drive_folder", "0103", "street", "edits_stop"),
         ),
+        (
+            "0103/street/scan_folder_trajectories_lateral_2m.tsv",
+            JobId("scan_folder", "0103", "street", "trajectories_lateral_2m"),
+        ),
         ("0103/compare.tsv", JobId("compare", "0103")),
         ("0103/street/edit_v1.2_stop.tsv", JobId("edit", "0103", "street", "v1.2_stop")),
     ],

@@ -1,5 +1,8 @@
 """A method that renders LiDAR through the whole workflow."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 from helpers.workflow_copy import TINY_TRAINING, WorkflowCopy
 
@@ -60,6 +63,23 @@ def test_scans_become_a_picture_a_film_and_a_table_of_the_report(copy):
     assert copy.read("results/gap_report.json")["lidar"]["rows"][0]["method"] == "with_lidar"
     refused = copy.run("results/0001/vanilla/lidar.mp4")
     assert refused.returncode != 0 and "renders no LiDAR of scene 0001" in refused.stdout
+
+
+def test_scans_from_beside_the_path_come_as_files_and_a_changed_format_makes_them_again(copy):
+    target = "results/0001/with_lidar/trajectories/lateral_2m/scans/scans.json"
+    done = copy.run(target)
+    assert done.returncode == 0, done.stdout
+    record = copy.read(target)
+    assert len(record["scans"]) == 10 and record["offset"]["lateral"] == 2.0
+    for scan in record["scans"]:
+        with np.load(copy.folder / Path(target).parent / scan["files"]["npz"]) as arrays:
+            assert (
+                arrays["ranges"].shape == arrays["azimuths"].shape and int(arrays["returned"].sum()) == scan["returns"]
+            )
+    assert record["provenance"]["stages"]["with_lidar/scan_folder"]["settings"]["formats"] == ["npz", "ply"]
+    copy.config["export"] = {"scan_formats": ["npz"]}
+    copy.write_config()
+    assert copy.planned(target) == {"scan_folder": 1}
 
 
 def test_a_changed_weight_of_scans_trains_that_method_alone_again(copy):

@@ -36,6 +36,7 @@ def config(tmp_path):
         (["drives"], ["gone", "more"], False),
         (["results/0001/street/edits/gone/drive/drive.json"], ["gone"], False),
         (["results/0001/street/trajectories/gone/drive/drive.json"], [], False),
+        (["results/0001/street/edits/gone/scans/scans.json"], ["gone"], False),
         (["results/0001/vanilla/removal.png"], [], True),
         (["results/0002/vanilla/removal.png"], [], False),
         (None, [], False),

@@ -283,6 +283,39 @@ def test_drive_folders_are_of_edits_and_of_trajectories_that_show_everything(tmp
             made.refuse_unknown([f"elsewhere/a1/{target}"])
 
 
+def test_scans_are_of_edits_and_trajectories_of_methods_that_render_lidar(tmp_path):
+    edits = tmp_path / "edits.yaml"
+    edits.write_text("edits: {gone: [remove: {track: a}]}")
+    dataset = {"scenes": ["a1"], "edits": {"a1": str(edits)}}
+    lidar = {"overrides": {"train": {"scans": {"share": 0.3}}}}
+    methods = {"vanilla": {}, "static": lidar, "moving": {"parts": ["background", "actors"], **lidar}}
+    trajectories = {"original": {}, "objects": {"parts": "moving"}}
+    made = plan(render={"trajectories": trajectories}, datasets={"a": dataset}, methods=methods)
+    made.refuse_unknown([
+        "elsewhere/a1/moving/edits/gone/scans/scans.json",
+        "elsewhere/a1/static/trajectories/original/scans/scans.json",
+    ])  # fmt: skip
+    for target, message in {
+        "vanilla/trajectories/original/scans/scans.json": "'vanilla' does not render LiDAR.* those do: static, moving",
+        "static/edits/gone/scans/scans.json": "'static' knows no actors",
+        "moving/edits/halt/scans/scans.json": "no edit called 'halt'",
+        "moving/trajectories/objects/scans/scans.json": "shows the moving parts alone",
+        "moving/edits/gone/scans": "ask for the file elsewhere/a1/moving/edits/gone/scans/scans.json",
+    }.items():
+        with pytest.raises(ConfigError, match=message) as refused:
+            made.refuse_unknown([f"elsewhere/a1/{target}"])
+        assert "\n" not in str(refused.value)
+
+
+def test_settings_of_scans_name_the_edit_or_the_trajectory_and_the_formats():
+    made = plan(export={"scan_formats": ["pcd.bin", "npz", "npz"]})
+    settings = json.loads(made.stage_settings("scan_folder", "a1", "vanilla", "trajectories/lateral_2m"))
+    assert settings["formats"] == ["pcd.bin", "npz"] and settings["edit"] is None
+    assert settings["trajectory"]["lateral"] == 2.0
+    with pytest.raises(ConfigError, match="scan_formats"):
+        plan(export={"scan_formats": []})
+
+
 def test_the_film_of_all_methods_is_left_out_where_the_settings_say_so_and_can_be_asked_for():
     made = plan(b={"render": {"compare": False}})
     assert [path for path in made.films() if "compare" in path] == [f"elsewhere/{s}/compare.mp4" for s in ("a1", "a2")]

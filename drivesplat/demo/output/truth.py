@@ -50,11 +50,7 @@ class ScanPlan:
 
 def planned_views(recorder: Recorder) -> list[TruthPlan]:
     """The views of each camera with truth: recorded, lateral, without the leading vehicle, edited."""
-    plans, settings = [], recorder.world.truth
-    viewpoints = {"recorded": Viewpoint(), **_lateral(recorder)}
-    if recorder.street.leading:
-        viewpoints["without_leading"] = Viewpoint(without=recorder.street.leading)
-    viewpoints |= {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
+    plans, settings, viewpoints = [], recorder.world.truth, _viewpoints(recorder)
     for sensor in SENSORS:
         if sensor.channel in settings.cameras:
             plans += [TruthPlan(sensor, view, f"{sensor.channel}/{name}") for name, view in viewpoints.items()]
@@ -62,12 +58,19 @@ def planned_views(recorder: Recorder) -> list[TruthPlan]:
 
 
 def planned_scans(recorder: Recorder) -> list[ScanPlan]:
-    """The scans of the LiDAR: recorded, from beside, edited; none unless the settings ask for them."""
+    """The scans of the LiDAR: recorded, lateral, without the leading vehicle, edited; none unless the settings ask for
+    them."""
     if not recorder.world.truth.lidar:
         return []
+    return [ScanPlan(view, f"lidar/{name}") for name, view in _viewpoints(recorder).items()]
+
+
+def _viewpoints(recorder: Recorder) -> dict[str, Viewpoint]:
+    """The viewpoints of truth, by the names of their folders."""
     viewpoints = {"recorded": Viewpoint(), **_lateral(recorder)}
-    viewpoints |= {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
-    return [ScanPlan(view, f"lidar/{name}") for name, view in viewpoints.items()]
+    if recorder.street.leading:
+        viewpoints["without_leading"] = Viewpoint(without=recorder.street.leading)
+    return viewpoints | {f"edits/{name}": Viewpoint(edit=name) for name in recorder.edits}
 
 
 def key_frames_of(recorder: Recorder, plan: TruthPlan) -> list[int]:
@@ -147,7 +150,8 @@ def write_scan(root: Path, recorder: Recorder, plan: ScanPlan, index: int) -> Tr
             returned=found.returned,
         )
     view = plan.viewpoint
-    return TruthScan(token(recorder.scene, LIDAR.channel, time_us), index, view.left, view.edit, name)
+    without = recorder.instance(view.without) if view.without else None
+    return TruthScan(token(recorder.scene, LIDAR.channel, time_us), index, view.left, view.edit, name, without)
 
 
 def write_truth(root: Path, recorder: Recorder, views: Iterable[TruthView], scans: Iterable[TruthScan]) -> None:

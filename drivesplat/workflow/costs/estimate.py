@@ -11,7 +11,9 @@ from drivesplat.settings.config import Config, for_scene
 from drivesplat.workflow.costs.measured import TRAIN, WORLD, Cost, JobId
 
 NOT_MEASURED = "not measured yet"
-MEMBER_FOLDERS = {"masks.json": ".", "checkpoint.npz": "tensorboard", "parts.json": ".", "drive.json": "."}
+MEMBER_FOLDERS = {
+    "masks.json": ".", "checkpoint.npz": "tensorboard", "parts.json": ".", "drive.json": ".", "scans.json": ".",
+}  # fmt: skip
 """Outputs beside which a job writes files that no rule declares, and the folder of these."""
 
 

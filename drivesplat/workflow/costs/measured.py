@@ -10,7 +10,7 @@ from typing import Any
 BENCHMARKS = "benchmarks"
 """The folder of benchmark files in that of the results."""
 TRAIN, FILM, EDIT, QUAD, FILM_PARTS, WORLD = "train", "film", "edit", "quad", "film_parts", "demo_world"
-DRIVE = "drive_folder"
+DRIVE, SCANS = "drive_folder", "scan_folder"
 COLUMNS = {"max_rss_mb": "max_rss", "cpu_seconds": "cpu_time", "mean_load": "mean_load"}
 """Fields of a Cost and the columns of Snakemake's benchmark files that hold them."""
 RENAMED = {"metrics": "scene_metrics"}
@@ -19,7 +19,7 @@ RENAMED = {"metrics": "scene_metrics"}
 
 @dataclass(frozen=True)
 class JobId:
-    """The identity of a job: stage, scene, method, and name of its film, edit or drive folder, each empty where it has
+    """The identity of a job: stage, scene, method, and name of its film, edit or folder, each empty where it has
     none. For the job that generates a synthetic world, `film` is the dataset."""
 
     stage: str
@@ -34,7 +34,7 @@ class JobId:
         if place == [WORLD]:
             return cls(WORLD, film=name)
         scene, method = [*place, "", ""][:2]
-        for stage in (FILM, EDIT, QUAD, DRIVE):
+        for stage in (FILM, EDIT, QUAD, DRIVE, SCANS):
             if method and name.startswith(f"{stage}_") and name != FILM_PARTS:
                 return cls(stage, scene, method, name.removeprefix(f"{stage}_"))
         return cls(RENAMED.get(name, name), scene, method)

@@ -1,0 +1,156 @@
+"""LiDAR scans of an edited drive, or of one beside the recorded path: the recorded rays, fired from where the sensor
+now is."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int, Int16
+
+from drivesplat.edited_motion.edited_actors import EditedActor
+from drivesplat.editing.actors import recorded_and_edited, trained_actors
+from drivesplat.editing.ego import EgoEdit
+from drivesplat.editing.film import actor_placements, collisions
+from drivesplat.lidar.objects_met import TrackedBoxes
+from drivesplat.model.scans import ScanView, group_met, view_of_scan
+from drivesplat.model.splat_model import SplatModel
+from drivesplat.rendering.sensor_path import beside, carried, recorded_ego, sensor_poses_of
+from drivesplat.rendering.trajectory import recorded_frames
+from drivesplat.scene.scan import RenderedScan
+from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan
+from drivesplat.scene.scene import Scene, Track
+from drivesplat.settings.edit import Edit
+from drivesplat.settings.export import ScanFolderJob
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """What a LiDAR would have measured. `sensor` has its rays, its pose and its velocities (what else it holds was
+    recorded); `rendered`, what the rays return; `objects`, the index into `ScanDrive.objects` of what each return
+    belongs to, or NO_OBJECT."""
+
+    sensor: RecordedScan
+    rendered: RenderedScan
+    objects: Int16[np.ndarray, "b a"]
+
+    @property
+    def returned(self) -> Bool[np.ndarray, "b a"]:
+        """The rays that return, without those that meet the ego vehicle or a broken sector."""
+        return self.rendered.returned & self.sensor.measured
+
+    def places(self) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+        """The returns in world coordinates, beam by beam, and the sensor's positions at their times, metres."""
+        offsets = self.sensor.scan.rays.offsets_s[self.returned].astype(np.float64)
+        poses = sensor_poses_of(self.sensor)(offsets)
+        seen = (self.sensor.scan.rays.directions() * self.rendered.ranges[..., None])[self.returned].astype(np.float64)
+        return np.einsum("nij,nj->ni", poses[:, :3, :3], seen) + poses[:, :3, 3], poses[:, :3, 3]
+
+
+@dataclass(frozen=True)
+class ScanDrive:
+    """Scans to render: the rays of `sensors`, each with the pose and the velocities that the sensor then has; the
+    `actors` of the model as they then are; and the annotated objects (`others`) that the model shows in its static
+    part, with their `boxes`."""
+
+    sensors: Sequence[RecordedScan]
+    actors: Sequence[EditedActor]
+    others: Sequence[Track]
+    boxes: TrackedBoxes
+
+    def objects(self, scene: Scene) -> list[dict[str, Any]]:
+        """What returns may belong to, as plain data: id, track whose Gaussians it has, category, class, and length,
+        width, height in metres. First the actors, then the other objects."""
+        sources = {track.id: track for track in scene.tracks}
+        found = [(actor.id, sources[actor.source], actor.size) for actor in self.actors]
+        found += [(track.id, track, track.size) for track in self.others]
+        return [
+            {
+                "id": name, "track": source.id, "category": source.category, "class": source.object_class.value,
+                "size": [round(float(value), 4) for value in size],
+            }
+            for name, source, size in found
+        ]  # fmt: skip
+
+    def simulated(
+        self, model: SplatModel, beam_spread: tuple[float, float], device: torch.device
+    ) -> Iterator[SimulatedScan]:
+        """The scans in order. `beam_spread` in radians."""
+        for sensor in self.sensors:
+            yield self._simulated(model, sensor, view_of_scan(sensor, beam_spread, device))
+
+    @torch.no_grad()
+    def _simulated(self, model: SplatModel, sensor: RecordedScan, view: ScanView) -> SimulatedScan:
+        time = np.array([sensor.seconds])
+        present = [i for i, actor in enumerate(self.actors) if actor.present(time)[0]]
+        (placed,) = actor_placements([self.actors[i] for i in present], time)
+        gaussians = model.gaussians_with_placements(sensor.seconds, placed, with_velocities=True, with_echoes=True)
+        rendered = model.scan(view, gaussians=gaussians).rendered()
+        objects = np.full(rendered.ranges.shape, NO_OBJECT, dtype=np.int16)
+        found = SimulatedScan(sensor, rendered, objects)
+        if placed:
+            numbers = np.array([*present, NO_OBJECT], dtype=np.int16)  # the last is what -1 finds
+            met = group_met(gaussians, view, model.placement_of_rows(placed)).cpu().numpy()
+            objects[found.returned] = numbers[met[found.returned]]
+        static = objects[found.returned] == NO_OBJECT
+        objects[found.returned] = np.where(static, self._boxes_met(found), objects[found.returned])
+        return found
+
+    def _boxes_met(self, found: SimulatedScan) -> Int[np.ndarray, " n"]:
+        """The objects in whose boxes the returns lie, of those that the static part shows."""
+        numbers = np.full(max([*self.boxes.indices, -1]) + 2, NO_OBJECT)  # the last is what NO_OBJECT finds
+        numbers[self.boxes.indices] = len(self.actors) + np.arange(len(self.others))
+        seconds = found.sensor.seconds + found.sensor.scan.rays.offsets_s[found.returned].astype(np.float64)
+        return numbers[self.boxes.met(*found.places(), seconds)]
+
+
+def scan_drive(
+    scene: Scene, model: SplatModel, scans: Sequence[RecordedScan], job: ScanFolderJob, where: str
+) -> ScanDrive:
+    """The drive of `job`: the rays of `scans`, as long as the ego vehicle is on its recorded path.
+
+    Warns where a sensor is inside a vehicle. Raises ConfigError, starting with `where`, if the edit does not fit the
+    scene or the model has no actors; DatasetError as `recorded_ego`; ResultError as `trained_actors`.
+    """
+    if job.edit is None:
+        trained = actors = trained_actors(model, scene, where)
+        sensors = _beside(scene, scans, job)
+    else:
+        trained, actors = recorded_and_edited(model, scene, job.eval_camera, job.edit, where)
+        sensors = _carried(scene, scans, job.eval_camera, job.edit, where)
+    boxes = TrackedBoxes.of_scene(scene, without={actor.id for actor in trained})
+    if sensors:
+        poses, seconds = np.stack([s.sensor_to_world for s in sensors]), np.array([s.seconds for s in sensors])
+        colliding = collisions(actors, poses, seconds)
+        if colliding.any():
+            first, last = seconds[colliding][[0, -1]]
+            log.warning("%s: the LiDAR is inside a vehicle between %.1f and %.1f s", where, first, last)
+    return ScanDrive(sensors, actors, [scene.tracks[i] for i in boxes.indices], boxes)
+
+
+def _beside(scene: Scene, scans: Sequence[RecordedScan], job: ScanFolderJob) -> list[RecordedScan]:
+    """The scans from beside the recorded path."""
+    offset = job.trajectory
+    if offset is None or not (offset.lateral or offset.vertical or offset.yaw):
+        return list(scans)
+    ego = recorded_ego(scene, job.eval_camera)
+    return [beside(scan, ego, offset) for scan in scans]
+
+
+def _carried(scene: Scene, scans: Sequence[RecordedScan], camera: str, edit: Edit, where: str) -> list[RecordedScan]:
+    """The scans of a sensor on the edited ego vehicle."""
+    change = EgoEdit.of(scene, camera, edit, where)
+    if change is None or not scans:
+        return list(scans)
+    frames, ego = recorded_frames(scene, camera), recorded_ego(scene, camera)
+    seconds = np.array([scan.seconds for scan in scans])
+    within = change.within(frames, seconds, until=float(seconds.max()))
+    return [
+        carried(scan, ego, lambda times: change.poses(frames, times)[1])
+        for scan, inside in zip(scans, within, strict=True)
+        if inside
+    ]
