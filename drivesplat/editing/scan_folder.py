@@ -10,9 +10,9 @@ from drivesplat.editing.scans import SimulatedScan, scan_drive
 from drivesplat.errors import ResultError
 from drivesplat.io.point_cloud import write_vertices
 from drivesplat.io.storage import Provenance, atomic_write, write_json
+from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.machine.device import explain_out_of_memory
 from drivesplat.model.checkpoint import TrainedCheckpoint, open_model
-from drivesplat.rendering.sensor_path import sensor_poses_of
 from drivesplat.scene.rigid import apply, inverse
 from drivesplat.scene.scan_record import ScanRecords
 from drivesplat.scene.scene import Scene

@@ -14,10 +14,11 @@ from drivesplat.edited_motion.edited_actors import EditedActor
 from drivesplat.editing.actors import recorded_and_edited, trained_actors
 from drivesplat.editing.ego import EgoEdit
 from drivesplat.editing.film import actor_placements, collisions
+from drivesplat.lidar.moved_sensor import sensor_poses_of
 from drivesplat.lidar.objects_met import TrackedBoxes
 from drivesplat.model.scans import ScanView, group_met, view_of_scan
 from drivesplat.model.splat_model import SplatModel
-from drivesplat.rendering.sensor_path import beside, carried, recorded_ego, sensor_poses_of
+from drivesplat.rendering.sensor_path import beside, carried, recorded_ego
 from drivesplat.rendering.trajectory import recorded_frames
 from drivesplat.scene.scan import RenderedScan
 from drivesplat.scene.scan_record import NO_OBJECT, RecordedScan

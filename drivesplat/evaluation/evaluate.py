@@ -17,6 +17,7 @@ from drivesplat.evaluation.lpips_map import load_lpips
 from drivesplat.evaluation.metrics import DepthErrors, FrameErrors, LpipsMap, RegionMetrics, measuring_threads, with_gap
 from drivesplat.evaluation.overlaps import OVERLAP_REGIONS, overlap_masks
 from drivesplat.evaluation.scan_evaluation import lidar_metrics
+from drivesplat.evaluation.scan_truth import ScanTruth, scan_truth_metrics
 from drivesplat.evaluation.synthetic import DriveTruth, lateral_metrics, removal_metrics, rendered, rendered_with_depth
 from drivesplat.io.prefetch import prefetch
 from drivesplat.io.storage import Provenance
@@ -36,6 +37,7 @@ from drivesplat.scene.training_record import TrainingRecord
 from drivesplat.settings.device import DeviceSettings
 from drivesplat.settings.evaluate import EvaluateJob
 from drivesplat.settings.lidar_depth import LidarDepthJob
+from drivesplat.settings.method import merged
 
 STATIC_FINDING_DB = 22.0
 VEHICLE_FINDING_DB = 18.0
@@ -140,13 +142,20 @@ def evaluate_method(inputs: EvaluationInputs, job: EvaluateJob, device_settings:
 def truth_metrics(
     model: SplatModel, inputs: EvaluationInputs, job: EvaluateJob, lpips_map: LpipsMap | None, device: torch.device
 ) -> dict[str, Any]:
-    """`lateral` and `removal` for a synthetic world, as far as it has truth for them; empty for a recorded drive."""
+    """`lateral` and `removal` for a synthetic world, as far as it has truth for them, with `lidar` where the method
+    renders it; empty for a recorded drive."""
     if inputs.truth is None or job.removal is None:
         return {}
-    known = DriveTruth(read_truth(inputs.truth), inputs.truth, inputs.recording)
+    truth, margin = read_truth(inputs.truth), job.removal.margin
+    known = DriveTruth(truth, inputs.truth, inputs.recording)
     lateral = lateral_metrics(model, known, job.eval_camera, lpips_map, device)
-    removal = removal_metrics(model, known, job.eval_camera, job.removal.margin, lpips_map, device)
-    return {**({"lateral": lateral} if lateral else {}), **({"removal": removal} if removal else {})}
+    removal = removal_metrics(model, known, job.eval_camera, margin, lpips_map, device)
+    found = {"lateral": lateral or {}, "removal": removal or {}}
+    if inputs.scans is not None and truth.scans:
+        spread = inputs.checkpoint.job.train.scans.beam_spread_rad
+        scans = ScanTruth.of(truth, inputs.truth, inputs.recording.scene, inputs.scans, job.lidar.own_car_radius)
+        found = merged(found, scan_truth_metrics(model, scans, margin, spread, device))
+    return {name: figures for name, figures in found.items() if figures}
 
 
 def protocol(record: TrainingRecord, masks_record: MasksRecord, job: EvaluateJob) -> dict[str, Any]:

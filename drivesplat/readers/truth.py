@@ -64,17 +64,19 @@ class TruthView:
 
 @dataclass(frozen=True)
 class TruthScan:
-    """A LiDAR scan: the token of its sample_data, its key frame, offset, edit and the instance that it is `without` as
-    of a view, and the name of an .npz file. Its arrays (beams, steps), one entry per ray of the pattern: `range`
+    """A LiDAR scan: the token of its sample_data, its key frame, the sensor's pose (4, 4) at its timestamp in the
+    dataset's global frame, offset, edit and the instance that it is `without` as of a view, and the name of an .npz
+    file. Its arrays (beams, steps), one entry per ray of the pattern: `range`
     without noise in metres (float32, infinite without a hit), `intensity` in [0, 1], `instance` as in instance images,
     `returned`."""
 
     token: str
     key_frame: int
+    sensor_to_global: list[list[float]]
     left_m: float
     edit: str | None
+    without: str | None
     file: str
-    without: str | None = None
 
 
 @dataclass(frozen=True)
@@ -159,3 +161,14 @@ def truth_image(path: str | Path, name: str) -> Path:
             f"{image} is missing; delete {path} and rerun: the rule '{RULE}' makes the world anew, with its truth"
         )
     return image
+
+
+def truth_arrays(path: str | Path, name: str, *arrays: str) -> list[np.ndarray]:
+    """Arrays of the .npz file `name` beside the truth.json at `path`. Raises ResultError naming it where it is missing
+    or does not hold them."""
+    file = truth_image(path, name)
+    try:
+        with np.load(file) as held:
+            return [held[array] for array in arrays]
+    except Exception as error:  # zip and numpy each fail in their own ways
+        raise unreadable(file, RULE, f"not an archive of {', '.join(arrays)} ({error})", delete=path) from error

@@ -1,14 +1,12 @@
 """LiDARs on other paths than the recorded one: beside it, or wherever an edited ego vehicle carries them."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from drivesplat.errors import DatasetError
-from drivesplat.lidar.scans import SensorPoses, mean_velocity
+from drivesplat.lidar.moved_sensor import moved, sensor_poses_of
 from drivesplat.rendering.trajectory import displaced, recorded_frames, smooth_poses
 from drivesplat.scene.rigid import inverse, rigid
 from drivesplat.scene.scan_record import RecordedScan
@@ -61,16 +59,6 @@ def _ego_of_sweeps(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return seconds, rigid(Rotation.from_euler("z", np.array(turns)[:, None]).as_matrix(), places)
 
 
-def sensor_poses_of(recorded: RecordedScan) -> SensorPoses:
-    """Sensor to world (n, 4, 4) at offsets (n,) in seconds from a scan's timestamp, by its velocities."""
-
-    def at(offsets: np.ndarray) -> np.ndarray:
-        turns = Rotation.from_rotvec(offsets[:, None] * recorded.angular).as_matrix()
-        return recorded.sensor_to_world @ rigid(turns, offsets[:, None] * recorded.linear)
-
-    return at
-
-
 def beside(recorded: RecordedScan, ego: EgoPoses, offset: TrajectorySettings) -> RecordedScan:
     """The scan's rays from a sensor displaced as cameras are (`drivesplat.rendering.trajectory.displaced`)."""
     if (offset.lateral, offset.vertical, offset.yaw) == (0.0, 0.0, 0.0):
@@ -88,13 +76,3 @@ def carried(recorded: RecordedScan, ego: EgoPoses, edited: EgoPoses) -> Recorded
         return edited(times) @ inverse(ego(times)) @ sensor(offsets)
 
     return moved(recorded, at)
-
-
-def moved(recorded: RecordedScan, sensor: SensorPoses) -> RecordedScan:
-    """The rays of a recorded scan from a sensor whose poses (n, 4, 4) in the world `sensor` gives at offsets (n,). What
-    the scan returned, and the objects that it met, stay those recorded."""
-    ends = recorded.scan.rays.offsets_s
-    first, last = float(ends.min()), float(ends.max())
-    pose: Float[np.ndarray, "4 4"] = sensor(np.zeros(1))[0]
-    linear, angular = mean_velocity(lambda offsets: inverse(pose) @ sensor(offsets), first, last)
-    return replace(recorded, sensor_to_world=pose, linear=linear, angular=angular)

@@ -11,7 +11,7 @@ from helpers.demo_worlds import CAMERAS, LIDAR, edit_of, job_of, recorder_of, wo
 from PIL import Image
 
 from drivesplat.demo.output.disk_space import world_bytes
-from drivesplat.demo.recorder import Recorder
+from drivesplat.demo.recorder import STREET_TO_GLOBAL, Recorder
 from drivesplat.demo.world import make_world
 from drivesplat.errors import ResultError
 from drivesplat.preprocess.extract import extract_scene
@@ -177,8 +177,9 @@ def test_the_edited_truth_lacks_the_removed_vehicle(root, truth):
 
 
 def test_scans_hold_every_ray_with_or_without_a_return(root, truth, recorder):
-    assert [(scan.left_m, scan.edit) for scan in truth.scans] == [
-        view for view in ((0.0, None), (2.0, None), (0.0, "gone")) for _ in range(KEY_FRAMES)
+    views = ((0.0, None, None), (2.0, None, None), (0.0, None, AHEAD), (0.0, "gone", None))
+    assert [(scan.left_m, scan.edit, scan.without) for scan in truth.scans] == [
+        view for view in views for _ in range(KEY_FRAMES)
     ]
     rows = {row["token"]: row for row in table(root, "sample_data")}
     for scan in truth.scans[:KEY_FRAMES:5]:
@@ -194,6 +195,25 @@ def test_scans_hold_every_ray_with_or_without_a_return(root, truth, recorder):
     pattern = np.load(root / "truth" / truth.pattern)
     np.testing.assert_array_equal(pattern["offsets"], recorder.pattern.offsets)
     assert (pattern["elevations"].shape, pattern["azimuths"].shape) == ((32,), (1085,))
+
+
+def test_scans_of_one_sweep_from_elsewhere_and_without_the_vehicle_ahead(root, truth, recorder):
+    recorded, left, without = (truth.scans_of(*view) for view in ((), (2.0,), (0.0, AHEAD)))
+    assert recorded.keys() == left.keys() == without.keys() and truth.left_of_scans == [2.0]
+    number = next(int(n) for n, token in truth.instances.items() if token == AHEAD)
+    for token, scan in recorded.items():
+        moved = np.linalg.inv(np.array(scan.sensor_to_global)) @ np.array(left[token].sensor_to_global)
+        aside = LIDAR.sensor_to_ego[:3, :3] @ moved[:3, 3]
+        np.testing.assert_allclose(aside, [0.0, 2.0, 0.0], atol=1e-6)
+        assert without[token].sensor_to_global == scan.sensor_to_global
+        before, after = (np.load(root / "truth" / one[token].file) for one in (recorded, without))
+        met = before["instance"] == number
+        assert met.sum() > 50 and not (after["instance"] == number).any()
+        assert (after["range"][met] > before["range"][met]).all()
+        np.testing.assert_array_equal(after["range"][~met], before["range"][~met])
+    first = next(iter(recorded.values()))
+    pose = STREET_TO_GLOBAL @ recorder.ego_pose(0.1 * first.key_frame) @ LIDAR.sensor_to_ego
+    np.testing.assert_allclose(first.sensor_to_global, pose, atol=1e-9)
 
 
 def test_the_stage_scans_finds_the_rays_of_the_truth_and_what_they_met(root, scene, truth):

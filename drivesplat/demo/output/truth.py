@@ -151,7 +151,9 @@ def write_scan(root: Path, recorder: Recorder, plan: ScanPlan, index: int) -> Tr
         )
     view = plan.viewpoint
     without = recorder.instance(view.without) if view.without else None
-    return TruthScan(token(recorder.scene, LIDAR.channel, time_us), index, view.left, view.edit, name, without)
+    pose = STREET_TO_GLOBAL @ recorder.ego_to_street(np.array([time_us * 1e-6]), view)[0] @ LIDAR.sensor_to_ego
+    sweep = token(recorder.scene, LIDAR.channel, time_us)
+    return TruthScan(sweep, index, pose.tolist(), view.left, view.edit, without, name)
 
 
 def write_truth(root: Path, recorder: Recorder, views: Iterable[TruthView], scans: Iterable[TruthScan]) -> None:
