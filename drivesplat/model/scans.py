@@ -15,6 +15,8 @@ from drivesplat.scene.scan_record import RecordedScan
 
 NOTHING = 1e-6
 """Alpha below which a ray has met nothing."""
+CHANNELS = 4
+"""Number of groups of Gaussians whose shares of rays are composited together."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +79,15 @@ def scan_picture(gaussians: Gaussians, view: ScanView, before: Float[Tensor, "b 
 def group_met(gaussians: Gaussians, view: ScanView, groups: Int[Tensor, " n"]) -> Int[Tensor, "b a"]:
     """The one of `groups`, numbers from -1, whose Gaussians contribute most to each ray; -1 where nothing is met."""
     numbers, own = groups.unique(return_inverse=True)
-    shares = torch.nn.functional.one_hot(own, len(numbers)).to(gaussians.means)
-    rendering = _rasterized(gaussians, view, shares)
-    return numbers[rendering.values.argmax(dim=-1)].where(rendering.alpha > NOTHING, -1)
+    most = gaussians.means.new_zeros(view.rays.azimuths.shape)
+    found = torch.full_like(most, -1, dtype=groups.dtype)
+    for first in range(0, len(numbers), CHANNELS):  # a fixed number, since kernels are compiled for each
+        shares = own[:, None] == torch.arange(first, first + CHANNELS, device=own.device)
+        weight, number = _rasterized(gaussians, view, shares.to(gaussians.means)).values.max(dim=-1)
+        better = weight > most.clamp(min=NOTHING)
+        found = torch.where(better, numbers[(first + number).clamp(max=len(numbers) - 1)], found)
+        most = torch.where(better, weight, most)
+    return found
 
 
 def _rasterized(

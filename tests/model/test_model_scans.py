@@ -1,5 +1,7 @@
 """LiDAR scans of a model: what its echoes give, seen along the rays of a sensor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,8 @@ from helpers.hand_made import actors_of, motion_through, round_gaussians, track_
 from torch import nn
 
 from drivesplat.errors import ResultError
-from drivesplat.model.scans import ScanView, scan_picture, view_of_scan
+from drivesplat.model.gaussians import concatenate
+from drivesplat.model.scans import ScanView, group_met, scan_picture, view_of_scan
 from drivesplat.model.splat_model import SplatModel
 from drivesplat.rasterization.scans import RayGrid
 from drivesplat.scene.scan import Scan, ScanRays
@@ -105,6 +108,21 @@ def test_alpha_before_a_range_is_that_of_what_is_nearer():
     picture = walls().scan(view(), before=before)
     assert (picture.alpha_before[:, 20:] > 0.99).all() and (picture.alpha_before[:, :20] < 1e-3).all()
     assert walls().scan(view()).alpha_before is None
+
+
+def test_each_ray_knows_the_group_that_contributes_most():
+    """Eleven groups around the sensor, numbered from -1; behind them, unseen, the Gaussians of another."""
+    model = walls()
+    near = model.gaussians_at(0.0, with_echoes=True)
+    around = torch.atan2(near.means[:, 1] - PLACE[1], near.means[:, 0] - PLACE[0])
+    own = ((around + np.pi) * 11 / (2 * np.pi)).long().clamp(max=10) - 1
+    far = replace(near, means=near.means + 5.0 * (near.means - torch.from_numpy(PLACE).float()))
+    both, groups = concatenate([far, near]), torch.cat([torch.full_like(own, 20), own])
+    found, seen = group_met(both, view(angle=0.0), groups), view(angle=0.0).rays.azimuths
+    position = (seen + np.pi) * 11 / (2 * np.pi)
+    inner = (position % 1.0 - 0.5).abs() < 0.3  # elsewhere two groups share a ray
+    assert inner.sum() > 50 and torch.equal(found[inner], position.long()[inner] - 1)
+    assert (group_met(near[:0], view(), own[:0]) == -1).all()
 
 
 def test_a_model_trained_without_lidar_is_refused():
